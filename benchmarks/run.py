@@ -51,15 +51,12 @@ SIZE, QUICK_SIZE = 1000, 20  # MB of a capture that is converted
 
 
 def working() -> list[str]:
-    """The back ends that can be used here; "auto" stands for one of them, and "construct" is the
-    reference, not a fast one.
-    """
+    """Return the back ends that can be used here; "auto" stands for one of them."""
     sensor = ls.sensor("ldrobot-stl27l")
     found = []
     for name in BACKENDS:
-        if name in ("auto", "construct") or (
-            name == "jit" and importlib.util.find_spec("numba") is None
-        ):
+        is_missing = name == "jit" and importlib.util.find_spec("numba") is None
+        if name == "auto" or is_missing:
             continue
         try:
             sensor.decode(sensor.example("data"), backend=name).points()

@@ -14,6 +14,7 @@ from lidarspec.framing.decoder import Decoder, frames_of, is_stream
 from lidarspec.framing.results import Found, Frames
 from lidarspec.packets.stream import PacketStream
 from lidarspec.testing.clouds import ULPS, assert_same_places, assert_well_formed, same
+from tests.by_construct import by_construct
 
 
 def cuts(found: Iterable[Found]) -> list[tuple[str, int, bytes]]:
@@ -59,29 +60,28 @@ def assert_same_points(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) 
 
 
 def assert_backends_agree(sensor: Sensor, data: Any) -> None:
-    """Fail unless the compiled and the interpreted path agree and no plugin failed.
+    """Fail unless our engine reads an input as construct does, and no plugin failed.
 
     Frames, packets, points and counters are compared.
 
     Args:
         data: bytes, or a list of datagrams.
     """
-    decoders = [
-        sensor.decoder(stream=is_stream(data), backend=backend) for backend in ("auto", "construct")
-    ]
+    judges = sensor, by_construct(sensor)
+    decoders = [judge.decoder(stream=is_stream(data)) for judge in judges]
     found = [frames_of(decoder, data) for decoder in decoders]
     split = [cuts(frame for frames in each for frame in frames.found()) for each in found]
     assert split[0] == split[1]
     for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):
-        compiled, interpreted = (
+        ours, theirs = (
             _packets(decoder, name, each) for decoder, each in zip(decoders, found, strict=True)
         )
-        assert not compiled.stats.plugin_errors, compiled.stats.tracebacks[0]
-        assert_same_packets(compiled, interpreted)
+        assert not ours.stats.plugin_errors, ours.stats.tracebacks[0]
+        assert_same_packets(ours, theirs)
         if sensor.frames[name].data:
-            cloud = compiled.points()
+            cloud = ours.points()
             assert_well_formed(cloud)
-            assert_same_points(cloud, interpreted.points())
+            assert_same_points(cloud, theirs.points())
 
 
 def _packets(decoder: Decoder, name: str, found: Sequence[Frames]) -> Packets:

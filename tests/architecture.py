@@ -56,7 +56,7 @@ CONFINED = {
         "spec.syntax",
         "spec.fields",
         "spec.description",
-        "framing.frame_engine",
+        "framing.plain_frames",
         "frames.parse",
         "frames.build",
         "frames.encode",

@@ -1,6 +1,4 @@
-"""What the tests of the sensors share: where vectors and captures are, and decoding on both back
-ends.
-"""
+"""Vectors and captures for the tests of sensors, and decoding that construct judges."""
 
 from __future__ import annotations
 
@@ -16,6 +14,7 @@ import pytest
 
 from lidarspec import Packets, PointCloud, Sensor
 from tests.agreement import assert_same_points
+from tests.by_construct import by_construct
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
 CAPTURES = Path(os.environ.get("LIDARSPEC_CAPTURES", _SHARED / "captures"))
@@ -61,19 +60,18 @@ def _present(path: Path) -> Path:
 
 
 def decoded(sensor: Sensor, data: Any, frame: str | None = None) -> Packets:
-    """The packets of this input, after the compiled and the interpreted path gave the same ones,
-    points and counters.
+    """Return the packets of an input.
+
+    Construct has to read the same packets and points, and count the same.
     """
-    packets, interpreted = (
-        sensor.decode(data, frame),
-        sensor.decode(data, frame, backend="construct"),
-    )
-    assert interpreted.raw.dtype == packets.raw.dtype
-    assert interpreted.raw.tobytes() == packets.raw.tobytes()
-    assert interpreted.stats == packets.stats
-    assert interpreted.time_ns.tolist() == packets.time_ns.tolist()
+    packets = sensor.decode(data, frame)
+    judged = by_construct(sensor).decode(data, frame)
+    assert judged.raw.dtype == packets.raw.dtype
+    assert judged.raw.tobytes() == packets.raw.tobytes()
+    assert judged.stats == packets.stats
+    assert judged.time_ns.tolist() == packets.time_ns.tolist()
     if frame is None:
-        assert_same_points(interpreted.points(), packets.points())
+        assert_same_points(judged.points(), packets.points())
     return packets
 
 

@@ -572,7 +572,7 @@ def open(
             "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port",
             "capture.pcap", or a name of `lidarspec.toml`.
         sensor: an id, a path to a sensor's module, or a Sensor; by default it is detected.
-        backend: evaluates `points`: "auto", "numpy", "jit" or "construct".
+        backend: evaluates `points`: "auto", "numpy" or "jit".
         start: False omits the commands that the sensor declares for opening and closing.
         record: a new file, or a `Recorder`, for everything that arrives and is sent; or a function
             that makes one for the open transport.

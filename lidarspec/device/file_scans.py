@@ -174,12 +174,8 @@ class FileScans(Closing):
 def _constants(sensor: Spec, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
     """What no byte changes, by name: all that a sensor holds, and what is made of it alone."""
     found = dict[tuple[Any, ...], Any]()
-    interpreted = decoder.backend == "construct"
     _walk(sensor, (), found, set())
-    codecs = {
-        ("codec", name): codec(frame, interpreted=interpreted)
-        for name, frame in sensor.frames.items()
-    }
+    codecs = {("codec", name): codec(frame) for name, frame in sensor.frames.items()}
     return {**found, **codecs, ("framing",): decoder.framing}
 
 

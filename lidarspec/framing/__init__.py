@@ -10,7 +10,8 @@ bytes whatever. Modules in reading order:
 * `frame_codec`: the interface of the engine of one frame type: its candidates judged,
   and its frames as columns.
 * `text_frames`: this engine for frames with a wire form.
-* `frame_engine`: this engine for binary frames: compiled, and interpreted by construct.
+* `frame_engine`: this engine for binary frames, by layouts.
+* `plain_frames`: this engine for frames without layouts, by construct.
 * `weak_frames`: types that are accepted only in runs: the runs among their candidates.
 * `candidates`: the candidates in a piece of a stream, of the types that are looked for.
 * `search`: the rule of a stream: the leftmost valid candidate, then on after its last byte.

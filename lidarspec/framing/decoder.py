@@ -46,7 +46,7 @@ ROW_BYTES = 1 << 23
 
 Data = bytes | bytearray | memoryview | NDArray[np.uint8]
 
-BACKENDS = ("auto", "numpy", "jit", "construct")
+BACKENDS = ("auto", "numpy", "jit")
 #: the variable of the environment that names the default.
 BACKEND = "LIDARSPEC_BACKEND"
 
@@ -72,8 +72,7 @@ class Decoder:
     Args:
         sensor: the sensor; only its incoming frames are looked for.
         stream: a byte stream, or datagrams one for each `feed`.
-        backend: what makes points of its packets, "auto", "numpy" or "jit"; "construct" also judges
-            every candidate.
+        backend: what makes points of its packets, "auto", "numpy" or "jit".
         sums: what computes checksums; by default their algorithms.
 
     Attributes:
@@ -92,9 +91,7 @@ class Decoder:
         self.stats = Counters()
         self.witness: Witness | None = None
         keep_freed_memory()
-        self.framing = _framing(
-            tuple(sensor.incoming), tuple(sensor.incoming.values()), backend == "construct", sums
-        )
+        self.framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), sums)
         answer = sensor.options.get(
             "answer", ""
         )  # as if the frame that the answer comes after had been seen
@@ -436,14 +433,9 @@ class Decoder:
 
 
 @lru_cache(maxsize=256)
-def _framing(
-    names: tuple[str, ...], frames: tuple[Frame, ...], interpreted: bool, sums: Sums | None
-) -> Framing:
+def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums | None) -> Framing:
     return Framing(
-        {
-            name: codec(frame, interpreted=interpreted)
-            for name, frame in zip(names, frames, strict=True)
-        },
+        {name: codec(frame) for name, frame in zip(names, frames, strict=True)},
         sums,
     )
 

@@ -1,39 +1,31 @@
-"""The engine of one frame type: judge candidates, and make columns of frames.
+"""The engine of binary frames: judge candidates by their layouts, and make columns of frames.
 
-There is a compiled and an interpreted one.
-
-Both codecs answer the same questions with the same results; every test runs on both.
-`CompiledCodec` works by layouts on whole batches: the header of a candidate is looked at once, when
-it is judged, and its layout goes with it into the columns. `InterpretedCodec` lets construct parse
-one candidate at a time, for structs that have no computable layout and as the reference.
-
-Frames with a wire form have an engine of their own (`lidarspec.framing.text_frames`).
+`CompiledCodec` works on whole batches: the header of a candidate is looked at once, when it is
+judged, and its layout goes with it into the columns. Frames with a wire form have an engine of
+their own (`lidarspec.framing.text_frames`), and so have frames without layouts
+(`lidarspec.framing.plain_frames`). `codec` returns the engine of a frame type.
 """
 
 from __future__ import annotations
 
 import functools
-import io
 from collections.abc import Iterable
 
-import construct
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import PluginError, SpecError
+from lidarspec.errors import PluginError
 from lidarspec.frames.arrays import alike, counted, repeated
 from lidarspec.frames.compilability import NotCompilable
-from lidarspec.frames.frame_table import Group, Records, Rows
+from lidarspec.frames.frame_table import Group, Rows
 from lidarspec.frames.layout import Layout, Refused, Sums, rows_at
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.wire_coder import FormCoder, frame_coder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.many_lengths import AlikeLayouts, LayoutGroup, Together
-from lidarspec.framing.plausibility import plausibility
+from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.framing.results import (
-    CHECKSUM,
     CONSTANT,
-    IMPLAUSIBLE,
     LENGTH,
     PLUGIN,
     SHORT,
@@ -43,7 +35,6 @@ from lidarspec.framing.results import (
 )
 from lidarspec.framing.text_frames import TextCodec
 from lidarspec.spec.description import Frame
-from lidarspec.spec.syntax import Mismatch, has_conditions
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
 BLOCK = 1 << 19
@@ -277,97 +268,6 @@ class CompiledCodec(Codec):
         return Rows(self.schema, groups)
 
 
-class InterpretedCodec(Codec):
-    """A frame type that construct parses, one candidate at a time.
-
-    `reason` says why it is not compiled.
-    """
-
-    is_compiled = False
-
-    def __init__(self, frame: Frame, reason: str = "") -> None:
-        super().__init__(frame)
-        self.reason = reason
-        if any(info.held for info in self.schema.all_fields.values()):
-            lengths = ["lengths"]
-        else:
-            lengths = []
-        self._levels = [
-            "constants",
-            *lengths,
-            *(["checksums"] if has_conditions(frame.prepared) else []),
-            True,
-        ]
-
-    def survey(
-        self,
-        buffer: NDArray[np.uint8],
-        offsets: NDArray[np.intp],
-        stops: NDArray[np.intp] | None = None,
-        *,
-        kind: int = 0,
-        gathered: bool = True,
-        sums: Sums | None = None,
-    ) -> Frames:
-        status = np.zeros(len(offsets), np.uint8)
-        sizes = np.zeros(len(offsets), np.intp)
-        errors: list[PluginError] = []
-        if stops is None:
-            ends = offsets + self.frame.room
-        else:
-            ends = np.minimum(offsets + self.frame.room, stops)
-        for index, (offset, end) in enumerate(zip(offsets.tolist(), ends.tolist(), strict=True)):
-            data = buffer[offset:end].tobytes()
-            status[index], sizes[index] = self._judge(data, errors)
-        return Frames(
-            buffer,
-            repeated(kind, len(offsets)),
-            offsets,
-            sizes,
-            status=status,
-            errors=tuple(errors),
-        )
-
-    def table(self, frames: Iterable[bytes]) -> Records:
-        frames = list(frames)
-        return Records(
-            self.schema,
-            [self.frame.prepared.parse(frame, _verify=False) for frame in frames],
-            frames,
-        )
-
-    def _judge(self, data: bytes, errors: list[PluginError]) -> tuple[int, int]:
-        stream = io.BytesIO(data)
-        try:
-            self.frame.prepared.parse_stream(stream, _verify=self._levels[0])
-            size = stream.tell()
-            if not size:
-                return LENGTH, 0
-            parsed = [
-                self.frame.prepared.parse(data[:size], _verify=level) for level in self._levels[1:]
-            ][-1]
-        except Mismatch as mismatch:
-            return {"checksum": CHECKSUM, "length": LENGTH, "value": IMPLAUSIBLE}.get(
-                mismatch.reason, CONSTANT
-            ), 0
-        except construct.CheckError:
-            return IMPLAUSIBLE, 0
-        except construct.StreamError:
-            return (LENGTH if len(data) >= self.frame.room else SHORT), 0
-        except SpecError:
-            raise
-        except construct.ConstructError:
-            return LENGTH, 0
-        except Exception as error:
-            errors.append(PluginError.of(error, "struct"))
-            return PLUGIN, 0
-        if self.frame.plausible is None:
-            return VALID, size
-        return int(
-            plausibility(self.frame, Records(self.schema, [parsed], [data[:size]]), errors)[0]
-        ), size
-
-
 def _partial(
     buffer: NDArray[np.uint8],
     offsets: NDArray[np.intp],
@@ -396,24 +296,16 @@ def _partial(
     return status, sizes
 
 
-def codec(
-    frame: Frame, *, interpreted: bool = False
-) -> CompiledCodec | InterpretedCodec | TextCodec:
+@functools.lru_cache(maxsize=2048)
+def codec(frame: Frame) -> CompiledCodec | PlainCodec | TextCodec:
     """Return the engine of a frame type, always the same one.
 
-    It is compiled if that is possible and construct is not asked for.
+    Frames without layouts are parsed by construct, one at a time.
     """
-    return _codec(frame, interpreted)
-
-
-@functools.lru_cache(maxsize=2048)
-def _codec(frame: Frame, interpreted: bool) -> CompiledCodec | InterpretedCodec | TextCodec:
     coder = frame_coder(frame)
     if isinstance(coder, FormCoder):
         return TextCodec(frame, coder)
-    if interpreted:
-        return InterpretedCodec(frame, "asked for")
     try:
         return CompiledCodec(frame)
     except NotCompilable as refusal:
-        return InterpretedCodec(frame, str(refusal))
+        return PlainCodec(frame, str(refusal))

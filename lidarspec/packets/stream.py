@@ -56,7 +56,7 @@ class PacketStream:
         sensor: that sends them.
         frame: their type.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
-        backend: what makes points of the packets, "auto", "numpy", "jit" or "construct".
+        backend: what makes points of the packets, "auto", "numpy" or "jit".
         state: frames of other types, by name, that count as seen before the first packet.
         reference: tells the turn of the clock from the first packet on.
 
@@ -289,7 +289,7 @@ class PacketStream:
         return seen
 
     def _codec_of(self, name: str) -> Codec:
-        return codec(self.sensor.frames[name], interpreted=self._backend == "construct")
+        return codec(self.sensor.frames[name])
 
     def _last(self, name: str) -> Table:
         """Return the last frame of another type, as a table."""

@@ -21,7 +21,8 @@ from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
 from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import Coder, frame_coder
-from lidarspec.framing.frame_engine import InterpretedCodec, codec
+from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.spec.description import Spec
 from lidarspec.spec.syntax import member
 from lidarspec.spec.tree import Formula, Kind, Node, refs
@@ -38,7 +39,7 @@ class FrameMaker:
 
     def __init__(self, sensor: Spec, frame: str) -> None:
         engine = codec(sensor.frames[frame])
-        if isinstance(engine, InterpretedCodec):
+        if isinstance(engine, PlainCodec):
             raise SpecError(
                 f"cannot be simulated, since it is not compiled: {engine.reason}",
                 path=frame,

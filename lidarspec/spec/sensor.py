@@ -212,7 +212,7 @@ class Sensor(Spec):
         Args:
             stream: True reads a byte stream, False one datagram for each `feed`; by default what
                 the data link says.
-            backend: "auto", "numpy", "jit" or "construct": the same results.
+            backend: "auto", "numpy" or "jit": the same results.
 
         Raises:
             UsageError: for an unknown back end, or a sensor that has no frames before it is
@@ -235,7 +235,7 @@ class Sensor(Spec):
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
                 datagrams.
-            backend: "auto", "numpy", "jit" or "construct": the same results.
+            backend: "auto", "numpy" or "jit": the same results.
 
         Raises:
             UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
@@ -254,7 +254,7 @@ class Sensor(Spec):
                 datagrams.
             frame: the name of a frame type; of several data frames, the first that arrives where
                 left out.
-            backend: "auto", "numpy", "jit" or "construct": the same results.
+            backend: "auto", "numpy" or "jit": the same results.
 
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
@@ -294,7 +294,7 @@ class Sensor(Spec):
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
                 datagrams.
-            backend: "auto", "numpy", "jit" or "construct": the same results.
+            backend: "auto", "numpy" or "jit": the same results.
             select: which scans, and what of each.
 
         Raises:

@@ -22,6 +22,7 @@ from lidarspec import Packets, Sensor, SpecError, WireError
 from lidarspec.frames.schema import schema
 from lidarspec.spec import Every, Fields, Frame, Polar, Udp
 from lidarspec.spec.syntax import frame_tree
+from tests.by_construct import reader
 
 BACKENDS = ("auto", "construct")
 #: what puts every 16-bit number among the ranges that are returns.
@@ -97,11 +98,11 @@ def agree(
         if kept:
             assert ours.build("data", found) == data
     for backend in BACKENDS:
-        accepted = ours.decode(invalid, backend=backend)
+        accepted = reader(ours, backend).decode(invalid)
         assert len(accepted) == 0, (
             f"{backend}: frame at byte {accepted.offset[0]} of {b''.join(invalid).hex()}"
         )
-        packets = ours.decode([data for data, _ in whole], backend=backend)
+        packets = reader(ours, backend).decode([data for data, _ in whole])
         assert len(packets) == len(whole), backend
         assert packets.stats.plugin_errors == 0, packets.stats.tracebacks
         for path in packets.table.schema.fields:
@@ -165,7 +166,7 @@ def clouds_agree(
             for value in flat(at(wanted, path.split(".")), len(info.axes))
         ]
         for backend in backends:
-            cloud = ours.decode([data for data, _ in kept], backend=backend).points()
+            cloud = reader(ours, backend).decode([data for data, _ in kept]).points()
             np.testing.assert_array_equal(
                 cloud.range, np.array(values, np.float32) + AWAY, err_msg=f"{backend} {path}"
             )

@@ -8,7 +8,8 @@ values at the edges of their fields.
 from __future__ import annotations
 
 from lidarspec import Sensor
-from lidarspec.framing.frame_engine import CompiledCodec, InterpretedCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.spec import Frame
 from lidarspec.testing import subject as material
 from lidarspec.testing.frames import acceptable, free
@@ -27,7 +28,7 @@ def is_compiled(frame: Frame) -> bool:
 def interpreted_reason(frame: Frame) -> str:
     """Return why construct parses a frame type one candidate at a time; "" if it does not."""
     engine = codec(frame)
-    return engine.reason if isinstance(engine, InterpretedCodec) else ""
+    return engine.reason if isinstance(engine, PlainCodec) else ""
 
 
 def assert_damaged_input_reads_alike(sensor: Sensor, count: int = DAMAGED_CONVERSATIONS) -> None:

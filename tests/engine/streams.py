@@ -16,6 +16,7 @@ from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
 from tests.agreement import cuts
+from tests.by_construct import reader
 from tests.engine.oracle import Cut
 
 #: about so many bytes to a stream: the oracle takes its time.
@@ -157,7 +158,7 @@ class Books:
     """
 
     def __init__(self, sensor: Sensor, *, backend: str = "auto") -> None:
-        self.decoder = sensor.decoder(backend=backend)
+        self.decoder = reader(sensor, backend).decoder()
         self.found: list[Cut] = []
 
     def feed(self, chunk: bytes) -> Books:

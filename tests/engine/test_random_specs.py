@@ -16,6 +16,7 @@ import pytest
 from construct import Construct
 
 from lidarspec import Sensor, SpecError
+from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, agree, clouds_agree, expected, sensor
 from tests.engine.engines import is_compiled
 from tests.engine.random_specs import made, spec
@@ -154,7 +155,7 @@ def test_what_loses_bits_is_refused_and_not_drawn(part: str) -> None:
 def test_a_frame_without_a_byte_is_never_found(text: str) -> None:
     ours = sensor(made(text))
     for backend in BACKENDS:
-        assert len(ours.decode([b"", b"\0"], backend=backend)) == 0
+        assert len(reader(ours, backend).decode([b"", b"\0"])) == 0
 
 
 def test_constants_of_an_element_that_is_not_there_are_asked_of_no_frame() -> None:
@@ -164,4 +165,4 @@ def test_constants_of_an_element_that_is_not_there_are_asked_of_no_frame() -> No
     )
     ours = sensor(made(f'Struct("n" / Int8ub, "a" / Array(0, {element}), "z" / Int16ub)'))
     for backend in BACKENDS:
-        assert len(ours.decode([b"\x01\x02\x03", b"\x07M\x03"], backend=backend)) == 2
+        assert len(reader(ours, backend).decode([b"\x01\x02\x03", b"\x07M\x03"])) == 2

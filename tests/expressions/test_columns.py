@@ -13,6 +13,7 @@ from construct import Array, Const, Int8ub, Int16ub, Int32ub, Struct, this
 
 from lidarspec import PointCloud, SpecError
 from lidarspec.spec import Clock, Fields, OnChange, Polar, Scaled, Sequence, running, take
+from tests.by_construct import reader
 from tests.engine import against_construct
 
 ENGINES = ["construct", "numpy", pytest.param("jit", marks=pytest.mark.slow)]
@@ -54,7 +55,7 @@ def frame(count: int, time: int = 0, number: int = 0) -> bytes:
 
 
 def cloud_of(points: Any, *frames: bytes, engine: str) -> PointCloud:
-    return replace(SENSOR, points=points).decode(b"".join(frames), backend=engine).points()
+    return reader(replace(SENSOR, points=points), engine).decode(b"".join(frames)).points()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -80,9 +81,8 @@ def test_elements_of_arrays_are_fields(engine: str) -> None:
 def test_clocks_counters_and_cuts_are_elements_too_in_integers(engine: str) -> None:
     times = [4_000_000_001, 4_000_000_004, 4_000_000_013, 4_000_000_016]
     counted = replace(SENSOR, sequence=Sequence("columns[3].number"))
-    packets = counted.decode(
+    packets = reader(counted, engine).decode(
         b"".join(frame(1, time, number) for number, time in zip([0, 1, 4, 5], times, strict=True)),
-        backend=engine,
     )
     assert packets.time_ns.tolist() == times
     assert packets.stats.lost == 2
@@ -90,7 +90,7 @@ def test_clocks_counters_and_cuts_are_elements_too_in_integers(engine: str) -> N
     data = b"".join(
         frame(1, 1000 * place, number) for place, number in enumerate((0, 0, 1, 1, 1, 2, 2))
     )
-    assert [len(scan.points) for scan in SENSOR.scans(data, backend=engine)] == [2, 3, 2]
+    assert [len(scan.points) for scan in reader(SENSOR, engine).scans(data)] == [2, 3, 2]
 
 
 def test_elements_that_are_not_there_are_named() -> None:

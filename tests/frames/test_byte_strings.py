@@ -55,6 +55,7 @@ from construct import (
 from lidarspec import SpecError, UsageError, WireError, export
 from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.subject import Subject
+from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, agree, plain, sensor
 from tests.engine.engines import (
     assert_damaged_input_reads_alike,
@@ -260,11 +261,11 @@ def test_a_length_that_is_no_number_is_the_plugins_fault_and_a_negative_one_is_t
     backend: str,
 ) -> None:
     for part in (Array(this.k / 2, Int8ub), Bytes(this.k / 2)):
-        stats = sensor(Struct("k" / Int8ub, "v" / part)).decode([b"\2\1"], backend=backend).stats
+        stats = reader(sensor(Struct("k" / Int8ub, "v" / part)), backend).decode([b"\2\1"]).stats
         assert (stats.plugin_errors, stats.bad_length) == (1, 0)
     for part in (Array(this.k, Int8ub), Bytes(this.k)):
         ours = sensor(Struct("k" / Int8sb, "v" / part))
-        stats = ours.decode([b"\xff\1"], backend=backend).stats
+        stats = reader(ours, backend).decode([b"\xff\1"]).stats
         assert (stats.plugin_errors, stats.bad_length) == (0, 1)
         with pytest.raises(WireError):
             ours.parse(b"\xff\1")
@@ -301,7 +302,7 @@ def test_a_count_is_bounded_by_the_longest_frame_also_where_elements_have_no_byt
     )  # more elements than bytes, and they are bits
     ours = sensor(Struct("k" / Int8ub, "n" / Int32ub, "bits" / bits, "v" / empty), max_length=20)
     short, huge = b"\0\0\0\0\3\7\7\7", b"\0\xff\xff\xff\xff\7\7\7"
-    stats = ours.decode([short, huge], backend=backend).stats
+    stats = reader(ours, backend).decode([short, huge]).stats
     assert (stats.frames, stats.bad_length, stats.plugin_errors) == ({"data": 1}, 1, 0)
     assert len(ours.parse(short).v) == 3
     with pytest.raises(WireError, match=r"v: .*4294967295"):
@@ -319,9 +320,9 @@ def test_elements_without_a_byte_are_bounded_together(backend: str) -> None:
         ),
         max_length=60,
     )
-    stats = ours.decode(
-        [b"\0\3", b"\0\xff", b"\0\x3c"], backend=backend
-    ).stats  # 3 + 9 + 27 elements; too many
+    stats = (
+        reader(ours, backend).decode([b"\0\3", b"\0\xff", b"\0\x3c"]).stats
+    )  # 3 + 9 + 27 elements; too many
     assert (stats.frames, stats.bad_length, stats.plugin_errors) == ({"data": 1}, 2, 0)
     assert len(ours.parse(b"\0\3").v[2][2]) == 3
     with pytest.raises(WireError, match=r"v: .*60"):
@@ -333,8 +334,8 @@ def test_elements_within_a_bit_block_are_no_elements_without_a_byte(backend: str
     block = BitStruct("x" / BitsInteger(8), "no" / Array(3, Struct()))
     assert (
         len(
-            sensor(Struct("v" / Array(20, block)), max_length=20).decode(
-                [bytes(20)], backend=backend
+            reader(sensor(Struct("v" / Array(20, block)), max_length=20), backend).decode(
+                [bytes(20)]
             )
         )
         == 1

@@ -34,6 +34,7 @@ from lidarspec.exports import messages
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Scaled
 from lidarspec.spec.tree import Select, nodes
+from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, agree, sensor
 from tests.engine.engines import is_compiled
 
@@ -158,7 +159,7 @@ def test_what_build_fills_in_is_not_asked_of_a_frame_that_comes(inside: bool) ->
     right, wrong = b"\2\3\7\7", b"\2\x09\7\7"
     assert ours.build("data", ours.parse(right)) == ours.build("data", ours.parse(wrong)) == right
     for backend in BACKENDS:
-        found = ours.decode([right, wrong], backend=backend)
+        found = reader(ours, backend).decode([right, wrong])
         assert found["head.length" if inside else "length"].tolist() == [3, 9]
     assert [
         ours.parse(data).head.length if inside else ours.parse(data).length

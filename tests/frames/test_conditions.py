@@ -32,6 +32,7 @@ from construct import (
 
 from lidarspec import UsageError, WireError
 from lidarspec.spec import Frame, Parts, Simulation
+from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, agree, sensor
 from tests.engine.engines import interpreted_reason, is_compiled
 
@@ -89,7 +90,7 @@ def test_frames_are_judged_as_construct_judges_them(name: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_what_is_not_allowed_is_counted_shown_and_not_built(backend: str) -> None:
     ours = sensor(Struct("a" / OneOf(Int8ub, [1, 2]), "b" / Int8ub, "ok" / Check(this.b < 9)))
-    packets = ours.decode(b"\1\2\3\4\2\x09\2\3", backend=backend)
+    packets = reader(ours, backend).decode(b"\1\2\3\4\2\x09\2\3")
     assert packets["b"].tolist() == [2, 3]
     assert (packets.stats.implausible, packets.stats.bytes_skipped) == (4, 4)
     assert ours.parse(b"\3\x09", verify=False).a == 3

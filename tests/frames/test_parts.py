@@ -16,6 +16,7 @@ from lidarspec import Sensor, SpecError, UsageError, WireError
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree
 from lidarspec.spec import Checksummed, Frame, Parts, Simulation, SizeOf, Sum, Xor
 from tests.agreement import assert_backends_agree
+from tests.by_construct import reader
 from tests.engine import against_construct
 from tests.engine.streams import Books
 from tests.shapes import SHAPES
@@ -125,7 +126,7 @@ def test_the_clock_of_a_part_is_its_own() -> None:
         for i, own in enumerate(times)
     ]
     for backend in ("auto", "construct"):
-        packets = SEGMENTS.decode(frames, backend=backend)
+        packets = reader(SEGMENTS, backend).decode(frames)
         first = (2**32 - 10) * 1000
         assert (packets.time_ns - first).tolist() == [0, 0, 30_000]
         assert (packets.parts("segments").time_ns - first).tolist() == [

@@ -19,6 +19,7 @@ from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Checksummed, Frame, Sum
 from lidarspec.testing.subject import Subject, mutated
 from tests.agreement import assert_backends_agree
+from tests.by_construct import reader
 from tests.engine import against_construct
 from tests.engine.oracle import Oracle
 from tests.engine.streams import Books, damaged, decoded
@@ -231,7 +232,7 @@ def test_a_datagram_with_a_wrong_constant_is_not_one_of_wrong_length() -> None:
         ([b"\xff"], "bad_length"),
     ):
         for backend in ("numpy", "construct"):
-            decoder = sensor.decoder(stream=False, backend=backend)
+            decoder = reader(sensor, backend).decoder(stream=False)
             assert decoder.feed(data[0]) == []
             counted = {
                 name: number

@@ -215,7 +215,7 @@ def _known(name: str) -> tuple[str, ...]:
         "link": ("serial", "udp", "out"),
         "scene": ("scene.toml", "stl.bin", "none.toml"),
         "speed": ("max",),
-        "backend": ("numpy", "construct", "auto"),
+        "backend": ("numpy", "jit", "auto"),
     }.get(name, (*SOURCES, "1", "2", "10ms", "0:47", "54 2c 68", "points", "max"))
 
 

@@ -16,6 +16,7 @@ import lidarspec as ls
 from lidarspec import Counters, Packets, Scan, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
+from tests.by_construct import reader
 from tests.representatives import load_sensor
 from tests.shapes import SHAPES
 
@@ -157,9 +158,8 @@ def test_packets_without_samples_give_no_points_whatever_packets_are_beside_them
     samples = [
         [dict(distance=1000 + index, quality=index)] * count for index, count in enumerate(counts)
     ]
-    packets = sensor.decode(
+    packets = reader(sensor, backend).decode(
         b"".join(sensor.build("data", first=0, last=100, samples=each) for each in samples),
-        backend=backend,
     )
     cloud = packets.points()
     assert (len(packets), len(cloud)) == (len(counts), sum(counts))

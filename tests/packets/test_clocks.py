@@ -12,6 +12,7 @@ from construct import Array, Int8ub, Int16ul, Int64ul, Struct
 from lidarspec import SpecError
 from lidarspec.packets.clocks import Unwrapper
 from lidarspec.spec import Clock, Scaled, Sequence
+from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, sensor
 
 SECOND = 10**9
@@ -103,12 +104,12 @@ def test_a_counter_of_64_bits_counts_losses_and_starts_again(first: int, backend
         (turn[2:], 0),
         ([2**64 - 3, first + 1], 3),
     ):
-        stats = counted.decode(wide(numbers), backend=backend).stats
+        stats = reader(counted, backend).decode(wide(numbers)).stats
         assert (stats.lost, stats.late, stats.duplicates, stats.plugin_errors) == (lost, 0, 0, 0), (
             numbers
         )
-    packets = counted.decode(
-        wide([10**18, 5, 6, 2**63, 2**63 + 1]), backend=backend
+    packets = reader(counted, backend).decode(
+        wide([10**18, 5, 6, 2**63, 2**63 + 1])
     )  # it was switched off and on
     assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
     assert np.diff(packets.index)[[1, 3]].tolist() == [1, 1]

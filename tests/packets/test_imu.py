@@ -20,6 +20,7 @@ from lidarspec.points.cloud import Mount
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Cartesian, Clock, Fields, Frame, Imu
+from tests.by_construct import reader
 from tests.shapes import SHAPES
 from tests.shapes.inertia import RATE, SAMPLES
 
@@ -71,7 +72,7 @@ def test_both_engines_and_single_packets_read_alike(frame: str) -> None:
     data = [SENSOR.example(frame, seed=seed) for seed in range(30)]
     bulk = SENSOR.decode(data, frame).imu()
     ways = [
-        SENSOR.decode(data, frame, backend="construct").imu(),
+        reader(SENSOR, "construct").decode(data, frame).imu(),
         joined([SENSOR.decode([each], frame).imu() for each in data]),
     ]
     for other in ways:

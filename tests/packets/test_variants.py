@@ -14,6 +14,7 @@ from construct import Array, Const, Int8ul, Struct, this
 import lidarspec
 from lidarspec import Sensor, SpecError, simulate
 from lidarspec.spec import Cartesian, Fields, Frame, Polar, Sequence, Simulation
+from tests.by_construct import reader
 from tests.made_captures import frame, pcap
 from tests.shapes import headed, lengths
 
@@ -103,7 +104,7 @@ def test_packets_whose_header_leaves_the_counter_out_follow_each_other(
     numbers: list[int | None], lost: int, duplicates: int, index: list[int] | None
 ) -> None:
     for backend in ("auto", "construct"):
-        packets = headed.SENSOR.decode([block(number) for number in numbers], backend=backend)
+        packets = reader(headed.SENSOR, backend).decode([block(number) for number in numbers])
         assert (packets.stats.lost, packets.stats.duplicates, packets.stats.plugin_errors) == (
             lost,
             duplicates,
@@ -147,7 +148,7 @@ def test_a_cloud_is_nominal_until_the_sensor_has_its_own_calibration() -> None:
 def test_an_array_without_elements_is_the_same_on_both_paths() -> None:
     empty = headed.SENSOR.build("data", unit=4, counted=0, rows=0, blocks=[], counter=None)
     compiled, interpreted = (
-        headed.SENSOR.decode([empty, block(1)], backend=backend)
+        reader(headed.SENSOR, backend).decode([empty, block(1)])
         for backend in ("auto", "construct")
     )
     assert (
@@ -181,7 +182,7 @@ def test_an_array_in_one_without_elements_may_have_a_length_of_its_own() -> None
     )
     data = [bytes.fromhex("5257 00 05"), bytes.fromhex("5257 02 03 010203 040506")]
     for backend in ("auto", "construct"):
-        packets = sensor.decode(data, backend=backend)
+        packets = reader(sensor, backend).decode(data)
         assert packets.raw["rows"]["cells"].tolist() == [[[0] * 3] * 2, [[1, 2, 3], [4, 5, 6]]]
         assert packets.count("rows.cells").tolist() == [0, 3]
         assert packets.points().range.tolist() == [1, 2, 3, 4, 5, 6]

@@ -14,6 +14,7 @@ from lidarspec import Sensor, SpecError
 from lidarspec.plugins import Registry
 from lidarspec.scans.scans import scans_of
 from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Serial, Sum, Xor, hookimpl
+from tests.by_construct import reader
 from tests.plugins.test_plugins import STRANGER
 from tests.shapes import SHAPES
 
@@ -54,7 +55,7 @@ def test_a_checksum_hook_replaces_the_algorithm_and_nothing_else(registry: Regis
     assert built[:-2] == plain[:-2]
     assert built[-2] == Xor()(plain[:-2])
     for backend in ("auto", "construct"):
-        assert hooked.decode(built + plain, backend=backend).stats.frames == {"data": 1}
+        assert reader(hooked, backend).decode(built + plain).stats.frames == {"data": 1}
     assert SHAPES["shape-count"].parse(plain)
     untouched = registry.sensor("shape-nested")
     assert untouched.parse(untouched.example("data"))

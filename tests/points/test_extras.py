@@ -31,6 +31,7 @@ from lidarspec.points.plain import evaluate
 from lidarspec.spec import Cartesian, Extra, Fields, Frame, Polar, Scaled, Simulation, along, take
 from lidarspec.testing.clouds import assert_well_formed
 from tests.agreement import assert_same_points
+from tests.by_construct import reader
 from tests.points.backends import BACKENDS, EVERY_BACKEND
 from tests.shapes import SHAPES
 
@@ -47,8 +48,8 @@ KINDS = {
 
 def packets(number: int = 40, backend: str = "numpy") -> Packets:
     """Packets with anything in them."""
-    return SENSOR.decode(
-        [SENSOR.example("data", seed=seed) for seed in range(number)], backend=backend
+    return reader(SENSOR, backend).decode(
+        [SENSOR.example("data", seed=seed) for seed in range(number)]
     )
 
 
@@ -254,9 +255,11 @@ def words() -> Sensor:
 def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(
     sensor: Sensor, backend: str
 ) -> None:
-    read = sensor.decode(
-        [sensor.example(sensor.data_frame, seed=seed) for seed in range(9)], backend=backend
-    ).with_points
+    read = (
+        reader(sensor, backend)
+        .decode([sensor.example(sensor.data_frame, seed=seed) for seed in range(9)])
+        .with_points
+    )
     plain = evaluate(read).cloud
     names = [*plain.columns, "valid"]
     for which in (..., slice(5, len(plain) - 5)):

@@ -23,6 +23,7 @@ from lidarspec.spec.links import is_datagram
 from lidarspec.testing.subject import Subject
 from tests.agreement import assert_same_points
 from tests.broken import sound
+from tests.by_construct import reader
 from tests.engine.against_construct import clouds_agree, sensor
 from tests.engine.random_specs import made
 from tests.installed import distinct_sensors_in, sensor_modules
@@ -214,7 +215,7 @@ def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str
         sample = Struct("distance" / Scaled(Int16ul, unit, "m"), "quality" / Int8ul)
         made = sound.sensor(sound.frame(sound.sealed(samples=Array(this.count, sample))))
         cloud = made.decode(b"".join(simulate(made, 40)), backend=backend).points()
-        plain = made.decode(b"".join(simulate(made, 40)), backend="construct").points()
+        plain = reader(made, "construct").decode(b"".join(simulate(made, 40))).points()
         assert cloud.valid.any()
         assert_same_points(cloud, plain)
 

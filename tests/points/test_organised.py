@@ -16,6 +16,7 @@ from lidarspec.points.evaluate import evaluated
 from lidarspec.points.plain import evaluate
 from lidarspec.spec import Fields, Polar, stack
 from tests.agreement import assert_same_points
+from tests.by_construct import reader
 from tests.points.backends import EVERY_BACKEND
 from tests.shapes import SHAPES
 from tests.shapes.columns import AZIMUTHS, COLUMNS, PIXELS, TURN
@@ -42,7 +43,7 @@ def frame(first: int, **of_all: Any) -> bytes:
 
 
 def cloud_of(*frames: bytes, points: Any = SENSOR.points, backend: str = "auto") -> PointCloud:
-    return replace(SENSOR, points=points).decode(list(frames), backend=backend).points()
+    return reader(replace(SENSOR, points=points), backend).decode(list(frames)).points()
 
 
 @EVERY_BACKEND
@@ -86,7 +87,7 @@ def test_rows_of_tables_are_looked_at_where_they_are_or_gathered() -> None:
     ]  # round the end of the table, too
     beyond, mixed = [frame(TURN - 1)], [frame(0), frame(32)]
     for frames in (in_order, beyond, mixed, in_order * 40 + beyond):
-        read = SENSOR.decode(frames, backend="numpy")
+        read = reader(SENSOR, "numpy").decode(frames)
         assert_same_points(evaluated(read).cloud, evaluate(read).cloud)
 
 

@@ -28,6 +28,7 @@ from lidarspec.spec import (
     wrap,
 )
 from tests.agreement import assert_same_points
+from tests.by_construct import reader
 from tests.engine import against_construct
 from tests.shapes import SHAPES, calibration
 
@@ -39,9 +40,11 @@ def degrees(cloud: PointCloud) -> list[float]:
 
 
 def cloud_of(sensor: Sensor, *frames: bytes, backend: str) -> PointCloud:
-    return sensor.decode(
-        list(frames) if sensor.datagrams else b"".join(frames), backend=backend
-    ).points()
+    return (
+        reader(sensor, backend)
+        .decode(list(frames) if sensor.datagrams else b"".join(frames))
+        .points()
+    )
 
 
 @both
@@ -60,7 +63,7 @@ def test_counts_spread_the_angles_and_wrap(backend: str) -> None:
     assert cloud.range.tolist() == pytest.approx([1.0, 2.0, np.inf, 4.66, 0.5])
     assert cloud.valid.tolist() == [True, True, False, True, True]
     np.testing.assert_allclose(cloud.xyz[4], [0, -0.5, 0], atol=1e-6)
-    packets = sensor.decode(frame(0, 10, 1, 2, 3) + frame(0, 10, 7), backend=backend)
+    packets = reader(sensor, backend).decode(frame(0, 10, 1, 2, 3) + frame(0, 10, 7))
     assert packets.count("samples").tolist() == [3, 1]
     assert packets.raw["samples"]["distance"].tolist() == [[1, 2, 3], [7, 0, 0]]
 
@@ -178,7 +181,7 @@ def test_bit_fields_in_both_orders(backend: str) -> None:
     )  # 0x1234 << 10 | 1 << 8 | 0xab = 0x48d1ab, low byte first
     assert data[26:29] == bytes.fromhex("48 d1 ab")
     assert data[44] == int(f"{1 << 5 | 0b11101:08b}"[::-1], 2)
-    packets = sensor.decode(data, backend=backend)
+    packets = reader(sensor, backend).decode(data)
     assert packets["little.distance"][0, 0] == packets["big.distance"][0, 5] == pytest.approx(4.66)
     assert (packets["drift"][0], packets["mirrored.tilt"][0]) == (pytest.approx(-0.002), -3)
     cloud = packets.points()
@@ -318,7 +321,7 @@ def test_options_of_the_header_change_what_follows(backend: str) -> None:
         frame(0, 1, 2, None, dict(rpm=0x1234, volts=12), 0, 9),
     ]
     assert [len(data) for data in frames] == [13, 24, 12]
-    packets = sensor.decode(b"".join(frames), backend=backend)
+    packets = reader(sensor, backend).decode(b"".join(frames))
     assert packets.count("distances").tolist() == [2, 4, 0]
     np.testing.assert_array_equal(packets["extra.rpm"], [np.nan, 600, 0x1234])
     np.testing.assert_array_equal(packets["extra.volts"], [np.nan, np.nan, 12])
@@ -335,21 +338,21 @@ def test_a_clock_that_wraps_runs_on(backend: str) -> None:
         sensor.build("data", seconds=int(t), ticks=round(t % 1 * 10_000), distances=[1, 2, 3, 4])
         for t in instants
     ]
-    packets = sensor.decode(b"".join(frames), backend=backend)
+    packets = reader(sensor, backend).decode(b"".join(frames))
     expected = [58.5, 59.25, 59.9999, 60.0, 89.5, 118.0, 121.0]
     assert packets.time_ns.tolist() == [round(t * 1e4) * 100_000 for t in expected]
     turns = [
         sensor.build("data", seconds=i * 10 % 60, ticks=0, distances=[1, 2, 3, 4])
         for i in range(300)
     ]
-    assert sensor.decode(b"".join(turns), backend=backend).time_ns.tolist() == [
+    assert reader(sensor, backend).decode(b"".join(turns)).time_ns.tolist() == [
         i * 10 * 10**9 for i in range(300)
     ]
     late = [turns[spot] for spot in (0, 1, 3, 2, 4)]
-    assert sensor.decode(b"".join(late), backend=backend).time_ns.tolist() == [
+    assert reader(sensor, backend).decode(b"".join(late)).time_ns.tolist() == [
         i * 10 * 10**9 for i in (0, 1, 3, 2, 4)
     ]
-    scans = list(sensor.scans(b"".join(frames[:4]), backend=backend))
+    scans = list(reader(sensor, backend).scans(b"".join(frames[:4])))
     assert [len(scan) for scan in scans] == [4, 4, 4, 4]
 
 
@@ -384,7 +387,7 @@ def test_arrays_in_arrays_and_cartesian_points(backend: str) -> None:
     sensor = SHAPES["shape-grid"]
     depth = [[1000 * (4 * row + column) for column in range(4)] for row in range(3)]
     skew = [[-1, 0, 0, 0], [0] * 4, [0, 0, 0, 50]]
-    packets = sensor.decode(sensor.build("data", frame=1, depth=depth, skew=skew), backend=backend)
+    packets = reader(sensor, backend).decode(sensor.build("data", frame=1, depth=depth, skew=skew))
     assert packets.raw["depth"].shape == (1, 3, 4)
     cloud = packets.points()
     assert cloud.shape == (3, 4)
@@ -407,7 +410,7 @@ def test_numbers_keep_every_bit(backend: str) -> None:
     )
     data = sensor.build("data", **values)
     assert data[-2:] not in (b"\0\0", b"\xff\xff")
-    packets = sensor.decode(data, backend=backend)
+    packets = reader(sensor, backend).decode(data)
     assert packets.raw["serial"][0] == -(2**63)
     assert packets.time_ns.tolist() == [12_345_678_901]
     cloud = packets.points()
@@ -417,7 +420,7 @@ def test_numbers_keep_every_bit(backend: str) -> None:
     for absent in (b"\0\0", b"\xff\xff"):
         unfilled = signalling[:-2] + absent
         assert sensor.build("data", sensor.parse(unfilled)) == unfilled
-        found = sensor.decode(unfilled + signalling, backend=backend)
+        found = reader(sensor, backend).decode(unfilled + signalling)
         assert (len(found), found.stats.bad_checksum) == (1, 1)
         assert found.points().valid.tolist() == [False, True, True]
 
@@ -445,14 +448,14 @@ def test_a_sequence_counts_what_is_lost_doubled_and_late(backend: str) -> None:
         block = dict(azimuth=number, channels=[dict(distance=number, intensity=1)] * 3)
         return sensor.build("data", number=number, reserved=bytes(3), blocks=[block] * 4)
 
-    stats = sensor.decode([frame(n) for n in (198, 199, 200, 1, 2, 3)], backend=backend).stats
+    stats = reader(sensor, backend).decode([frame(n) for n in (198, 199, 200, 1, 2, 3)]).stats
     assert (stats.lost, stats.duplicates, stats.late) == (0, 0, 0)
-    stats = sensor.decode([frame(n) for n in (199, 2, 3, 3, 1, 6)], backend=backend).stats
+    stats = reader(sensor, backend).decode([frame(n) for n in (199, 2, 3, 3, 1, 6)]).stats
     assert (stats.lost, stats.duplicates, stats.late) == (3, 1, 1)
     assert stats.frames == {"data": 6}
-    ordered = list(sensor.scans([frame(n) for n in range(1, 9)], backend=backend))
+    ordered = list(reader(sensor, backend).scans([frame(n) for n in range(1, 9)]))
     shuffled = list(
-        sensor.scans([frame(n) for n in (1, 2, 4, 3, 3, 5, 7, 6, 8, 8)], backend=backend)
+        reader(sensor, backend).scans([frame(n) for n in (1, 2, 4, 3, 3, 5, 7, 6, 8, 8)])
     )
     for one, other in zip(ordered, shuffled, strict=True):
         np.testing.assert_array_equal(one.points.xyz, other.points.xyz)
@@ -480,7 +483,7 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
     points: Any, backend: str
 ) -> None:
     sensor = replace(against_construct.sensor(BESIDE), points=points)
-    cloud = sensor.decode([bytes(range(16))] * 2, backend=backend).points()
+    cloud = reader(sensor, backend).decode([bytes(range(16))] * 2).points()
     assert cloud.range.tolist() == [1, 2, 3] * 2
     np.testing.assert_allclose(cloud.azimuth, [*ANGLES] * 2, rtol=1e-6)
 
@@ -519,8 +522,8 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
 def test_numbers_that_go_along_several_arrays_or_none_are_refused_by_their_names(
     points: Any, said: str, backend: str
 ) -> None:
-    packets = replace(against_construct.sensor(BESIDE), points=points).decode(
-        [bytes(range(16))] * 2, backend=backend
+    packets = reader(replace(against_construct.sensor(BESIDE), points=points), backend).decode(
+        [bytes(range(16))] * 2
     )
     with pytest.raises(SpecError, match=said):
         packets.points()
@@ -529,16 +532,17 @@ def test_numbers_that_go_along_several_arrays_or_none_are_refused_by_their_names
 @both
 def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None:
     sensor = against_construct.sensor(BESIDE)
-    terms = replace(
-        sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)
-    ).decode([bytes(16)], backend=backend)
+    terms = reader(
+        replace(sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)), backend
+    ).decode([bytes(16)])
     with pytest.raises(
         SpecError, match=r"lengths that do not go together: 1: other 4 x other\[\] 3, 2: other 3"
     ):
         terms.points()
-    parts = replace(
-        sensor, points=lambda f: Polar(range=f.other, azimuth=along("other", np.zeros(2)))
-    ).decode([bytes(16)], backend=backend)
+    parts = reader(
+        replace(sensor, points=lambda f: Polar(range=f.other, azimuth=along("other", np.zeros(2)))),
+        backend,
+    ).decode([bytes(16)])
     with pytest.raises(
         SpecError,
         match=r"lengths that do not go together: range: other 4 x other\[\] 3, azimuth: other 2",

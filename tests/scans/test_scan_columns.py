@@ -30,6 +30,7 @@ from lidarspec.points.cloud import COLUMNS
 from lidarspec.scans.scans import ScanStream, scans_of
 from lidarspec.spec import OnChange, OnWrap, Udp
 from tests.broken import points_fail, sound
+from tests.by_construct import reader
 from tests.points.backends import BACKENDS, COMPILED
 from tests.representatives import REPRESENTATIVES
 from tests.shapes import SHAPES
@@ -48,7 +49,7 @@ def frames_of(name: str, number: int) -> list[bytes]:
 
 
 def packets_of(name: str, number: int, backend: str) -> Packets:
-    return ls.sensor(name).decode(frames_of(name, number), backend=backend)
+    return reader(ls.sensor(name), backend).decode(frames_of(name, number))
 
 
 def batches(packets: Packets, *sizes: int) -> list[Packets]:
@@ -270,15 +271,16 @@ def test_a_number_of_sectors_that_is_none_is_refused_by_name(number: Any) -> Non
 def test_a_scan_with_gaps_is_not_complete_and_one_whose_packets_are_mostly_lost_not_whole(
     backend: str,
 ) -> None:
-    sensor = ls.sensor("cspc-m1c1-mini")
+    judged = reader(ls.sensor("cspc-m1c1-mini"), backend)
+    sensor = judged.sensor
     frames = simulate(sensor, 1500)
     noise = random.Random(5)
 
     def scans_with(share: float, pieces: int) -> list[Scan]:
         """The scans where a share of the packets is damaged, read in so many pieces."""
         data = b"".join(bytes(len(frame)) if noise.random() < share else frame for frame in frames)
-        stream, decoder = ScanStream(sensor), sensor.decoder(stream=True, backend=backend)
-        packets = PacketStream(sensor, "data", decoder.stats, backend=backend)
+        stream, decoder = ScanStream(sensor), judged.decoder(stream=True)
+        packets = PacketStream(sensor, "data", decoder.stats, backend=judged.backend)
         step = len(data) // pieces + 1
         cut = [
             stream.add(packets.add(decoder.frames(data[at : at + step])))
@@ -340,7 +342,7 @@ def test_the_shape_of_a_scan_is_that_of_its_packets_whatever_they_came_with(
         for i in range(len(segments) // 2)
     ]
     read = [
-        sensor.decode(frames[start : start + size], backend=backend)
+        reader(sensor, backend).decode(frames[start : start + size])
         for start in range(0, len(frames), size)
     ]
     assert [scan.points.shape for scan in scans_of(sensor, read)] == [
