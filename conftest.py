@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import pytest
 
 from lidarspec.framing import examples
-from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
 from tests.missing import describe_missing
 
 #: plugins whose tests need an environment of their own: `make test-ros2`.
@@ -65,12 +65,12 @@ def _examples_are_made_once() -> Iterator[None]:
     """Make each example frame once, since thousands of tests use the same frames of the same
     sensors.
     """
-    made: weakref.WeakKeyDictionary[Spec, dict[tuple[str, int], bytes]] = (
+    made: weakref.WeakKeyDictionary[Sensor, dict[tuple[str, int], bytes]] = (
         weakref.WeakKeyDictionary()
     )
     original = examples.example
 
-    def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
+    def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
         frames = made.setdefault(sensor, {})
         if (frame, seed) not in frames:
             frames[frame, seed] = original(sensor, frame, seed=seed)

@@ -16,7 +16,7 @@ from lidarspec.errors import WireError, suggest
 from lidarspec.framing.frame_engine import codec
 from lidarspec.known_sensors import KnownSensor, Signature, install_command, known_sensors
 from lidarspec.plugins import registry
-from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
 
 #: bytes at the beginning of a frame that a signature covers.
 MAX_SYNC_BYTES = 16
@@ -33,7 +33,7 @@ MIN_SYNC_COUNT_BY_CHANCE = 20
 MAX_LISTED = 6
 
 
-def signatures(sensor: Spec) -> tuple[Signature, ...]:
+def signatures(sensor: Sensor) -> tuple[Signature, ...]:
     """Return the signatures of the data frames of a sensor that have enough constant bytes."""
     found = []
     for name in sensor.data_frames:

@@ -34,7 +34,6 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets, StateOf
 from lidarspec.scans.scans import Scan, ScanStream
-from lidarspec.spec.description import Spec
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import CaptureTransport, FileTransport
 from lidarspec.transports.open_url import transport
@@ -171,7 +170,7 @@ class FileScans(Closing):
             opened.file.seek(self._input.decoder.stats.bytes_in)
 
 
-def _constants(sensor: Spec, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
+def _constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
     """What no byte changes, by name: all that a sensor holds, and what is made of it alone."""
     found = dict[tuple[Any, ...], Any]()
     _walk(sensor, (), found, set())
@@ -215,7 +214,7 @@ class _Writer(pickle.Pickler):
         For a sensor that reads its time from another clock it is the name of that clock.
         """
         name = self._names.get(id(obj))
-        if name is None and isinstance(obj, Spec):
+        if name is None and isinstance(obj, Sensor):
             return ("clock", self._names[id(obj.clock)])
         return name
 

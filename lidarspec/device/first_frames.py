@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, told_seconds
-from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
 
 #: bytes of a file without any frame that could tell the turn of the clock; then no such frame is
 #: expected.
@@ -34,12 +34,12 @@ class FirstFrames:
     reference: ClockReference | None = None
 
 
-def is_searched(sensor: Spec) -> bool:
+def is_searched(sensor: Sensor) -> bool:
     """Return whether any frames of a sensor apply from the start."""
     return bool(sensor.state) or (sensor.clock is not None and sensor.clock.told is not None)
 
 
-def find_first_frames(sensor: Spec, batches: Iterable[list[Frames]]) -> FirstFrames:
+def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstFrames:
     """Return what applies from the start of a file.
 
     Args:
@@ -77,7 +77,7 @@ def find_first_frames(sensor: Spec, batches: Iterable[list[Frames]]) -> FirstFra
 
 
 def _find_reference(
-    sensor: Spec, name: str, frames: Frames, rows: NDArray[np.intp]
+    sensor: Sensor, name: str, frames: Frames, rows: NDArray[np.intp]
 ) -> ClockReference | None:
     """Return the first of some frames that tells the turn of the clock."""
     assert sensor.clock is not None

@@ -25,7 +25,6 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import MadeFor, recorder
-from lidarspec.spec.description import Spec
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.host_clock import HostClock
@@ -39,7 +38,7 @@ _FIGURES = re.compile(r"[\d.]+")
 
 
 def recorder_like(
-    opened: Transport, source: str, target: str, sensor: Spec | str | None, *, overwrite: bool
+    opened: Transport, source: str, target: str, sensor: Sensor | str | None, *, overwrite: bool
 ) -> Appender:
     """Return the recorder of a new file for an open source.
 
@@ -302,7 +301,7 @@ class SourceRecording:
                 return
             self.packets += source.datagrams
 
-    def _open_log(self, source: Transport, sensor: Spec | str | None) -> TimedLog:
+    def _open_log(self, source: Transport, sensor: Sensor | str | None) -> TimedLog:
         """The recorder, now that the source is open, and the sensor known as it is read."""
         counts = source.datagrams or (
             self._sensor is not None and isinstance(source, LiveTransport)

@@ -22,7 +22,7 @@ from lidarspec.frames.parse import identify, layout_of
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Sensor
-from lidarspec.spec.description import with_frames
+from lidarspec.spec.sensor import with_frames
 from lidarspec.transports.protocol import Chunk
 
 #: constant bytes that look like the beginning of a frame in the midst of others.

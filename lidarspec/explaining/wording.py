@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
 from lidarspec.spec.arguments import Range, Taken
-from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
 
 if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
@@ -401,7 +401,7 @@ def _marked(error: WireError) -> int:
     return 1
 
 
-def describe_losses(sensor: Spec) -> str:
+def describe_losses(sensor: Sensor) -> str:
     """Return how lost packets are counted, or why they are not."""
     if sensor.sequence is not None:
         return f"counted by `{sensor.sequence.field}`"

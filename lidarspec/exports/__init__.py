@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 
 from lidarspec.errors import SpecError, UnknownFrame, UnknownName, UsageError, printable
 from lidarspec.spec import tree
-from lidarspec.spec.description import Frame, with_frames
+from lidarspec.spec.description import Frame
+from lidarspec.spec.sensor import with_frames
 
 if TYPE_CHECKING:
     from lidarspec.spec.sensor import Sensor

@@ -25,7 +25,8 @@ from lidarspec.frames.schema import schema
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import Examined, examine
 from lidarspec.spec.bits import BitField
-from lidarspec.spec.description import Frame, Spec
+from lidarspec.spec.description import Frame
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.syntax import WireNaN, seen, unnamed
 from lidarspec.spec.tree import (
     Blob,
@@ -43,7 +44,12 @@ from lidarspec.spec.tree import (
 
 
 def parse(
-    sensor: Spec, data: bytes, *, frame: str | None = None, verify: bool = True, units: bool = False
+    sensor: Sensor,
+    data: bytes,
+    *,
+    frame: str | None = None,
+    verify: bool = True,
+    units: bool = False,
 ) -> Any:
     """Return the Container of raw values of exactly one frame.
 
@@ -66,7 +72,7 @@ def parse(
     return values
 
 
-def identify(sensor: Spec, data: bytes, *, frame: str | None = None) -> str:
+def identify(sensor: Sensor, data: bytes, *, frame: str | None = None) -> str:
     """Return the name of the frame type that bytes are a frame of.
 
     Args:
@@ -90,7 +96,7 @@ def _as_bytes(data: bytes) -> bytes:
     return bytes(data)
 
 
-def _find_sound(sensor: Spec, data: bytes, frame: str | None) -> tuple[str, Any] | None:
+def _find_sound(sensor: Sensor, data: bytes, frame: str | None) -> tuple[str, Any] | None:
     """Return type and values of a frame that nothing is wrong with; else None."""
     names = sensor.frames if frame is None or frame not in sensor.frames else (frame,)
     for name in names:
@@ -125,7 +131,7 @@ def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
 
 
 def _parse_unsound(
-    sensor: Spec, data: bytes, frame: str | None, *, verify: bool
+    sensor: Sensor, data: bytes, frame: str | None, *, verify: bool
 ) -> tuple[str, Any]:
     """Return type and values of a frame that something is wrong with, if that is not verified.
 
@@ -152,7 +158,7 @@ def _parse_unsound(
     raise _likeliest(sensor, data, faults)
 
 
-def _find_fault(sensor: Spec, name: str, data: bytes) -> WireError:
+def _find_fault(sensor: Sensor, name: str, data: bytes) -> WireError:
     """Return what is wrong with the bytes of a frame."""
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilable):
@@ -175,7 +181,7 @@ def _find_fault(sensor: Spec, name: str, data: bytes) -> WireError:
 
 
 def _error_of(
-    sensor: Spec, name: str, data: bytes, examined: Examined, place: Callable[[int], int]
+    sensor: Sensor, name: str, data: bytes, examined: Examined, place: Callable[[int], int]
 ) -> WireError:
     """Return the first fault of a frame as an error.
 
@@ -189,7 +195,7 @@ def _error_of(
 
 
 def _search(
-    sensor: Spec,
+    sensor: Sensor,
     name: str,
     find: Callable[[Examined], diagnose.Fault | None],
     examined: Examined,
@@ -206,7 +212,7 @@ def _search(
 
 
 def _wire_error(
-    sensor: Spec, name: str, data: bytes, fault: diagnose.Fault, place: Callable[[int], int]
+    sensor: Sensor, name: str, data: bytes, fault: diagnose.Fault, place: Callable[[int], int]
 ) -> WireError:
     offset = place(fault.offset)
     return WireError(
@@ -221,7 +227,7 @@ def _wire_error(
     )
 
 
-def _parse_unverified(sensor: Spec, name: str, data: bytes) -> Any:
+def _parse_unverified(sensor: Sensor, name: str, data: bytes) -> Any:
     """Return the values of a frame whatever is wrong with it.
 
     Raises:
@@ -521,7 +527,7 @@ def _rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContainer]:
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
 
 
-def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:
+def layout_of(sensor: Sensor, name: str, data: bytes) -> Layout | Refused | None:
     """Return the layout that the header of this frame leads to.
 
     Returns None if the type is not compiled, or if the header is incomplete.
@@ -532,7 +538,7 @@ def layout_of(sensor: Spec, name: str, data: bytes) -> Layout | Refused | None:
     return layouts.layout(data)
 
 
-def _progress(sensor: Spec, fault: WireError) -> tuple[int, int]:
+def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
     """Return how far a frame type matched before it failed.
 
     A frame of exactly this size, or one at the start, precedes all others.
@@ -549,7 +555,7 @@ def _progress(sensor: Spec, fault: WireError) -> tuple[int, int]:
     return (0, fault.offset)
 
 
-def _likeliest(sensor: Spec, data: bytes, faults: list[WireError]) -> WireError:
+def _likeliest(sensor: Sensor, data: bytes, faults: list[WireError]) -> WireError:
     best = max(faults, key=functools.partial(_progress, sensor))
     if best.offset > 0 or len(sensor.frames) == 1:
         return best

@@ -27,8 +27,9 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
 from lidarspec.framing.search import leftmost
 from lidarspec.framing.steady import steady_stream
-from lidarspec.spec.description import Frame, Spec
+from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Udp
+from lidarspec.spec.sensor import Sensor
 
 __all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
 
@@ -81,7 +82,7 @@ class Decoder:
     """
 
     def __init__(
-        self, sensor: Spec, *, stream: bool, backend: str = "auto", sums: Sums | None = None
+        self, sensor: Sensor, *, stream: bool, backend: str = "auto", sums: Sums | None = None
     ) -> None:
         if not sensor.incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")

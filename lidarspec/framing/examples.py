@@ -29,7 +29,8 @@ from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
-from lidarspec.spec.description import Frame, Spec
+from lidarspec.spec.description import Frame
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.syntax import Fault, member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
@@ -50,7 +51,7 @@ Drawn = Mapping[str, Callable[[random.Random], Any]]
 NOTHING: Drawn = {}
 
 
-def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
+def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
     """The bytes of a valid frame with seeded random content.
 
     Raises:
@@ -61,7 +62,9 @@ def example(sensor: Spec, frame: str, *, seed: int = 0) -> bytes:
     return random_frame(sensor, frame, random.Random(f"{sensor.id} {frame} {seed}"))
 
 
-def random_frame(sensor: Spec, frame: str, source: random.Random, drawn: Drawn = NOTHING) -> bytes:
+def random_frame(
+    sensor: Sensor, frame: str, source: random.Random, drawn: Drawn = NOTHING
+) -> bytes:
     """Return a valid frame with a random header and random content.
 
     Args:
@@ -174,7 +177,7 @@ def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -
 
 
 def _interpreted(
-    sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn
+    sensor: Sensor, frame: str, engine: Codec, source: random.Random, drawn: Drawn
 ) -> bytes:
     """A frame that construct alone can read, or one of parts."""
     for _ in range(LARGEST_BATCH * TRIES):
@@ -226,7 +229,7 @@ def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> 
     return rows
 
 
-def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
     if layout.conditions:
         rows = rows[layout.meets(rows)]
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
@@ -241,7 +244,7 @@ def _plausible(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]
     return _sent(sensor, frame, layout, rows[good])
 
 
-def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+def _sent(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
     """Return the first frame that can be written in the form of its type, or none."""
     encode = frame_coder(sensor.frames[frame]).encode
     frames = (encode(row.tobytes()) for row in rows)
@@ -249,7 +252,7 @@ def _sent(sensor: Spec, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> 
 
 
 def _make_along_sweep(
-    sensor: Spec, frame: str, engine: Codec, source: random.Random, drawn: Drawn
+    sensor: Sensor, frame: str, engine: Codec, source: random.Random, drawn: Drawn
 ) -> bytes:
     """Return a frame with the values that the sensor's `sweep` declares.
 

@@ -16,8 +16,8 @@ from lidarspec.frames.arrays import alike, repeated
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import codec
-from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import exact
 
@@ -99,7 +99,9 @@ class Epoch:
         ns: nanoseconds that make the times of an `Unwrapper` complete; None before it was told.
     """
 
-    def __init__(self, sensor: Spec, clock: Clock, reference: ClockReference | None = None) -> None:
+    def __init__(
+        self, sensor: Sensor, clock: Clock, reference: ClockReference | None = None
+    ) -> None:
         assert clock.told is not None
         assert clock.wraps_at is not None
         self.frame = clock.told[0]
@@ -179,7 +181,7 @@ def told_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
     return np.broadcast_to(seconds.reshape(-1), (len(table),))
 
 
-def clock_ns(sensor: Spec, batch: Batch) -> Times:
+def clock_ns(sensor: Sensor, batch: Batch) -> Times:
     """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire.
 
     Where it stands in the parts of a frame, it is that of the first one; in a frame without any
@@ -191,7 +193,7 @@ def clock_ns(sensor: Spec, batch: Batch) -> Times:
     return held(which, readings, np.zeros(len(batch), np.int64))
 
 
-def clocked(sensor: Spec, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
+def clocked(sensor: Sensor, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
     """Return the packets that have the clock (None: all), and its readings.
 
     If the clock is in parts, the first part counts.
@@ -243,7 +245,7 @@ def _summed(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
     return total
 
 
-def clock_parts(sensor: Spec, schema: Schema) -> tuple[str, str] | None:
+def clock_parts(sensor: Sensor, schema: Schema) -> tuple[str, str] | None:
     """The parts, and their kind, in which the clock stands; None where it stands in the frame."""
     places = {
         schema.within(path)
@@ -257,7 +259,7 @@ def clock_parts(sensor: Spec, schema: Schema) -> tuple[str, str] | None:
 
 
 def part_times(
-    sensor: Spec, place: tuple[str, str], table: Table, which: NDArray[np.intp], times: Times
+    sensor: Sensor, place: tuple[str, str], table: Table, which: NDArray[np.intp], times: Times
 ) -> Times:
     """The times of parts, (k,), where they have a clock of their own.
 
@@ -287,7 +289,7 @@ def _prefix(place: tuple[str, str]) -> str:
     return ".".join(filter(None, place))
 
 
-def _in_parts(sensor: Spec, place: tuple[str, str], table: Table) -> Times:
+def _in_parts(sensor: Sensor, place: tuple[str, str], table: Table) -> Times:
     """The clock that stands in parts, in each of them."""
     assert sensor.clock is not None
     own = tuple(path.removeprefix(f"{_prefix(place)}.") for path in paths(sensor.clock))

@@ -16,8 +16,8 @@ from lidarspec.errors import plugin_errors
 from lidarspec.expressions.columns import Batch, Fields, of_points, unpadded
 from lidarspec.points.conventions import vendor_turn
 from lidarspec.points.plain import flat
-from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Imu
+from lidarspec.spec.sensor import Sensor
 
 #: the columns of a sample after its time, in the order in which files list them, and their units.
 UNITS = {
@@ -78,7 +78,7 @@ def joined(parts: Sequence[ImuSamples]) -> ImuSamples:
     return ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def samples(sensor: Spec, frame: str, batch: Batch, time_ns: NDArray[np.int64]) -> ImuSamples:
+def samples(sensor: Sensor, frame: str, batch: Batch, time_ns: NDArray[np.int64]) -> ImuSamples:
     """The samples of packets.
 
     Args:

@@ -41,7 +41,7 @@ from lidarspec.packets.counter_order import CounterOrder
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
 from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
-from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Clock
 
 Integers = NDArray[np.int64]
@@ -66,7 +66,7 @@ class PacketStream:
 
     def __init__(
         self,
-        sensor: Spec,
+        sensor: Sensor,
         frame: str,
         stats: Counters,
         *,
@@ -333,7 +333,7 @@ class ImuStream:
 
     def __init__(
         self,
-        sensor: Spec,
+        sensor: Sensor,
         stats: Counters,
         *,
         backend: str = "auto",
@@ -439,7 +439,7 @@ class _Part:
         return some(array, self.own)
 
 
-def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
+def data_frame(sensor: Sensor, found: Sequence[Frames]) -> str | None:
     """Return the type of data frame that an input is read by if none is asked for.
 
     It is the configured one, or the first that arrived; None if the sensor has several, none is
@@ -456,7 +456,7 @@ def data_frame(sensor: Spec, found: Sequence[Frames]) -> str | None:
     return None
 
 
-def _clock_of(sensor: Spec, frame: str, schema: Schema) -> Clock | None:
+def _clock_of(sensor: Sensor, frame: str, schema: Schema) -> Clock | None:
     """Return the clock of frames of a type, if any.
 
     Data frames use the clock of the sensor, as do frames of an IMU that have its fields.
@@ -476,11 +476,11 @@ def _clock_of(sensor: Spec, frame: str, schema: Schema) -> Clock | None:
     return None
 
 
-def _has_counter(sensor: Spec, frame: str) -> bool:
+def _has_counter(sensor: Sensor, frame: str) -> bool:
     return sensor.sequence is not None and _has_field(sensor, frame, sensor.sequence.field)
 
 
-def _has_field(sensor: Spec, frame: str, path: str) -> bool:
+def _has_field(sensor: Sensor, frame: str, path: str) -> bool:
     """Return whether packets of this type have a field, or should, since no data frame has it."""
     schemas = {name: codec(sensor.frames[name]).schema for name in sensor.data_frames}
     having = [

@@ -24,8 +24,8 @@ from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud, organised
 from lidarspec.points.conventions import Kind
-from lidarspec.spec.description import Spec
 from lidarspec.spec.results import Cartesian, Points, Polar
+from lidarspec.spec.sensor import Sensor
 
 _OPTIONAL = ("intensity", "ring", "return_index", "column")
 
@@ -41,7 +41,7 @@ class PacketBatch(Protocol):
         backend: what makes points of them, "auto", "numpy" or "jit".
     """
 
-    sensor: Spec
+    sensor: Sensor
     frame: str
     table: Table
     time_ns: NDArray[np.int64]

@@ -39,8 +39,8 @@ from lidarspec.recording.format import (
     packed,
     size_at,
 )
-from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", *WRITINGS, ".bin")
@@ -54,7 +54,7 @@ class MadeFor:
     what was learned of it.
     """
 
-    make: Callable[[Transport, Spec | str | None], Log]
+    make: Callable[[Transport, Sensor | str | None], Log]
 
 
 #: a file, a recorder, or what makes one when the source is open.
@@ -90,7 +90,7 @@ class Recorder(Appender):
     def __init__(
         self,
         path: str | Path,
-        sensor: Spec | str | None = None,
+        sensor: Sensor | str | None = None,
         source: str | Path = "",
         *,
         datagrams: bool | None = None,
@@ -174,7 +174,7 @@ class FrameRecorder(Appender):
         sensor: whose frames they are.
     """
 
-    def __init__(self, path: str | Path, sensor: Spec, *, overwrite: bool = False) -> None:
+    def __init__(self, path: str | Path, sensor: Sensor, *, overwrite: bool = False) -> None:
         self._decoder = Decoder(sensor, stream=True)
         self._held = bytearray()
         self._base = 0
@@ -231,7 +231,7 @@ class RawRecorder(Appender):
             self._put(chunk.data, len(chunk.data))
 
 
-def declared_port(sensor: Spec | None) -> int:
+def declared_port(sensor: Sensor | None) -> int:
     """The first port that the datagrams of a sensor go to; 0 where nobody knows one."""
     links = sensor.links.values() if sensor is not None else ()
     return next((port for link in links if isinstance(link, Udp) for port in link.ports), 0)
@@ -251,7 +251,7 @@ def check_suffix(path: str | Path) -> str:
 
 def recorder(
     path: str | Path,
-    sensor: Spec | str | None = None,
+    sensor: Sensor | str | None = None,
     source: str | Path = "",
     *,
     datagrams: bool,
@@ -281,7 +281,9 @@ def recorder(
                 " with -s, or record an .lsr"
             )
         return FrameRecorder(
-            path, sensor if isinstance(sensor, Spec) else named_sensor(sensor), overwrite=overwrite
+            path,
+            sensor if isinstance(sensor, Sensor) else named_sensor(sensor),
+            overwrite=overwrite,
         )
     if suffix == ".bin" and datagrams:
         raise UsageError(
@@ -290,14 +292,14 @@ def recorder(
         )
     if suffix == ".lsr":
         return Recorder(path, sensor, source, datagrams=datagrams, baud=baud, overwrite=overwrite)
-    port = declared_port(sensor if isinstance(sensor, Spec) else None)
+    port = declared_port(sensor if isinstance(sensor, Sensor) else None)
     if suffix in WRITINGS:
         return PcapRecorder(path, port=port, overwrite=overwrite)
     return RawRecorder(path, overwrite=overwrite)
 
 
 def recorder_for(
-    target: RecordTo, sensor: Spec | str | None, source: str | Path, opened: Transport
+    target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport
 ) -> tuple[Log, bool]:
     """Return the recorder for a target, and whether it was made here.
 
@@ -311,12 +313,12 @@ def recorder_for(
 
 
 def _header(
-    sensor: Spec | str | None, source: str, *, datagrams: bool | None, baud: int | None
+    sensor: Sensor | str | None, source: str, *, datagrams: bool | None, baud: int | None
 ) -> Header:
     known = (
         named_sensor(sensor) if isinstance(sensor, str) and sensor and datagrams is None else sensor
     )
-    if isinstance(known, Spec):
+    if isinstance(known, Sensor):
         name = known.id
         options = dict(known.options)
         link = known.datagrams

@@ -17,7 +17,7 @@ from lidarspec.packets.masked_sector import FULL_TURNS, JITTER, AngleReader, Sec
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.points.plain import Evaluated
-from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Every, OnChange, OnFlag, OnJump, OnRewind, OnWrap, Split
 
 #: an angle has to have been this part of a turn away from the cut before it cuts again, so that
@@ -120,7 +120,7 @@ class End(NamedTuple):
 class Cutter:
     """Finds where the scans of one stream of points end."""
 
-    def __init__(self, sensor: Spec) -> None:
+    def __init__(self, sensor: Sensor) -> None:
         self._rule: Split = sensor.scan
         self._reader = AngleReader(sensor)
         self._cut: float | None = None  # where the user wants scans to be cut, in turns

@@ -32,8 +32,8 @@ from lidarspec.points.evaluate import guarded
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter, End, first_points
 from lidarspec.scans.masking import Masking, describe
-from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Serial
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 
 #: seconds that a turn takes at the slowest where no sensor says so; of a scan at least where
@@ -183,7 +183,7 @@ class Scan:
     points: PointCloud
     rate_hz: float
     complete: bool
-    sensor: Spec
+    sensor: Sensor
     whole: bool = False
     imu: ImuSamples | None = None
     host_ns: int = 0
@@ -410,7 +410,7 @@ class Progress:
     packets, and their breaks.
     """
 
-    def __init__(self, sensor: Spec) -> None:
+    def __init__(self, sensor: Sensor) -> None:
         rule = sensor.scan
         link = sensor.links.get("data")
         counter = sensor.sequence
@@ -700,7 +700,7 @@ class ScanStream:
     """
 
     def __init__(
-        self, sensor: Spec, mount: Mount | None = None, imu: Waiting | None = None
+        self, sensor: Sensor, mount: Mount | None = None, imu: Waiting | None = None
     ) -> None:
         self._sensor = sensor
         self._mount = mount
@@ -914,7 +914,7 @@ def _hosts_ns(packets: Packets, points: Evaluated, indices: Sequence[int]) -> li
 
 
 def scans_of(
-    sensor: Spec, batches: Iterable[Packets], imu: Waiting | None = None
+    sensor: Sensor, batches: Iterable[Packets], imu: Waiting | None = None
 ) -> Iterator[Scan]:
     """Every scan of batches of one stream; `imu`: the samples that go with them."""
     stream = ScanStream(sensor, imu=imu)

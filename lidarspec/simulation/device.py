@@ -26,8 +26,9 @@ from lidarspec.simulation.faults import Faults, Line
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Scene, furnished
 from lidarspec.simulation.simulator import Rest, Simulation, simulation
-from lidarspec.spec.description import Answer, Command, Spec, with_frames
+from lidarspec.spec.description import Answer, Command
 from lidarspec.spec.links import is_datagram
+from lidarspec.spec.sensor import Sensor, with_frames
 from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000
@@ -71,7 +72,7 @@ class Answering:
     rad/s.
     """
 
-    def __init__(self, sensor: Spec, shake: float = 0.0) -> None:
+    def __init__(self, sensor: Sensor, shake: float = 0.0) -> None:
         self._sensor = sensor
         self._shake = shake
         self._rests: dict[str, Rest] = {}
@@ -171,7 +172,7 @@ class Answering:
         return None
 
 
-def _listening(sensor: Spec, link: str) -> Decoder:
+def _listening(sensor: Sensor, link: str) -> Decoder:
     """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
     frames = {
         name: replace(frame, direction="in")
@@ -284,7 +285,7 @@ class SimulatedDevice:
 
     def __init__(
         self,
-        sensor: Spec,
+        sensor: Sensor,
         *,
         scene: Scene | None = None,
         seed: int = 0,

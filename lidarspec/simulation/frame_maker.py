@@ -23,7 +23,7 @@ from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import Coder, frame_coder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.plain_frames import PlainCodec
-from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.syntax import member
 from lidarspec.spec.tree import Formula, Kind, Node, refs
 
@@ -37,7 +37,7 @@ class FrameMaker:
         SpecError: where the frame type is not compiled.
     """
 
-    def __init__(self, sensor: Spec, frame: str) -> None:
+    def __init__(self, sensor: Sensor, frame: str) -> None:
         engine = codec(sensor.frames[frame])
         if isinstance(engine, PlainCodec):
             raise SpecError(

@@ -38,10 +38,10 @@ from lidarspec.points.conventions import coordinates, direction_of
 from lidarspec.points.plain import parts_of
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.scenes import Room, Scene
-from lidarspec.spec.description import Spec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Cartesian, Points, Polar
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Every
 from lidarspec.spec.tree import FieldInfo, exact
 
@@ -126,7 +126,7 @@ class Measurement:
             they are not ranges.
     """
 
-    def __init__(self, sensor: Spec, frame: str, table: Rows, given: Container[str] = ()) -> None:
+    def __init__(self, sensor: Sensor, frame: str, table: Rows, given: Container[str] = ()) -> None:
         self._sensor = sensor
         self._frame = frame
         self._points = sensor.points_of(_name(frame, table))
@@ -140,7 +140,7 @@ class Measurement:
         self._coupled = self._encode is not None or self._turning(table)
 
     @classmethod
-    def of(cls, sensor: Spec, frame: str, table: Rows, given: Container[str]) -> Measurement:
+    def of(cls, sensor: Sensor, frame: str, table: Rows, given: Container[str]) -> Measurement:
         """Return the measurement of a frame's points.
 
         It is a `Placement` if the points are given by coordinates, else by direction.
@@ -492,7 +492,7 @@ def _name(frame: str, table: Rows) -> str:
     return frame
 
 
-def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
+def _result(sensor: Sensor, frame: str, table: Rows) -> tuple[Points, Batch]:
     """What the sensor's `points` says of a table of its frames, which nothing goes before."""
     batch = _batch(sensor, table)
     points = sensor.points_of(_name(frame, table))
@@ -508,7 +508,7 @@ def _result(sensor: Spec, frame: str, table: Rows) -> tuple[Points, Batch]:
     return result, batch
 
 
-def _batch(sensor: Spec, table: Rows) -> Batch:
+def _batch(sensor: Sensor, table: Rows) -> Batch:
     """A table of frames, or of parts of them, which nothing goes before."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
@@ -607,7 +607,7 @@ class Rest:
         SpecError: where no field makes what the IMU feels.
     """
 
-    def __init__(self, sensor: Spec, frame: str, given: Container[str]) -> None:
+    def __init__(self, sensor: Sensor, frame: str, given: Container[str]) -> None:
         self._sensor = sensor
         self._frame = frame
         self._given = given
@@ -712,7 +712,7 @@ class Pace:
         interval: ns from one packet to the next, on average; 0 where the spec says nothing of time.
     """
 
-    def __init__(self, sensor: Spec, frame: str, table: Rows, beams: Beams) -> None:
+    def __init__(self, sensor: Sensor, frame: str, table: Rows, beams: Beams) -> None:
         self._sensor = sensor
         self._rate = sensor.simulation_of(frame).rate
         self._point = _seconds_per_point(beams)
@@ -793,7 +793,7 @@ class Simulation:
         SpecError: where its ranges cannot be traced back to fields.
     """
 
-    def __init__(self, sensor: Spec, frame: str, *, blocked: bool = False) -> None:
+    def __init__(self, sensor: Sensor, frame: str, *, blocked: bool = False) -> None:
         sweep = sensor.simulation_of(frame).sweep
         if sweep is None:
             raise UsageError(
@@ -884,7 +884,7 @@ class Simulation:
 
 
 @functools.lru_cache(maxsize=64)
-def simulation(sensor: Spec, frame: str, *, blocked: bool = False) -> Simulation:
+def simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> Simulation:
     """The simulation of a data frame type; kept, since it takes a while to find out how a sensor
     carries its ranges.
     """
@@ -892,7 +892,7 @@ def simulation(sensor: Spec, frame: str, *, blocked: bool = False) -> Simulation
 
 
 def simulate(
-    sensor: Spec, packets: int = 100, *, start: int = 0, scene: Scene | None = None
+    sensor: Sensor, packets: int = 100, *, start: int = 0, scene: Scene | None = None
 ) -> list[bytes]:
     """The data frames that a sensor standing in a scene sends, one after another.
 
@@ -909,7 +909,7 @@ def simulate(
     return made.block(start, packets, scene or Room(), start * made.interval / 1e9).frames
 
 
-def opening(sensor: Spec) -> bytes:
+def opening(sensor: Sensor) -> bytes:
     """What the sensor sends before its data frames: the frame that they come after; empty where
     they need none.
     """

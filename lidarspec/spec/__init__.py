@@ -3,15 +3,13 @@
     from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled,
     Sensor, Serial, Simulation, hookimpl, spread
 
-A plugin imports from here and from `lidarspec` alone. In: a manual, as values. Out: a `Sensor`,
-checked as it is made, of which every
-other package is a function. Nothing in this package reads bytes of a stream. Modules in reading
-order:
+A plugin imports from here and from `lidarspec` alone. The facts of a manual become a `Sensor`,
+which is checked when it is made; every other package is a set of functions of a `Sensor`. Nothing
+in this package reads bytes of a stream. Modules in reading order:
 
-* `description`: `Spec`, `Frame`, `Command`, `Simulation`: what must fit together.
-* `sensor`: a `Spec` with everything that can be done with it as methods; it stands above the
-  stations that do it.
-* `arguments`: what a command is told, and what is found out when it is sent.
+* `description`: `Frame`, `Command`, `Simulation`, `Relative`.
+* `sensor`: `Sensor`, which puts all of these together; its methods call the engines.
+* `arguments`: arguments of commands, and values that are filled in when a command is sent.
 * `fields`: units and seals, as parts of a struct.
 * `checksums`: algorithms as values; of one message.
 * `wire_forms`: frames whose fields have no fixed places on the wire: tokens, lines, escapes.

@@ -1,8 +1,9 @@
-"""A sensor: its `Spec`, and what can be done with it as methods.
+"""The class `Sensor`: the facts of a sensor's manual as fields, the engines as methods.
 
-Each method hands over to the station that does it: wire (parse, build), simulation (example),
-framing (decoder, split), packets (decode), scans. They are imported when a method is called first:
-a sensor is found and looked at far more often than all of them are needed.
+A `Sensor` is immutable. It checks that its parts fit together when it is made. Importing this
+module imports facts only. Each method calls an engine (`frames`, `framing`, `packets`, `scans`)
+and imports it on the first call. So engines can take a `Sensor` without an import cycle, and
+listing sensors does not import any engine.
 """
 
 from __future__ import annotations
@@ -14,17 +15,37 @@ import os
 import re
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from numbers import Integral, Real
 from os import PathLike
 from reprlib import repr as shown
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 from lidarspec.display import drawn
-from lidarspec.errors import LidarSpecError, PluginError, UnknownOption, UsageError
-from lidarspec.spec.description import Spec
-from lidarspec.spec.timing import OnChange, OnWrap
+from lidarspec.errors import (
+    LidarSpecError,
+    PluginError,
+    SpecError,
+    UnknownFrame,
+    UnknownOption,
+    UsageError,
+)
+from lidarspec.spec.description import (
+    Command,
+    Frame,
+    FrameTypes,
+    Relative,
+    Simulation,
+    check_simulation,
+    freeze,
+    reject_unknown_arguments,
+)
+from lidarspec.spec.links import Link, is_datagram
+from lidarspec.spec.results import Imu, Points
+from lidarspec.spec.timing import Clock, OnChange, OnWrap, Sequence, Split
 from lidarspec.trust import beside
 
 if TYPE_CHECKING:
@@ -37,6 +58,14 @@ if TYPE_CHECKING:
     from lidarspec.scans.scans import Scan
     from lidarspec.scans.selection import Selection
 
+#: version of the plugin interface; the engine reads this one and the one before.
+API = 1
+STATUSES = ("manual", "vectors", "capture", "hardware")
+#: the keys of `Sensor.info`.
+ROLES = ("serial", "firmware", "model", "temperature")
+#: directions of the vendor's axes; in REP-103 x points forward, y left and z up.
+DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
+_ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
 #: bytes of something learned at most, where a file says it.
 LARGEST = 1 << 20
 #: options that every sensor has.
@@ -94,77 +123,231 @@ class Learned(bytes):
             raise UsageError(f"{value!s}: {getattr(error, 'strerror', None) or error}") from None
 
 
-class Sensor(Spec):
-    """One sensor, described, and all that can be done with it.
+@reject_unknown_arguments
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensor:
+    """One sensor: the facts of its manual, and the engines as methods.
 
     Args:
-        id: vendor-model in lower case with hyphens; the same everywhere and for ever.
-        vendor, model: as people write them.
-        frames: every message type by name, in both directions; where several fit at one place,
-            their order decides.
-        points: a function of `Fields` that returns `Polar` or `Cartesian`; None where each data
-            frame has its own.
-        scan: where one scan ends and the next begins.
-        links: by name; the data come over "data", commands over the link that they name.
-        commands: what can be asked of it, by name.
-        clock: its own time, if it has one.
-        sequence: its counter of packets, if it has one.
-        fillers: bytes that it sends between frames; they are counted on their own.
-        state: defaults of other frames' fields for ``f.state``, by frame and path, in units.
-        simulation: what a simulated sensor needs beyond all this.
+        id: vendor-model in lower case with hyphens; it never changes.
+        vendor, model: names as the vendor writes them.
+        frames: every message type by name, in both directions. If several types fit at one
+            offset, the first one in this order is taken.
+        points: a function of `Fields` that returns `Polar` or `Cartesian`; None if each data frame
+            has a function of its own.
+        scan: the rule by which a scan ends and the next one begins.
+        links: the links by name. Data comes over "data", commands go over the link that they name.
+        commands: the commands by name.
+        clock: the sensor's clock, if it has one.
+        sequence: the packet counter, if it has one.
+        fillers: bytes that the sensor sends between frames; they are counted separately.
+        state: default values for ``f.state``, by frame and field path, in the unit of the field.
+        simulation: additional facts for a simulated sensor.
         configure: a function of the sensor and its options, by name, that returns another sensor.
-        recognise: where data frames do not say how they are laid out: a function of datagrams that
-            returns the options of `configure` with which they are read, {} where they are of no
-            such sensor.
-        on_open, on_close: names of the commands that are sent when it is opened and closed.
+            The annotations of its parameters say which values an option takes.
+        recognise: needed if data frames do not contain their own layout: a function of datagrams
+            that returns the options of `configure` which decode them, {} if the datagrams are not
+            from such a sensor.
+        on_open, on_close: names of the commands that are sent on opening and on closing.
         range_limits: the shortest and the longest range that it can measure, metres.
-        vendor_axes: where the vendor's x, y and z point, of forward, back, left, right, up and
-            down, for ``frame="vendor"``.
-        beams: points of a scan, where their number is constant.
+        vendor_axes: the directions of the vendor's x, y and z axes, for ``frame="vendor"``: three
+            of forward, back, left, right, up and down.
+        beams: points of a scan, if their number is constant.
         turn: the slowest and the fastest number of scans a second.
-        relatives: ids of sensors that it can be mistaken for, installed or not -> what tells them
-            apart: a text, where it is the pace of the clock or what `info` names as model; a
-            `Relative`, where single packets show it.
-        info: what frames say of the device ("serial", "firmware", "model", "temperature") -> the
-            field, as "frame.path".
-        status: how far it is proven: "manual", "vectors", "capture" or "hardware".
-        source: the manual with its revision and sections, the captures.
-        aliases: other ids that it is known by.
+        relatives: ids of related models, installed or not, with the difference: a text if the pace
+            of the clock or the model in `info` shows it, a `Relative` if single packets show it.
+        info: fields with information about the device: "serial", "firmware", "model" or
+            "temperature" -> "frame.path".
+        status: how it was verified: "manual", "vectors", "capture" or "hardware".
+        source: the manual with its revision and sections, and the captures.
+        aliases: other ids of the sensor.
         api: the version of this interface that it was written for.
-        acknowledged: findings of `lidarspec check` about the sensor as a whole that are true and
-            meant, as "LS401" -> the reason.
-        options: what it was configured with; not for plugins to set.
-        hooked: applies the hooks of installed plugins to a value like this one; not for plugins to
-            set.
+        acknowledged: findings of `lidarspec check` about the sensor as a whole that are accepted:
+            "LS401" -> the reason.
+        options: the options that it was configured with; not set by plugins.
+        hooked: applies the hooks of installed plugins to a sensor; not set by plugins.
 
     Raises:
-        SpecError: for an id, status or reference between its parts that cannot be.
+        SpecError: for an invalid id or status, or if a part refers to one that does not exist.
     """
+
+    id: str
+    vendor: str = field(kw_only=True)
+    model: str = field(kw_only=True)
+    frames: Mapping[str, Frame] = field(kw_only=True)
+    points: Callable[[Any], Points] | None = field(kw_only=True)
+    scan: Split = field(kw_only=True)
+    links: Mapping[str, Link] = field(kw_only=True)
+    commands: Mapping[str, Command] = field(default_factory=dict, kw_only=True)
+    clock: Clock | None = field(default=None, kw_only=True)
+    sequence: Sequence | None = field(default=None, kw_only=True)
+    fillers: bytes = field(default=b"", kw_only=True)
+    state: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, kw_only=True)
+    simulation: Simulation = field(default_factory=Simulation, kw_only=True)
+    configure: Any = field(default=None, kw_only=True)
+    recognise: Callable[[tuple[bytes, ...]], Mapping[str, Any]] | None = field(
+        default=None, kw_only=True
+    )
+    on_open: tuple[str, ...] = field(default=(), kw_only=True)
+    on_close: tuple[str, ...] = field(default=(), kw_only=True)
+    range_limits: tuple[float, float] = field(kw_only=True)
+    vendor_axes: tuple[str, str, str] | None = field(default=None, kw_only=True)
+    beams: int | None = field(default=None, kw_only=True)
+    turn: tuple[float, float] | None = field(default=None, kw_only=True)
+    relatives: Mapping[str, str | Relative] = field(default_factory=dict, kw_only=True)
+    info: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    status: str = field(kw_only=True)
+    source: str = field(kw_only=True)
+    aliases: tuple[str, ...] = field(default=(), kw_only=True)
+    api: int = field(default=API, kw_only=True)
+    acknowledged: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    options: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    hooked: Callable[[Any], Any] | None = field(default=None, kw_only=True)
 
     _repr_html_ = drawn("sensor")
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        object.__setattr__(self, "frames", MappingProxyType(FrameTypes(self.id, self.frames)))
+        freeze(self, "links", "commands", "state", "relatives", "info", "acknowledged", "options")
+        for name in ("on_open", "on_close", "aliases"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         if isinstance(self.configure, Configure):
             function = self.configure.function
         else:
             function = self.configure
+        object.__setattr__(self, "configure", function)
+        _check_sensor(self)
         object.__setattr__(self, "configure", Configure(self, function))
+
+    @property
+    def data_frame(self) -> str:
+        """The name of the frame type with the points; with several, the chosen one.
+
+        Raises:
+            UnknownFrame: if there is none yet, for a sensor that needs a file first.
+        """
+        names = self.data_frames
+        if not names:
+            raise UnknownFrame(
+                "data", self.frames, place=self.id, hint="; configure the sensor first"
+            )
+        answer = self.options.get("answer")
+        return answer if answer in names else names[0]
+
+    @cached_property
+    def incoming(self) -> Mapping[str, Frame]:
+        """The frame types that the sensor sends, by name, in the order of `frames`."""
+        return {name: frame for name, frame in self.frames.items() if frame.direction == "in"}
+
+    @cached_property
+    def data_frames(self) -> tuple[str, ...]:
+        """The names of the frame types with points."""
+        return tuple(name for name, frame in self.frames.items() if frame.data)
+
+    @cached_property
+    def imu_frames(self) -> tuple[str, ...]:
+        """The names of the incoming frame types with IMU measurements."""
+        return tuple(name for name, frame in self.incoming.items() if frame.imu is not None)
+
+    def points_of(self, frame: str) -> Callable[[Any], Points]:
+        """Return the `points` function of a frame type: its own, or for data the sensor's.
+
+        Args:
+            frame: a name, or "name.path" for the parts of a frame.
+
+        Raises:
+            SpecError: if the frame type has no points.
+        """
+        name, _, parts = frame.partition(".")
+        function = self.frames[name].points
+        if isinstance(function, Mapping):
+            function = function.get(parts)
+        elif function is None and self.frames[name].data and not parts:
+            function = self.points
+        if function is None:
+            raise SpecError("this frame type has no points", path=frame, sensor=self.id)
+        return function
+
+    def imu_of(self, frame: str) -> Callable[[Any], Imu]:
+        """Return the `imu` function of a frame type.
+
+        Args:
+            frame: a name, or "name.path" for the parts of a frame.
+
+        Raises:
+            SpecError: if it has none; the message lists the frame types that have one.
+        """
+        name, _, parts = frame.partition(".")
+        function = self.frames[name].imu
+        if isinstance(function, Mapping):
+            function = function.get(parts)
+        if function is not None:
+            return function
+        if self.imu_frames:
+            having = f"those of {', '.join(self.imu_frames)} have"
+        else:
+            having = "no frame of the sensor has"
+        raise SpecError(
+            f"this frame type has nothing of an IMU; {having}", path=frame, sensor=self.id
+        )
+
+    def parts_with(self, function: Literal["points", "imu"], frame: str) -> str:
+        """Return the path of the parts that have a frame's `points` or `imu`.
+
+        Returns:
+            "" if the frame itself has them, or if there is no such frame.
+        """
+        if frame not in self.frames:
+            return ""
+        declared = getattr(self.frames[frame], function)
+        if not isinstance(declared, Mapping):
+            return ""
+        (path,) = declared
+        return str(path)
+
+    def simulation_of(self, frame: str) -> Simulation:
+        """Return the simulation facts of a frame type.
+
+        For data, the sensor's facts fill in those that the frame does not declare.
+        """
+        declared = self.frames[frame]
+        if declared.data:
+            shared = self.simulation
+        else:
+            shared = Simulation()
+        return Simulation(
+            sweep=declared.simulation.sweep or shared.sweep,
+            encode=declared.simulation.encode or shared.encode,
+            rate=declared.simulation.rate or shared.rate,
+            directions=declared.simulation.directions or shared.directions,
+        )
+
+    @property
+    def datagrams(self) -> bool:
+        """Whether the data link sends one frame per datagram."""
+        return is_datagram(self.links.get("data"))
+
+    @property
+    def counts_losses(self) -> bool:
+        """Whether lost packets are counted: by a counter, or a clock with a declared pace."""
+        if self.sequence is not None:
+            return True
+        return self.clock is not None and self.clock.pace is not None
 
     def parse(
         self, data: bytes, frame: str | None = None, *, verify: bool = True, units: bool = False
     ) -> Any:
-        """Exactly one frame as a construct Container of raw wire integers.
+        """Return exactly one frame as a construct Container of raw wire integers.
 
         Args:
-            frame: its type; found out where left out.
+            frame: its type; identified if left out.
             verify: False accepts wrong constants, a wrong checksum and trailing bytes.
-            units: physical values, as ``build(units=True)`` takes them: those of scaled fields in
-                their units, others as they are.
+            units: return physical values, as ``build(units=True)`` takes them: scaled fields in
+                their units, other fields as they are.
 
         Raises:
-            WireError: where the bytes are not such a frame: sensor, offset, field path, expected
-                and got.
+            WireError: if the bytes are not such a frame; it has the sensor, the offset, the field
+                path and the expected and actual value.
         """
         from lidarspec.frames.parse import parse
 
@@ -173,11 +356,11 @@ class Sensor(Spec):
     def build(
         self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any
     ) -> bytes:
-        """The bytes of one frame; constants, counts and the checksum are filled in.
+        """Return the bytes of one frame; constants, counts and checksum are filled in.
 
         Args:
             value: a mapping of all fields, such as what `parse` returned; `values` override it.
-            units: take physical values, and round them to the wire's steps.
+            units: take physical values, and round them to the steps of the wire.
 
         Raises:
             UsageError: for a missing or unknown field, or a value that its field cannot hold.
@@ -187,7 +370,7 @@ class Sensor(Spec):
         return build(self, frame, value, values, units=units)
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
-        """The bytes of a valid frame with seeded random content.
+        """Return the bytes of a valid frame with seeded random content.
 
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
@@ -197,22 +380,26 @@ class Sensor(Spec):
         return example(self, frame, seed=seed)
 
     def command(self, name: str, /, **arguments: Any) -> bytes:
-        """The bytes of a command; arguments by name, in units.
+        """Return the bytes of a command.
+
+        Args:
+            arguments: by name, in the unit of the field.
 
         Raises:
-            UnknownCommand, OutOfRange: for what the sensor does not take.
+            UnknownCommand: for a command that the sensor does not have.
+            OutOfRange: for an argument outside its range.
         """
         from lidarspec.frames.commands import build_command
 
         return build_command(self, name, arguments)
 
     def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Decoder:
-        """A new incremental decoder, sans-IO and independent of every other.
+        """Return a new incremental decoder without I/O, independent of all others.
 
         Args:
-            stream: True reads a byte stream, False one datagram for each `feed`; by default what
-                the data link says.
-            backend: "auto", "numpy" or "jit": the same results.
+            stream: True reads a byte stream, False one datagram with each `feed`; by default the
+                data link decides.
+            backend: "auto", "numpy" or "jit"; the results are the same.
 
         Raises:
             UsageError: for an unknown back end, or a sensor that has no frames before it is
@@ -226,16 +413,19 @@ class Sensor(Spec):
             from lidarspec.points.numba_kernels import compiled_sums
 
             sums = compiled_sums()
-        stream = not self.datagrams if stream is None else stream
+        if stream is None:
+            stream = not self.datagrams
         return Decoder(self, stream=stream, backend=chosen, sums=sums)
 
     def split(self, data: Any, *, backend: str = "auto") -> list[Found]:
-        """Every incoming frame of all types, in stream order. Raises on no bytes whatever.
+        """Return every incoming frame of all types, in stream order.
+
+        Invalid bytes do not raise.
 
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
                 datagrams.
-            backend: "auto", "numpy" or "jit": the same results.
+            backend: "auto", "numpy" or "jit"; the results are the same.
 
         Raises:
             UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
@@ -247,26 +437,27 @@ class Sensor(Spec):
         return [found for frames in frames_of(decoder, data) for found in frames.found()]
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
-        """The data frames, or those of another type, as columns. Raises on no bytes whatever.
+        """Return the data frames, or those of another type, as columns.
+
+        Invalid bytes do not raise.
 
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
                 datagrams.
-            frame: the name of a frame type; of several data frames, the first that arrives where
-                left out.
-            backend: "auto", "numpy" or "jit": the same results.
+            frame: the name of a frame type; by default the data frame, of several the type that
+                arrives first.
+            backend: "auto", "numpy" or "jit"; the results are the same.
 
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
             UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
                 before it is configured.
         """
-        return self._decoded(data, frame, backend)[0]
+        packets, _ = self._decode(data, frame, backend)
+        return packets
 
-    def _decoded(
-        self, data: Any, frame: str | None, backend: str
-    ) -> tuple[Packets, Waiting | None]:
-        """The packets of a frame type; and where none is named, what an IMU felt by their clock."""
+    def _decode(self, data: Any, frame: str | None, backend: str) -> tuple[Packets, Waiting | None]:
+        """Return the packets of a frame type, and the IMU samples if no type is named."""
         from lidarspec.framing.decoder import frames_of, is_stream
         from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
 
@@ -275,54 +466,187 @@ class Sensor(Spec):
         name = frame or data_frame(self, frames) or self.data_frame
         stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
         packets = stream.add(frames, whole=True)
-        if frame is None:
-            imu = ImuStream(self, decoder.stats, backend=decoder.backend)
-        else:
-            imu = None
-        if imu is not None:
-            imu.add(frames, packets, whole=True)
-        return packets, None if imu is None else imu.waiting
+        if frame is not None:
+            return packets, None
+        imu = ImuStream(self, decoder.stats, backend=decoder.backend)
+        imu.add(frames, packets, whole=True)
+        return packets, imu.waiting
 
     def scans(
         self, data: Any, *, backend: str = "auto", select: Selection | None = None
     ) -> Iterator[Scan]:
-        """Every scan of the data; the first and last piece are marked ``complete=False``.
+        """Return an iterator over the scans; the first and last have ``complete=False``.
 
-        Where there is no data frame in the data, or `points` raises at some of the packets, a
-        Python warning says so.
+        Issues a Python warning if the data has no data frame, or if `points` raises for some of
+        the packets.
 
         Args:
             data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
                 datagrams.
-            backend: "auto", "numpy" or "jit": the same results.
-            select: which scans, and what of each.
+            backend: "auto", "numpy" or "jit"; the results are the same.
+            select: the scans to return, and the part of each.
 
         Raises:
             UsageError: for a text or a path, an unknown back end, a sensor that has no frames
-                before it is configured, or where none of the scans is wanted.
+                before it is configured, or if no scan is selected.
         """
         from lidarspec.scans.scans import scans_of
         from lidarspec.scans.selection import Sieve
 
-        packets, imu = self._decoded(data, None, backend)
+        packets, imu = self._decode(data, None, backend)
         if packets.stats.bytes_in and not len(packets):
             warnings.warn(
                 f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): is it of"
                 " another sensor?",
                 stacklevel=2,
             )
-        found = scans_of(self, [packets], imu)
-        return self._followed(
-            found if select is None else Sieve(select, "the data").of(found), packets
-        )
+        scans = scans_of(self, [packets], imu)
+        if select is None:
+            return self._warn_after(scans, packets)
+        return self._warn_after(Sieve(select, "the data").of(scans), packets)
 
-    def _followed(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
-        """Scans, and behind them what the plugin failed at, and that they have no end."""
+    def _warn_after(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
+        """Yield the scans, then warn about errors of the plugin and scans without an end."""
         yield from scans
         if packets.stats.unended:
             warnings.warn(f"{self.id}: {packets.stats.unended}", stacklevel=2)
-        if (failure := packets.stats.failure(self.id)) is not None:
+        failure = packets.stats.failure(self.id)
+        if failure is not None:
             warnings.warn(str(failure), stacklevel=2)
+
+    def __repr__(self) -> str:
+        options = "".join(f", {name}={value!r}" for name, value in self.options.items())
+        return (
+            f"Sensor({self.id}, {self.vendor} {self.model}, frames:"
+            f" {', '.join(self.frames) or 'none yet'}{options})"
+        )
+
+
+def with_frames(sensor: Sensor, frames: Mapping[str, Frame]) -> Sensor:
+    """Return a sensor with only these frame types, and without everything that names others.
+
+    It has no commands, no state, and no fields with information about the device.
+    """
+    clock = sensor.clock
+    if clock is not None and clock.told is not None and clock.told[0] not in frames:
+        clock = replace(clock, told=None)
+    return replace(
+        sensor, frames=frames, clock=clock, commands={}, state={}, info={}, on_open=(), on_close=()
+    )
+
+
+def _check_sensor(sensor: Sensor) -> None:
+    """Raise SpecError if a fact is invalid, or a part refers to one that does not exist."""
+    check_simulation(sensor.simulation)
+    _check_facts(sensor)
+    for name, frame in sensor.frames.items():
+        _check_names(sensor, f"frames.{name}.after", [frame.after], sensor.frames)
+    for name, command in sensor.commands.items():
+        _check_command(sensor, name, command)
+    if sensor.commands:
+        _check_names(sensor, "simulation.answers", sensor.simulation.answers, sensor.commands)
+    _check_names(sensor, "state", sensor.state, sensor.frames)
+    _check_clock(sensor)
+    info_frames = [path.partition(".")[0] for path in sensor.info.values()]
+    _check_names(sensor, "info", info_frames, sensor.frames)
+    _check_names(sensor, "on_open, on_close", sensor.on_open, sensor.commands)
+    _check_names(sensor, "on_open, on_close", sensor.on_close, sensor.commands)
+    if sensor.points is None and any(
+        frame.data and frame.points is None for frame in sensor.frames.values()
+    ):
+        raise SpecError("a data frame without a points function", path="points", sensor=sensor.id)
+
+
+def _check_facts(sensor: Sensor) -> None:
+    """Raise SpecError for a fact that is invalid on its own."""
+    if not _ID.fullmatch(sensor.id):
+        raise SpecError(
+            "an id is vendor-model in lower case with hyphens", path="id", sensor=sensor.id
+        )
+    if sensor.status not in STATUSES:
+        raise SpecError(
+            f"status is one of {', '.join(STATUSES)}, not {sensor.status!r}",
+            path="status",
+            sensor=sensor.id,
+        )
+    if not API - 1 <= sensor.api <= API:
+        raise SpecError(
+            f"written for interface {sensor.api}; this engine reads {API - 1} and {API}",
+            path="api",
+            sensor=sensor.id,
+        )
+    unknown_roles = sorted(set(sensor.info) - set(ROLES))
+    if unknown_roles:
+        raise SpecError(
+            f"{unknown_roles[0]!r} is not among {', '.join(ROLES)}", path="info", sensor=sensor.id
+        )
+    unknown_directions = sorted(set(sensor.vendor_axes or ()) - set(DIRECTIONS))
+    if unknown_directions:
+        raise SpecError(
+            f"no direction {unknown_directions[0]!r}", path="vendor_axes", sensor=sensor.id
+        )
+    if sensor.beams is not None and sensor.beams < 1:
+        raise SpecError(
+            f"a scan has at least 1 point, not {sensor.beams}", path="beams", sensor=sensor.id
+        )
+    if sensor.turn is not None and not 0 < sensor.turn[0] <= sensor.turn[1]:
+        raise SpecError(
+            f"the slowest and the fastest number of scans a second, not {sensor.turn}",
+            path="turn",
+            sensor=sensor.id,
+        )
+
+
+def _check_command(sensor: Sensor, name: str, command: Command) -> None:
+    """Raise SpecError if a command refers to something that the sensor does not have."""
+    frames = [command.frame, *command.replies, command.refusal]
+    _check_names(sensor, f"commands.{name}", frames, sensor.frames)
+    _check_names(sensor, f"commands.{name}.link", [command.link], sensor.links)
+    if command.only_stopped and not any(
+        other.starts or other.stops for other in sensor.commands.values()
+    ):
+        raise SpecError(
+            "only_stopped needs a command that starts or stops the data, and there is none",
+            path=f"commands.{name}",
+        )
+    if command.learns is not None and not (command.replies and sensor.configure is not None):
+        raise SpecError(
+            "learns needs a reply to learn from, and a `configure` function that takes the options",
+            path=f"commands.{name}.learns",
+        )
+    if "timeout" in command.args:
+        raise SpecError(
+            "'timeout' is the time to wait for the reply, and cannot be an argument",
+            path=f"commands.{name}.args",
+        )
+
+
+def _check_clock(sensor: Sensor) -> None:
+    """Raise SpecError if `told` of the clock cannot complete it."""
+    clock = sensor.clock
+    if clock is None or clock.told is None:
+        return
+    _check_names(sensor, "clock.told", clock.told[:1], sensor.frames)
+    if clock.wraps_at is None or callable(clock.source):
+        raise SpecError(
+            "told completes a clock made of fields that starts again at `wraps_at`",
+            path="clock.told",
+            sensor=sensor.id,
+        )
+
+
+def _check_names(
+    sensor: Sensor, path: str, names: Iterable[str | None], table: Mapping[str, Any]
+) -> None:
+    """Raise SpecError for the first name that is not in a table; None is valid.
+
+    A sensor without frames, which needs a file first, is not checked.
+    """
+    for name in names:
+        if name is not None and name not in table and sensor.frames:
+            raise SpecError(
+                f"{name!r} is not among {', '.join(table) or 'none'}", path=path, sensor=sensor.id
+            )
 
 
 @dataclass(frozen=True)
@@ -466,7 +790,7 @@ def _type_names(annotation: object) -> set[str]:
     return {word.rpartition(".")[2] for word in re.findall(r"[\w.]+", text)}
 
 
-def _check_cut(sensor: Spec, degrees: object) -> None:
+def _check_cut(sensor: Sensor, degrees: object) -> None:
     """Raise UsageError unless scans of a sensor can be cut at an angle, and it is one."""
     has_angle = isinstance(sensor.scan, OnWrap) or (
         isinstance(sensor.scan, OnChange) and bool(sensor.scan.angle)
@@ -481,7 +805,7 @@ def _check_cut(sensor: Spec, degrees: object) -> None:
         raise UsageError(f"{sensor.id}: cut is an angle in degrees, not {shown(degrees)}")
 
 
-def _check_shared(sensor: Spec, options: Mapping[str, Any]) -> None:
+def _check_shared(sensor: Sensor, options: Mapping[str, Any]) -> None:
     frame = options.get("frame", FRAMES_OF_REFERENCE[0])
     if frame not in FRAMES_OF_REFERENCE:
         raise UsageError(

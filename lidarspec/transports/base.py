@@ -11,7 +11,6 @@ from collections.abc import Collection
 from typing import Any, TypeVar
 
 from lidarspec.errors import SourceError, suggest
-from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Link
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.host_clock import HostClock
@@ -121,7 +120,7 @@ def error_numbers(error: BaseException) -> list[int]:
     return [number for number in error.args if isinstance(number, int)]
 
 
-def data_link(sensor: Spec | None, kind: type[L]) -> L | None:
+def data_link(sensor: Sensor | None, kind: type[L]) -> L | None:
     """Return the data link of a sensor if it is of this kind."""
     if sensor is not None:
         link = sensor.links.get("data")

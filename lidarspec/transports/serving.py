@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable, Iterator
 
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.spec.description import Spec
 from lidarspec.spec.links import Udp
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.outlets import LOCALHOST, Outlet
 from lidarspec.transports.protocol import POLL, Chunk, Closing, Sender
 
@@ -162,7 +162,7 @@ def due_chunks(
     return chunks
 
 
-def _find_endpoint(sensor: Spec, frame: str) -> Sender:
+def _find_endpoint(sensor: Sensor, frame: str) -> Sender:
     """Return the address of a datagram: data frames use the first declared port.
 
     All other frames use the second one, if it is declared.

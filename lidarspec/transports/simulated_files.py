@@ -17,7 +17,7 @@ from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.frames.commands import build_command
 from lidarspec.recording.recorders import recorder
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.spec.description import Spec
+from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.serving import due_chunks
 
@@ -92,7 +92,7 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
             yield chunk, "in"
 
 
-def _commands_on_open(sensor: Spec) -> list[str]:
+def _commands_on_open(sensor: Sensor) -> list[str]:
     """Return the commands that open a device and have a frame: others only move control lines."""
     return [name for name in sensor.on_open if sensor.commands[name].frame]
 

@@ -434,7 +434,7 @@ def test_a_command_that_is_answered_only_while_the_sensor_is_stopped_says_so() -
         ReplyTimeout, match="answered only while the sensor is stopped: send 'stop' first"
     ):
         pending.result()
-    with pytest.raises(ls.SpecError, match="no command starts or stops it"):
+    with pytest.raises(ls.SpecError, match="needs a command that starts or stops the data"):
         dataclasses.replace(SENSOR, commands={"ask": asking}, on_open=(), on_close=())
 
 

@@ -15,7 +15,7 @@ from lidarspec import Scan, Sensor, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.scans import ScanStream
 from lidarspec.spec import Fields, Polar, following
-from lidarspec.spec.description import with_frames
+from lidarspec.spec.sensor import with_frames
 from tests.shapes import segments
 
 FRAMES = 200
