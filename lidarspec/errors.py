@@ -46,7 +46,7 @@ _NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 def struct_error(error: Exception, *, path: str, sensor: str = "") -> SpecError:
     """Return the error for an expression or a checksum of a struct that raised."""
     reason = f"an expression of the struct failed: {type(error).__name__}: {error}"
-    return SpecError(reason, path=path, sensor=sensor)
+    return SpecError(reason, path=path, sensor=sensor, rule="LS115")
 
 
 class PluginError(SpecError):

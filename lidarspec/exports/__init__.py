@@ -176,7 +176,7 @@ def _check(node: tree.Node) -> None:
         *tree.formulas(node),
         *([node.condition] if isinstance(node, tree.Check) else []),
     ):
-        if isinstance(formula, tree.Code):
+        if isinstance(formula, tree.Untraced):
             raise Refused(formula.reason)
         if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):
             raise Refused(

@@ -43,10 +43,12 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
                 if len(part.indices) > 1:
                     raise NotCompilable(part.info.path, "an array of arrays of bits")
     for formula in tree.formulas(node):
-        if isinstance(formula, tree.Code) and formula.blind:
-            raise NotCompilable(path, formula.reason.partition(": ")[2])
+        _check_traced(formula)
         for ref in tree.refs(formula):
             check_control(ref.info)
+    for info in tree.infos(node):
+        _check_traced(info.rebuilt)
+        _check_traced(info.default)
     if isinstance(node, tree.Parts):
         for kind in node.kinds:
             _check_part(kind, path)
@@ -57,6 +59,12 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
         else:
             below = path
         _check(child, below, in_array=in_array or isinstance(node, tree.Repeat))
+
+
+def _check_traced(formula: object) -> None:
+    if isinstance(formula, tree.Untraced):
+        path, _, reason = formula.reason.partition(": ")
+        raise NotCompilable(path, reason)
 
 
 def _check_part(kind: tree.Kind, path: str) -> None:

@@ -128,19 +128,19 @@ class _Encoder:
             except Unknown as unknown:
                 path = unknown.leaf.info.path
                 found = self.read(path)
-                if not isinstance(found, tuple):
+                if found is None:
                     raise self._uncounted(path) from None
-                values[path] = int(found[1])
+                values[path] = int(found)
             except TooLong as fault:
                 raise UsageError(
                     f"{self._place}: {self._prefix or fault or 'the frame'}: these values give no"
                     f" frame of at most {self._limit} bytes"
                 ) from None
 
-    def read(self, path: str) -> tuple[FieldInfo, Any] | str | None:
-        """Return the value at a path, as formulas read it (`lidarspec.spec.tree.Read`)."""
+    def read(self, path: str) -> Any:
+        """Return the value of a field, as formulas read it (`lidarspec.spec.tree.Read`)."""
         if path.startswith("_."):
-            return FieldInfo(path), self._around[path[2:]]
+            return self._around[path[2:]]
         value: Any = self._given
         names = ""
         for step in steps(path):
@@ -156,16 +156,12 @@ class _Encoder:
                     value = None
         if isinstance(value, list) and names in self._indices:
             value = value[self._indices[names]]
-        if path not in self._schema.fields:
-            if value is None:
-                return None
-            return path
         info = self._schema.fields[path]
         if value is None or (info.rebuilt is not None and not info.held):
             value = self._implied(info)
         if value is None:
             return None
-        return (info, raw_of(info, value))
+        return raw_of(info, value)
 
     def _implied(self, info: FieldInfo) -> Any:
         """Return the value that a field has if none is given; None if it has to be given."""
@@ -185,8 +181,8 @@ class _Encoder:
         around = {}
         for ref in node.outer:
             found = self.read(ref.path)
-            if isinstance(found, tuple):
-                around[ref.path] = int(found[1])
+            if found is not None:
+                around[ref.path] = int(found)
         kinds = [kind_of(node, part) for part in given]
         encoded: list[bytes] = []
         following = 0
@@ -545,9 +541,7 @@ def known_paths(root: Node) -> frozenset[str]:
     return frozenset(".".join(names[:depth]) for names in split for depth in range(len(names) + 1))
 
 
-def given_value(
-    given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str
-) -> tuple[FieldInfo, Any] | str | None:
+def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> Any:
     """Return a value that is given for a frame, as formulas read it (`lidarspec.spec.tree.Read`).
 
     Raises:
@@ -556,9 +550,6 @@ def given_value(
     value: Any = given
     for step in steps(path):
         value = value[step]
-    if isinstance(value, Mapping) or path not in fields:
-        return path
-    info = fields[path]
     if value is None:
         return None
-    return (info, raw_of(info, value))
+    return raw_of(fields[path], value)

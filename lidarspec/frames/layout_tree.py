@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import by_value
-from lidarspec.frames.compilability import NotCompilable, check_compilable, check_control
+from lidarspec.frames.compilability import NotCompilable, check_compilable
 from lidarspec.frames.layout import Condition, Layout, Leaf, Refused, Seal
 from lidarspec.frames.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
 from lidarspec.frames.schema import ByPath, without_indices
@@ -141,9 +141,8 @@ class Walk:
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
     #: elements without a byte, of all arrays.
     empty: int = 0
-    #: what expressions can ask for by now: a field, the path of a struct, None for what the header
-    #: leaves out.
-    parts: dict[str, Leaf | Measure | str | None] = field(default_factory=dict)
+    #: fields that formulas can ask for by now; None for a field that the header leaves out.
+    parts: dict[str, Leaf | Measure | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
         """What was found, as a value."""
@@ -165,36 +164,29 @@ class Walk:
         )
         return Layout(*found, held, tuple(self.conditions.values()))
 
-    def read(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
-        """Return the field and raw value, or the struct path, that a formula reads.
+    def read(self, path: str) -> int | None:
+        """Return the raw value of a field that a formula asks for.
 
         Returns None if the header leaves it out.
 
         Raises:
-            NotCompilable: for what is no field before the formula, or not one integer.
             Unknown: for a field whose value is not given.
         """
         if path.startswith("_."):
-            return tree.FieldInfo(path), self.given[path[2:]]
+            return self.given[path[2:]]
         if path not in self.parts and "[" in path:
             return self._element(path)
-        if path not in self.parts:
-            scope, _, name = path.rpartition(".")
-            raise NotCompilable(
-                scope, f"an expression asks for {name!r}, which is not a field before it"
-            )
         part = self.parts[path]
-        if not isinstance(part, Leaf | Measure):
-            return part
+        if part is None:
+            return None
         if isinstance(part, Measure) and part.region.size is not None:
-            return part.info, part.region.size
+            return part.region.size
         if path not in self.values:
-            check_control(part.info)
-            return part.info, self.asked(part, self)
-        return part.info, self.values[path]
+            return self.asked(part, self)
+        return self.values[path]
 
-    def _element(self, path: str) -> tuple[tree.FieldInfo, int]:
-        """An element of an array: the whole of it stands before the formula."""
+    def _element(self, path: str) -> int:
+        """Return the value of an element of an array that stands before the formula."""
         base, indices = without_indices(path)
         if base in self.leaves:
             leaf = self.leaves[base].element(path, indices)
@@ -202,7 +194,9 @@ class Walk:
             leaf = None
         if leaf is None:
             raise IndexError(f"{base} has no such element")
-        return leaf.info, self.values[path] if path in self.values else self.asked(leaf, self)
+        if path in self.values:
+            return self.values[path]
+        return self.asked(leaf, self)
 
     def visit(
         self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()
@@ -243,7 +237,6 @@ class Walk:
     def _struct(
         self, node: tree.Struct, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        self.parts.setdefault(path, path)
         for member in node.members:
             if member.name:
                 below = f"{node.path}.{member.name}".strip(".")
@@ -374,9 +367,6 @@ class Walk:
             names = ".".join(name for name in (path, *part.names) if name)
             groups.setdefault(names, []).append(part.bits)
             infos[names] = part.info
-            for depth in range(len(part.names)):
-                above = ".".join(name for name in (path, *part.names[:depth]) if name)
-                self.parts.setdefault(above, above)
         for name, elements in groups.items():
             info = infos[name]
             inside = len(info.axes) > len(shape)
@@ -453,10 +443,10 @@ class Walk:
                 ):  # of the others: construct evaluates them when a frame is built
                     yield leaf, operator.index(tree.evaluated(leaf.info.rebuilt, self._read_known))
 
-    def _read_known(self, path: str) -> tuple[tree.FieldInfo, int] | str | None:
+    def _read_known(self, path: str) -> int | None:
         part = self.parts[path]
         if isinstance(part, Leaf) and isinstance(part.info.const, int) and path not in self.values:
-            return part.info, part.info.const
+            return part.info.const
         return self.read(path)
 
     def _value(self, formula: tree.Formula) -> Any:
@@ -641,13 +631,8 @@ class _Told:
 
 
 def _asks(formula: tree.Formula, info: tree.FieldInfo) -> bool:
-    """Whether a formula may ask for a field; nobody knows all that Python asks for."""
-    match formula:
-        case tree.Op():
-            return any(_asks(arg, info) for arg in formula.args)
-        case tree.Ref():
-            return formula.path == info.path
-    return isinstance(formula, tree.Code)
+    """Return whether a formula depends on a field."""
+    return any(ref.path == info.path for ref in tree.refs(formula))
 
 
 def _counts(node: tree.Node, formula: tree.Formula) -> bool:
@@ -676,8 +661,7 @@ def _rises(formula: tree.Formula) -> bool:
 
 def _with_value(formula: tree.Formula, value: int) -> int:
     """A formula of one field, where that has this value."""
-    ref, *_ = tree.refs(formula)
-    return int(tree.evaluated(formula, lambda _: (ref.info, value)))
+    return int(tree.evaluated(formula, lambda _: value))
 
 
 class _Places:

@@ -338,13 +338,13 @@ class _Walk:
         """What a formula says in one part; -1 where it fails."""
         part = self._buffer[spot : spot + layout.size].tobytes()
 
-        def read(path: str) -> tuple[tree.FieldInfo, int] | None:
+        def read(path: str) -> int | None:
             if path.startswith("_."):
-                return tree.FieldInfo(path), self._region.given[path[2:]]
+                return self._region.given[path[2:]]
             leaf = layout.leaves.get(path)
             if leaf is None:
                 return None
-            return (leaf.info, leaf.scalar(part))
+            return leaf.scalar(part)
 
         try:
             return min(int(tree.evaluated(formula, read)), self._region.limit + 1)

@@ -299,7 +299,7 @@ def phrase(formula: tree.Formula) -> str:
             value in ref.info.labels
         ):
             return f"{ref.path} {symbol} {ref.info.labels[value]!r}"
-    if isinstance(formula, tree.Code):
+    if isinstance(formula, tree.Untraced):
         text = formula.text
     else:
         text = tree.written(formula, lambda ref: ref.path, {})

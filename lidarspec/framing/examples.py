@@ -17,7 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import PluginError, SpecError, UnknownFrame, UsageError
+from lidarspec.errors import (
+    LidarSpecError,
+    PluginError,
+    SpecError,
+    UnknownFrame,
+    UsageError,
+    struct_error,
+)
 from lidarspec.frames.build import build
 from lidarspec.frames.frame_table import Group, Rows
 from lidarspec.frames.layout import Layout, Leaf
@@ -72,7 +79,7 @@ def random_frame(
     """
     engine = codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.parts:
-        return _interpreted(sensor, frame, engine, source, drawn)
+        return _make_of_values(sensor, frame, engine, source, drawn)
     for attempt in range(
         TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP
     ):
@@ -176,20 +183,20 @@ def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -
     return rows
 
 
-def _interpreted(
+def _make_of_values(
     sensor: Sensor, frame: str, engine: Codec, source: random.Random, drawn: Drawn
 ) -> bytes:
-    """A frame that construct alone can read, or one of parts."""
+    """Return a frame with parts, or without layouts: its values are drawn one by one."""
     for _ in range(LARGEST_BATCH * TRIES):
         try:
-            data = build(
-                sensor,
-                frame,
-                _left_open(random_value(engine.frame.prepared, source, drawn), engine.frame.tree),
-                {},
-            )
-        except (UsageError, Fault):  # what was drawn goes not together; something else may
-            continue
+            values = random_value(engine.frame.prepared, source, drawn)
+            data = build(sensor, frame, _left_open(values, engine.frame.tree), {})
+        except (UsageError, Fault):
+            continue  # the values do not fit together; others may
+        except LidarSpecError:
+            raise
+        except Exception as error:
+            raise struct_error(error, path=frame, sensor=sensor.id) from error
         if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
             return data
     raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)

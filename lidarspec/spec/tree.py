@@ -21,8 +21,8 @@ value) and how it is stored; where it begins is the sum of what stands before it
     Opaque          what construct alone can read
 
 Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and
-operations on both (`Op`). What only Python can calculate is `Code`, which can be evaluated, but not
-be written down in another language.
+operations on both (`Op`). An expression that cannot be written down like this is `Untraced`, and
+construct reads its frames.
 
 Parts stand in the tree twice: as they are described, with paths from the top of the frame
 (`Kind.element`), and as frames in themselves, with paths from their own start (`Kind.root`), which
@@ -38,7 +38,6 @@ tree.
 from __future__ import annotations
 
 import functools
-import itertools
 import operator
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -232,30 +231,24 @@ class Op:
 
 
 @dataclass(frozen=True, eq=False)
-class Code:
-    """A formula that only Python can calculate.
+class Untraced:
+    """A formula that cannot be written down, such as a Python function that decides on values.
+
+    construct reads the frames of a struct with such a formula, one at a time.
 
     Attributes:
-        function: from what reads a field (see `Read`) to the value.
-        refs: fields that it is known to ask for; which others depends on their values.
         reason: why it cannot be written down, with the path of the part that it belongs to.
-        text: as the author wrote it, with fields by their whole paths; "?" where that cannot be
-            read.
-        blind: whether it asks for something that is no field before it, which construct alone may
-            know.
+        text: the formula as the author wrote it, with fields by their whole paths; "?" for a
+            function.
     """
 
-    function: Callable[[Read], Any]
-    refs: tuple[Ref, ...]
     reason: str
     text: str
-    blind: bool
 
 
-Formula = int | Ref | Op | Code
-#: from the path of a field to what it is and its raw value; to its path for a struct, to None for a
-#: part that the header leaves out.
-Read = Callable[[str], "tuple[FieldInfo, int] | str | None"]
+Formula = int | Ref | Op | Untraced
+#: From the path of a field to its raw value; to None if the header leaves the field out.
+Read = Callable[[str], "int | None"]
 
 _OPERATIONS: dict[str, Callable[..., Any]] = {
     **{
@@ -294,27 +287,24 @@ def evaluated(formula: Formula, read: Read) -> Any:
             in construct.
 
     Raises:
-        Exception: whatever the operation or the author's function raises on these values.
+        Exception: whatever the operation raises on these values.
     """
     match formula:
         case Ref():
-            value = read(formula.path)
-            if isinstance(value, tuple):
-                return value[1]
-            return value
+            return read(formula.path)
         case Op("*", (condition, _)) if _is_condition(condition) and not evaluated(condition, read):
             return (
                 0  # the size of an alternative that is not there, whose fields nobody can ask for
             )
         case Op():
             return _OPERATIONS[formula.symbol](*(evaluated(arg, read) for arg in formula.args))
-        case Code():
-            return formula.function(read)
+        case Untraced():
+            raise ValueError(formula.reason)
     return formula
 
 
 def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
-    """The values of a formula without `Code`, by arrays of its fields of a type that holds all it
+    """Return the values of a formula by arrays of its fields of a type that holds all it
     comes to; truths stay truths.
     """
     match formula:
@@ -348,7 +338,7 @@ def _is_condition(formula: Formula) -> bool:
 
 
 def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
-    """A formula, without `Code` in it, as an expression of another language.
+    """A formula, that is traced in it, as an expression of another language.
 
     Args:
         named: what gives the text of a field.
@@ -365,7 +355,7 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
                 symbol, "(not {})" if symbol == "not" else f"({{}} {symbol} {{}})"
             )
             return text.format(*(written(arg, named, operations) for arg in args))
-        case Code():
+        case Untraced():
             raise ValueError(formula.reason)
     if formula < 0:
         return f"({formula})"
@@ -399,12 +389,7 @@ def parts(formula: Formula) -> Iterator[Formula]:
 
 def refs(formula: Formula) -> tuple[Ref, ...]:
     """The fields that a formula depends on, in the order in which it names them, each once."""
-    found = (
-        (part,) if isinstance(part, Ref) else part.refs
-        for part in parts(formula)
-        if isinstance(part, Ref | Code)
-    )
-    return tuple(dict.fromkeys(itertools.chain.from_iterable(found)))
+    return tuple(dict.fromkeys(part for part in parts(formula) if isinstance(part, Ref)))
 
 
 #: bits of a value that a formula in 64-bit integers may reach.
@@ -412,12 +397,12 @@ MOST_BITS = 62
 
 
 def width(formula: Formula) -> int:
-    """How many bits, besides a sign, a formula without `Code` takes at most."""
+    """How many bits, besides a sign, a formula that is traced takes at most."""
     if isinstance(formula, Ref):
         return formula.info.bits
     if isinstance(formula, int):
         return formula.bit_length()
-    if isinstance(formula, Code):
+    if isinstance(formula, Untraced):
         raise ValueError(formula.reason)
     args = [width(arg) for arg in formula.args]
     match formula.symbol:
@@ -658,8 +643,9 @@ class When:
 
 @dataclass(frozen=True, eq=False)
 class Select:
-    """What stands there for each value of the key, and for all others; integers, unless the key is
-    `Code`.
+    """A part for each value of the key, and one for all other values.
+
+    The values are integers, unless the key is `Untraced`.
     """
 
     name: str
@@ -901,7 +887,7 @@ class Scope:
                 return self.parent["_root"]
             return self
         if name not in self.names:
-            raise Blind(f"an expression asks for {name!r}, which is not a field before it")
+            raise Untraceable(f"an expression asks for {name!r}, which is not a field before it")
         part = self.names[name]
         if isinstance(part, Scope):
             return part
@@ -914,7 +900,7 @@ class Scope:
         return self[name]
 
     def __len__(self) -> int:
-        raise Blind("an expression asks for the length of an array")
+        raise Untraceable("an expression asks for the length of an array")
 
 
 class Outside(Scope):
@@ -936,10 +922,6 @@ class Outside(Scope):
 
 class Untraceable(Exception):
     """Why an expression cannot be written down as data."""
-
-
-class Blind(Untraceable):
-    """What an expression asks for that construct alone may know."""
 
 
 class Symbol:

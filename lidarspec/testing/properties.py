@@ -240,8 +240,6 @@ def _gist(error: BaseException) -> str:
 
 
 def _rule_of(error: SpecError) -> str:
-    if "expression of the struct" in error.reason:
-        return "LS115"
     if "random frame" in error.reason:
         return "LS301"
     return "LS414"

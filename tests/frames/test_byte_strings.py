@@ -88,9 +88,9 @@ COMPILED: dict[str, Any] = {
         "a" / Array(2, Int8ub), "b" / Array(this.a[0] % 4, Int8ub), "c" / Bytes(this.a[1] % 3)
     ),
     "as many as a byte says": Struct("a" / Bytes(2), "b" / Array(this.a[1] % 3, Int16ub)),
-    "of what is not there": If(lambda found: found.y is None, Int8ub),
 }
 INTERPRETED: dict[str, Any] = {
+    "of what is not there": If(lambda found: found.y is None, Int8ub),
     "terminated": TEXT,
     "terminated ones": Array(this.k, TEXT),
     "prefixed": Array(this.k, Prefixed(Int8ub, GreedyBytes)),

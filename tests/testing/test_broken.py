@@ -49,7 +49,7 @@ CONSTRUCT = {
     "pointer": {"LS112"},
     "optional": {"LS113"},
     "bare_errors": {"LS308"},
-    "lambda_raises": {"LS115"},
+    "lambda_raises": {"LS115", "LS116"},
 }
 #: where pluggy bites, and what else keeps a plugin from being loaded.
 PLUGGY = {

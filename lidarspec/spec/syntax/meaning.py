@@ -114,29 +114,6 @@ def _whole_path(path: str, way: re.Match[str]) -> str:
     return ".".join(names)
 
 
-class _Fields:
-    """What an expression sees when it is evaluated: values by name, as construct shows them."""
-
-    def __init__(self, read: tree.Read, paths: tuple[str, ...]) -> None:
-        self._read = read
-        self._paths = paths
-
-    def __getitem__(self, name: str) -> Any:
-        if name == "_":
-            if len(self._paths) > 1:
-                return _Fields(self._read, self._paths[1:])
-            return None
-        if name == "_root":
-            return _Fields(self._read, self._paths[-1:])
-        value = self._read(f"{self._paths[0]}.{name}" if self._paths[0] else name)
-        if isinstance(value, str):
-            return _Fields(self._read, (value, *self._paths))
-        return value and seen(*value)
-
-    def __getattr__(self, name: str) -> Any:
-        return self[name]
-
-
 def seen(info: tree.FieldInfo, raw: int) -> Any:
     """A raw value as the expressions of a struct see it: where construct's Enum has a name for it,
     that name.
@@ -295,7 +272,6 @@ class _Builder:
             tree.Scope(None, "", self._asked),
         )
         scope.asked.clear()
-        blind = False
         try:
             value = _traced(expression, scope)
             if not isinstance(expression, ExprMixin) and any(
@@ -312,40 +288,10 @@ class _Builder:
                 return value.formula
         except tree.Untraceable as untraceable:
             reason = str(untraceable)
-            blind = isinstance(untraceable, tree.Blind)
         except Exception as error:
             reason = f"a Python function of other fields ({type(error).__name__}: {error})"
-        return self._code(expression, place, reason, tuple(scope.asked), blind=blind)
-
-    def _code(
-        self,
-        expression: Any,
-        place: _Place,
-        reason: str,
-        asked: tuple[tree.Ref, ...],
-        *,
-        blind: bool = False,
-    ) -> tree.Code:
-        paths = list[str]()
-        scope = place.scope
-        while scope is not None:
-            paths.append(scope.path)
-            scope = scope.parent
-        ways = tuple(paths or [""])
         path = place.info.path
-
-        def function(read: tree.Read) -> Any:
-            if callable(expression):
-                return expression(_Fields(read, ways))
-            return expression
-
-        return tree.Code(
-            function,
-            tuple(dict.fromkeys(asked)),
-            f"{path}: {reason}",
-            _spelled(expression, path),
-            blind,
-        )
+        return tree.Untraced(f"{path}: {reason}", _spelled(expression, path))
 
     def _select(self, con: construct.Switch, place: _Place) -> tree.Select:
         key = self._formula(con.keyfunc, place, is_key=True)
@@ -358,13 +304,14 @@ class _Builder:
             if case not in labels
         }
         odd = [case for case, value in values.items() if not isinstance(value, int)]
-        if odd and not isinstance(key, tree.Code):
+        if odd and not isinstance(key, tree.Untraced):
             if isinstance(key, tree.Ref) and isinstance(odd[0], str):
                 reason = f"{key.path} has no value named {odd[0]!r}"
             else:
                 reason = f"a case for {odd[0]!r}, which is no integer"
-            key = self._code(con.keyfunc, place, reason, tuple(tree.refs(key)))
-        if isinstance(key, tree.Code):
+            path = place.info.path
+            key = tree.Untraced(f"{path}: {reason}", _spelled(con.keyfunc, path))
+        if isinstance(key, tree.Untraced):
             values = {case: case for case in con.cases}
         cases = tuple(
             (value, self._branch(con.cases[case], place)) for case, value in values.items()
