@@ -48,15 +48,18 @@ def build(
     place = f"{sensor.id} {frame}"
     checker = _Values(schema(declared.tree), known_paths(declared.tree), place, units=units)
     given = checker.checked({**(value or {}), **values}, "")
-    if isinstance(frame_layouts(declared), NotCompilable):
+    layouts = frame_layouts(declared)
+    if isinstance(layouts, NotCompilable):
         fill_counts(given, schema(declared.tree))
         return build_plain(declared, given, place)
     try:
-        struct = encode(declared.tree, given, declared.room, place)
+        struct = encode(layouts, given, place)
     except LidarSpecError:
         raise
     except Exception as error:  # an expression or a checksum of the plugin
         raise struct_error(error, path=frame, sensor=sensor.id) from error
+    if declared.wire is None:
+        return struct
     data = frame_coder(declared).encode(struct, (value or {}).get(SPELLING))
     if data is None:
         raise UsageError(
@@ -89,10 +92,9 @@ class _Values:
         if isinstance(value, np.ndarray):
             value = value.tolist()
         if isinstance(value, list | tuple):
-            found = [
-                self.checked(element, path, f"{shown}[{index}]")
-                for index, element in enumerate(value)
-            ]
+            found = []
+            for index, element in enumerate(value):
+                found.append(self.checked(element, path, f"{shown}[{index}]"))
             if info is not None and info.kind == "bytes":
                 return self._bytes(found, shown)
             return found

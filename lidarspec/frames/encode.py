@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from lidarspec.errors import MissingField, OutOfRange, UsageError
 from lidarspec.frames.field_paths import steps
 from lidarspec.frames.layout import Layout, Leaf, Seal
-from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
-from lidarspec.frames.parts import FOUND
-from lidarspec.frames.schema import Schema, schema
+from lidarspec.frames.layout_tree import TooLong, kinds_of
+from lidarspec.frames.parts import FOUND, Layouts, Measure
+from lidarspec.frames.schema import Schema, counting_field, schema
 from lidarspec.spec.syntax import WireNaN, member
 from lidarspec.spec.tree import (
     Blob,
@@ -44,25 +44,24 @@ from lidarspec.spec.tree import (
     format_hex,
     listed,
     nodes,
-    refs,
 )
 
 #: The largest value that is tried for a field that counts.
 MAX_COUNT_TRIED = 65535
 
 
-def encode(root: Node, given: Container, limit: int, place: str) -> bytes:
+def encode(layouts: Layouts, given: Container, place: str) -> bytes:
     """Return the bytes of a frame.
 
     Args:
+        layouts: of the frame type.
         given: raw values by name, nested as in the struct; completed in place.
-        limit: the longest frame, in bytes.
         place: sensor and frame, for messages.
 
     Raises:
         UsageError: for a missing value, or one that its field cannot hold.
     """
-    return _Encoder(root, given, limit, place).encode()
+    return _Encoder(layouts, given, place).encode()
 
 
 class _Encoder:
@@ -70,26 +69,24 @@ class _Encoder:
 
     def __init__(
         self,
-        root: Node,
+        layouts: Layouts,
         given: Container,
-        limit: int,
         place: str,
         prefix: str = "",
         around: Mapping[str, int] | None = None,
     ) -> None:
-        self._root = root
+        self._layouts = layouts
         self._given = given
-        self._limit = limit
         self._place = place
         #: path of the part in the frame around it, for messages; "" for a frame.
         self._prefix = prefix
         #: values of fields of the frame around a part, by their path there.
         self._around = around or {}
-        self._schema = schema(root)
+        self._schema = schema(layouts.root)
         #: paths of the fields that hold checksums, which need not be given.
-        self._checksums = {
-            path for node in nodes(root) if isinstance(node, Sealed) for path in node.fields
-        }
+        self._checksums = set[str]()
+        #: bytes of the parts at a path, by the path of their size.
+        self._totals: dict[str, int] = {}
         #: raw values of each field, element by element.
         self._columns: dict[str, list[Any]] = {}
         #: index of the element that is being collected, by the axis of its array.
@@ -97,14 +94,15 @@ class _Encoder:
 
     def encode(self) -> bytes:
         fill_counts(self._given, self._schema)
-        parts = {axis: self._encode_parts(node) for axis, node in self._schema.parts.items()}
-        layout = self._layout(
-            {
-                node.total.path: sum(map(len, parts[axis]))
-                for axis, node in self._schema.parts.items()
-            }
-        )
-        self._collect(self._root, self._given, "", self._prefix, layout)
+        parts = dict[str, list[bytes]]()
+        for axis, node in self._schema.parts.items():
+            parts[axis] = self._encode_parts(node)
+            self._totals[node.total.path] = sum(map(len, parts[axis]))
+        layout = self._layout()
+        for seal in layout.seals:
+            for leaf in seal.leaves:
+                self._checksums.add(leaf.info.path)
+        self._collect(self._layouts.root, self._given, "", self._prefix, layout)
         row = np.zeros((1, layout.size), np.uint8)
         for path, leaf in layout.leaves.items():
             if path in self._columns:
@@ -119,23 +117,25 @@ class _Encoder:
         self._check(layout, row, parts)
         return row.tobytes()
 
-    def _layout(self, totals: Mapping[str, int]) -> Layout:
+    def _layout(self) -> Layout:
         """Return the layout that the values of the header fields lead to."""
-        values = dict(totals)
-        while True:
-            try:
-                return layout_of(self._root, values, self._limit, self._around)
-            except Unknown as unknown:
-                path = unknown.leaf.info.path
-                found = self.read(path)
-                if found is None:
-                    raise self._uncounted(path) from None
-                values[path] = int(found)
-            except TooLong as fault:
-                raise UsageError(
-                    f"{self._place}: {self._prefix or fault or 'the frame'}: these values give no"
-                    f" frame of at most {self._limit} bytes"
-                ) from None
+        try:
+            return self._layouts.layout_for(self._read_header)
+        except TooLong as fault:
+            raise UsageError(
+                f"{self._place}: {self._prefix or fault or 'the frame'}: these values give no"
+                f" frame of at most {self._layouts.limit} bytes"
+            ) from None
+
+    def _read_header(self, leaf: Leaf | Measure) -> int:
+        """Return the value of a field that decides the layout."""
+        path = leaf.info.path
+        if path in self._totals:
+            return self._totals[path]
+        found = self.read(path)
+        if found is None:
+            raise self._uncounted(path)
+        return int(found)
 
     def read(self, path: str) -> Any:
         """Return the value of a field, as formulas read it (`lidarspec.spec.tree.Read`)."""
@@ -184,6 +184,10 @@ class _Encoder:
             if found is not None:
                 around[ref.path] = int(found)
         kinds = [kind_of(node, part) for part in given]
+        layouts = {
+            kind.node: kind.layouts
+            for kind in kinds_of(node, tuple(around.items()), self._layouts.limit)
+        }
         encoded: list[bytes] = []
         following = 0
         # From the last to the first: a part of a chain says how long the next one is.
@@ -192,7 +196,7 @@ class _Encoder:
             part = given[index]
             fill_in(kind.following, part, following, schema(kind.root).fields, node.axis)
             prefix = self._shown(f"{node.axis}[{index}]")
-            encoder = _Encoder(kind.root, part, self._limit, self._place, prefix, around)
+            encoder = _Encoder(layouts[kind], part, self._place, prefix, around)
             encoded.insert(0, encoder.encode())
             following = len(encoded[0])
         total = sum(map(len, encoded))
@@ -405,9 +409,9 @@ class _Encoder:
 
     def _uncounted(self, path: str) -> UsageError:
         """Return why a field that decides the layout has no value."""
-        for axis, count in self._schema.arrays.items():
+        for axis, counting in self._schema.counting_fields.items():
             array = member(self._given, axis, None)
-            if array is not None and counting_field(count, self._schema.fields) == path:
+            if array is not None and counting == path:
                 return self._wrong(self._shown(axis), "a list of its elements", array)
         return self._missing(path)
 
@@ -437,7 +441,7 @@ def fill_counts(given: Container, table: Schema) -> None:
     counted = set[str]()
     for axis, count in table.arrays.items():
         array = member(given, axis, None)
-        path = counting_field(count, table.fields)
+        path = table.counting_fields[axis]
         if not isinstance(array, list | bytes) or path is None or path in counted:
             continue
         counted.add(path)
@@ -445,12 +449,6 @@ def fill_counts(given: Container, table: Schema) -> None:
             holder, name = _holder(given, path)
             holder.pop(name, None)
         fill_in(count, given, len(array), table.fields, axis)
-
-
-def counting_field(formula: Formula | None, fields: Mapping[str, FieldInfo]) -> str | None:
-    """Return the path of the field that a count or length follows from; None if there is none."""
-    asked = () if formula is None else refs(formula)
-    return next((ref.path for ref in asked if ref.path in fields and "[" not in ref.path), None)
 
 
 def fill_in(
@@ -461,8 +459,10 @@ def fill_in(
     axis: str,
 ) -> None:
     """Set the field that a formula depends on, if it is not given, so that it gives a value."""
+    if formula is None:
+        return
     path = counting_field(formula, fields)
-    if formula is None or path is None:
+    if path is None:
         return
     holder, name = _holder(given, path)
     if isinstance(holder, dict) and holder.get(name) is None:

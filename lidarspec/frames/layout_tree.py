@@ -733,14 +733,16 @@ class _Places:
 class HeaderTree:
     """All layouts of one frame type or kind of parts.
 
-    They depend on the values of the fields around the parts.
+    The layouts of parts depend on the values of fields around them, too.
+
+    Attributes:
+        root: the frame type or kind of parts.
+        limit: the longest frame, in bytes.
     """
 
-    def __init__(
-        self, frame: tree.Node, limit: int, given: Mapping[str, int] | None = None
-    ) -> None:
-        self._frame = frame
-        self._limit = limit
+    def __init__(self, root: tree.Node, limit: int, given: Mapping[str, int] | None = None) -> None:
+        self.root = root
+        self.limit = limit
         self._given = given or {}
         self._root = HeaderNode()
         self._size = 0
@@ -748,7 +750,7 @@ class HeaderTree:
 
     @functools.cached_property
     def _prefix(self) -> dict[int, tuple[int, int]]:
-        return prefix_of(self._frame, self._limit)
+        return prefix_of(self.root, self.limit)
 
     def classify(
         self,
@@ -764,7 +766,7 @@ class HeaderTree:
             stops: where their bytes end, and no more will come; by default with those of the
                 buffer, and more may come.
         """
-        places = _Places(buffer, offsets, stops, self._limit)
+        places = _Places(buffer, offsets, stops, self.limit)
         groups: list[Group] = []
         for result, which in self.sorted(len(offsets), places.read, places):
             groups.append((result, which))
@@ -819,7 +821,7 @@ class HeaderTree:
             known = self._root.result.leaves
         else:
             known = self._root.before
-        return tuple(known.values()), prefix_of(self._frame, self._limit)
+        return tuple(known.values()), prefix_of(self.root, self.limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
         """Return the common layout of candidates, one a row, else None.
@@ -872,6 +874,26 @@ class HeaderTree:
         """The layout of one frame, or None where its header is not all there."""
         return self._end(frame, self._root).result
 
+    def layout_for(self, read: Callable[[Leaf | Measure], int]) -> Layout:
+        """Return the layout that values of header fields lead to.
+
+        Args:
+            read: returns the value of a field that decides the layout.
+
+        Raises:
+            Exception: as `layout_of`, or what `read` raises.
+        """
+        self._forget_many()
+        node = self._root
+        while node.result is None:
+            if node.leaf is None:
+                self._explore(node)
+            else:
+                node = node.child(node.meant(read(node.leaf)))
+        if isinstance(node.result, Layout):
+            return node.result
+        return layout_of(self.root, node.values, self.limit, self._given)  # raises the reason
+
     def _end(
         self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False
     ) -> HeaderNode:
@@ -919,9 +941,9 @@ class HeaderTree:
         if is_all and len(data) < node.least:
             return node
         self._size += not node.least  # it is known, where it was cut off before
-        walk = Walk(node.values, self._limit, self._given, asked, len(data) if is_all else None)
+        walk = Walk(node.values, self.limit, self._given, asked, len(data) if is_all else None)
         try:
-            node.result = walk_layout(walk, self._frame)
+            node.result = walk_layout(walk, self.root)
         except Unknown:
             pass
         except CutOff:
@@ -958,7 +980,7 @@ class HeaderTree:
         if not isinstance(leaf, Leaf):
             return None  # nothing is known of parts before they are walked
         if leaf.info.path not in self._told:
-            self._told[leaf.info.path] = _Told.of(leaf.info, self._frame, self._limit)
+            self._told[leaf.info.path] = _Told.of(leaf.info, self.root, self.limit)
         return self._told[leaf.info.path]
 
 

@@ -9,7 +9,7 @@ buffer, as frames are, so that parts have layouts, rows and tables like any fram
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -18,7 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.frames.layout import Bytes2D, Layout, Refused, Word, equal, marks, span, words
+from lidarspec.frames.layout import (
+    Bytes2D,
+    Layout,
+    Leaf,
+    Refused,
+    Word,
+    equal,
+    marks,
+    span,
+    words,
+)
 from lidarspec.spec import tree
 
 Offsets = NDArray[np.intp]
@@ -31,7 +41,10 @@ ANY = -1
 
 
 class Layouts(Protocol):
-    """The layouts of a kind of parts, as a `HeaderTree` has them."""
+    """The layouts of a frame type or kind of parts, as a `HeaderTree` has them."""
+
+    root: tree.Node
+    limit: int
 
     def classify(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
@@ -41,6 +54,9 @@ class Layouts(Protocol):
         Candidates with an incomplete header are left out. `stops` are the offsets after their last
         bytes.
         """
+
+    def layout_for(self, read: Callable[[Leaf | Measure], int]) -> Layout:
+        """Return the layout that values of header fields lead to."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ from lidarspec.spec.tree import (
     children,
     element_of,
     nodes,
+    refs,
 )
 
 #: of a path, the index of an element of an array: "columns[0].timestamp".
@@ -122,6 +123,14 @@ class Schema:
         return self.fields
 
     @cached_property
+    def counting_fields(self) -> Mapping[str, str | None]:
+        """The field that each array takes its length from, by the path of the array."""
+        return {
+            axis: None if count is None else counting_field(count, self.fields)
+            for axis, count in self.arrays.items()
+        }
+
+    @cached_property
     def chain(self) -> tuple[str, ...]:
         """The axes of the deepest nesting of arrays; the first one of equally deep ones."""
         return max(
@@ -198,6 +207,12 @@ class Schema:
     def depth(self) -> int:
         """How many arrays are nested at most."""
         return len(self.chain)
+
+
+def counting_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str | None:
+    """Return the path of the field that a count or length follows from; None if there is none."""
+    asked = refs(formula)
+    return next((ref.path for ref in asked if ref.path in fields and "[" not in ref.path), None)
 
 
 @lru_cache(maxsize=4096)
