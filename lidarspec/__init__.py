@@ -54,7 +54,8 @@ if TYPE_CHECKING:
     from lidarspec.plugins import sensor as sensor, sensors as sensors
     from lidarspec.points.cloud import PointCloud as PointCloud
     from lidarspec.recording.recorders import Recorder as Recorder
-    from lidarspec.scans.scans import LaserScan as LaserScan, Scan as Scan
+    from lidarspec.scans.laserscan import LaserScan as LaserScan
+    from lidarspec.scans.scan import Scan as Scan
     from lidarspec.scans.selection import Selection as Selection
     from lidarspec.simulation.simulator import simulate as simulate
     from lidarspec.spec.sensor import Sensor as Sensor
@@ -70,7 +71,8 @@ _NAMES = {
     "packets.imu": ("ImuSamples",),
     "packets.packets": ("Packets",),
     "points.cloud": ("PointCloud",),
-    "scans.scans": ("Scan", "LaserScan"),
+    "scans.laserscan": ("LaserScan",),
+    "scans.scan": ("Scan",),
     "scans.selection": ("Selection",),
     "explaining.explanation": ("explain",),
     "exports": ("export",),

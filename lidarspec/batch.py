@@ -55,7 +55,7 @@ from lidarspec.formats import format_of, write
 from lidarspec.formats.tables import tables
 from lidarspec.libraries import import_library
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
 from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import (

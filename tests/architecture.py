@@ -105,7 +105,7 @@ PAGE_MAY_IMPORT = {
     "points.conventions",
     "points.look",
     "recording.switch",
-    "scans.scans",
+    "scans.provenance",
     "spec.arguments",
     "transports.host_clock",
     "transports.open_url",

@@ -36,7 +36,7 @@ from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Times, received
 from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import found

@@ -37,7 +37,7 @@ from lidarspec.errors import (
 )
 from lidarspec.frames.parse import identify
 from lidarspec.plugins import sensors
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Times, received
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, unhexed

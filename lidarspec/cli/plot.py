@@ -19,7 +19,7 @@ from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError
 from lidarspec.formats.writing import replacing
 from lidarspec.points.look import fit, look
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.view import figures

@@ -28,7 +28,7 @@ from lidarspec.cli.terminal import note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame, UsageError
 from lidarspec.points.conventions import UNITS
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Slice
 from lidarspec.spec.sensor import Sensor
 from lidarspec.view.feed import LOOK_S, Feed

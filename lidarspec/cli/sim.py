@@ -25,7 +25,7 @@ from lidarspec.known_sensors import no_sensors
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.look import look
 from lidarspec.recording.recorders import SUFFIXES
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import BLOCKED, Faults
 from lidarspec.simulation.scenes import read_scene

@@ -23,7 +23,7 @@ from lidarspec.errors import UsageError
 from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
 from lidarspec.spec.sensor import Sensor
 

@@ -30,8 +30,9 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.recording.appending import Log
 from lidarspec.recording.recorders import RecordTo, recorder_for
-from lidarspec.scans.scans import Scan, ScanStream
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Sieve
+from lidarspec.scans.stream import ScanStream
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Closing, LiveTransport, Transport

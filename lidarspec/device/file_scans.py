@@ -33,7 +33,8 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets, StateOf
-from lidarspec.scans.scans import Scan, ScanStream
+from lidarspec.scans.scan import Scan
+from lidarspec.scans.stream import ScanStream
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.files import CaptureTransport, FileTransport
 from lidarspec.transports.open_url import transport

@@ -16,7 +16,8 @@ from lidarspec.framing.results import Frames
 from lidarspec.packets.imu import Waiting, joined
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
-from lidarspec.scans.scans import Scan, ScanStream, handed_out
+from lidarspec.scans.scan import Scan
+from lidarspec.scans.stream import ScanStream, handed_out
 from lidarspec.spec.sensor import Sensor
 
 #: Batches that are kept until the type of the data frames is known.

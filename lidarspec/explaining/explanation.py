@@ -27,7 +27,7 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
-from lidarspec.scans.cutter import first_points
+from lidarspec.scans.ends import first_points
 from lidarspec.spec import Sensor
 
 #: most points of a frame without arrays that are told.

@@ -51,7 +51,7 @@ from lidarspec.formats.text import CSV, CSV_GZ, XYZ, write_columns
 from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Format
 
 #: the places in a path of a scan's number, and of its stamp's date, hour, minute and second, of

@@ -22,7 +22,7 @@ from lidarspec.formats.rows import NAMES, Rows, write_rows
 from lidarspec.formats.writing import Spool, picture, written
 from lidarspec.libraries import import_library
 from lidarspec.points.cloud import structured_type, units_of
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: numbers of a chunk of Zarr, and of one of those that have a number a scan.

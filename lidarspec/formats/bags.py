@@ -21,7 +21,7 @@ from typing import Any
 from lidarspec.formats.messages import CLOUD, SCAN, Message, Messages
 from lidarspec.libraries import import_library
 from lidarspec.scans.planes import Planes
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.bags import RAW
 from lidarspec.transports.protocol import Chunk, Format
 

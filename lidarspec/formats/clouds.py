@@ -19,7 +19,7 @@ from lidarspec.errors import UsageError, suggest
 from lidarspec.formats.rows import Rows, room, write_rows
 from lidarspec.formats.writing import Spool
 from lidarspec.libraries import import_library
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: types that a format, or a common reader of it, does not know, and those that hold their numbers:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidarspec.formats.writing import GPS_EPOCH, columns_of
 from lidarspec.libraries import import_library
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: our columns, and the standard's names of them.

@@ -17,8 +17,9 @@ from lidarspec.formats.bags import CHUNK, TOPICS
 from lidarspec.formats.messages import CLOUD, SCAN, fields_of, records
 from lidarspec.libraries import import_library
 from lidarspec.points.cloud import PointCloud
+from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.planes import Planes
-from lidarspec.scans.scans import LaserScan, Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: the numbers by which foxglove.PackedElementField names types.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import UsageError, suggest
 from lidarspec.formats.writing import GPS_EPOCH, behind, columns_of
 from lidarspec.libraries import import_library
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: the columns that LAS has a place for, and those that are extra dimensions as the sensor's further

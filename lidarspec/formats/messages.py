@@ -18,7 +18,8 @@ from lidarspec.formats.writing import picture
 from lidarspec.libraries import import_library
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
-from lidarspec.scans.scans import LaserScan, Scan
+from lidarspec.scans.laserscan import LaserScan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.bags import DATAGRAM, RAW, STAMP, STREAM
 from lidarspec.transports.protocol import Chunk
 

@@ -24,7 +24,7 @@ from lidarspec.libraries import import_library
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp
 from lidarspec.points.look import STEPS, Look, look, steps
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: of a point on the screen, in its viewer's pixels; and metres of the axes of a sensor.

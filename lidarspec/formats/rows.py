@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from lidarspec.formats.writing import behind, columns_of, picture
 from lidarspec.points.cloud import STRUCTURED, PointCloud
-from lidarspec.scans.scans import Scan, handed_out
+from lidarspec.scans.scan import Scan
+from lidarspec.scans.stream import handed_out
 
 #: columns that rows begin with; a sensor's further ones follow.
 NAMES = STRUCTURED.names or ()

@@ -18,7 +18,7 @@ import numpy as np
 from lidarspec.formats.writing import behind, written
 from lidarspec.libraries import import_library
 from lidarspec.points.cloud import PointCloud, arrow_schema
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: points of a row group or record batch at least, those at the end excepted.

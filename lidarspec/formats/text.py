@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.formats.writing import behind, kept, written
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
 #: how a number of each type is written: seven figures are half a micrometre at a metre; times keep

@@ -23,7 +23,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import SourceError, UsageError, suggest, system_errors
 from lidarspec.points.cloud import COLUMNS, PointCloud, source_of
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.stores import take_away
 from lidarspec.unfinished import path_while_written, remove_abandoned
 

@@ -29,14 +29,9 @@ WINDOW = 10
 
 
 class Reorder:
-    """Orders the packets of one stream.
+    """Orders the packets of one stream."""
 
-    Args:
-        enabled: whether packets can be put in order; all pass as they arrive if not.
-    """
-
-    def __init__(self, *, enabled: bool) -> None:
-        self._enabled = enabled
+    def __init__(self) -> None:
         self._next: int | None = None  # index that follows the packets released so far
         self._released = 0  # the order of the last one of them
         self._held: Packets | None = None
@@ -44,9 +39,7 @@ class Reorder:
 
     def push(self, packets: Packets) -> list[Packets]:
         """Return the packets that are now in order; at most one batch."""
-        if not self._enabled or not len(packets):
-            if len(packets):
-                return [packets]
+        if not len(packets):
             return []
         held_count = 0
         if self._held is not None:

@@ -4,9 +4,15 @@ A scan is one revolution or frame period, by the sensor's declared rule.
 
 In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules in reading order:
 
-* `scans`: `ScanStream`, which takes batches as they come and gives the scans that they complete.
+* `scan`: `Scan`, the points of one revolution.
+* `laserscan`: `LaserScan`, and the nearest return at each angle of a grid.
 * `planes`: planar scans of one sensor, all on one grid of angles.
+* `provenance`: the frame that a point of a scan came from.
+* `stream`: `ScanStream`, which makes scans of batches of packets as they arrive.
+* `cutter`: `Cutter`, which decides where a scan ends and whether it is complete.
+* `ends`: the ends of scans by the sensor's rule; `rotation`: at which rows an angle passes another.
+* `limits`: the longest and the largest scan.
+* `completeness`: the packets of a scan, and those missing in it.
 * `masking`: the masked sector of a rotating sensor, in which scans are cut.
-* `cutter`: before which points a scan ends, by a column that wraps, a field that changes, or time.
-* `selection`: which scans are wanted, and what of each; which bytes, by their arrival.
+* `selection`: which scans to read, and what of each; which bytes, by their arrival.
 """

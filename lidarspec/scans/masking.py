@@ -38,7 +38,7 @@ class Masking:
     """Marks what a masked sector leaves out in the packets of one stream, which come in order.
 
     Args:
-        sensor: of the packets.
+        sensor: of the packets, in which its `AngleReader` is available.
 
     Attributes:
         angle_before_sector: of the last packet before the first one that is marked, in turns; None
@@ -47,7 +47,7 @@ class Masking:
 
     def __init__(self, sensor: Sensor) -> None:
         self._reader = AngleReader(sensor)
-        self._is_settled = not self._reader.is_available
+        self._is_settled = False
         self._longest_ns = int(
             MAX_TURNS / (sensor.turn[0] if sensor.turn else 1 / SLOWEST_TURN_S) * 1e9
         )

@@ -2,9 +2,9 @@
 
 They are the scans of a planar sensor, or of one ring or layer of another sensor.
 
-The first complete scan shows the grid: how many beams, and from where to where they look, which is
-where the sensor's scans begin, so that one line of times fits all beams. Of a sensor that sees less
-than a turn it is what it sees.
+The first complete scan determines the grid: the number of beams, and the first and the last angle.
+The grid begins where the scans of the sensor begin, so that one line of times fits all beams. If
+the sensor sees less than a turn, the grid covers what it sees.
 """
 
 from __future__ import annotations
@@ -15,106 +15,123 @@ import numpy as np
 
 from lidarspec.errors import UsageError
 from lidarspec.points.cloud import PointCloud
-from lidarspec.scans.scans import LaserScan, Scan
+from lidarspec.scans.laserscan import FULL_TURN, LaserScan, unwrap_azimuths
+from lidarspec.scans.scan import Scan
 
-#: radians from the horizon up to which points are in its plane: what rounding leaves of a mount's
-#: turns.
-LEVEL = 1e-5
-#: share of a turn from which on a scan is one of the whole turn.
-TURN = 0.98
+#: elevations of points in the plane of a sensor, radians: rounding leaves so much of the rotation
+#: of a mount.
+MAX_LEVEL_RAD = 1e-5
+#: share of a turn from which on a scan counts as a whole turn.
+MIN_TURN_SHARE = 0.98
+
+Field = tuple[float, float]
 
 
 class Planes:
-    """Makes planar scans of one sensor's.
+    """Makes planar scans of the scans of one sensor.
 
     Args:
-        beams: of each; by default as many as the scans or the sensor say, else as the first
-            complete scan has points.
-        field: where the first and the last beam look, radians, in the place of what the sensor
-            sees.
-        ring: the one that is taken of a sensor of several.
-        heights: from and up to which z, metres, points are taken of a sensor of several rings.
+        beams: the number of beams; by default that of the scans or the sensor, else the number of
+            points of the first complete scan.
+        field: the first and the last angle, radians; by default what the sensor sees.
+        ring: the ring to take from a sensor with several.
+        heights: the lowest z and the z above the highest one to take, metres, from a sensor with
+            several rings.
     """
 
     def __init__(
         self,
         beams: int | None = None,
-        field: tuple[float, float] | None = None,
+        field: Field | None = None,
         *,
         ring: int | None = None,
         heights: tuple[float, float] | None = None,
     ) -> None:
         self._beams = beams
-        self._wanted = field
+        self._field = field
         self._ring = ring
         self._heights = heights
         self._is_flat: bool | None = None
-        self._grid: tuple[int, tuple[float, float]] | None = None
+        self._grid: tuple[int, Field] | None = None
 
     def scan(self, scan: Scan) -> LaserScan | None:
-        """The scan on the grid; None of a sensor of several planes, where none is chosen.
+        """Return the scan on the grid; None if the sensor has several planes, and none is chosen.
 
         Raises:
-            UsageError: where a ring is asked for that the points have not.
+            UsageError: if the points do not have the chosen ring.
         """
-        level = self._level(scan)
+        level = self._take_level(scan)
         if level is None:
             return None
         if self._grid is None and level.complete and len(level) > 1:
-            self._grid = self._grid_of(level)
-        return level.to_laserscan(*(self._grid or (self._beams, self._wanted)))
+            self._grid = self._make_grid(level)
+        if self._grid is None:
+            return level.to_laserscan(self._beams, self._field)
+        return level.to_laserscan(*self._grid)
 
-    def _level(self, scan: Scan) -> Scan | None:
-        """What of a scan is in the plane."""
+    def _take_level(self, scan: Scan) -> Scan | None:
+        """Return the points of a scan that are in the plane."""
         cloud = scan.points
         if self._ring is None and self._heights is None:
-            if self._is_flat is None and (valid := cloud.valid).any():
-                self._is_flat = bool((np.abs(cloud.elevation[valid]) < LEVEL).all())
+            if self._is_flat is None and cloud.valid.any():
+                elevations = cloud.elevation[cloud.valid]
+                self._is_flat = bool((np.abs(elevations) < MAX_LEVEL_RAD).all())
             if self._is_flat:
                 return scan
             return None
-        if self._ring is not None and (
-            cloud.ring is None or (self._grid is None and not (cloud.ring == self._ring).any())
-        ):
+        wanted = np.ones(len(cloud), np.bool_)
+        if self._ring is not None:
             if cloud.ring is None:
-                rings = "none"
-            else:
-                rings = f"{cloud.ring.min()} to {cloud.ring.max()}"
-            raise UsageError(
-                f"{scan.sensor.id}: ring {self._ring} is asked for, and its points have {rings}"
-            )
-        if self._ring is None:
-            wanted = np.ones(len(cloud), np.bool_)
-        else:
-            wanted = np.asarray(cloud.ring == self._ring)
+                raise self._no_such_ring(scan, "none")
+            wanted = cloud.ring == self._ring
+            if self._grid is None and not wanted.any():
+                raise self._no_such_ring(scan, f"{cloud.ring.min()} to {cloud.ring.max()}")
         if self._heights is not None:
-            wanted &= (cloud.z >= self._heights[0]) & (cloud.z < self._heights[1])
-        return replace(scan, points=_level_with(cloud[wanted]))
+            low, high = self._heights
+            wanted = wanted & (cloud.z >= low) & (cloud.z < high)
+        return replace(scan, points=_project(cloud[wanted]))
 
-    def _grid_of(self, scan: Scan) -> tuple[int, tuple[float, float]]:
-        """How many beams, and where the first and the last one look."""
-        azimuth, _ = scan.swept()
-        begin, end, low, high = (
-            float(angle) for angle in (azimuth[0], azimuth[-1], azimuth.min(), azimuth.max())
+    def _no_such_ring(self, scan: Scan, rings: str) -> UsageError:
+        return UsageError(
+            f"{scan.sensor.id}: ring {self._ring} is asked for, and its points have {rings}"
         )
-        if low == high:  # it looks one way
+
+    def _make_grid(self, scan: Scan) -> tuple[int, Field]:
+        """Return the number of beams, and the first and the last angle."""
+        azimuths, _ = unwrap_azimuths(scan.points)
+        low = float(azimuths.min())
+        high = float(azimuths.max())
+        if low == high:  # all beams have one direction
             return 1, (low, high)
         count = self._beams or scan.beams or scan.sensor.beams or len(scan)
-        turn = 2 * np.pi
-        step = (high - low) / (len(azimuth) - 1)
-        if high - low > TURN * turn:
-            step = turn / count
-            # what is measured first stands first in the order of the angles, or last, in front of
-            # what is measured last
-            low = (round((begin + np.pi) / step) + (end < begin)) * step % turn - np.pi
-            high = low + turn - step
-        if self._wanted is not None:
-            low, high = self._wanted
+        step = (high - low) / (len(azimuths) - 1)
+        if high - low > MIN_TURN_SHARE * FULL_TURN:
+            step = FULL_TURN / count
+            low = _start_of_turn(float(azimuths[0]), float(azimuths[-1]), step)
+            high = low + FULL_TURN - step
+        if self._field is not None:
+            low, high = self._field
             count = self._beams or scan.beams or round((high - low) / step) + 1
         return count, (low, high)
 
 
-def _level_with(cloud: PointCloud) -> PointCloud:
-    """Points in the plane below or above which they are, as far away as there."""
-    away = np.where(cloud.valid, np.hypot(cloud.x, cloud.y), cloud.range)
-    return replace(cloud, range=away, elevation=np.zeros_like(cloud.elevation))
+def _start_of_turn(begin: float, end: float, step: float) -> float:
+    """Return the first angle of a grid of the whole turn, from -pi to pi.
+
+    The point that is measured first is the first one of the grid. If the angle falls with time, it
+    is the last one, and the point that is measured last is the first one.
+
+    Args:
+        begin, end: the first and the last angle that is measured.
+        step: of the grid.
+    """
+    steps = round((begin + np.pi) / step)
+    if end < begin:
+        steps += 1
+    return steps * step % FULL_TURN - np.pi
+
+
+def _project(cloud: PointCloud) -> PointCloud:
+    """Return points moved vertically to the plane of the sensor."""
+    ranges = np.where(cloud.valid, np.hypot(cloud.x, cloud.y), cloud.range)
+    return replace(cloud, range=ranges, elevation=np.zeros_like(cloud.elevation))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Transport
 
 #: a time: seconds from the first scan, or a date.

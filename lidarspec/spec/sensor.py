@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from lidarspec.framing.results import Found
     from lidarspec.packets.imu import Waiting
     from lidarspec.packets.packets import Packets
-    from lidarspec.scans.scans import Scan
+    from lidarspec.scans.scan import Scan
     from lidarspec.scans.selection import Selection
 
 #: version of the plugin interface; the engine reads this one and the one before.
@@ -490,8 +490,8 @@ class Sensor:
             UsageError: for a text or a path, an unknown back end, a sensor that has no frames
                 before it is configured, or if no scan is selected.
         """
-        from lidarspec.scans.scans import scans_of
         from lidarspec.scans.selection import Sieve
+        from lidarspec.scans.stream import scans_of
 
         packets, imu = self._decode(data, None, backend)
         if packets.stats.bytes_in and not len(packets):

@@ -11,7 +11,8 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate
-from lidarspec.scans.scans import Scan, scans_of
+from lidarspec.scans.scan import Scan
+from lidarspec.scans.stream import scans_of
 from lidarspec.spec.sensor import Sensor
 from lidarspec.testing import subject as material
 from lidarspec.testing.clouds import assert_same_places, assert_well_formed

@@ -13,8 +13,9 @@ from collections import deque
 from lidarspec.device.arrivals import BATCH_BYTES
 from lidarspec.device.device import Device
 from lidarspec.packets.packets import Packets
-from lidarspec.scans.scans import Scan, ScanStream
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Sieve, Slice
+from lidarspec.scans.stream import ScanStream
 from lidarspec.view.meter import Meter
 
 #: for which one look at a live source waits for data.

@@ -17,7 +17,7 @@ from lidarspec.errors import UsageError
 from lidarspec.libraries import import_library
 from lidarspec.points.colours import make_ramp, to_hex
 from lidarspec.points.look import Look, bounds
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.view.feed import Feed
 from lidarspec.view.meter import totals
 

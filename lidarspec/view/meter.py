@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 
 #: scans that means and medians are made of.
 KEPT_SCANS = 1 << 12

@@ -23,7 +23,7 @@ from lidarspec.exports.diagram import svg as diagram
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.look import fit, look
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.view.svg import svg

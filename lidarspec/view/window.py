@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from lidarspec.points.look import Look, look, ramps
 from lidarspec.recording.switch import RecordingSwitch
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.view.canvas import ALARM, GOOD, PLAIN, STRONG, Cells
 from lidarspec.view.feed import Feed
 from lidarspec.view.meter import NOTHING, Reading, format_figure

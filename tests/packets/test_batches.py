@@ -15,7 +15,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import Counters, Packets, Scan, simulate
 from lidarspec.packets.stream import PacketStream
-from lidarspec.scans.scans import ScanStream
+from lidarspec.scans.stream import ScanStream
 from tests.by_construct import reader
 from tests.representatives import load_sensor
 from tests.shapes import SHAPES

@@ -14,7 +14,7 @@ import lidarspec as ls
 from lidarspec import Packets, Scan, Sensor, simulate
 from lidarspec.packets.reorder import WINDOW, Reorder
 from lidarspec.packets.stream import PacketStream
-from lidarspec.scans.scans import ScanStream
+from lidarspec.scans.stream import ScanStream
 from tests.representatives import load_sensor
 from tests.shapes.paced import FAST_S
 
@@ -131,7 +131,7 @@ def test_the_sizes_of_batches_do_not_matter(name: str) -> None:
 @pytest.mark.parametrize("name", SHAPES)
 def test_packets_in_order_are_held_at_the_start_alone(name: str) -> None:
     sensor = load_sensor(name)
-    reorder = Reorder(enabled=True)
+    reorder = Reorder()
     released = [
         sum(map(len, reorder.push(packets))) for packets in pieces(sensor, simulate(sensor, 60), 1)
     ]
@@ -144,7 +144,7 @@ def test_packets_in_order_are_held_at_the_start_alone(name: str) -> None:
 def test_a_lost_packet_holds_no_more_than_a_window(name: str) -> None:
     sensor = load_sensor(name)
     frames = simulate(sensor, 100)
-    reorder = Reorder(enabled=True)
+    reorder = Reorder()
     arrived = released = 0
     most_held = 0
     for packets in pieces(sensor, frames[:50] + frames[51:], 1):

@@ -12,7 +12,7 @@ from construct import Const, Int8ul, Struct
 import lidarspec
 from lidarspec import Sensor, SpecError
 from lidarspec.plugins import Registry
-from lidarspec.scans.scans import scans_of
+from lidarspec.scans.stream import scans_of
 from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Serial, Sum, Xor, hookimpl
 from tests.by_construct import reader
 from tests.plugins.test_plugins import STRANGER

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from lidarspec import Sensor
-from lidarspec.scans.scans import scans_of
+from lidarspec.scans.stream import scans_of
 from lidarspec.spec import OnChange, OnFlag, OnJump, OnRewind, OnWrap
 from tests.shapes import SHAPES
 

@@ -12,7 +12,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import Scan, Sensor, UsageError, simulate
 from lidarspec.packets.stream import PacketStream
-from lidarspec.scans.scans import ScanStream
+from lidarspec.scans.stream import ScanStream
 from lidarspec.spec import Clock, Fields, OnChange, OnWrap, Simulation
 from tests.packets.test_reorder import assert_same_scans
 from tests.representatives import load_sensor

@@ -13,7 +13,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import Scan, Sensor, simulate
 from lidarspec.packets.stream import PacketStream
-from lidarspec.scans.scans import ScanStream
+from lidarspec.scans.stream import ScanStream
 from lidarspec.spec import Fields, Polar, following
 from lidarspec.spec.sensor import with_frames
 from tests.shapes import segments

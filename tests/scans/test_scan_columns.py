@@ -27,7 +27,7 @@ from lidarspec.frames.frame_table import Rows
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points import lazy_columns
 from lidarspec.points.cloud import COLUMNS
-from lidarspec.scans.scans import ScanStream, scans_of
+from lidarspec.scans.stream import ScanStream, scans_of
 from lidarspec.spec import OnChange, OnWrap, Udp
 from tests.broken import points_fail, sound
 from tests.by_construct import reader

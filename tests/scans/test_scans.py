@@ -15,7 +15,7 @@ import lidarspec as ls
 from lidarspec import Scan, simulate
 from lidarspec.framing.results import Frames
 from lidarspec.packets.stream import PacketStream
-from lidarspec.scans.scans import ScanStream
+from lidarspec.scans.stream import ScanStream
 from lidarspec.simulation.scenes import Room
 from lidarspec.simulation.simulator import opening, simulation
 from tests.shapes import SHAPES

@@ -11,7 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import Decoder, Packets, simulate
 from lidarspec.packets.stream import PacketStream
-from lidarspec.scans.scans import ScanStream
+from lidarspec.scans.stream import ScanStream
 from lidarspec.view.meter import Meter
 
 ID = "ldrobot-stl27l"

@@ -11,7 +11,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.packets.stream import PacketStream
-from lidarspec.scans.scans import ScanStream
+from lidarspec.scans.stream import ScanStream
 from tests.agreement import assert_same_points
 from tests.evidence import decoded, vector_bytes, vectors
 

@@ -20,8 +20,8 @@ from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.cloud import Mount
 from lidarspec.recording.appending import Log
+from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.planes import Planes
-from lidarspec.scans.scans import LaserScan
 from lidarspec.scans.selection import Selection
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Transport

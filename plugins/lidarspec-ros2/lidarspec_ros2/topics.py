@@ -27,7 +27,7 @@ from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream
 from lidarspec.points.cloud import Mount
-from lidarspec.scans.scans import Scan
+from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Sieve
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.bags import RAW

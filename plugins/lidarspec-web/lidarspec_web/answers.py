@@ -16,7 +16,7 @@ from lidarspec.explaining.assignments import arguments
 from lidarspec.explaining.contents import duration
 from lidarspec.explaining.explanation import Explanation, reply_text
 from lidarspec.points.look import is_flat
-from lidarspec.scans.scans import Place
+from lidarspec.scans.provenance import PointOrigin
 from lidarspec_web.backlog import MAX_DAMAGED, Backlog, Damaged, Taken
 from lidarspec_web.broadcast import Broadcast, Shown
 from lidarspec_web.command_forms import find_restart, make_form
@@ -102,7 +102,7 @@ class Answers:
             "damaged": {"total": broadcast.backlog.damaged, "newest": self._list_damaged(since)},
         }
 
-    def frame(self, taken: Taken, why: str, place: Place | None = None) -> dict[str, Any]:
+    def frame(self, taken: Taken, why: str, place: PointOrigin | None = None) -> dict[str, Any]:
         """Return a frame with every byte explained.
 
         Args:

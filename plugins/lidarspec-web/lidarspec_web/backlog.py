@@ -22,7 +22,7 @@ from lidarspec import Decoder, Sensor, WireError
 from lidarspec.explaining.explanation import Explanation
 from lidarspec.explaining.pieces import Piece, explained
 from lidarspec.framing.results import Frames, Numbers, array_of
-from lidarspec.scans.scans import Place
+from lidarspec.scans.provenance import PointOrigin
 
 #: of input that are kept.
 MAX_INPUT_BYTES = 1 << 23
@@ -207,7 +207,7 @@ class Backlog:
             return None
         return result.take(number - result.first_number)
 
-    def at(self, place: Place) -> Taken | None:
+    def at(self, place: PointOrigin) -> Taken | None:
         """Return the frame that a point came from.
 
         None if it is not kept, and the scan does not have its bytes as they were sent.

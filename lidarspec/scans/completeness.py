@@ -1,0 +1,163 @@
+"""Count the packets of the current scan, and the packets that are missing in it.
+
+The index of packets shows how many are missing before each (see `Packets.index`), and their breaks
+show that something is missing at all. A frame whose parts have the points counts once.
+
+A packet in which one scan ends and the next one begins counts in both, and what is missing before
+it counts in one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.frames.arrays import alike, repeated
+from lidarspec.packets.packets import Packets
+
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class PacketCounts:
+    """What packets add to a scan, (n,) each.
+
+    Attributes:
+        times: ns.
+        counts: 1 for each packet; for parts, 1 for the first part of a frame, and 0 for the others.
+        sizes: in bytes or in points.
+        missing: packets missing before each.
+        is_broken: whether there is a break before each.
+    """
+
+    times: Integers
+    counts: Integers
+    sizes: NDArray[np.intp]
+    missing: Integers
+    is_broken: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        packets: Packets,
+        number: int,
+        points: NDArray[np.intp] | None,
+        previous_index: int | None,
+    ) -> PacketCounts:
+        """Return the counts of the first packets of a batch.
+
+        Args:
+            number: the number of these packets.
+            points: of each of them, as sizes; None to take bytes.
+            previous_index: the index of the packet before them; None if there is none.
+        """
+        index = packets.index[:number]
+        if previous_index is None:
+            previous_index = index.item(0) - 1
+        frames, rows = packets.frames
+        is_in_parts = frames is not packets.table
+        is_broken = packets.breaks[:number]
+        if is_in_parts or packets.masked is not None or index.item(-1) - previous_index != number:
+            steps = np.diff(index, prepend=previous_index)
+            missing = np.maximum(steps - 1, 0)
+            if packets.masked is not None:
+                masked = packets.masked[:number]
+                missing = np.maximum(missing - masked, 0)
+                is_broken = is_broken & (masked == 0)
+            is_broken = is_broken | (missing > 0)
+        else:
+            missing = repeated(0, number)
+            if is_broken.any():
+                is_broken = is_broken.copy()
+        counts = repeated(1, number)
+        if is_in_parts:
+            counts = (steps != 0).astype(np.int64)
+        sizes = points
+        if sizes is None:
+            sizes = frames.sizes[rows][:number]
+            if is_in_parts:
+                sizes = sizes * counts
+        return cls(packets.time_ns[:number], counts, sizes, missing, is_broken)
+
+    def part(self, start: int, stop: int) -> PacketCounts:
+        """Return the counts of some of the packets, which share memory with these."""
+        rows = slice(start, stop)
+        return PacketCounts(
+            self.times[rows],
+            self.counts[rows],
+            self.sizes[rows],
+            self.missing[rows],
+            self.is_broken[rows],
+        )
+
+    def share(self, row: int) -> None:
+        """Count a packet, or the frame that it is part of, in the next scan as well.
+
+        What is missing before it has been counted already.
+        """
+        if not self.counts[row]:
+            self.counts[row] = 1
+        if self.missing[row]:
+            self.missing[row] = 0
+        if self.is_broken[row]:
+            self.is_broken[row] = False
+
+
+@dataclass(frozen=True)
+class OpenScan:
+    """The counts of a scan that has not ended.
+
+    Attributes:
+        has_start: whether its start was seen.
+        since: the time of its first packet, ns.
+        packets: the number of its packets.
+        size: their bytes or points.
+        lost: the number of packets missing between them.
+        is_broken: whether there is any break.
+    """
+
+    has_start: bool = False
+    since: int = 0
+    packets: int = 0
+    size: float = 0
+    lost: int = 0
+    is_broken: bool = False
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the start was seen, and at least half of the packets."""
+        return self.has_start and self.lost <= self.packets
+
+    @property
+    def has_gap(self) -> bool:
+        """Whether anything is missing."""
+        return self.lost > 0 or self.is_broken
+
+    def add(self, packets: PacketCounts) -> OpenScan:
+        """Return the scan with further packets; at least one."""
+        since = self.since
+        if not self.packets:
+            since = packets.times.item(0)
+        return replace(
+            self.add_gap(packets),
+            since=since,
+            packets=self.packets + _sum(packets.counts),
+            size=self.size + _sum(packets.sizes),
+        )
+
+    def add_gap(self, packets: PacketCounts) -> OpenScan:
+        """Return the scan with only what is missing before some packets."""
+        return replace(
+            self,
+            lost=self.lost + _sum(packets.missing),
+            is_broken=self.is_broken or bool(packets.is_broken.any()),
+        )
+
+
+def _sum(values: Integers) -> int:
+    each = alike(values)
+    if each is None:
+        return int(values.sum())
+    return each * len(values)

@@ -1,0 +1,94 @@
+"""Limit the length and the size of a scan, so that it ends even if its end does not arrive.
+
+A scan takes at most twice as long as the slowest turn, by the times of the packets. It is at most
+twice as large as a scan of a constant number of points, else as the bytes that a serial line
+carries in that time, else `MAX_BYTES`. If packets are missing, and with them perhaps the end, it
+becomes little longer than the scan before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarspec.scans.completeness import OpenScan, PacketCounts
+from lidarspec.spec.links import Serial
+from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.timing import Every
+
+#: the slowest turn if the sensor does not declare it.
+SLOWEST_TURN_S = 1.0
+#: the least time limit if packets have the times of their arrival, which may pause.
+MIN_LIMIT_S = 1.0
+#: the largest scan if neither points nor a serial line limit it.
+MAX_BYTES = 1 << 26
+#: how much longer than the whole scan before a scan with a gap may become.
+MAX_GROWTH = 1.125
+
+
+class ScanLimits:
+    """The limits of the scans of one sensor.
+
+    Attributes:
+        seconds: the longest scan.
+        longest_ns: the same in ns.
+        has_point_limit: whether the limit of the size is in points, not in bytes.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        turn_s = SLOWEST_TURN_S
+        if isinstance(sensor.scan, Every):
+            turn_s = sensor.scan.seconds
+        elif sensor.turn:
+            turn_s = 1 / sensor.turn[0]
+        self.seconds = 2 * turn_s
+        if sensor.clock is None:
+            self.seconds = max(self.seconds, MIN_LIMIT_S)
+        self.longest_ns = int(self.seconds * 1e9)
+        self.has_point_limit = sensor.beams is not None
+        link = sensor.links.get("data")
+        self._largest: float = MAX_BYTES
+        if sensor.beams:
+            self._largest = 2 * sensor.beams
+        elif isinstance(link, Serial):
+            self._largest = self.seconds * link.baud / 10
+
+    def allow(self, scan: OpenScan, packets: PacketCounts, usual: float) -> bool:
+        """Return whether a scan is within the limits.
+
+        Args:
+            scan: it, with these packets.
+            packets: the last packets of the scan.
+            usual: the packets of a whole scan.
+        """
+        latest = int(packets.times.max())
+        earliest = int(packets.times.min())
+        if max(latest - scan.since, scan.since - earliest) > self.longest_ns:
+            return False
+        if scan.size > self._largest:
+            return False
+        return not scan.lost or scan.packets - 1 + scan.lost <= MAX_GROWTH * usual
+
+    def find_excess(
+        self, scan: OpenScan, packets: PacketCounts, usual: float
+    ) -> tuple[int | None, bool]:
+        """Return the packet with which a scan exceeds the limits, and whether its end is overdue.
+
+        If the end is not overdue, the scan has a gap. The packet is None if there is none.
+
+        Args:
+            scan: it, without these packets.
+            packets: the next ones.
+            usual: the packets of a whole scan.
+        """
+        since = scan.since if scan.packets else packets.times.item(0)
+        is_overdue = np.abs(packets.times - since) > self.longest_ns
+        is_overdue |= scan.size + np.cumsum(packets.sizes) > self._largest
+        lost = scan.lost + np.cumsum(packets.missing)
+        length = scan.packets + np.cumsum(packets.counts) - 1 + lost
+        is_over = is_overdue | ((lost > 0) & (length > MAX_GROWTH * usual))
+        if not scan.packets:
+            is_over[0] = False  # a scan has at least one packet
+        row = int(is_over.argmax())
+        if is_over[row]:
+            return row, bool(is_overdue[row])
+        return None, False

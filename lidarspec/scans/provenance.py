@@ -1,0 +1,114 @@
+"""Find the frame that a point of a scan came from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from lidarspec.packets.packets import Packets
+from lidarspec.points.plain import Evaluated
+from lidarspec.scans.ends import first_points
+
+
+class PointOrigin(NamedTuple):
+    """The frame that a point came from.
+
+    Attributes:
+        frame: the type of the frame.
+        offset: the offset of its first byte in the input.
+        host_ns: when it arrived, ns since 1970; 0 if unknown.
+        part: the index of the part of the frame, if its parts have the points; else 0.
+        number: the index of the point in the frame, or in that part.
+        data: the bytes of the frame; if it has another form on the wire, the bytes that its fields
+            are in (`Frame.wire`).
+    """
+
+    frame: str
+    offset: int
+    host_ns: int
+    part: int
+    number: int
+    data: bytes
+
+
+class PointRun(NamedTuple):
+    """Consecutive points of one batch of packets.
+
+    Attributes:
+        packets: the batch.
+        points: the points of the batch.
+        start, stop: the indices of the run in `points`.
+        parts_before: the number of parts of the first frame in earlier batches.
+    """
+
+    packets: Packets
+    points: Evaluated
+    start: int
+    stop: int
+    parts_before: int
+
+
+class Provenance:
+    """The frames that the points of a scan came from.
+
+    Args:
+        runs: the points of the scan, in stream order.
+    """
+
+    def __init__(self, runs: Sequence[PointRun] = ()) -> None:
+        self._runs = runs
+
+    def __call__(self, point: int) -> PointOrigin:
+        """Return the origin of a point of the scan, given its index.
+
+        Raises:
+            IndexError: if the scan has no such point.
+        """
+        size = sum(run.stop - run.start for run in self._runs)
+        if not 0 <= point < size:
+            raise IndexError(f"point {point} of {size}")
+        first = 0
+        runs = iter(self._runs)
+        run = next(runs)
+        while first + run.stop - run.start <= point:
+            first += run.stop - run.start
+            run = next(runs)
+        return _find_origin(run, run.start + point - first)
+
+    def __reduce__(self) -> Any:
+        return Provenance, ()  # packets do not go with a scan to another process
+
+
+def _find_origin(run: PointRun, point: int) -> PointOrigin:
+    """Return the origin of a point of a batch, given its index there."""
+    packets = run.packets
+    starts = first_points(run.points)
+    row = int(starts.searchsorted(point, side="right")) - 1
+    table, rows = packets.frames
+    if isinstance(rows, slice):
+        frame_row = row
+    else:
+        frame_row = int(rows[row])
+    return PointOrigin(
+        frame=packets.frame.partition(".")[0],
+        offset=int(packets.offset[row]),
+        host_ns=int(packets.host_ns[row]),
+        part=find_part(packets, row, run.parts_before),
+        number=point - int(starts[row]),
+        data=table.frame(frame_row),
+    )
+
+
+def find_part(packets: Packets, row: int, parts_before: int) -> int:
+    """Return the index of a packet among the parts of its frame, from 0.
+
+    Args:
+        parts_before: the number of parts of the first frame in earlier batches.
+    """
+    _, rows = packets.frames
+    if isinstance(rows, slice):
+        return 0
+    part = row - int(rows.searchsorted(rows[row]))
+    if rows[row] == rows[0]:
+        part += parts_before
+    return part

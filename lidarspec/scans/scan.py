@@ -1,0 +1,188 @@
+"""Scans: the points of one revolution or frame period each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.display import drawn
+from lidarspec.errors import UsageError
+from lidarspec.packets.imu import ImuSamples
+from lidarspec.points.cloud import Mount, PointCloud
+from lidarspec.points.conventions import axes_of
+from lidarspec.scans.laserscan import FULL_TURN, LaserScan, find_nearest_returns, fit_times
+from lidarspec.scans.provenance import Provenance
+from lidarspec.spec.sensor import Sensor
+
+#: the usual name of the frame that the points are in: x forward, y left, z up (REP-103).
+FRAME_ID = "laser"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scan:
+    """The points between two cuts.
+
+    Attributes:
+        points: in stream order.
+        rate_hz: one over the time to the next scan; nan if that is unknown, or if the scan is not
+            whole.
+        complete: whether both ends were seen, and nothing is missing between them; the first and
+            the last scan of a stream are not complete.
+        sensor: the sensor that measured the points.
+        whole: whether both ends were seen, and at least half of the packets between them.
+        imu: the samples of the IMU from the first point to the first point of the next scan; None
+            without an IMU, or if it has another clock.
+        host_ns: when the packet of the first point arrived, int64 ns since 1970 by the clock of the
+            computer; 0 if unknown.
+        beams: the number of beams of `to_laserscan` by default; None: as many as the sensor
+            declares, else as there are points.
+        frame_id: the name of the frame of the points in ROS's messages.
+        number: the index of the scan in its file, if the file is read in pieces.
+        mount: how the sensor is mounted: the points are in the axes of its carrier; None if they
+            are in the axes of the sensor.
+        provenance: the frame that each point came from.
+    """
+
+    points: PointCloud
+    rate_hz: float
+    complete: bool
+    sensor: Sensor
+    whole: bool = False
+    imu: ImuSamples | None = None
+    host_ns: int = 0
+    beams: int | None = None
+    frame_id: str = FRAME_ID
+    number: int | None = None
+    mount: Mount | None = None
+    provenance: Provenance = field(default_factory=Provenance)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the first point, int64 ns."""
+        return self.points.stamp_ns
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        ranges = self.points.range[self.points.valid]
+        if len(ranges):
+            span = f"{ranges.min():.2f}..{ranges.max():.2f} m"
+        else:
+            span = "no returns"
+        rate = ""
+        if np.isfinite(self.rate_hz):
+            rate = f"{self.rate_hz:.1f} Hz, "
+        nominal = ""
+        if self.points.nominal:
+            nominal = ", nominal calibration"
+        if self.complete:
+            state = "complete"
+        elif self.whole:
+            state = "with gaps"
+        else:
+            state = "partial"
+        return f"Scan({len(self)} points, {rate}{span}, {state}{nominal})"
+
+    _repr_svg_ = drawn("scan")
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """The origin of the points, as stored in files.
+
+        `sensor`; `source`, the source of its format; `frame`, the directions of x, y and z;
+        `calibration`, "nominal" or "own".
+        """
+        directions = zip("xyz", axes_of(self.sensor), strict=True)
+        return {
+            "sensor": self.sensor.id,
+            "source": self.sensor.source,
+            "frame": ", ".join(f"{axis} {direction}" for axis, direction in directions),
+            "calibration": self.points.calibration,
+        }
+
+    def to_arrow(self) -> Any:
+        """Return the `pyarrow.Table` of the points, with `facts` in its metadata.
+
+        See `PointCloud.to_arrow`.
+
+        Raises:
+            UsageError: if pyarrow is not installed.
+        """
+        return self.points.to_arrow(self.facts)
+
+    def __arrow_c_stream__(self, requested_schema: object = None) -> object:
+        """Return the table of `to_arrow` as DuckDB, Polars and pandas read it from an object."""
+        return self.to_arrow().__arrow_c_stream__(requested_schema)
+
+    def to_bins(self, n: int) -> NDArray[np.float32]:
+        """Return the nearest return in each of n equal sectors from -pi on.
+
+        The result is (n,) float32, metres, inf without a return.
+
+        Raises:
+            UsageError: if `n` is not a positive whole number.
+        """
+        step = FULL_TURN / _check_count(n, "to_bins")
+        ranges, _ = find_nearest_returns(self.points, n, step / 2 - np.pi, step)
+        return ranges
+
+    def to_laserscan(
+        self, beams: int | None = None, field: tuple[float, float] | None = None
+    ) -> LaserScan:
+        """Return the scan on an even grid of angles.
+
+        Args:
+            beams: the number of angles; by default that of `beams`.
+            field: the first and the last angle, radians; by default they cover the whole turn from
+                -pi on. The times of the beams are right if no scan begins within it: `Planes` finds
+                such a field.
+
+        Raises:
+            UsageError: if `beams` is not a positive whole number.
+        """
+        if beams is not None:
+            count = _check_count(beams, "to_laserscan")
+        else:
+            count = self.beams or self.sensor.beams or max(len(self), 1)
+        first, last = field or (-np.pi, np.pi - FULL_TURN / count)
+        step = FULL_TURN
+        if count > 1:
+            step = (last - first) / (count - 1)
+        ranges, intensities = find_nearest_returns(self.points, count, first, step)
+        start, slope = fit_times(self.points, first, last)
+        if np.isfinite(self.rate_hz) and self.rate_hz > 0:
+            period = 1 / self.rate_hz
+        else:
+            period = abs(slope) * FULL_TURN
+        range_min, range_max = self.sensor.range_limits
+        return LaserScan(
+            angle_min=first,
+            angle_max=last,
+            angle_increment=step,
+            time_increment=slope * step,
+            scan_time=period,
+            range_min=range_min,
+            range_max=range_max,
+            ranges=ranges,
+            intensities=intensities,
+            stamp_ns=self.stamp_ns + round(start * 1e9),
+            host_ns=self.host_ns,
+        )
+
+
+def _check_count(count: Any, method: str) -> int:
+    """Return a number of sectors.
+
+    Raises:
+        UsageError: if it is not a positive whole number.
+    """
+    is_whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+    if not is_whole or count < 1:
+        raise UsageError(
+            f"{method} takes how many sectors the turn has, a whole number from 1 on, not {count!r}"
+        )
+    return int(count)

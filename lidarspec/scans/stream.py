@@ -1,0 +1,277 @@
+"""Make scans of batches of packets as they arrive.
+
+Packets are put in order (`packets.reorder`), marked at a masked sector (`masking`), evaluated to
+points, and cut (`cutter`). A `ScanStream` keeps the points of the scan that has not ended, and the
+packets whose points depend on the next ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarspec.expressions.columns import Carry
+from lidarspec.packets.imu import ImuSamples, Waiting
+from lidarspec.packets.masked_sector import AngleReader
+from lidarspec.packets.packets import Packets, joined
+from lidarspec.packets.reorder import Reorder
+from lidarspec.points.cloud import LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
+from lidarspec.points.evaluate import guarded
+from lidarspec.points.plain import Evaluated
+from lidarspec.scans.cutter import Cutter
+from lidarspec.scans.ends import first_points
+from lidarspec.scans.masking import Masking, describe
+from lidarspec.scans.provenance import PointRun, Provenance, find_part
+from lidarspec.scans.scan import Scan
+from lidarspec.spec.sensor import Sensor
+
+
+class ScanStart(NamedTuple):
+    """The start of a scan.
+
+    Attributes:
+        time_ns: the time of its first point.
+        host_ns: when the packet of that point arrived; 0 if unknown.
+    """
+
+    time_ns: int
+    host_ns: int
+
+
+class ScanStream:
+    """Makes the scans of one stream.
+
+    Args:
+        sensor: that sends the packets.
+        mount: how it is mounted; the scans are in the axes of its carrier.
+        imu: the samples of its IMU; they are added before the packets that arrived with them.
+    """
+
+    def __init__(
+        self, sensor: Sensor, mount: Mount | None = None, imu: Waiting | None = None
+    ) -> None:
+        self._sensor = sensor
+        self._mount = mount
+        self._imu = imu
+        self._reorder: Reorder | None = None
+        if sensor.sequence is not None or (sensor.clock is not None and sensor.datagrams):
+            self._reorder = Reorder()
+        self._masking: Masking | None = None
+        if AngleReader(sensor).is_available:
+            self._masking = Masking(sensor)
+        self._uses_sector = False
+        self._cutter = Cutter(sensor)
+        self._waiting: Packets | None = None  # whose points depend on the next packets
+        self._waiting_parts = 0  # parts of their first frame that were ready
+        self._carry: Carry = {}
+        self._epoch: int | None = None  # of all batches, so that they do not change a bit of a time
+        self._empty_frames = 0  # frames without parts that have points
+        self._is_broken = False  # whether there is a break before the last ones of them
+        self._runs: list[PointRun] = []  # of the scan that has not ended
+        self._start: ScanStart | None = None  # of that scan; None without points
+        self._is_foreign = False  # whether another stream makes that scan
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether there are points of a scan that has not ended, and is made here."""
+        return bool(self._runs) and not self._is_foreign
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state to pickle, which continues behind the scan that has not ended.
+
+        Its points are left out.
+        """
+        is_foreign = self._is_foreign or bool(self._runs)
+        return {**vars(self), "_runs": [], "_is_foreign": is_foreign}
+
+    def add(self, packets: Packets) -> list[Scan]:
+        """Return the scans that these packets complete."""
+        if not len(packets):
+            return []
+        ordered = [packets]
+        if self._reorder is not None:
+            ordered = self._reorder.push(packets)
+        return self._add_ordered(ordered)
+
+    def finish(self) -> list[Scan]:
+        """Return the scans that waited for more packets, and what remains."""
+        scans = list[Scan]()
+        if self._reorder is not None:
+            scans += self._add_ordered(self._reorder.finish())
+        if self._masking is not None:
+            scans += self._add_marked(self._masking.finish())
+        if self._waiting is not None:
+            scans += self._evaluate(self._waiting, final=True)
+        scans += self._close(None)
+        return scans
+
+    def _add_ordered(self, batches: list[Packets]) -> list[Scan]:
+        """Return the scans that packets in order complete."""
+        if self._masking is not None:
+            batches = [marked for packets in batches for marked in self._masking.push(packets)]
+        return self._add_marked(batches)
+
+    def _add_marked(self, batches: list[Packets]) -> list[Scan]:
+        """Return the scans that packets complete, which are marked at a masked sector."""
+        scans = list[Scan]()
+        for packets in batches:
+            if packets.masked is not None and not self._uses_sector:
+                self._use_sector(packets)
+            ready = self._with_points(packets)
+            if self._waiting is not None:
+                ready = joined([self._waiting, ready])
+            if len(ready):
+                scans += self._evaluate(ready, final=False)
+        return scans
+
+    def _use_sector(self, packets: Packets) -> None:
+        """Cut scans in the masked sector that was found."""
+        assert self._masking is not None
+        sector = self._masking.sector
+        assert sector is not None
+        self._cutter.use_sector(sector, self._masking.angle_before_sector)
+        packets.stats.masked = describe(sector)
+        self._uses_sector = True
+
+    def _with_points(self, packets: Packets) -> Packets:
+        """Return the packets with points: these, or the parts in them.
+
+        A frame without any part leaves no gap.
+        """
+        parts = packets.with_points
+        if parts is not packets:
+            rows = np.searchsorted(packets.index, parts.index)
+            is_empty = ~np.isin(np.arange(len(packets)), rows)
+            empty = self._empty_frames + np.cumsum(is_empty)
+            parts.index = parts.index - empty[rows]
+            self._empty_frames = int(empty[-1])
+            parts.breaks[:1] |= self._is_broken
+            if len(rows):
+                self._is_broken = bool(packets.breaks[rows[-1] + 1 :].any())
+            else:
+                self._is_broken = self._is_broken or bool(packets.breaks.any())
+        return parts
+
+    def _evaluate(self, packets: Packets, *, final: bool) -> list[Scan]:
+        """Return the scans that the points of some packets complete."""
+        self._waiting = None
+        if self._epoch is None:
+            self._epoch = packets.time_ns.item(0)
+        points = guarded(packets, self._carry, final=final, epoch=self._epoch)
+        if points is None:
+            return []
+        self._carry = points.carry
+        parts_before = self._waiting_parts
+        self._waiting_parts = 0
+        if points.ready < len(packets):
+            self._waiting = packets.take(slice(points.ready, None))
+            self._waiting_parts = find_part(packets, points.ready, parts_before)
+        return self._cut(packets, points, parts_before)
+
+    def _cut(self, packets: Packets, points: Evaluated, parts_before: int) -> list[Scan]:
+        """Return the scans that points complete, and keep the points after them."""
+        cuts = self._cutter.cut(packets, points)
+        indices = [cut.point for cut in cuts]
+        if self._start is None:
+            self._start, *starts = _read_starts(packets, points, [0, *indices])
+        else:
+            starts = _read_starts(packets, points, indices)
+        scans = list[Scan]()
+        first = 0
+        for cut, start in zip(cuts, starts, strict=True):
+            self._keep(PointRun(packets, points, first, cut.point, parts_before))
+            scans += self._close(start, whole=cut.whole, complete=cut.complete)
+            self._start = start
+            first = cut.point
+        self._keep(PointRun(packets, points, first, source_of(points.cloud).size, parts_before))
+        return scans
+
+    def _keep(self, run: PointRun) -> None:
+        """Add points to the scan that has not ended."""
+        if run.start < run.stop:
+            self._runs.append(run)
+
+    def _close(
+        self, following: ScanStart | None, *, whole: bool = False, complete: bool = False
+    ) -> list[Scan]:
+        """Return the scan of the points so far; none if there are no points.
+
+        Args:
+            following: the start of the next scan; None if it is unknown.
+        """
+        runs = self._runs
+        start = self._start
+        is_foreign = self._is_foreign
+        self._runs = []
+        self._is_foreign = False
+        end_ns: int | None = None
+        if following is not None:
+            end_ns = following.time_ns
+        if is_foreign and self._imu is not None:
+            self._imu.until(end_ns)  # those samples belong to the scan that another stream makes
+        if is_foreign or not runs:
+            return []
+        assert start is not None  # since there are points
+        parts = [Stretch(source_of(run.points.cloud), run.start, run.stop) for run in runs]
+        cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), start.time_ns)
+        samples: ImuSamples | None = None
+        if self._imu is not None:
+            samples = self._imu.until(end_ns)
+        if self._mount is not None:
+            cloud = self._mount.applied(cloud)
+            if samples is not None:
+                samples = samples.turned(self._mount.rotation)
+        rate_hz = np.nan
+        if whole and end_ns is not None and end_ns > start.time_ns:
+            rate_hz = 1 / ((end_ns - start.time_ns) * 1e-9)
+        scan = Scan(
+            cloud,
+            rate_hz,
+            complete,
+            self._sensor,
+            whole,
+            samples,
+            start.host_ns,
+            mount=self._mount,
+            provenance=Provenance(runs),
+        )
+        return [scan]
+
+
+def _read_starts(
+    packets: Packets, points: Evaluated, indices: Sequence[int]
+) -> list[ScanStart | None]:
+    """Return the starts of scans at some points, in order; None for indices past the end."""
+    source = source_of(points.cloud)
+    known = [index for index in indices if index < source.size]
+    starts: list[ScanStart | None] = [None] * len(indices)
+    if known:
+        rows = first_points(points).searchsorted(known, side="right") - 1
+        hosts = packets.host_ns[rows].tolist()
+        times = source.times_at(np.array(known, np.intp)).tolist()
+        for number, (time, host) in enumerate(zip(times, hosts, strict=True)):
+            starts[number] = ScanStart(source.base + round(time * 1e9), host)
+    return starts
+
+
+def scans_of(
+    sensor: Sensor, batches: Iterable[Packets], imu: Waiting | None = None
+) -> Iterator[Scan]:
+    """Yield every scan of the batches of one stream.
+
+    Args:
+        imu: the samples that belong to them.
+    """
+    stream = ScanStream(sensor, imu=imu)
+    for batch in batches:
+        yield from handed_out(stream.add(batch))
+    yield from stream.finish()
+
+
+def handed_out(scans: list[Scan]) -> Iterator[Scan]:
+    """Yield scans one by one, and release each with its columns."""
+    scans.reverse()
+    while scans:
+        yield scans.pop()
