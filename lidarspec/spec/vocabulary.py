@@ -19,6 +19,9 @@ from lidarspec.errors import SpecError
 
 Array = Any
 
+#: a step between blocks may be longer than the fastest one by this factor: in captures of rotating
+#: sensors, steps at a constant speed vary by 5 %.
+STEP_TOLERANCE = 1.25
 #: NumPy functions that work element by element, and so keep axes; others see plain arrays.
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
 
@@ -211,26 +214,32 @@ def last(a: Array, where: Array | None = None) -> Array:
     return np.where(spots >= 0, values.ravel()[spots], np.nan).reshape(values.shape)
 
 
-def between_blocks(azimuth: Array, ahead: Array, *, limit: float, full: float = 360.0) -> Array:
+def between_blocks(
+    azimuth: Array, ahead: Array, *, fastest: Array, repeat: bool = True, full: float = 360.0
+) -> Array:
     """Return how far a rotor turns from each block to the next one.
 
-    A step of `limit` or more is a loss or a masked sector: the last good step in stream order is
-    taken instead.
+    A step that is longer than the rotor can turn is a loss or a masked sector. The last good step
+    in stream order replaces it.
 
     Args:
         azimuth: azimuth of each block, in the unit of `full`.
         ahead: azimuth of the next block that does not share it, such as ``following(azimuth)``.
-        limit: steps have to be smaller than this: what the sensor turns in this time at its
-            fastest.
+        fastest: how far the sensor turns from block to block at its highest speed, in the unit of
+            `full`. Encoder readings vary, so steps may be up to 25 % longer.
+        repeat: False returns nan in place of the last good step.
         full: the whole circle in the unit of `azimuth`.
 
     Returns:
-        float64, the shape of `azimuth`; the shorter way round, so negative where readings jitter;
+        float64, the shape of `azimuth`; the shorter way round, so negative if the readings jitter;
         nan before the first good step.
     """
     step = ahead - azimuth
     step = step - full * np.rint(step / full)
-    return last(np.where(np.abs(step) < limit, step, np.nan))
+    good = np.where(np.abs(step) < fastest * STEP_TOLERANCE, step, np.nan)
+    if repeat:
+        return last(good)
+    return good
 
 
 def stack(*columns: Array) -> Array:

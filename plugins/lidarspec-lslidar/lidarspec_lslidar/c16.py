@@ -33,9 +33,8 @@ from lidarspec.spec import (
     Sensor,
     Simulation,
     Udp,
+    between_blocks,
     following,
-    previous,
-    wrap,
 )
 
 BLOCKS = 12
@@ -45,13 +44,10 @@ STRONGEST = 0x37
 DUAL = 0x39
 LASER = 3.125e-6  # seconds from laser to laser
 BLOCK = GROUPS * LASERS * LASER
-CENTRE, ASIDE = (
-    0.0361,
-    20.25,
-    # metres from the axis to the optical centre, and degrees by which it lies to the left of the
-    # azimuth
-)
-GAP = 2.0  # degrees; 20 turns a second are 0.72 from block to block
+CENTRE = 0.0361  # metres from the axis to the optical centre
+ASIDE = 20.25  # degrees by which the optical centre lies to the left of the azimuth
+TURN = (5.0, 20.0)  # turns per second, the slowest and the fastest
+FASTEST = TURN[1] * 360  # degrees per second
 UNITS = (0.4, 0.25)  # centimetres of a step of distance, by the unit
 ELEVATION = np.array([-16.0, 0, -14, 2, -12, 4, -10, 6, -8, 8, -6, 10, -4, 12, -2, 14])
 
@@ -149,11 +145,10 @@ def pace(f: Fields) -> Any:
 
 
 def rotor_step(f: Fields, dual: Any) -> Any:
-    """Degrees from each firing's azimuth to the next one's; over a loss as before it."""
+    """Return the degrees from each firing's azimuth to the next one's."""
     azimuth = f.blocks.azimuth
-    ahead = wrap(np.where(dual, following(azimuth, 2), following(azimuth)) - azimuth, 360)
-    behind = wrap(azimuth - np.where(dual, previous(azimuth, 2), previous(azimuth)), 360)
-    return np.where(ahead <= GAP, ahead, np.where(behind <= GAP, behind, np.nan))
+    ahead = np.where(dual, following(azimuth, 2), following(azimuth))
+    return between_blocks(azimuth, ahead, fastest=FASTEST * BLOCK)
 
 
 def configure(sensor: Sensor, /, *, distance_unit: float) -> Sensor:
@@ -207,7 +202,7 @@ C16 = Sensor(
     configure=configure,
     range_limits=(0.3, 200.0),  # the defaults of the driver
     vendor_axes=("right", "forward", "up"),
-    turn=(5.0, 20.0),
+    turn=TURN,
     info={"model": "data.model"},
     aliases=("c16", "leishen-c16"),
     status="vectors",

@@ -48,7 +48,6 @@ from lidarspec.spec import (
     Simulation,
     Udp,
     following,
-    previous,
     take,
 )
 from lidarspec_robosense.rotor import (
@@ -203,8 +202,7 @@ def points(f: Fields) -> Polar:
     difop = f.state.difop
     dual = f.returns == DUAL
     low = f.blocks.index % 2 == 0
-    ahead = np.where(dual, following(azimuth, 4), following(azimuth, 2)) - azimuth
-    behind = azimuth - np.where(dual, previous(azimuth, 4), previous(azimuth, 2))
+    ahead = np.where(dual, following(azimuth, 4), following(azimuth, 2))
     vertical = np.where(low, signed(difop.vertical_low), signed(difop.vertical_high))
     horizontal = np.where(low, signed(difop.horizontal_low), signed(difop.horizontal_high))
     delay = np.where(
@@ -216,7 +214,6 @@ def points(f: Fields) -> Polar:
         ROTOR,
         (vertical, horizontal),
         ahead,
-        behind,
         elapsed=delay,
         duration=ROTOR.period,
         shot=np.where(dual, block // 4, block // 2),

@@ -36,11 +36,11 @@ from construct import (
 )
 from numpy.typing import NDArray
 
-from lidarspec.spec import Clock, Fields, OnWrap, Polar, Scaled, Udp, following, previous, wrap
+from lidarspec.spec import Clock, Fields, OnWrap, Polar, Scaled, Udp, between_blocks, following
 
-# degrees; a longer step between blocks is the edge of the field of view that was set (rs_driver)
-GAP = 1.0
 TURNS = 10  # per second, the factory's setting
+TURN = (5.0, 20.0)  # turns per second, the slowest and the fastest of the family
+FASTEST = TURN[1] * 360  # degrees per second
 
 BLOCK: Construct = Const(b"\xff\xee")  # what a block begins with
 #: of most models: the low byte first, its sign in a bit of its own.
@@ -205,12 +205,11 @@ def pairs(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
     """
     azimuth = f.blocks.azimuth
     block = f.blocks.index
-    ahead = np.where(dual, following(azimuth, 2), following(azimuth)) - azimuth
-    behind = azimuth - np.where(dual, previous(azimuth, 2), previous(azimuth))
+    ahead = np.where(dual, following(azimuth, 2), following(azimuth))
     shot = np.where(dual, (block + late) // 2, block)
     echo = np.where(dual, (block + late) % 2, 0)
     times = {"elapsed": model.delay, "duration": model.period, "shot": shot}
-    return beams(f, f.blocks.channels, model, directions(f), ahead, behind, echo=echo, **times)
+    return beams(f, f.blocks.channels, model, directions(f), ahead, echo=echo, **times)
 
 
 def halves(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar:
@@ -218,17 +217,15 @@ def halves(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar
 
     The groups are two firings, or with dual return the two returns of one firing.
     """
-    azimuth = f.blocks.azimuth
     group = np.arange(2)[:, None]
     duration = np.where(dual, 1, 2) * model.period
     elapsed = np.where(dual, 0, group) * model.period + model.delay
-    ahead = following(azimuth) - azimuth
-    behind = azimuth - previous(azimuth)
+    ahead = following(f.blocks.azimuth)
     echo = np.where(dual, group, 0)
     channels = f.blocks.groups.channels
     shot = f.blocks.index
     times = {"elapsed": elapsed, "duration": duration, "shot": shot}
-    return beams(f, channels, model, lasers, ahead, behind, echo=echo, **times)
+    return beams(f, channels, model, lasers, ahead, echo=echo, **times)
 
 
 def beams(
@@ -237,7 +234,6 @@ def beams(
     model: Rotor,
     lasers: tuple[Any, Any],
     ahead: Any,
-    behind: Any,
     *,
     elapsed: Any,
     duration: Any,
@@ -246,24 +242,24 @@ def beams(
     distance: Any = None,
     ring: Any = None,
 ) -> Polar:
-    """Lasers beside the rotor's direction, from an optical centre that turns with it (rs_driver,
-    internDecodeMsopPkt).
+    """Return the points of lasers beside the rotor's direction.
+
+    The optical centre turns with the rotor (rs_driver, internDecodeMsopPkt). Before the first good
+    step between shots, the speed that DIFOP reports gives the step.
 
     Args:
         lasers: degrees above the horizon, and clockwise of the rotor's direction.
-        ahead, behind: degrees to the azimuth of the next shot and from that of the one before, not
-            wrapped.
+        ahead: azimuth of the next shot, degrees.
         elapsed: seconds from the azimuth of a shot to each laser.
         duration: seconds from shot to shot.
-        shot: which shot of the packet a block is of.
-        echo: which return it holds.
-        distance: metres, where `channels` have no field of that name.
-        ring: numbers of the lasers, where not by their elevation.
+        shot: the number of the shot in the packet, for each block.
+        echo: the number of the return, for each block.
+        distance: metres; by default the field of that name in `channels`.
+        ring: numbers of the lasers; by default in the order of their elevation.
     """
-    step, (vertical, horizontal) = (
-        rotor_step(ahead, behind, f.state.difop.rpm * 6 * duration),
-        lasers,
-    )
+    vertical, horizontal = lasers
+    step = between_blocks(f.blocks.azimuth, ahead, fastest=FASTEST * duration)
+    step = np.where(np.isnan(step), f.state.difop.rpm * 6 * duration, step)
     rotor = np.deg2rad(f.blocks.azimuth + step * elapsed / duration)
     return Polar(
         range=channels.distance if distance is None else distance,
@@ -286,16 +282,6 @@ def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
         dual: the return mode with two returns.
     """
     return np.where(f.state.difop.return_mode == dual, shots / 2, shots) * period
-
-
-def rotor_step(ahead: Any, behind: Any, usual: Any) -> Any:
-    """Return the degrees to the next shot.
-
-    Over a loss or a gap it is the step before, or the configured step of the rotor.
-    """
-    ahead = wrap(ahead, 360)
-    behind = wrap(behind, 360)
-    return np.where(ahead <= GAP, ahead, np.where(behind <= GAP, behind, usual))
 
 
 def sweep(i: int, shots: int, period: float, **others: Any) -> dict[str, Any]:
@@ -329,6 +315,6 @@ COMMON: dict[str, Any] = {
     "links": {"data": Udp(6699, 7788)},
     "clock": Clock(("seconds", "microseconds")),
     "vendor_axes": ("forward", "left", "up"),
-    "turn": (5.0, 20.0),
+    "turn": TURN,
     "status": "manual",
 }

@@ -35,7 +35,6 @@ from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST, TURN
 
 LAST_BLOCK = ("previous", "invalid")
 FASTEST = TURN[1] * 360  # degrees per second
-JITTER = 1.25  # azimuths are encoder readings; steps of the captures vary by 5 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,19 +112,8 @@ def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
     """Return the degrees from each block's azimuth to the next, (n, blocks, 1)."""
     azimuth = f.blocks.azimuth
     ahead = np.where(dual, following(azimuth, 2 * model.sharing), following(azimuth, model.sharing))
-    limit = FASTEST * model.period * JITTER
-    if last_block == "previous":
-        return between_blocks(azimuth, ahead, limit=limit)
-    step = difference(azimuth, ahead)
-    return np.where(np.abs(step) < limit, step, np.nan)
-
-
-def difference(start: Any, end: Any) -> Any:
-    """The shorter way round from start to end, degrees: a reading that falls back by jitter is no
-    turn.
-    """
-    step = end - start
-    return step - 360 * np.rint(step / 360)
+    repeat = last_block == "previous"
+    return between_blocks(azimuth, ahead, fastest=FASTEST * model.period, repeat=repeat)
 
 
 def configure(sensor: Sensor, /, *, last_block: str) -> Sensor:

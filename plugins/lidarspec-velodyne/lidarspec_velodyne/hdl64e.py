@@ -41,7 +41,7 @@ from lidarspec.spec import (
     between_blocks,
     following,
 )
-from lidarspec_velodyne.firings import FASTEST, JITTER
+from lidarspec_velodyne.firings import FASTEST
 from lidarspec_velodyne.frames import BLOCKS, HOUR, SLOTS, TURN
 
 UPPER = 0xFFEE
@@ -189,7 +189,7 @@ def points(f: Fields, unit: Unit) -> Polar:
     block = f.blocks.index
     twice = dual(f)
     ahead = np.where(twice, following(azimuth, 4), following(azimuth, 2))
-    step = between_blocks(azimuth, ahead, limit=FASTEST * unit.period * JITTER)
+    step = between_blocks(azimuth, ahead, fastest=FASTEST * unit.period)
     turned = np.deg2rad(azimuth + step * (unit.delay / unit.period) - unit.of_blocks(unit.offset))
     elevation = np.deg2rad(unit.of_blocks(unit.vertical))
     height = unit.of_blocks(unit.height)
