@@ -14,7 +14,7 @@ in this package reads bytes of a stream. Modules in reading order:
 * `checksums`: algorithms as values; of one message.
 * `wire_forms`: frames whose fields have no fixed places on the wire: tokens, lines, escapes.
 * `links`: how a sensor is connected.
-* `timing`: clocks, counters, where scans end.
+* `timing`: clocks and dates, counters, ends of scans.
 * `results`, `vocabulary`: what a `points` function returns, and what it is written with.
 * `tree`: a frame type as nodes, which all others walk.
 * `syntax`, `bits`: from construct to the tree; the bits of bit blocks, found by probing.
@@ -77,6 +77,7 @@ if TYPE_CHECKING:
         OnRewind as OnRewind,
         OnWrap as OnWrap,
         Sequence as Sequence,
+        unix_time as unix_time,
     )
     from lidarspec.spec.vocabulary import (
         along as along,
@@ -129,6 +130,7 @@ _NAMES = {
         "OnJump",
         "OnRewind",
         "Every",
+        "unix_time",
     ),
     "expressions.columns": ("Fields", "Column"),
     "spec.results": ("Points", "Polar", "Cartesian", "Extra", "Imu"),

@@ -1,5 +1,6 @@
-"""Where a scan ends, what the clock is and how packets are counted: declared rules, carried out by
-the engine.
+"""Ends of scans, clocks and packet counters: rules that a sensor declares and the engine applies.
+
+`unix_time` is for the functions of a clock: it converts the fields of a date.
 """
 
 from __future__ import annotations
@@ -8,8 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from lidarspec.errors import SpecError
 
+_DAY_S = 86_400
+#: days from 0000-03-01 to 1970-01-01, plus 1 because days of a month are counted from 1.
+_EPOCH_DAYS = 719_469
 #: times are counted in 64-bit nanoseconds: 292 years.
 MAX_CLOCK_S = 2**63 / 1e9
 #: a field path, several that add up, or a function of the frame's `Fields` (returning a column or
@@ -19,7 +25,7 @@ Source = str | tuple[str, ...] | Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class OnWrap:
-    """Cut where a circular column passes `at`.
+    """Cut when a circular column passes `at`.
 
     Args:
         name: a field path of an angle ("blocks.azimuth": cut between the rows of that array) or a
@@ -48,9 +54,9 @@ class OnChange:
     Args:
         name: a field path.
         angle: the path of a field that grows evenly as a rotating sensor turns, the angle at which
-            a packet begins. By it a masked sector is found, in which scans are cut then, and
-            `configure(cut=)` cuts. "" if there is none.
-        full: how much `angle` grows in a turn, in its unit.
+            a packet begins; "" if there is none. It is used to find a masked sector, in which scans
+            are then cut, and by `configure(cut=)`.
+        full: growth of `angle` in one turn, in its unit.
     """
 
     name: str
@@ -81,7 +87,7 @@ class OnRewind:
 
 @dataclass(frozen=True)
 class Every:
-    """Cut every so many seconds of the packets' time, for sensors without a physical period."""
+    """Cut after a number of seconds of packet time, for sensors without a physical period."""
 
     seconds: float
 
@@ -96,17 +102,17 @@ class Clock:
     Args:
         source: the field, the fields that add up (seconds and microseconds), or a function of
             `Fields` that returns a column, or several that add up, in seconds. Terms are summed as
-            integer nanoseconds.
+            integer nanoseconds. `unix_time` converts the fields of a date.
         wraps_at: seconds after which it starts again at 0; None if it does not.
-        pace: a function of `Fields`: by how many seconds it advances from a packet to the next, nan
-            if that is unknown. If there is no counter, it shows what is missing. Beside a counter
-            it shows how often a short one has wrapped in a gap, and whether a number that jumps is
-            damaged: there it has to be right in every mode. Without it the clock counts no loss.
-            It tells relatives apart; if it is left out, the pace of a simulation does.
-        told: what completes a clock that starts again: another frame type that has the clock's
-            field too, and a function of its `Fields` to the seconds since 1970 that it tells, nan
-            where it tells none. The turn of the clock is the one closest to what the first frame
-            that tells it says: from the start of a file, and of live packets from that frame on.
+        pace: a function of `Fields` that returns the seconds from a packet to the next, nan if
+            unknown. If there is no counter, it shows losses. With a counter it shows how often a
+            short counter has wrapped in a gap, and whether a number that jumps is corrupt; then it
+            has to be right in every mode. A clock without it counts no loss. It distinguishes
+            related models; if it is left out, the pace of a simulation does.
+        told: another frame type that completes a clock that starts again: it has the clock's
+            field too. With it a function of its `Fields` that returns seconds since 1970, nan if
+            the frame has no date. The first frame with a date decides: from the start of a file,
+            and for live packets from that frame on.
 
     Raises:
         SpecError: if `wraps_at` is not positive, or too long to ever be reached.
@@ -138,10 +144,37 @@ class Sequence:
 
     Args:
         field: path of the counter.
-        first, last: its lowest and highest value; `last` may be a function of `Fields`, and is the
-            field's largest value where it is left out.
+        first, last: its lowest and highest value. `last` may be a function of `Fields`; by default
+            it is the largest value of the field.
     """
 
     field: str
     first: int = 0
     last: int | Callable[[Any], Any] | None = None
+
+
+def unix_time(
+    year: Any, month: Any, day: Any, hour: Any = 0, minute: Any = 0, second: Any = 0
+) -> Any:
+    """Return the seconds from 1970-01-01 to a date of the Gregorian calendar, in UTC.
+
+    Works on numbers, arrays and columns, for the `source` of a `Clock`. A fraction of a second is a
+    term of its own there, so that nanoseconds stay exact.
+
+    Args:
+        year: with its century, such as 2026.
+        month: 1 to 12.
+        day: 1 to 31.
+        hour, minute, second: of the day, and of each other; not limited to their range.
+
+    Returns:
+        float64, the broadcast shape; whole seconds are exact.
+    """
+    # years begin in March, so that the leap day is the last day of a year
+    is_before_march = month <= 2
+    years = np.where(is_before_march, year - 1, year)
+    months = np.where(is_before_march, month + 9, month - 3)
+    leap_days = np.floor(years / 4) - np.floor(years / 100) + np.floor(years / 400)
+    days_before_month = np.floor((153 * months + 2) / 5)  # months have 31, 30, 31, 30, 31 days
+    days = 365 * years + leap_days + days_before_month + day - _EPOCH_DAYS
+    return _DAY_S * days + 3600 * hour + 60 * minute + second

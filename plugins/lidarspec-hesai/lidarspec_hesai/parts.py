@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from construct import Bytes, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec.spec import Fields, Polar, Scaled
+from lidarspec.spec import Fields, Polar, Scaled, unix_time
 from lidarspec_hesai.calibration import Calibration
 
 RETURN_MODES = (
@@ -62,22 +62,12 @@ def returns_of(mode: Any) -> Any:
 
 
 def clock(f: Fields) -> tuple[Any, Any]:
-    """Whole seconds since 1970, and the microseconds within the second: two terms, each exact."""
+    """Return the whole seconds since 1970, and the microseconds within the second."""
     utc = f.utc
     year = np.where(utc.year < 70, utc.year + 2000, utc.year + 1900)
-    date = 86_400 * _days(year, utc.month, utc.day) + 3600 * utc.hour + 60 * utc.minute + utc.second
+    date = unix_time(year, utc.month, utc.day, utc.hour, utc.minute, utc.second)
     unix = (((utc.month * 256 + utc.day) * 256 + utc.hour) * 256 + utc.minute) * 256 + utc.second
     return np.where(utc.year == 0, unix, date), f.timestamp
-
-
-def _days(year: Any, month: Any, day: Any) -> Any:
-    """Days from 1970-01-01 in the Gregorian calendar; years begin in March, so that the leap day is
-    the last.
-    """
-    years = np.where(month <= 2, year - 1, year)
-    months = np.where(month <= 2, month + 9, month - 3)
-    leap_days = np.floor(years / 4) - np.floor(years / 100) + np.floor(years / 400)
-    return 365 * years + leap_days + np.floor((153 * months + 2) / 5) + day - 719_469
 
 
 def beams(

@@ -40,6 +40,7 @@ from lidarspec.spec import (
     Udp,
     along,
     take,
+    unix_time,
 )
 from lidarspec_livox.points import (
     DEPTH,
@@ -97,19 +98,18 @@ def packet(kind: int, *members: Any) -> Struct:
 
 
 def clock(f: Fields) -> tuple[Any, ...]:
-    """Seconds of a date, or the pieces of a number of nanoseconds: each term is exact."""
+    """Return the terms of the time in seconds: of a date, or of a number of nanoseconds.
+
+    Each term is exact.
+    """
     low = f.timestamp.low
     middle = f.timestamp.middle
     high = f.timestamp.high
     dated = f.timestamp_type == GPS
     year, month, day, hour = (np.mod(np.floor(low / 256**place), 256) for place in range(4))
-    years = np.where(month <= 2, year - 1, year)
-    months = np.mod(month + 9, 12)  # from March on, so that the leap day is the last
-    days = (
-        11_016 + day + 365 * years + np.floor(years / 4) + np.floor((153 * months + 2) / 5)
-    )  # 2000-03-01 is day 11 017 of 1970
+    date = unix_time(year + 2000, month, day, hour)
     return (
-        np.where(dated, 86_400 * days + 3600 * hour, 281_474 * high),
+        np.where(dated, date, 281_474 * high),
         np.where(dated, (65_536 * high + middle) * 1e-6, low * 1e-9),
         np.where(dated, 0, middle * 4.294967296),
         np.where(dated, 0, high * 0.976710656),

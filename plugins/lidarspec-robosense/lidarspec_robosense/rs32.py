@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from construct import Array, Bytes, Const, Construct, Int8ub, Int16ub, Int24ub, Struct
 
-from lidarspec.spec import Clock, Fields, Frame, Polar, Scaled, Sensor, Simulation
+from lidarspec.spec import Clock, Fields, Frame, Polar, Scaled, Sensor, Simulation, unix_time
 from lidarspec_robosense.rotor import (
     COMMON,
     TEMPERATURE,
@@ -153,14 +153,9 @@ def plausible_bpearl(f: Fields, v4: bool) -> Any:
 
 
 def clock(f: Fields) -> tuple[Any, Any, Any]:
-    """Whole seconds since 1970, milliseconds and microseconds; years begin in March, so that the
-    leap day is the last.
-    """
-    years = np.where(f.month <= 2, f.year + 1999, f.year + 2000)
-    months = np.where(f.month <= 2, f.month + 9, f.month - 3)
-    leap_days = np.floor(years / 4) - np.floor(years / 100) + np.floor(years / 400)
-    days = 365 * years + leap_days + np.floor((153 * months + 2) / 5) + f.day - 719_469
-    return 86_400 * days + 3600 * f.hour + 60 * f.minute + f.second, f.milliseconds, f.microseconds
+    """Return the whole seconds since 1970, the milliseconds and the microseconds."""
+    date = unix_time(f.year + 2000, f.month, f.day, f.hour, f.minute, f.second)
+    return date, f.milliseconds, f.microseconds
 
 
 def clock_of(source: Any, shots: int, model: Rotor) -> Clock:
