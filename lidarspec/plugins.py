@@ -1,9 +1,9 @@
 """Plugins: the hooks that they may have, how they are found, and the registry of what they add.
 
 A distribution names its sensors in the entry-point group ``lidarspec.sensors``, one entry for each
-id and alias, so that asking for one sensor loads one plugin; modules with other hooks stand in the
-group ``lidarspec``, and are loaded before any sensor is handed out. A hook is a function of a name
-below, marked with ``@hookimpl``.
+id and alias, so that asking for one sensor loads one plugin. The registry reads the aliases of a
+sensor from there. Modules with other hooks are in the group ``lidarspec`` and are loaded before any
+sensor is returned. A hook is a function of a name below, marked with ``@hookimpl``.
 
 Each plugin is loaded on its own. One that cannot be imported, names a hook that does not exist or
 adds a sensor that cannot be, is named with its distribution and its error, rolled back, and
@@ -299,14 +299,20 @@ class Registry:
                 self._load(entry)
 
     def _add_offered(self, entry: EntryPoint, sensor: Any) -> list[str]:
-        """Keep a sensor that an entry point names by its id or one of its aliases."""
+        """Keep the sensor of an entry point.
+
+        The names of all entry points of the sensor, except for its id, are added to its aliases.
+        """
         self._check(sensor, [sensor])
-        if entry.name not in (sensor.id, *sensor.aliases):
+        home = (entry.distribution, entry.module)
+        names = {other.name for other in self._offered[home] if other.value == entry.value}
+        if sensor.id not in names and entry.name not in sensor.aliases:
             raise SpecError(
-                f"its entry point is called {entry.name!r}, which is none of its names",
+                f"its entry point is called {entry.name!r}, and none of {entry.value} has its id",
                 sensor=sensor.id,
             )
-        self._keep((entry.distribution, entry.module), [sensor])
+        aliases = sorted(names.union(sensor.aliases) - {sensor.id})
+        self._keep(home, [replace(sensor, aliases=aliases)])
         return [sensor.id]
 
     def _together(self, entries: list[EntryPoint]) -> Plugin:

@@ -160,7 +160,8 @@ class Sensor:
             "temperature" -> "frame.path".
         status: how it was verified: "manual", "vectors", "capture" or "hardware".
         source: the manual with its revision and sections, and the captures.
-        aliases: other ids of the sensor.
+        aliases: other ids of the sensor. An installed plugin declares them as entry points, which
+            are added here; give them if there are no entry points, such as in a script.
         api: the version of this interface that it was written for.
         acknowledged: findings of `lidarspec check` about the sensor as a whole that are accepted:
             "LS401" -> the reason.

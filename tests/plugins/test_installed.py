@@ -208,6 +208,15 @@ def test_an_alias_without_an_entry_of_its_own_is_known_once_all_are_loaded(
     assert registry(offered="acme-x1 = acme, beta-x1 = beta").sensor("b-one").id == "beta-x1"
 
 
+def test_names_of_entry_points_are_aliases(plugins: dict[str, SimpleNamespace]) -> None:
+    entries = [
+        EntryPoint(name, "liar:liar_x1", "dist", "1") for name in ("liar-x1", "x1", "liar-x1b")
+    ]
+    found = Registry(offered=entries)
+    assert found.sensor("x1").aliases == ("liar-x1b", "x1")
+    assert found.sensor("liar-x1b") is found.sensor("liar-x1")
+
+
 def test_an_unknown_id_is_told_with_the_ids_of_all_plugins(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
@@ -263,7 +272,7 @@ def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(
     [
         (
             "liar-x2 = liar",
-            "liar-x1: its entry point is called 'liar-x2', which is none of its names",
+            "liar-x1: its entry point is called 'liar-x2', and none of liar:liar_x2 has its id",
         ),
         ("odd-x1 = odd", "lidarspec_sensors returns sensors, not int"),
         ("gone-x1 = a_module_that_nobody_has", "ModuleNotFoundError"),

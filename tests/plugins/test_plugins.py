@@ -155,13 +155,6 @@ def test_a_sensor_is_known_by_the_names_that_people_use(name: str, meant: str) -
     assert lidarspec.sensor(name).id == meant
 
 
-def test_each_name_of_a_sensor_loads_it_alone() -> None:
-    offered = {entry.name for entry in entry_points(SENSORS)}
-    assert {
-        name for sensor in lidarspec.sensors().values() for name in (sensor.id, *sensor.aliases)
-    } <= offered
-
-
 def test_a_file_may_have_dataclasses_with_annotations_that_are_texts(tmp_path: Path) -> None:
     text = STRANGER.read_text(encoding="utf-8")
     own = "\n".join(

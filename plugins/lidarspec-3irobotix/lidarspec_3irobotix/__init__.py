@@ -135,7 +135,6 @@ MODELS: dict[str, tuple[str, int, int, tuple[int, ...]]] = {
     "3irobotix-delta2g": ("Delta-2G", 15, 24, (115_200,)),
     "3irobotix-lds08rr": ("LDS08RR (Delta packets)", 16, 24, (115_200,)),
 }
-ALIASES = {"3irobotix-lds08rr": ("lds08rr-delta",)}
 
 
 def relative(own: int, other: int) -> str | Relative:
@@ -163,7 +162,6 @@ def lidar(name: str) -> Sensor:
         relatives={
             other: relative(packets, row[1]) for other, row in MODELS.items() if other != name
         },
-        aliases=ALIASES.get(name, (model.lower(),)),
         status="vectors" if model == "Delta-2A" else "manual",
         source="kaiaai/LDS and lds2d"
         + "; two packets of a unit" * (model == "Delta-2A")

@@ -181,27 +181,24 @@ def configure(sensor: Sensor, *, unit: str = "cm") -> Sensor:
     return dataclasses.replace(sensor, frames={**sensor.frames, "data": data(unit)})
 
 
-#: id -> model, shortest and longest range, most frames a second, other ids, source.
-MODELS: dict[str, tuple[str, tuple[float, float], int, tuple[str, ...], str]] = {
+#: id -> model, shortest and longest range, most frames a second, source.
+MODELS: dict[str, tuple[str, tuple[float, float], int, str]] = {
     "benewake-tfmini": (
         "TFmini-S",
         (0.1, 12.0),
         1000,
-        ("tfmini", "tfmini-s", "benewake-tfmini-s"),
         "TFmini-S manual A01, 5.3 and table 12",
     ),
     "benewake-tfmini-plus": (
         "TFmini Plus",
         (0.1, 12.0),
         1000,
-        ("tfmini-plus",),
         "TFmini Plus manual A04, 5.3 and 7; data sheet A00",
     ),
     "benewake-tfluna": (
         "TF-Luna",
         (0.2, 8.0),
         250,
-        ("tf-luna", "benewake-tf-luna"),
         "TF-Luna manual A05, 5 and appendix II",
     ),
 }
@@ -209,7 +206,7 @@ MODELS: dict[str, tuple[str, tuple[float, float], int, tuple[str, ...], str]] = 
 
 def rangefinder(name: str) -> Sensor:
     """One row of the table as a sensor."""
-    model, limits, fastest, aliases, source = MODELS[name]
+    model, limits, fastest, source = MODELS[name]
     return Sensor(
         name,
         vendor="Benewake",
@@ -231,7 +228,6 @@ def rangefinder(name: str) -> Sensor:
             if other != name
         },
         info={"temperature": "data.temperature"},
-        aliases=aliases,
         status="vectors",
         source=source,
     )

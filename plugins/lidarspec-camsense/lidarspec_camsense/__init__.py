@@ -150,7 +150,6 @@ LDS08RR = dataclasses.replace(
     points=partial(points, count=12),
     simulation=Simulation(partial(sweep, count=12, steps=360, speed=302)),
     configure=None,  # where the zero of its housing is, no public source says
-    aliases=("lds08rr-camsense",),
     status="capture",
     source=(
         "two captured packets; kaiaai/LDS, LDS_LDS08RR_CAMSENSE. Limits of range and speed are"

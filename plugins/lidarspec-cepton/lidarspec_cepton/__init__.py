@@ -140,7 +140,6 @@ VISTA = Sensor(
     simulation=Simulation(sweep, directions=directions),
     range_limits=(0.5, 200.0),
     vendor_axes=("right", "forward", "up"),
-    aliases=("vista", "cepton-vista-p60", "cepton-vista-p90", "cepton-vista-x120"),
     status="manual",
     source=(
         "Sensor Communication Specifications (opening), and a public reader; the reach is assumed"

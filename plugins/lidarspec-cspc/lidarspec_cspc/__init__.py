@@ -369,7 +369,6 @@ M1C1_MINI = Sensor(
         "model": "info.model",
         "firmware": "info.revision",
     },  # ack.firmware is 0 but in the answer to start (manual 2.1.3)
-    aliases=("m1c1-mini", "m1c1"),
     status="vectors",
     source=(
         "CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC"
@@ -410,7 +409,6 @@ M1C1_MINI_V11 = Sensor(
     vendor_axes=M1C1_MINI.vendor_axes,
     relatives={f"ydlidar-{name}": TELLS_SPEED for name in MODELS_2.split()},
     info=M1C1_MINI.info,
-    aliases=("cspc-m1c1-mini-v1", "m1c1-mini-v11", "m1c1-mini-v1"),
     status="vectors",
     source=(
         "CSPC M1C1_Mini development manual v1.1 (2020-01-22), sections 1 and 2; baud rate and DTR"
@@ -428,7 +426,6 @@ def coin(model: str, **facts: Any) -> Sensor:
         M1C1_MINI,
         id=name,
         model=model,
-        aliases=(model.lower(),),
         links={"data": Serial(230_400, dtr=False)},
         state={
             "info": {"correction": 0, "zero_angle": 0}

@@ -261,7 +261,6 @@ AT128 = spinning(
     vendor_axes=("forward", "left", "up"),
     turn=(10.0, 10.0),
     range_limits=(1.0, 180.0),
-    aliases=("at128", "at128e2x", "pandarat128"),
     status="manual",
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, AT128E2X correction files), tier4/nebula (times,"

@@ -106,7 +106,6 @@ JT128 = spinning(
     "body.blocks.azimuth",
     model="JT128",
     range_limits=(0.0, 262.14),  # what packets can say in steps of 4 mm
-    aliases=("jt128",),
     relatives=relatives("hesai-jt128"),
     status="manual",
     source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, JT128 correction files); {UNSEEN}",

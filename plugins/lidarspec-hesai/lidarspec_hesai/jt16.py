@@ -150,7 +150,6 @@ JT16 = Sensor(
     configure=partial(configure, points, TABLE),
     range_limits=(0.0, 262.14),  # what packets can say
     vendor_axes=("right", "forward", "up"),
-    aliases=("jt16",),
     status="manual",
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc, JT16 correction file); no"

@@ -230,7 +230,6 @@ PANDAR128 = spinning(
     "body.blocks.azimuth",
     model="Pandar128E3X",
     range_limits=(0.3, 200.0),
-    aliases=("pandar128", "pandar128e3x", "hesai-pandar128e3x"),
     relatives=relatives("hesai-pandar128"),
     status="manual",
     source=(
@@ -248,7 +247,6 @@ OT128 = spinning(
     "body.blocks.azimuth",
     model="OT128",
     range_limits=(0.3, 200.0),
-    aliases=("ot128", "pandar128e4x", "hesai-pandar128e4x"),
     relatives=relatives("hesai-ot128"),
     status="manual",
     source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, OT128 correction files); {UNSEEN}",

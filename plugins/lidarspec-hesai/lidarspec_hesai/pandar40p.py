@@ -120,7 +120,6 @@ PANDAR40P = spinning(
     model="Pandar40P",
     clock=paced_clock(BLOCKS),
     range_limits=(0.3, 200.0),
-    aliases=("pandar40p",),
     status="capture",
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_p40.h, Pandar40P correction files); captures of"

@@ -109,7 +109,6 @@ PANDAR64 = spinning(
     model="Pandar64",
     clock=paced_clock(BLOCKS),
     range_limits=(0.3, 200.0),
-    aliases=("pandar64",),
     status="vectors",
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_p64.h, Pandar64 correction files); one captured packet of"

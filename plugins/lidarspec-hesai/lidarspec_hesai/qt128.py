@@ -142,7 +142,6 @@ QT128 = spinning(
     "body.blocks.azimuth",
     model="QT128C2X",
     range_limits=(0.05, 50.0),
-    aliases=("qt128", "qt128c2x"),
     status="vectors",
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, QT128C2X correction files); one captured packet"

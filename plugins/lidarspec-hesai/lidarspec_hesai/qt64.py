@@ -86,7 +86,6 @@ QT64 = spinning(
     sweep,
     model="PandarQT64",
     range_limits=(0.1, 60.0),
-    aliases=("qt64", "pandarqt64"),
     status="capture",
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h, PandarQT correction files); capture of"

@@ -87,7 +87,6 @@ XT32 = spinning(
     sweep,
     model="PandarXT-32",
     range_limits=(0.05, 120.0),
-    aliases=("xt32", "pandarxt-32"),
     relatives={
         "hesai-xt32m": Relative(
             "6 blocks in a packet, an XT32 sends 8", lambda f: f.block_count == 6
@@ -108,7 +107,6 @@ XT16 = spinning(
     sweep,
     model="PandarXT-16",
     range_limits=(0.05, 120.0),
-    aliases=("xt16", "pandarxt-16"),
     status="vectors",
     source=(
         "HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h, PandarXT-16 correction files); one captured"
@@ -124,7 +122,6 @@ XT32M = spinning(
     partial(sweep, blocks=6),
     model="XT32M2X",
     range_limits=(0.5, 300.0),
-    aliases=("xt32m", "xt32m2x"),
     relatives={
         "hesai-xt32": Relative(
             "8 blocks in a packet, an XT32M sends 6", lambda f: f.block_count == 8

@@ -152,10 +152,6 @@ def scanner(name: str) -> Sensor:
             "firmware": "version.firmware.text",
             "model": "parameters.model.text",
         },
-        aliases=tuple(
-            alias
-            for alias in (name.removeprefix("hokuyo-"), model.lower(), f"hokuyo-{model.lower()}")
-        ),
         status=status,
         source=(
             "SCIP 2.0, C-42-03320B"

@@ -235,7 +235,6 @@ STL27L = lidar(
         9.9,
         10.1,
     ),  # by its own control (manual, section 1); no limits are given for control by PWM
-    aliases=("stl27l",),
     status="vectors",
     source="STL-27L development manual, sections 1 to 4",
 )
@@ -245,7 +244,6 @@ LD06 = lidar(
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
     turn=(5.0, 13.0),  # inno-maker's page of the LD06; by PWM, as for the LD19
-    aliases=("ld06", "ld19", "ldrobot-ld19", "stl19p", "ldrobot-stl19p", "d500"),
     status="capture",
     source=(
         "LD06 and LD19 development manual v2.5 (the STL-27L's frame); three consecutive captured"
@@ -257,7 +255,6 @@ LD20 = lidar(
     turns=6,
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
-    aliases=("ld20",),
     status="vectors",
     source="one captured frame; baud and range are assumed to be the LD19's",
 )
@@ -266,7 +263,6 @@ STL06P = lidar(
     model="STL-06P, STL-26",
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
-    aliases=("stl06p", "stl26", "ldrobot-stl26"),
     status="manual",
     source="ldlidar_stl_ros2, lipkg.cpp (the rate); baud and range are assumed to be the LD19's",
 )
@@ -277,7 +273,6 @@ LD14 = lidar(
     frames=TOLD,
     links={"data": Serial(115_200)},
     range_limits=(0.1, 8.0),
-    aliases=("ld14",),
     status="vectors",
     source=(
         "ldlidar_sdk (ldlidar_protocol.h, sl_transform.cpp, demo.cpp); the STL-27L manual's"
@@ -302,7 +297,6 @@ LD14P = lidar(
     ),  # it turns by itself when it is plugged in, and not where it was stopped before
     range_limits=(0.1, 8.0),
     turn=(2.0, 8.0),
-    aliases=("ld14p", "d200"),
     status="vectors",
     source=(
         "ldlidar_sdk, as the LD14; commands as kaiaai/LDS sends them; Waveshare's page of the D200"

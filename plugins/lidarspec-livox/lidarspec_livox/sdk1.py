@@ -420,7 +420,7 @@ ANSWERS = {
 #: send: a Mid-40's view, an Avia's.
 WIDEST: dict[int, View] = {100_000: (-19.2, 19.2, -19.2, 19.2), 240_000: (-35.2, 35.2, -38.6, 38.6)}
 #: id -> model, device type, shots a second, usual type of data, view, ranges, other ids.
-MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float], tuple[str, ...]]] = {
+MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float]]] = {
     "livox-mid40": (
         "Mid-40",
         1,
@@ -428,7 +428,6 @@ MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float], tuple[str
         "cartesian",
         WIDEST[100_000],
         (1.0, 260.0),
-        ("mid40", "mid-40", "livox-mid-40"),
     ),
     "livox-mid70": (
         "Mid-70",
@@ -437,7 +436,6 @@ MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float], tuple[str
         "cartesian",
         (-35.2, 35.2, -35.2, 35.2),
         (0.05, 260.0),
-        ("mid70", "mid-70", "livox-mid-70"),
     ),
     "livox-horizon": (
         "Horizon LiDAR",
@@ -446,7 +444,6 @@ MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float], tuple[str
         "tagged",
         (-40.85, 40.85, -12.55, 12.55),
         (0.5, 260.0),
-        (),
     ),
     "livox-tele15": (
         "Tele-15",
@@ -455,15 +452,14 @@ MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float], tuple[str
         "tagged",
         (-7.25, 7.25, -8.1, 8.1),
         (3.0, 500.0),
-        ("tele15", "tele-15", "livox-tele-15"),
     ),
-    "livox-avia": ("Avia", 7, 240_000, "tagged", WIDEST[240_000], (1.0, 450.0), ("avia",)),
+    "livox-avia": ("Avia", 7, 240_000, "tagged", WIDEST[240_000], (1.0, 450.0)),
 }
 
 
 def lidar(name: str) -> Sensor:
     """One row of the table as a sensor."""
-    model, device_type, rate, first, view, limits, aliases = MODELS[name]
+    model, device_type, rate, first, view, limits = MODELS[name]
     who = {
         "head.seq": 0,
         "broadcast_code": b"0TFSIMULATED001",
@@ -500,7 +496,6 @@ def lidar(name: str) -> Sensor:
             "model": "broadcast.device_type",
             "firmware": "firmware.firmware",
         },
-        aliases=aliases,
         status="manual",
         acknowledged=(
             {"LS507": "it sees nothing in a small room, which is nearer than its shortest range"}

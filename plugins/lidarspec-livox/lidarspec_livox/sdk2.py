@@ -490,9 +490,7 @@ COMMANDS: dict[str, Command] = {
 Ports = dict[str, tuple[int, int]]
 #: id -> model, device type, port of the Lidar for commands and of the host, ports of the rest,
 #: points a second, view, ranges, other ids.
-MODELS: dict[
-    str, tuple[str, int, int, int, Ports, int, View, tuple[float, float], tuple[str, ...]]
-] = {
+MODELS: dict[str, tuple[str, int, int, int, Ports, int, View, tuple[float, float]]] = {
     "livox-mid360": (
         "Mid-360",
         9,
@@ -502,7 +500,6 @@ MODELS: dict[
         200_000,
         (-180, 180, -7, 52),
         (0.1, 70.0),
-        ("mid360", "mid-360", "livox-mid-360"),
     ),
     "livox-hap": (
         "HAP",
@@ -513,7 +510,6 @@ MODELS: dict[
         452_000,
         (-60, 60, -12.5, 12.5),
         (0.5, 150.0),
-        ("hap", "livox-hap-tx", "livox-hap-t1"),
     ),
 }
 
@@ -525,7 +521,7 @@ def told(request: Mapping[str, Any]) -> tuple[Any, ...]:
 
 def lidar(name: str) -> Sensor:
     """One row of the table as a sensor."""
-    model, device_type, control, local, ports, rate, view, limits, aliases = MODELS[name]
+    model, device_type, control, local, ports, rate, view, limits = MODELS[name]
     discovery = "control" if control == DISCOVERY else "discovery"
     found = {
         "result": 0,
@@ -571,7 +567,6 @@ def lidar(name: str) -> Sensor:
             "firmware": "parameters.parameters.app_version.app_version",
             "temperature": "parameters.parameters.core_temperature.core_temperature",
         },
-        aliases=aliases,
         status="manual",
         source=(
             "Livox Mid-360 protocol document 1.4.10; HAP protocol document 1.4.8; Livox-SDK2"

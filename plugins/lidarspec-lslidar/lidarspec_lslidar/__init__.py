@@ -318,11 +318,6 @@ MODELS = {
         clock=CLOCK,
     ),
 }
-ALIASES = {
-    "lslidar-n10": ("n10",),
-    "lslidar-n10p": ("n10p", "lslidar-n10plus"),
-    "lslidar-m10": ("m10",),
-}
 
 
 def lidar(name: str) -> Sensor:
@@ -349,7 +344,6 @@ def lidar(name: str) -> Sensor:
         on_open=("start",),
         range_limits=(0.02, 25.0),
         turn=model.hertz,
-        aliases=ALIASES.get(name, ()),
         status=model.status,
         source=(
             "the vendor's ROS drivers, lslidar_driver and Lslidar_ROS2_driver V5. Limits of range"

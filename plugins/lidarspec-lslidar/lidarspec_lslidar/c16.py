@@ -204,7 +204,6 @@ C16 = Sensor(
     vendor_axes=("right", "forward", "up"),
     turn=TURN,
     info={"model": "data.model"},
-    aliases=("c16", "leishen-c16"),
     status="vectors",
     source=(
         "Lslidar_ROS2_driver, C16_V4.0; C32 user manual (device information); one captured packet,"

@@ -156,7 +156,6 @@ XV11 = Sensor(
     range_limits=(0.15, 6.0),
     beams=360,
     relatives={name: TOLD_BY for name in KIN if name != "neato-xv11"},
-    aliases=("xv11",),
     status="vectors",
     source="xv_11_laser_driver; kaiaai/LDS, LDS_NEATO_XV11. Limits of range are assumed",
 )
@@ -166,7 +165,6 @@ LDS01RR = dataclasses.replace(
     vendor="Xiaomi",
     model="LDS01RR",
     relatives={name: TOLD_BY for name in KIN if name != "xiaomi-lds01rr"},
-    aliases=("lds01rr",),
     source="kaiaai/LDS, LDS_LDS01RR. Limits of range are assumed",
 )
 LDS02RR = dataclasses.replace(
@@ -176,7 +174,6 @@ LDS02RR = dataclasses.replace(
     model="LDS02RR",
     points=partial(points, turns=-1),
     relatives={name: TOLD_BY for name in KIN if name != "xiaomi-lds02rr"},
-    aliases=("lds02rr",),
     source="kaiaai/LDS, LDS_LDS02RR. Limits of range are assumed",
 )
 HLS_LFCD2 = Sensor(
@@ -206,7 +203,6 @@ HLS_LFCD2 = Sensor(
     range_limits=(0.12, 3.5),
     beams=360,
     turn=(4.83, 5.17),  # 300 turns a minute, give or take 10 (ROBOTIS, LDS-01)
-    aliases=("hls-lfcd2", "robotis-lds-01", "turtlebot3-lds-01"),
     status="vectors",
     source=(
         "hls_lfcd_lds_driver and the LDS-01's page of ROBOTIS; thijses/HLS_LFCD. What its trailer"

@@ -287,7 +287,6 @@ def model(name: str, status: str) -> Sensor:
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
         turn=(5, 20),
-        aliases=(name.lower(),),
         relatives={f"ouster-{other.lower()}": TOLD_BY for other in MODELS if other != name},
         status=status,
         source=(

@@ -192,7 +192,6 @@ def lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) 
         relatives={
             f"quanergy-{other}": "nothing in the packets: the label, or the sensor's web page"
         },
-        aliases=(model.lower(),),
         status="manual",
         source="quanergy_client; rate, turns and range are assumed",
         **facts,

@@ -278,7 +278,6 @@ AIRY = Sensor(
     simulation=Simulation(sweep_data),
     range_limits=(0.1, 60.0),  # Table 1
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware"},
-    aliases=("airy", "rs-airy"),
     source=(
         "Airy user manual 1.3, chapter 4.4 and appendices C and D; rs_driver (decoder_RSAIRY.hpp);"
         " no packet was seen"

@@ -227,7 +227,6 @@ HELIOS_16P = Sensor(
             "pairs of blocks with one azimuth; or a packet each 0.67 ms", in_pairs
         ),
     },
-    aliases=("helios16p", "rs-helios-16p"),
     source=(
         "RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; nebula's capture and"
         " point clouds"
@@ -249,7 +248,6 @@ HELIOS_32 = dataclasses.replace(
             "halves of blocks alike; or a packet each 1.33 ms", two_returns
         ),
     },
-    aliases=("helios32", "robosense-helios1615", "rs-helios-1615"),
     status="manual",
     source=(
         "rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; no packet of this model was"
@@ -265,7 +263,6 @@ HELIOS_5515 = dataclasses.replace(
     state=HELIOS_5515_ROTOR.state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_5515)),
     relatives={"robosense-helios16p": NOT_5515, "robosense-helios32": NOT_5515},
-    aliases=("helios5515", "rs-helios-5515"),
     status="capture",
     source=(
         "rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; nebula's capture, which is of"

@@ -246,7 +246,6 @@ M1 = Sensor(
     vendor_axes=("forward", "left", "up"),
     turn=(FRAME_RATE, FRAME_RATE),
     info={"serial": "difop.serial_number", "firmware": "difop.pl_firmware"},
-    aliases=("rs-m1", "rs-lidar-m1", "robosense-m1plus", "rs-m1p"),
     status="vectors",
     source=(
         "RS-LiDAR-M1 user guide 2.1.2 (Table 5); RS-LiDAR-M1P user guide, pages 9 to 14; rs_driver"

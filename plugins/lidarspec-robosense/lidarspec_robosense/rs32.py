@@ -222,7 +222,6 @@ RS32 = Sensor(
         "firmware": "difop.top_firmware",
         "model": "data.lidar_type",
     },
-    aliases=("rs32", "rs-lidar-32"),
     source="rs_driver (decoder_RS32.hpp); angles of an example unit in ros_rslidar",
     **{**COMMON, "clock": clock_of(clock, BLOCKS, RS32_ROTOR)},
 )
@@ -245,7 +244,6 @@ RS16 = dataclasses.replace(
         "difop": {"rpm": TURNS * 60, "return_mode": STRONGEST, "pitch": np.abs(RS16_ROTOR.vertical)}
     },
     simulation=Simulation(partial(sweep, shots=111.0, lidar_type=RS16_TYPE)),
-    aliases=("rs16", "rs-lidar-16"),
     source="rs_driver (decoder_RS16.hpp and its test); angles of an example unit in ros_rslidar",
 )
 
@@ -266,7 +264,6 @@ BPEARL = dataclasses.replace(
     state=BPEARL_ROTOR.state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep, shots=55.52, lidar_type=0)),
     range_limits=(0.1, 150.0),  # likewise
-    aliases=("bpearl", "rs-bpearl", "rsbp"),
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware"},
     source="rs_driver (decoder_RSBP.hpp and its tests); angles of an example unit in ros_rslidar",
 )
@@ -289,5 +286,4 @@ BPEARL_V4 = dataclasses.replace(
     simulation=Simulation(
         lambda i: turning(i, BLOCKS, BPEARL_V4_ROTOR.period, series=V4[0], version=V4[1])
     ),
-    aliases=("bpearl-v4", "rs-bpearl-v4"),
 )

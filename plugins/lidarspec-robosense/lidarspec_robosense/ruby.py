@@ -163,9 +163,7 @@ FRAMES = {
 }
 
 
-def model(
-    id: str, name: str, rotor: Rotor, aliases: tuple[str, ...], relative: str, variant: Any = None
-) -> Sensor:
+def model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = None) -> Sensor:
     """A Ruby, or where its id says so a Ruby Plus; what the two series have in common."""
     lasers = len(rotor.delay)
     plus = "plus" in id
@@ -190,7 +188,6 @@ def model(
                 else Relative("series 5", is_plus)
             )
         },
-        aliases=aliases,
         source="RS-Ruby Plus and RS-Ruby user manuals; rs_driver; no packet of this model was seen",
         **{
             **COMMON,
@@ -210,23 +207,19 @@ PLUS_128_ROTOR = rotor(staged(TIMES_128, [4] * 15 + [5] + [4] * 15 + [2, 1]), 55
 PLUS_80_ROTOR = rotor(staged(TIMES, COUNTS_80), 55.56e-6, 0.02892)
 PLUS_48_ROTOR = rotor(staged(TIMES[:24], [2] * 24), 55.56e-6, 0.02892)
 
-RS128 = model(
-    "robosense-rs128", "RS-LiDAR-128", RS128_ROTOR, ("rs128", "rs-ruby"), "robosense-ruby-plus-128"
-)
-RS80 = model("robosense-rs80", "RS-LiDAR-80", RS80_ROTOR, ("rs80",), "robosense-ruby-plus-80")
-RS48 = model("robosense-rs48", "RS-LiDAR-48", RS48_ROTOR, ("rs48",), "robosense-ruby-plus-48")
+RS128 = model("robosense-rs128", "RS-LiDAR-128", RS128_ROTOR, "robosense-ruby-plus-128")
+RS80 = model("robosense-rs80", "RS-LiDAR-80", RS80_ROTOR, "robosense-ruby-plus-80")
+RS48 = model("robosense-rs48", "RS-LiDAR-48", RS48_ROTOR, "robosense-ruby-plus-48")
 RUBY_PLUS_128 = model(
     "robosense-ruby-plus-128",
     "RS-Ruby Plus",
     PLUS_128_ROTOR,
-    ("robosense-ruby-plus", "ruby-plus", "rsp128"),
     "robosense-rs128",
 )
 RUBY_PLUS_80 = model(
     "robosense-ruby-plus-80",
     "RS-Ruby Plus 80",
     PLUS_80_ROTOR,
-    ("ruby-plus-80", "rsp80"),
     "robosense-rs80",
     variant=staged(TIMES[:20], [4] * 20),
 )
@@ -234,6 +227,5 @@ RUBY_PLUS_48 = model(
     "robosense-ruby-plus-48",
     "RS-Ruby Plus 48",
     PLUS_48_ROTOR,
-    ("ruby-plus-48", "rsp48"),
     "robosense-rs48",
 )

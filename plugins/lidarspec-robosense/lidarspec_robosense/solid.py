@@ -294,7 +294,6 @@ M2 = dataclasses.replace(
     **counted(M2_SCANNER, (DUAL,)),
     simulation=Simulation(partial(sweep, model=M2_SCANNER)),
     range_limits=(0.2, 250.0),  # rs_driver's limits for these models
-    aliases=("rs-m2", "rs-lidar-m2"),
     status="manual",
     source="rs_driver (decoder_RSM2.hpp); no packet of this model was seen",
 )
@@ -318,7 +317,6 @@ MX = dataclasses.replace(
     ),  # whose packets have a second radius that is used
     range_limits=(0.2, 200.0),
     info={"serial": "difop.serial_number"},
-    aliases=("rs-mx",),
     source="rs_driver (decoder_RSMX.hpp); no packet of this model was seen",
 )
 
@@ -339,7 +337,6 @@ E1 = dataclasses.replace(
     simulation=Simulation(partial(sweep, model=E1_SCANNER)),
     range_limits=(0.1, 200.0),  # E1 user manual, Table 1; rs_driver's
     info={"serial": "difop.serial_number", "firmware": "difop.software"},
-    aliases=("rs-e1",),
     source=(
         "E1 user manual, Tables 4 to 9; rs_driver (decoder_RSE1.hpp); no packet of this model was"
         " seen"

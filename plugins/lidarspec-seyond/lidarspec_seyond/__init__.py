@@ -234,7 +234,6 @@ FALCON = Sensor(
     range_limits=(0.1, 500.0),
     turn=(5.0, 20.0),
     vendor_axes=("up", "right", "forward"),
-    aliases=("seyond-falcon-k", "innovusion-falcon"),
     status="manual",
     source=(
         "Innovusion SDK 3.102 (inno_lidar_packet.h, inno_lidar_packet_utils.h); no packet of a"

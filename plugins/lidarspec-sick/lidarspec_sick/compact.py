@@ -239,7 +239,6 @@ def scanner(name: str) -> Sensor:
         links={"data": Udp(2115), "imu": Udp(7503)},
         range_limits=limits,
         relatives={other: "how many layers its modules have" for other in MODELS if other != name},
-        aliases=(model.lower(),),
         status=status,
         source=(
             "sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, turns, beams,"

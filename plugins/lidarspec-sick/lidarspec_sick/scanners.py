@@ -187,7 +187,6 @@ def scanner(name: str) -> Sensor:
         range_limits=limits,
         relatives={other: relative(kind, row[1]) for other, row in MODELS.items() if other != name},
         info={"serial": "scan.serial", "firmware": "firmware.text"},
-        aliases=(model.lower(),),
         status=status,
         source="SICK Telegram Listing 8014631, 8023198 table 17",
     )

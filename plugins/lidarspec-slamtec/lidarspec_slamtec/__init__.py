@@ -157,7 +157,6 @@ def rplidar(
     turn: tuple[float, float] | None = None,
     status: str,
     source: str,
-    aliases: tuple[str, ...] = (),
 ) -> Sensor:
     """One model of the family; simulated, it is this unit."""
     commands = {**COMMANDS, **motor}
@@ -197,7 +196,6 @@ def rplidar(
         },  # the firmware stands in two fields, major and minor
         status=status,
         source=f"RPLIDAR interface protocol and SDK; {source}",
-        aliases=(f"rplidar-{name.lower()}", *aliases),
     )
 
 
@@ -210,7 +208,6 @@ A1 = rplidar(
     turn=(1.0, 10.0),  # A1M8 data sheet, scan rate
     status="vectors",
     source="A1M8 data sheet; an A1's exchange",
-    aliases=("rplidar",),  # the one that most people have
 )
 A2 = rplidar(
     "A2",
@@ -221,7 +218,6 @@ A2 = rplidar(
     turn=(5.0, 15.0),
     status="manual",
     source="A2M8 data sheet rev. 2.5 (12 m, turns); the reach of an A2M7 is assumed",
-    aliases=("rplidar-a2m8", "rplidar-a2m7", "rplidar-a2m12"),
 )
 A3 = rplidar(
     "A3",

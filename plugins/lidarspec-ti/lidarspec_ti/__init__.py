@@ -216,7 +216,6 @@ IWR6843 = Sensor(
     simulation=Simulation(sweep, rate=RATE, directions=directions),
     range_limits=(0.05, 100.0),
     vendor_axes=("right", "forward", "up"),
-    aliases=("iwr6843", "ti-iwr6843isk", "ti-iwr6843aop"),
     status="manual",
     source=(
         "TI, Understanding the Out of Box Demo Data Output (industrial toolbox 4.10); mmWave SDK"

@@ -253,7 +253,6 @@ VLP16 = Sensor(
         **OTHERS,
     },
     info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
-    aliases=("vlp16", "puck", "puck-lite", "velodyne-puck-lite"),
     status="capture",
     source=(
         "velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures"
@@ -280,7 +279,6 @@ HDL32E = relative(
     "velodyne-hdl32e",
     "HDL-32E",
     HDL32E_FIRINGS,
-    aliases=("hdl32e",),
     range_limits=(0.9, 130.0),  # likewise
     relatives={
         "velodyne-vlp16": Relative(
@@ -296,7 +294,6 @@ PUCK_HI_RES = relative(
     "velodyne-puck-hi-res",
     "Puck Hi-Res",
     HI_RES_FIRINGS,
-    aliases=("puck-hi-res", "vlp16-hi-res"),
     relatives={
         "velodyne-vlp16": Relative(
             "product 0x22, or 0x21 of old firmware",
@@ -317,7 +314,6 @@ VLP32C = relative(
     "VLP-32C",
     VLP32C_FIRINGS,
     frames=VLP32C_FRAMES,
-    aliases=("vlp32c", "ultra-puck"),
     range_limits=(0.4, 200.0),  # data sheet
     relatives={},
     info={"model": "data.product", **VLP16.info},
@@ -334,7 +330,6 @@ VLS128 = relative(
     "VLS-128",
     VLS128_SINGLE,
     frames=VLS128_FRAMES,
-    aliases=("vls128", "alpha-prime", "velodyne-alpha-prime"),
     range_limits=(0.4, 245.0),  # data sheet of the Alpha Prime
     relatives={},
     info={"model": "data.product", **VLP16.info},

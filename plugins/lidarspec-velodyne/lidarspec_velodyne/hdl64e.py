@@ -306,7 +306,6 @@ def model(series: str, unit: Unit, other: str) -> Sensor:
             "velodyne_decoder (calibrations of an example unit, packet_decoder.cpp) and"
             " ros-drivers/velodyne (rawdata.cc)"
         ),
-        aliases=(f"hdl64e-{series}", *(("velodyne-hdl64e", "hdl64e") if series == "s2" else ())),
     )
 
 

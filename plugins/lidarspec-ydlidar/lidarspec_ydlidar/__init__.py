@@ -212,7 +212,6 @@ def lidar(name: str) -> Sensor:
         turn=model.turn,
         relatives=relatives(name),
         info={"serial": "info.serial", "model": "info.model"} if talks else {},
-        aliases=(slug(name).removeprefix("ydlidar-"),) if name.startswith("T-") else (),
         status=model.proof,
         source="YDLIDAR SDK: communication protocol, data set of models"
         + "; packets of a unit" * (model.proof == "capture"),
