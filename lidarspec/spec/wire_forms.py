@@ -465,37 +465,32 @@ class Echoes:
             The characters, and the offset of each, which for a missing echo is that of the next
             one. A mark that joins no echoes stays, and can be read as no number.
         """
-        parts = list[bytes]()
-        begins = list[int]()
-        counts = list[int]()
-        begin = 0
         stride = self.size + len(self.mark)
-        while match := self._step.match(characters, begin):
-            step = match[0]
-            count = -(-len(step) // stride)
-            echoes = [step[at : at + self.size] for at in range(0, len(step), stride)]
-            parts.append(b"".join(echoes).ljust(self.most * self.size, zero))
-            begins.append(begin)
-            counts.append(count)
-            begin = match.end()
+        step_sizes = np.array([len(step) for step in self._find_steps(characters)], np.intp)
+        ends = np.cumsum(step_sizes)
+        begin = int(step_sizes.sum())
+        counts = -(-step_sizes // stride)
         numbers = np.arange(self.most)
-        follows = np.array([*begins[1:], begin], np.intp)[: len(begins), None, None]
-        firsts = np.array(begins, np.intp)[:, None] + stride * numbers
-        indices = np.where(
-            (numbers < np.array(counts, np.intp)[:, None])[:, :, None],
-            firsts[:, :, None] + np.arange(self.size),
-            follows,
-        )
-        steps = b"".join(parts)
-        places = np.append(offsets, end)[indices.reshape(-1)]
+        is_sent = np.repeat(numbers < counts[:, None], self.size, axis=1)
+        within_step = stride * numbers[:, None] + np.arange(self.size)
+        indices = (ends - step_sizes)[:, None] + within_step.reshape(-1)
+        digits = np.frombuffer(characters + zero, np.uint8)
+        steps: bytes = digits[np.where(is_sent, indices, -1)].tobytes()
+        places = np.append(offsets, end)[np.where(is_sent, indices, ends[:, None])].reshape(-1)
         rest = characters[begin:]
-        if counts and counts[-1] < self.most and self._begins_echo(rest, is_whole=is_whole):
+        last_count = counts.item(-1) if len(counts) else self.most
+        if last_count < self.most and self._begins_echo(rest, is_whole=is_whole):
             # The last step goes on with an echo that is cut off, so that none is missing.
-            size = len(steps) - (self.most - counts[-1]) * self.size
+            size = len(steps) - (self.most - last_count) * self.size
             steps = steps[:size]
             places = places[:size]
             begin += len(self.mark)
         return steps + characters[begin:], np.append(places, offsets[begin:])
+
+    def _find_steps(self, characters: bytes) -> list[bytes]:
+        """Return the steps at the beginning of characters, up to the first that is incomplete."""
+        steps = re.match(b"(?:%b)*" % self._step.pattern, characters, re.DOTALL)
+        return [step[0] for step in self._step.finditer(steps[0])] if steps else []
 
     def _begins_echo(self, characters: bytes, *, is_whole: bool) -> bool:
         """Return whether characters begin with a mark that joins an echo."""
@@ -519,15 +514,17 @@ class Echoes:
                 f" of {self.size}",
                 path="wire",
             )
-        steps = list[bytes]()
-        missing = zero * self.size
-        for begin in range(0, len(characters), room):
-            step = characters[begin : begin + room]
-            echoes = [step[at : at + self.size] for at in range(0, room, self.size)]
-            while len(echoes) > 1 and echoes[-1] == missing:
-                echoes.pop()
-            steps.append(self.mark.join(echoes))
-        return b"".join(steps)
+        echoes = np.frombuffer(characters, np.uint8).reshape(-1, self.most, self.size)
+        has_value = (echoes != zero[0]).any(axis=2)
+        # An echo is sent if it or one behind it in its step has a value, and the first always.
+        is_sent = np.logical_or.accumulate(has_value[:, ::-1], axis=1)[:, ::-1]
+        is_sent[:, 0] = True
+        marks = np.full((*is_sent.shape, 1), self.mark[0], np.uint8)
+        sent = np.concatenate([marks, echoes], axis=2)
+        is_kept = np.repeat(is_sent[:, :, None], 1 + self.size, axis=2)
+        is_kept[:, 0, 0] = False
+        joined: bytes = sent[is_kept].tobytes()
+        return joined
 
 
 @dataclass(frozen=True)
