@@ -229,19 +229,21 @@ def schema(root: Node) -> Schema:
     for node in parts.values():
         for kind in node.kinds:
             _walk(kind.element, inside, {}, optional=False)
-    own, theirs = (
-        {
-            path: replace(info, docs=info.docs or _docs_around(path, structs))
-            for path, info in found.items()
-        }
-        for found in (fields, inside)
-    )
     return Schema(
-        ByPath(own, functools.partial(_element, arrays)),
+        ByPath(_with_docs(fields, structs), functools.partial(_element, arrays)),
         arrays,
         {axis: node for axis, node in parts.items() if not node.total.axes},
-        theirs,
+        _with_docs(inside, structs),
     )
+
+
+def _with_docs(fields: dict[str, FieldInfo], structs: dict[str, str]) -> dict[str, FieldInfo]:
+    """Return the fields, and for those without docs the docs of the struct around them."""
+    for path, info in fields.items():
+        docs = "" if info.docs else _docs_around(path, structs)
+        if docs:
+            fields[path] = replace(info, docs=docs)
+    return fields
 
 
 def _element(

@@ -15,7 +15,7 @@ from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 #: random blocks that have to agree before a probed block is believed.
-CONFIRMATIONS = 24
+CONFIRMATIONS = 8
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,8 @@ class _Place:
 
     def inside(self, **changes: Any) -> _Place:
         """The place with some facts of the field changed."""
-        return replace(self, info=replace(self.info, **changes))
+        info = replace(self.info, **changes)
+        return _Place(info, self.scope, self.name, self.in_bits, self.room)
 
 
 class _Builder:
@@ -222,7 +223,8 @@ class _Builder:
         """
         while True:
             if isinstance(con, construct.Renamed):
-                place = place.inside(docs=con.docs or place.info.docs)
+                if con.docs:
+                    place = place.inside(docs=con.docs)
             elif isinstance(con, Describing):
                 place = replace(place, info=con.described(place.info))
             elif isinstance(con, construct.Enum):
