@@ -144,11 +144,13 @@ def _trace_points(subject: Subject, name: str) -> Any:
     )[0]
 
 
-def used(value: Any, *, looked_up: bool = True) -> list[Node]:
-    """The fields that a traced value is made of; with `looked_up` false without those that are only
-    looked up in a table.
+def used(*values: Any, looked_up: bool = True) -> list[Node]:
+    """Return the fields that traced values are made of.
+
+    Args:
+        looked_up: whether fields count that are only looked up in a table.
     """
-    nodes = traverse(value, into=lambda node: looked_up or not isinstance(node.function, LookUp))
+    nodes = traverse(*values, into=lambda node: looked_up or not isinstance(node.function, LookUp))
     return [node for node in nodes if node.kind in ("field", "state")]
 
 
@@ -292,7 +294,7 @@ def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
     """A frame with an angle of exactly 360 degrees, where it is plausible, has the points of the
     one with 0.
     """
-    for path, info in subject.fields(name).items():
+    for path, info in _angles_of_points(subject, name).items():
         full = _full_circle(info)
         if full is None:
             continue
@@ -325,7 +327,7 @@ def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
 
     Golden vectors with points in two quadrants prove the sense better. It is noted in any case.
     """
-    for path, info in subject.fields(name).items():
+    for path, info in _angles_of_points(subject, name).items():
         zero = _zero(info)
         if zero is None:
             clouds = []
@@ -420,13 +422,15 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
 
 def counters_run_on(subject: Subject, name: str) -> None:
     """Along the sweep no packet counts as lost, late or doubled, and time does not run back."""
+    if name != subject.sensor.data_frame:
+        return
     frames = make_sweep(
         subject,
         name,
         700 if subject.sensor.frames[name].max_length <= LONG_FRAME_BYTES else 260,
         COUNTER_BYTES,
     )
-    if not frames or name != subject.sensor.data_frame:
+    if not frames:
         return
     packets = read(subject, name, frames)
     if subject.sensor.sequence is not None:
@@ -468,6 +472,24 @@ def _zero(info: FieldInfo) -> int | None:
     if info.limits[0] <= raw <= info.limits[1] - SMALL:
         return raw
     return None
+
+
+def _angles_of_points(subject: Subject, name: str) -> dict[str, FieldInfo]:
+    """Return the angles of a frame type that may turn its points, by path.
+
+    These are the ones that `points` uses, and optional ones, which the traced example may lack;
+    all of them if `points` cannot be traced.
+    """
+    angles = {path: info for path, info in subject.fields(name).items() if info.unit in FULL_TURNS}
+    try:
+        result = traced(subject, name)
+    except Exception:  # a property of its own says what fails
+        return angles
+    if result is None:
+        return angles
+    nodes = used(*vars(result).values())
+    sources = {info.path for info in (field_of(subject, name, node) for node in nodes) if info}
+    return {path: info for path, info in angles.items() if info.optional or path in sources}
 
 
 def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
