@@ -30,7 +30,7 @@ from lidarspec.framing.results import (
     Frames,
 )
 from lidarspec.spec.description import Frame
-from lidarspec.spec.syntax import Mismatch, has_conditions
+from lidarspec.spec.syntax import Mismatch
 
 
 class PlainCodec(Codec):
@@ -44,16 +44,6 @@ class PlainCodec(Codec):
     def __init__(self, frame: Frame, reason: str = "") -> None:
         super().__init__(frame)
         self.reason = reason
-        if any(info.held for info in self.schema.all_fields.values()):
-            lengths = ["lengths"]
-        else:
-            lengths = []
-        self._levels = [
-            "constants",
-            *lengths,
-            *(["checksums"] if has_conditions(frame.prepared) else []),
-            True,
-        ]
 
     def survey(
         self,
@@ -95,13 +85,10 @@ class PlainCodec(Codec):
     def _judge(self, data: bytes, errors: list[PluginError]) -> tuple[int, int]:
         stream = io.BytesIO(data)
         try:
-            self.frame.prepared.parse_stream(stream, _verify=self._levels[0])
+            parsed = self.frame.prepared.parse_stream(stream)
             size = stream.tell()
             if not size:
                 return LENGTH, 0
-            parsed = [
-                self.frame.prepared.parse(data[:size], _verify=level) for level in self._levels[1:]
-            ][-1]
         except Mismatch as mismatch:
             return {"checksum": CHECKSUM, "length": LENGTH, "value": IMPLAUSIBLE}.get(
                 mismatch.reason, CONSTANT

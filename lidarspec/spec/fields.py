@@ -243,7 +243,7 @@ class Checksummed(layer.Sealing):
         start = stream.tell()
         obj = self._marked._parsereport(stream, context, path)
         end = stream.tell()
-        if not layer.verifying(context, "checksums"):
+        if not layer.verifying(context):
             return obj
         stream.seek(start)
         data = stream.read(end - start)
@@ -509,7 +509,7 @@ class Parts(layer.Partition):
         trial = Container(
             {
                 **context,
-                "_params": Container({**context._params, "_verify": "constants", "_trail": None}),
+                "_params": Container({**context._params, "_verify": True}),
             }
         )
         for name in names if len(names) > 1 else ():

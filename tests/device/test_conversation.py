@@ -202,7 +202,7 @@ def test_what_is_learned_is_no_path(configure: Any) -> None:
 
 
 def test_what_learns_has_a_reply_and_somewhere_to_go() -> None:
-    with pytest.raises(SpecError, match="goes to `configure`"):
+    with pytest.raises(SpecError, match="learns"):
         dataclasses.replace(SENSOR, configure=None)
 
 

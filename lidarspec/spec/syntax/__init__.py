@@ -28,7 +28,6 @@ from lidarspec.spec.syntax.classes import (
     clean as clean,
     field_path as field_path,
     fixed_size as fixed_size,
-    has_conditions as has_conditions,
     has_member as has_member,
     is_expression as is_expression,
     is_struct as is_struct,

@@ -92,7 +92,7 @@ class MarkedStruct(Struct):  # type: ignore[misc]
                 obj[con.name] = inner[con.name] = value
                 marks[con.name] = (start, end)
         obj["_marks"] = marks
-        for sizing, place, spot, value in inner._sizings if verifying(context, "lengths") else ():
+        for sizing, place, spot, value in inner._sizings if verifying(context) else ():
             expected = sizing.value(obj)
             if value != expected:
                 raise Mismatch(place, spot, expected, value, "length")
@@ -241,7 +241,7 @@ class Limited(Subconstruct):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
-        if verifying(context, "values"):
+        if verifying(context):
             return self._held(obj, start, path)
         return obj
 
@@ -258,7 +258,7 @@ class HeldCheck(construct.Check):  # type: ignore[misc]
     """A Check that can be read unchecked."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        if verifying(context, "values"):
+        if verifying(context):
             return super()._parse(stream, context, path)
         return None
 
@@ -552,18 +552,9 @@ class Partition(Construct):  # type: ignore[misc]
     limit: int = sys.maxsize
 
 
-#: how much of a frame is checked, where it is not all of it (``_verify``: True) or nothing (False).
-LEVELS = ("constants", "lengths", "checksums", "values")
-
-
-def verifying(context: Any, what: str = "constants") -> bool:
-    """Whether constants, lengths, checksums or values are checked in this parse; who checks one of
-    them checks those before it.
-    """
-    wanted = context._params.get("_verify", True)
-    if isinstance(wanted, str):
-        return LEVELS.index(what) <= LEVELS.index(wanted)
-    return bool(wanted)
+def verifying(context: Any) -> bool:
+    """Return whether constants, lengths, checksums and values are checked in this parse."""
+    return bool(context._params.get("_verify", True))
 
 
 #: construct's classes -> those that stand in for them.
@@ -831,11 +822,6 @@ def children(con: Construct) -> list[Construct]:
         return list(con.subcons)
     found = [getattr(con, name) for name in _INNER if name in vars(con)]
     return found + (list(con.cases.values()) if "cases" in vars(con) else [])
-
-
-def has_conditions(con: Construct) -> bool:
-    """Whether a struct asks something of values."""
-    return isinstance(con, Limited | HeldCheck) or any(map(has_conditions, children(con)))
 
 
 def seals(con: Construct) -> Iterator[Sealing]:
