@@ -29,7 +29,8 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Found
 from lidarspec.spec.arguments import Address, Filled
 from lidarspec.spec.description import Command
-from lidarspec.spec.sensor import Learned, Sensor
+from lidarspec.spec.options import Learned
+from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
 
 #: fields that a reply's repr shows.

@@ -9,6 +9,7 @@ in this package reads bytes of a stream. Modules in reading order:
 
 * `description`: `Frame`, `Command`, `Simulation`, `Relative`.
 * `sensor`: `Sensor`, which puts all of these together; its methods call the engines.
+* `options`: the values that options of `configure` take, from their annotations.
 * `arguments`: arguments of commands, and values that are filled in when a command is sent.
 * `fields`: units and seals, as parts of a struct.
 * `checksums`: algorithms as values; of one message.
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
         Tcp as Tcp,
         Udp as Udp,
     )
+    from lidarspec.spec.options import Learned as Learned
     from lidarspec.spec.results import (
         Cartesian as Cartesian,
         Extra as Extra,
@@ -67,7 +69,7 @@ if TYPE_CHECKING:
         Points as Points,
         Polar as Polar,
     )
-    from lidarspec.spec.sensor import Learned as Learned, Sensor as Sensor
+    from lidarspec.spec.sensor import Sensor as Sensor
     from lidarspec.spec.timing import (
         Clock as Clock,
         Every as Every,
@@ -115,7 +117,8 @@ if TYPE_CHECKING:
     )
 
 _NAMES = {
-    "spec.sensor": ("Sensor", "Learned"),
+    "spec.sensor": ("Sensor",),
+    "spec.options": ("Learned",),
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
     "spec.arguments": ("Text", "Address", "Count"),
     "spec.fields": ("Scaled", "Checksummed", "Parts", "SizeOf", "HttpRequest", "HttpReply"),

@@ -8,17 +8,15 @@ listing sensors does not import any engine.
 
 from __future__ import annotations
 
-import base64
 import inspect
 import math
 import os
 import re
 import warnings
-import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Integral, Real
+from numbers import Real
 from os import PathLike
 from reprlib import repr as shown
 from types import MappingProxyType
@@ -44,6 +42,7 @@ from lidarspec.spec.description import (
     reject_unknown_arguments,
 )
 from lidarspec.spec.links import Link, is_datagram
+from lidarspec.spec.options import Learned, OptionType, option_types
 from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.timing import Clock, OnChange, OnWrap, Sequence, Split
 from lidarspec.trust import beside
@@ -66,61 +65,11 @@ ROLES = ("serial", "firmware", "model", "temperature")
 #: directions of the vendor's axes; in REP-103 x points forward, y left and z up.
 DIRECTIONS = ("forward", "back", "left", "right", "up", "down")
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
-#: bytes of something learned at most, where a file says it.
-LARGEST = 1 << 20
 #: options that every sensor has.
 OPTIONS = ("frame", "answer", "cut")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
-#: what a file may give as an option without naming a path.
+#: a text that an untrusted file may give as an option: it is not a path.
 _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
-
-
-class Learned(bytes):
-    """What a sensor said of itself, as the value of an option: the content of what else is a file,
-    never a path.
-
-    An option takes it where its parameter is annotated with it, ``calibration: str | Path |
-    Learned``.
-    """
-
-    def __repr__(self) -> str:
-        return f"Learned({len(self)} bytes)"
-
-    def to_dict(self) -> dict[str, str]:
-        """As data, such as in the header of a recording."""
-        return {"learned": base64.b64encode(zlib.compress(self)).decode()}
-
-    @classmethod
-    def of_dict(cls, data: Mapping[str, Any]) -> Learned:
-        """What `to_dict` gave.
-
-        Raises:
-            UsageError: for what it never gives, or more than a megabyte.
-        """
-        reader = zlib.decompressobj()
-        try:
-            content = reader.decompress(base64.b64decode(data["learned"], validate=True), LARGEST)
-        except (KeyError, TypeError, ValueError, zlib.error):
-            content = b""
-        if not reader.eof or set(data) != {"learned"}:
-            raise UsageError(f"{shown(data)} is nothing that a sensor said")
-        return cls(content)
-
-    @classmethod
-    def content(cls, value: str | PathLike[str] | Learned) -> bytes:
-        """The bytes that an option stands for: learned ones themselves, those of a file for its
-        path.
-
-        Raises:
-            UsageError: for a file that cannot be read.
-        """
-        if isinstance(value, cls):
-            return bytes(value)
-        try:
-            with open(value, "rb") as file:
-                return file.read()
-        except (OSError, ValueError) as error:
-            raise UsageError(f"{value!s}: {getattr(error, 'strerror', None) or error}") from None
 
 
 @reject_unknown_arguments
@@ -652,96 +601,98 @@ def _check_names(
 
 @dataclass(frozen=True)
 class Configure:
-    """``sensor.configure(...)``: the options of every sensor, then the sensor's own function, on a
-    new value.
+    """``sensor.configure(...)``: returns a sensor with options.
+
+    Every sensor has the options in `OPTIONS`. The others are those of the sensor's own function.
     """
 
     sensor: Sensor
     function: Callable[..., Sensor] | None
 
     def __call__(self, **options: Any) -> Sensor:
-        """A new sensor with these options; the old one stays as it is.
+        """Return a new sensor with these options; the old one is not changed.
 
         Raises:
-            UnknownOption: for an option that neither every sensor nor this one has.
-            UsageError: for a value that an option cannot have.
-            PluginError: where the sensor's own function fails at something else.
+            UnknownOption: for an option that the sensor does not have.
+            UsageError: for a value that an option does not take.
+            PluginError: if the sensor's own function fails in another way.
         """
         sensor = self.sensor
-        own = {name: value for name, value in options.items() if name not in OPTIONS}
         _check_shared(sensor, options)
-        configured = self._by_function(own) if own else sensor
+        own_options = {name: value for name, value in options.items() if name not in OPTIONS}
+        if own_options:
+            configured = self._call_function(own_options)
+        else:
+            configured = sensor
         return replace(configured, options={**sensor.options, **options}, configure=self.function)
+
+    @property
+    def types(self) -> dict[str, OptionType]:
+        """The types of the sensor's own options, by name.
+
+        Raises:
+            SpecError: for an annotation that cannot be evaluated.
+        """
+        return option_types(self.function)
 
     @property
     def files(self) -> tuple[str, ...]:
         """The names of the sensor's own options that take a path."""
-        return tuple(name for name, kinds in self._kinds.items() if "Path" in kinds)
+        return tuple(name for name, option in self.types.items() if option.is_file)
 
     def takes(self, name: str, value: object) -> bool:
-        """Whether a value is of a type that the option is declared with, by the annotation of its
-        parameter; of others nobody knows.
-        """
-        kinds = self._kinds.get(name, {""})
-        if isinstance(value, Learned):
-            return "Learned" in kinds
-        return any(_TYPES.get(kind, _anything)(value) for kind in kinds)
+        """Return whether an option accepts a value; True for an unknown option."""
+        return self.types.get(name, OptionType()).accepts(value)
 
     def options_of_file(self, options: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """The options that stand in a file in `folder` that anybody may have written: numbers,
-        words, what was learned, files beside it.
+        """Return the options of an untrusted file in `folder`.
+
+        They are numbers, words, learned content, and paths of files beside it.
 
         Raises:
             UsageError: for a path that leads anywhere else, and for other values.
         """
-        given = dict(options)
+        checked = dict(options)
         for name, value in options.items():
+            is_word = isinstance(value, str) and _WORD.fullmatch(value)
             if isinstance(value, Mapping):
-                given[name] = Learned.of_dict(value)
+                checked[name] = Learned.of_dict(value)
             elif name in self.files and value is not None:
                 try:
-                    given[name] = beside(folder, value)
+                    checked[name] = beside(folder, value)
                 except UsageError as error:
                     raise UsageError(f"{name}: {error}") from None
-            elif not isinstance(value, bool | int | float | None) and not (
-                isinstance(value, str) and _WORD.fullmatch(value)
-            ):
+            elif not isinstance(value, bool | int | float | None) and not is_word:
                 raise UsageError(f"{name}: {shown(value)} is neither a number nor a word")
-        return given
+        return checked
 
-    @property
-    def _kinds(self) -> dict[str, set[str]]:
-        """The names of the types that the sensor's own options are declared with, by option."""
-        known = inspect.signature(self.function).parameters if self.function is not None else {}
-        return {name: _type_names(parameter.annotation) for name, parameter in known.items()}
-
-    def _by_function(self, options: Mapping[str, Any]) -> Sensor:
+    def _call_function(self, options: Mapping[str, Any]) -> Sensor:
+        """Return the result of the sensor's own function, with hooks applied."""
+        sensor = self.sensor
         if self.function is None:
-            raise UnknownOption(min(options), OPTIONS, place=self.sensor.id)
+            raise UnknownOption(min(options), OPTIONS, place=sensor.id)
         try:
-            inspect.signature(self.function).bind(self.sensor, **options)
+            inspect.signature(self.function).bind(sensor, **options)
         except TypeError as error:
-            raise UnknownOption(
-                min(options), OPTIONS, place=self.sensor.id, hint=f": {error}"
-            ) from None
+            raise UnknownOption(min(options), OPTIONS, place=sensor.id, hint=f": {error}") from None
+        types = self.types
         for name, value in options.items():
-            if not self.takes(name, value):
-                kinds = (
-                    " or ".join(_TOLD[kind] for kind in sorted(self._kinds[name]) if kind in _TOLD)
-                    or "no content"
-                )
-                raise UsageError(f"{self.sensor.id}: {name} is {kinds}, not {shown(value)}")
-            if name in self.files and value is not None and not isinstance(value, Learned):
+            option = types.get(name, OptionType())
+            if not option.accepts(value):
+                raise UsageError(f"{sensor.id}: {name} is {option.describe()}, not {shown(value)}")
+            if option.is_file and value is not None and not isinstance(value, Learned):
                 _refuse_pipe(value)
         try:
-            configured = self.function(self.sensor, **options)
+            configured = self.function(sensor, **options)
         except (LidarSpecError, OSError):
             raise
         except Exception as error:
             raise PluginError.of(
-                error, "configure", sensor=self.sensor.id, function=self.function
+                error, "configure", sensor=sensor.id, function=self.function
             ) from error
-        hooked: Sensor = self.sensor.hooked(configured) if self.sensor.hooked else configured
+        if sensor.hooked is None:
+            return configured
+        hooked: Sensor = sensor.hooked(configured)
         return hooked
 
 
@@ -751,44 +702,6 @@ def _refuse_pipe(path: str | PathLike[str]) -> None:
         raise UsageError(
             f"{path!s}: a pipe or device is not read as a file; write its content to a file first"
         )
-
-
-def _anything(value: object) -> bool:
-    return True
-
-
-#: a type that an option is declared with -> whether a value is of it; what it is called, in the
-#: order of the alphabet.
-_TYPES: dict[str, Callable[[object], bool]] = {
-    "Path": lambda value: isinstance(value, str | PathLike),
-    "Learned": lambda value: False,
-    "bool": lambda value: isinstance(value, bool),
-    "float": lambda value: isinstance(value, Real) and not isinstance(value, bool),
-    "int": lambda value: isinstance(value, Integral) and not isinstance(value, bool),
-    "str": lambda value: isinstance(value, str),
-    "None": lambda value: value is None,
-    "Optional": lambda value: value is None,
-    "Union": lambda value: False,
-}
-_TOLD = {
-    "Learned": "what a sensor said",
-    "Path": "a path",
-    "bool": "true or false",
-    "float": "a number",
-    "int": "a whole number",
-    "str": "a text",
-}
-
-
-def _type_names(annotation: object) -> set[str]:
-    """The names in an annotation, such as {"str", "Path"} of `str | pathlib.Path`; {""} of none."""
-    if annotation is inspect.Parameter.empty:
-        return {""}
-    if isinstance(annotation, type):
-        text = annotation.__name__
-    else:
-        text = str(annotation)
-    return {word.rpartition(".")[2] for word in re.findall(r"[\w.]+", text)}
 
 
 def _check_cut(sensor: Sensor, degrees: object) -> None:

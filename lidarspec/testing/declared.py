@@ -7,10 +7,9 @@ from __future__ import annotations
 import dis
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields, replace
 from functools import partial
-from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -165,9 +164,7 @@ def _clock(sensor: Sensor) -> Findings:
 
 
 def _options(sensor: Sensor) -> Findings:
-    """Options of `configure` that it never reads, or with all values of which it returns the sensor
-    as it is.
-    """
+    """Yield the options that `configure` never reads, or whose choices all give the same sensor."""
     function = sensor.configure.function
     if isinstance(function, partial):
         plain = function.func
@@ -175,18 +172,15 @@ def _options(sensor: Sensor) -> Findings:
         plain = function
     if not inspect.isfunction(plain):
         return
-    parameters = inspect.signature(plain).parameters.values()
     read = {
         instruction.argval
         for instruction in dis.get_instructions(plain)
         if instruction.opname.startswith("LOAD_")
     }
-    for name in [one.name for one in parameters if one.kind is inspect.Parameter.KEYWORD_ONLY]:
+    for name, option in sensor.configure.types.items():
         if name not in read:
             yield "LS217", f"configure never reads {name!r}", f"configure.{name}"
-        elif name not in sensor.configure.files and _changes_nothing(
-            sensor, name, _words(plain.__code__)
-        ):
+        elif _changes_nothing(sensor, name, option.choices):
             yield (
                 "LS217",
                 f"configure returns the same sensor whatever {name!r} is",
@@ -194,19 +188,7 @@ def _options(sensor: Sensor) -> Findings:
             )
 
 
-def _words(code: CodeType) -> list[str]:
-    """Return the texts that a function compares or returns: among them are the values of its
-    options.
-    """
-    flat = [
-        each
-        for one in code.co_consts
-        for each in (one if isinstance(one, tuple | frozenset) else (one,))
-    ]
-    return [one for one in flat if isinstance(one, str) and re.fullmatch(r"[\w-]{1,32}", one)]
-
-
-def _changes_nothing(sensor: Sensor, name: str, values: list[str]) -> bool:
+def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
     """Return whether `configure` accepts two values of an option at least, and returns an equal
     sensor for all.
     """

@@ -146,7 +146,7 @@ def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: 
             ]
         assert np.array_equal(again[0], live.points.azimuth)
         kept = Header(sensor.id, {"table": {"learned": "bm90aGluZw=="}})
-        with pytest.raises(UsageError, match="is nothing that a sensor said"):
+        with pytest.raises(UsageError, match="expected data reported by the sensor"):
             kept.known_sensor(tmp_path)
 
 
@@ -202,7 +202,7 @@ def test_what_is_learned_is_no_path(configure: Any) -> None:
 
 
 def test_what_learns_has_a_reply_and_somewhere_to_go() -> None:
-    with pytest.raises(SpecError, match="learns"):
+    with pytest.raises(SpecError, match="learns needs a reply to learn from"):
         dataclasses.replace(SENSOR, configure=None)
 
 

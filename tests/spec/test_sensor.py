@@ -39,13 +39,15 @@ def configure(
         ({"turned": True}, "turned .*True"),
         ({"mode": 1.5}, "mode .*1.5"),
         ({"upside": 1}, "upside .*1"),
+        ({"kind": "c"}, "kind is 'a' or 'b', not 'c'"),
+        ({"kind": 3}, "kind is 'a' or 'b', not 3"),
         (
             {
                 "file": None,
                 "turned": 1,
                 "mode": np.int64(3),
                 "upside": True,
-                "kind": 3,
+                "kind": "b",
                 "plain": [1],
             },
             "",
@@ -62,6 +64,25 @@ def test_an_option_is_of_the_type_that_its_parameter_declares(
         return
     with pytest.raises(ls.UsageError, match=f"shape-count: {named}"):
         sensor.configure(**options)
+
+
+def configured_by(annotation: str) -> ls.Sensor:
+    """Return a sensor with an option `table`; its module imports no name of the annotation."""
+    names: dict[str, Any] = {}
+    exec(f"def typed(sensor: 'Sensor', *, table: {annotation!r}):\n    return sensor\n", names)
+    return dataclasses.replace(SHAPES["shape-count"], configure=names["typed"])
+
+
+def test_annotation_that_cannot_be_evaluated_names_the_option() -> None:
+    with pytest.raises(ls.SpecError, match=r"configure\.table: .*'Table' is not defined"):
+        configured_by("Table | None").configure(table=1)
+
+
+def test_types_of_options_need_not_be_imported_by_the_plugin() -> None:
+    sensor = configured_by("Path | None")
+    assert sensor.configure.files == ("table",)
+    with pytest.raises(ls.UsageError, match="table is a path, not 1"):
+        sensor.configure(table=1)
 
 
 def test_on_the_command_line_a_digit_can_be_the_name_of_a_file(

@@ -16,11 +16,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 from construct import Const, Int8ul, Int16ul, Int32ul, Struct
 
-from lidarspec import UsageError
 from lidarspec.spec import (
     Checksummed,
     Command,
@@ -170,14 +169,8 @@ def answers() -> dict[str, Any]:
     return {"get_version": (("version", {"revision": 1, "minor": 2, "major": 3}),), **done}
 
 
-def configure(sensor: Sensor, *, unit: str = "cm") -> Sensor:
-    """The sensor that sends its distances in centimetres, as it comes, or in millimetres.
-
-    Raises:
-        UsageError: for another unit than "cm" and "mm".
-    """
-    if unit not in UNITS:
-        raise UsageError(f"{sensor.id}: unit is 'cm' or 'mm', not {unit!r}")
+def configure(sensor: Sensor, *, unit: Literal["cm", "mm"] = "cm") -> Sensor:
+    """Return the sensor for distances in centimetres, the factory setting, or millimetres."""
     return dataclasses.replace(sensor, frames={**sensor.frames, "data": data(unit)})
 
 

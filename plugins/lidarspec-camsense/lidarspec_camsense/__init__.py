@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from construct import (
@@ -29,7 +29,6 @@ from construct import (
     Struct,
 )
 
-from lidarspec import UsageError
 from lidarspec.spec import (
     Checksummed,
     Fields,
@@ -97,18 +96,13 @@ def points(f: Fields, count: int, zero: float = 0.0) -> Polar:
     )
 
 
-def configure(sensor: Sensor, *, zero: str = "data") -> Sensor:
-    """The X1 with angles counted from the zero of the data, as on the wire, or from the housing's,
-    as the vendor's SDK does.
+def configure(sensor: Sensor, *, zero: Literal["data", "housing"] = "data") -> Sensor:
+    """Return the X1 with angles from the zero of the data, as on the wire, or of the housing.
 
-    Raises:
-        UsageError: for another zero than "data" and "housing".
+    The vendor's SDK counts from the zero of the housing.
     """
-    if zero not in ("data", "housing"):
-        raise UsageError(f"{sensor.id}: zero is 'data' or 'housing', not {zero!r}")
-    return dataclasses.replace(
-        sensor, points=partial(points, count=8, zero=HOUSING * (zero == "housing"))
-    )
+    offset = HOUSING if zero == "housing" else 0.0
+    return dataclasses.replace(sensor, points=partial(points, count=8, zero=offset))
 
 
 def sweep(i: int, count: int, steps: int, speed: float) -> dict[str, float]:

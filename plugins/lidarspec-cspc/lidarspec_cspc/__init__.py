@@ -24,7 +24,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from construct import (
@@ -41,7 +41,6 @@ from construct import (
     this,
 )
 
-from lidarspec import UsageError
 from lidarspec.spec import (
     Checksummed,
     Command,
@@ -246,17 +245,17 @@ def older_points(f: Fields, zero: str = "data") -> Polar:
     return Polar(range=f.samples.distance, azimuth=-np.deg2rad(directions(f, zero)[1]))
 
 
-def configure(points: Callable[..., Polar], sensor: Sensor, /, *, zero: str = "data") -> Sensor:
-    """The sensor with angles counted from the zero of the data (as on the wire), or from the
-    housing's mark.
-
-    Raises:
-        UsageError: for another zero than "data" and "housing".
+def configure(
+    points: Callable[..., Polar],
+    sensor: Sensor,
+    /,
+    *,
+    zero: Literal["data", "housing"] = "data",
+) -> Sensor:
+    """Return the sensor with angles from the zero of the data, as on the wire, or the housing.
 
     Source: manual 2.2.2, bytes 13 and 14; it does not say whether the host should add the angle.
     """
-    if zero not in ("data", "housing"):
-        raise UsageError(f"{sensor.id}: zero is 'data' or 'housing', not {zero!r}")
     return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -134,16 +134,15 @@ def frames(kind: Kind, cola: str) -> dict[str, Frame]:
     return own | dict(messages(cola))
 
 
-def configure(sensor: Sensor, *, cola: str = "B", echoes: int = 0) -> Sensor:
-    """The scanner that is spoken to in CoLa "A" or "B"; scans are read in either form, with one
-    echo and with so many, by default all.
+def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0) -> Sensor:
+    """Return the scanner for commands in CoLa A or B, and a number of echoes.
+
+    Scans are read in both forms, with one echo and with `echoes`, by default all.
 
     Raises:
-        UsageError: for another form, or more echoes than the scanner has.
+        UsageError: for more echoes than the scanner has.
     """
     kind = MODELS[sensor.id][1]
-    if cola not in ("A", "B"):
-        raise UsageError(f"{sensor.id}: cola is 'A' or 'B', not {cola!r}")
     if echoes not in range(kind.echoes + 1):
         raise UsageError(f"{sensor.id}: echoes is a number from 1 to {kind.echoes}, not {echoes!r}")
     own = frames(dataclasses.replace(kind, echoes=echoes or kind.echoes), cola)

@@ -32,6 +32,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Mapping
 from functools import partial
+from typing import Literal
 
 from lidarspec import UsageError
 from lidarspec.spec import Command, Frame, Link, OnWrap, Sensor, Serial, Simulation, Udp, hookimpl
@@ -40,7 +41,6 @@ from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
 from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
 from lidarspec_slamtec.requests import REQUESTS
 
-DTHETA = ("unsigned", "signed")
 MODELS = ("A1", "A2", "A3", "S1", "S2", "S2L", "S3", "T1", "C1")
 TWINS = ("S2", "S2L")
 
@@ -111,21 +111,21 @@ FRAMES = {
 }
 
 
-def configure(sensor: Sensor, *, dtheta: str | None = None, mode: int | None = None) -> Sensor:
-    """The sensor with another reading of express capsules, or another scan mode when it is opened.
+def configure(
+    sensor: Sensor, *, dtheta: Literal["unsigned", "signed"] | None = None, mode: int | None = None
+) -> Sensor:
+    """Return the sensor with another interpretation of express capsules, or another scan mode.
 
     Args:
-        dtheta: "unsigned" (as the SDK reads the compensation of express capsules) or "signed" (as
-            the protocol says).
+        dtheta: interpretation of the compensation in express capsules: "unsigned" as in the SDK,
+            or "signed" as in the protocol.
         mode: the scan mode that opening starts, instead of a scan of nodes; `answer` has to be the
-            kind that it answers in.
+            kind of its answers.
 
     Raises:
-        UsageError: for another dtheta, or a mode that is not a number from 0 to 255.
+        UsageError: for a mode that is not a number from 0 to 255.
     """
     if dtheta is not None:
-        if dtheta not in DTHETA:
-            raise UsageError(f"{sensor.id}: dtheta is one of {', '.join(DTHETA)}, not {dtheta!r}")
         changed = dataclasses.replace(
             sensor.frames["express"],
             points=partial(capsules.express_points, signed=dtheta == "signed"),

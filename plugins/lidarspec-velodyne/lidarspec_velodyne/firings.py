@@ -24,16 +24,15 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec import UsageError
 from lidarspec.spec import Fields, Polar, Sensor, between_blocks, following
 from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST, TURN
 
-LAST_BLOCK = ("previous", "invalid")
+LastBlock = Literal["previous", "invalid"]
 FASTEST = TURN[1] * 360  # degrees per second
 
 
@@ -86,7 +85,7 @@ class Firings:
         return -self.focal_distance * np.tan(np.deg2rad(self.elevation))
 
 
-def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
+def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Polar:
     """The sensor turns clockwise from its forward axis; heights are along the axis of rotation."""
     dual = model.returns == 2 if model.returns else f.return_mode == DUAL
     block = np.arange(model.blocks)[:, None]
@@ -108,7 +107,7 @@ def points(f: Fields, model: Firings, last_block: str = "previous") -> Polar:
     )
 
 
-def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
+def _step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> Any:
     """Return the degrees from each block's azimuth to the next, (n, blocks, 1)."""
     azimuth = f.blocks.azimuth
     ahead = np.where(dual, following(azimuth, 2 * model.sharing), following(azimuth, model.sharing))
@@ -116,17 +115,8 @@ def _step(f: Fields, dual: Any, model: Firings, last_block: str) -> Any:
     return between_blocks(azimuth, ahead, fastest=FASTEST * model.period, repeat=repeat)
 
 
-def configure(sensor: Sensor, /, *, last_block: str) -> Sensor:
-    """The sensor with another rule for the last block, "previous" or "invalid" (see the module's
-    text).
-
-    Raises:
-        UsageError: for another rule.
-    """
-    if last_block not in LAST_BLOCK:
-        raise UsageError(
-            f"{sensor.id}: last_block is one of {', '.join(LAST_BLOCK)}, not {last_block!r}"
-        )
+def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
+    """Return the sensor with another rule for the last block (see the docstring of the module)."""
 
     def ruled(function: Any) -> Any:
         return function and partial(function, last_block=last_block)

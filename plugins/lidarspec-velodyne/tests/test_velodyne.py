@@ -422,7 +422,7 @@ def test_the_option_is_checked_and_kept() -> None:
     again = chosen.configure(frame="vendor")
     assert not again.decode([filled(0)]).points().valid[spot(11, 5)]
     assert VLP16.decode([filled(0)]).points().valid.all()
-    with pytest.raises(ls.UsageError, match="previous, invalid"):
+    with pytest.raises(ls.UsageError, match="'previous' or 'invalid', not 'mean'"):
         VLP16.configure(last_block="mean")
     with pytest.raises(UnknownOption):
         VLP16.configure(last="invalid")
