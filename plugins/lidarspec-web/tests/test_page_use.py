@@ -14,7 +14,7 @@ import pytest
 
 import lidarspec as ls
 
-from .visits import Visit, served
+from .visits import Visit, served, streaming
 
 pytestmark = pytest.mark.slow
 
@@ -51,19 +51,31 @@ def link() -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def desk(browser: Any, link: str) -> Iterator[Visit]:
+def desk_page(browser: Any, link: str) -> Iterator[Visit]:
     visit = Visit(browser, link)
     yield visit
     visit.context.close()
     assert not visit.errors
 
 
+@pytest.fixture
+def desk(desk_page: Visit) -> Iterator[Visit]:
+    with streaming(desk_page):
+        yield desk_page
+
+
 @pytest.fixture(scope="module")
-def phone(browser: Any, link: str) -> Iterator[Visit]:
+def phone_page(browser: Any, link: str) -> Iterator[Visit]:
     visit = Visit(browser, link, size=PHONE, touch=True)
     yield visit
     visit.context.close()
     assert not visit.errors
+
+
+@pytest.fixture
+def phone(phone_page: Visit) -> Iterator[Visit]:
+    with streaming(phone_page):
+        yield phone_page
 
 
 def check_fits(visit: Visit) -> None:
