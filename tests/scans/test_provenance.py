@@ -27,11 +27,14 @@ POINTS = 24
 POINTS_OF_LARGE = 12
 #: Sensors with long frames.
 LARGE = ("robosense-airy", "velodyne-vlp16")
-NAMES = (
-    "parts",
-    "waiting parts",
-    "ldrobot-stl27l",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in LARGE),
+#: Sensors with short frames, with parts and without.
+SMALL = ("parts", "waiting parts", "ldrobot-stl27l")
+#: names and the frames that come at a time.
+CASES = (
+    *((name, together) for name in SMALL for together in (3, FRAMES)),
+    *(pytest.param(name, 1, marks=pytest.mark.slow) for name in SMALL),
+    *(pytest.param(name, 3, marks=pytest.mark.slow) for name in LARGE),
+    *(pytest.param(name, FRAMES, marks=pytest.mark.slow) for name in LARGE),
 )
 
 
@@ -72,8 +75,7 @@ def scans_of(sensor: Sensor, frames: list[bytes], together: int) -> tuple[list[S
     return scans + stream.finish(), offsets
 
 
-@pytest.mark.parametrize("together", [3, FRAMES, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "together"), CASES)
 def test_each_point_leads_to_its_frame_and_row(name: str, together: int) -> None:
     known = segments.SENSOR if name in ("parts", "waiting parts") else ls.sensor(name)
     sensor, frames = waiting() if name == "waiting parts" else known, frames_of(known)
