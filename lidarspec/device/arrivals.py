@@ -7,15 +7,15 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarspec.captures.bulk import Batch
 from lidarspec.detect.identification import said
@@ -73,20 +73,22 @@ class Input(Protocol):
 
         A frame with parts is ignored if it lacks values that an earlier frame reported.
         """
-        telling = {path.partition(".")[0] for path in self.sensor.info.values()}
-        for frames in found if telling else ():
-            for name in telling.intersection(frames.names):
-                where = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
-                for item in frames.only(where[-1:]).found():
-                    if name in self.told and schema(self.sensor.frames[name].tree).parts:
-                        known = [self.told[name]]
-                    else:
-                        known = []
-                    if (
-                        said(self.sensor, known).keys()
-                        <= said(self.sensor, [item] if known else []).keys()
-                    ):
+        if not self.sensor.info:
+            return
+        reporting = {path.partition(".")[0] for path in self.sensor.info.values()}
+        for frames in found:
+            for name in reporting.intersection(frames.names):
+                rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
+                for item in frames.only(rows[-1:]).found():
+                    if not self._lacks_values(item):
                         self.told = {**self.told, name: item}
+
+    def _lacks_values(self, item: Found) -> bool:
+        """Return whether a frame with parts lacks values that an earlier one reported."""
+        known = self.told.get(item.frame)
+        if known is None or not schema(self.sensor.frames[item.frame].tree).parts:
+            return False
+        return not said(self.sensor, [known]).keys() <= said(self.sensor, [item]).keys()
 
     @property
     def state(self) -> str:
@@ -192,7 +194,7 @@ class Input(Protocol):
         """
 
 
-def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
+def decode_chunks(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
     """Return the frames that consecutive chunks complete.
 
     Each frame has the arrival time of the chunk that holds its last byte.
@@ -201,28 +203,44 @@ def fed(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
         return [decoder.datagrams([chunk.data for chunk in chunks], [chunk.at for chunk in chunks])]
     if len(chunks) == 1:
         return decoder.frames(chunks[0].data, chunks[0].at)
-    data = [chunk.data for chunk in chunks]
-    ends = np.array([*accumulate(map(len, data), initial=decoder.stats.bytes_in)])[1:]
-    found = decoder.frames(b"".join(data), chunks[-1].at)
-    times = np.array([-1 if chunk.at is None else chunk.at for chunk in chunks], np.int64)
-    return [
-        frames.arrived(times[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found
-    ]
+    end = decoder.stats.bytes_in
+    ends = list[int]()
+    times = list[int]()
+    for chunk in chunks:
+        end += len(chunk.data)
+        ends.append(end)
+        times.append(-1 if chunk.at is None else chunk.at)
+    found = decoder.frames(b"".join([chunk.data for chunk in chunks]), chunks[-1].at)
+    return _set_arrival(found, np.array(ends), np.array(times))
 
 
-def _streamed(decoder: Decoder, packets: Batch, together: int) -> Iterator[list[Frames]]:
+def _decode_stream(decoder: Decoder, packets: Batch, size: int) -> Iterator[list[Frames]]:
     """Yield the frames that the packets of a byte stream complete.
 
     Each frame has the arrival time of the packet that holds its last byte.
+
+    Args:
+        size: bytes decoded together.
     """
     data = packets.joined
     ends = decoder.stats.bytes_in + np.cumsum(packets.sizes)
-    at = np.where(packets.at, packets.at, -1)  # nobody knows
-    for start in range(0, len(data), together):
-        found = decoder.frames(data[start : start + together])
-        yield [
-            frames.arrived(at[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found
-        ]
+    times = np.where(packets.at, packets.at, -1)
+    for start in range(0, len(data), size):
+        yield _set_arrival(decoder.frames(data[start : start + size]), ends, times)
+
+
+def _set_arrival(
+    found: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
+) -> list[Frames]:
+    """Return frames with the arrival times of the pieces of input that hold their last bytes.
+
+    Args:
+        ends: of the pieces, (n,) bytes from the start of the input.
+        times: of the pieces, (n,) ns since 1970; -1 if unknown.
+    """
+    return [
+        frames.arrived(times[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found
+    ]
 
 
 def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
@@ -346,7 +364,7 @@ class FileInput(Input):
                 )
                 return find_first_frames(self.sensor, batches)
             return find_first_frames(
-                self.sensor, (fed(decoder, [chunk]) for chunk in source.chunks())
+                self.sensor, (decode_chunks(decoder, [chunk]) for chunk in source.chunks())
             )
 
     def _read(self) -> Iterator[Arrival]:
@@ -357,7 +375,8 @@ class FileInput(Input):
                     yield Arrival(self.decoder.rest(), interrupted=True)
                 if self.decoder.stream:
                     yield from map(
-                        Arrival, _streamed(self.decoder, datagrams, self._together or BATCH_BYTES)
+                        Arrival,
+                        _decode_stream(self.decoder, datagrams, self._together or BATCH_BYTES),
                     )
                     continue
                 for part in datagrams.parts(self._together) if self._together else [datagrams]:
@@ -369,7 +388,7 @@ class FileInput(Input):
         for batch in self._batches():
             if batch[0].gap or batch[0].quiet:
                 yield Arrival(self.decoder.rest(), interrupted=batch[0].gap)
-            found = fed(self.decoder, batch)
+            found = decode_chunks(self.decoder, batch)
             if not self.decoder.stream:
                 self.senders.see(frame_senders(batch, found[0], self.decoder.stats.bytes_in))
             yield Arrival(found)

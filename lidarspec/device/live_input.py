@@ -20,7 +20,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from lidarspec.device.arrivals import Arrival, Input, answers, fed
+from lidarspec.device.arrivals import Arrival, Input, answers, decode_chunks
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.senders import Kept, frame_senders
 from lidarspec.device.session import Outgoing, Pending, Reply, Session, learned
@@ -526,9 +526,10 @@ class LiveInput(Input):
             self._due = time.monotonic() + self._period
         for link, run in _runs(events):
             self._take(link, run)
-        with self._talk:
-            self._session.tick(self._clock.now())
-            self._speak()
+        if deadline is not None:
+            with self._talk:
+                self._session.tick(self._clock.now())
+                self._speak()
         if self._checked:
             self._compare()
         elif (silent := list(self._session.unanswered.values())) and silent != self._silent:
@@ -564,22 +565,27 @@ class LiveInput(Input):
         decoder = self._decoders[link]
         if chunks[0].gap:
             self._hand_on(link, decoder.rest(), interrupted=True)
-        if link == "data":
-            chunks = self._of_the_sensor(chunks)
-        elif link in self._answering:
+        if link == "data" and chunks[0].sender is not None:  # then all chunks of the link have one
+            self._decode_senders(chunks)
+            return
+        if link in self._answering:
             chunks = self._of_who_answered(link, chunks)
+        if chunks:
+            self._hand_on(link, decode_chunks(decoder, chunks))
+
+    def _decode_senders(self, chunks: list[Chunk]) -> None:
+        """Decode chunks of the data link from several senders, of which one is the sensor."""
+        chunks = self._of_the_sensor(chunks)
         if not chunks:
             return
-        found = fed(decoder, chunks)
-        if link == "data" and not decoder.stream:
-            found = [
-                self._kept.of_ports(
-                    frame_senders(chunks, found[0], decoder.stats.bytes_in), found[0]
-                )
-            ]
-        if link == "data" and self._kept.address is not None:
-            self._captures[link].transport.accept(self._kept.address)
-        self._hand_on(link, found)
+        decoder = self.decoder
+        found = decode_chunks(decoder, chunks)
+        if not decoder.stream:
+            senders = frame_senders(chunks, found[0], decoder.stats.bytes_in)
+            found = [self._kept.of_ports(senders, found[0])]
+        if self._kept.address is not None:
+            self._captures["data"].transport.accept(self._kept.address)
+        self._hand_on("data", found)
 
     def _of_the_sensor(self, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks that the sensor sent.

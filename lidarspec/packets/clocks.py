@@ -199,7 +199,8 @@ def clocked(sensor: Sensor, batch: Batch) -> tuple[NDArray[np.intp] | None, Time
     If the clock is in parts, the first part counts.
     """
     assert sensor.clock is not None
-    place = clock_parts(sensor, batch.table.schema)
+    fields = paths(sensor.clock)
+    place = clock_parts(fields, batch.table.schema)
     source = sensor.clock.source
     if place is not None:
         table, which = batch.table.parts(*place)
@@ -208,7 +209,7 @@ def clocked(sensor: Sensor, batch: Batch) -> tuple[NDArray[np.intp] | None, Time
     if callable(source):
         terms = header_function(source, batch.table.schema, _nanoseconds)(batch)
         return None, sum(terms, np.zeros(len(batch), np.int64))
-    return None, _summed(paths(sensor.clock), batch.table, sensor.id)
+    return None, _summed(fields, batch.table, sensor.id)
 
 
 def held(which: NDArray[np.intp], times: Times, before: Times) -> Times:
@@ -245,16 +246,22 @@ def _summed(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
     return total
 
 
-def clock_parts(sensor: Sensor, schema: Schema) -> tuple[str, str] | None:
-    """The parts, and their kind, in which the clock stands; None where it stands in the frame."""
-    places = {
-        schema.within(path)
-        for path in (paths(sensor.clock) if sensor.clock is not None else ())
-        if path not in schema.fields
-    }
-    found = {place[:2] for place in places if place is not None}
-    if len(found) == 1:
-        return found.pop()
+@lru_cache(maxsize=256)
+def clock_parts(fields: tuple[str, ...], schema: Schema) -> tuple[str, str] | None:
+    """Return the parts of a frame that have the fields of a clock, and their kind.
+
+    Returns None if the frame itself has them.
+    """
+    places = set[tuple[str, str]]()
+    for path in fields:
+        if path in schema.fields:
+            continue
+        place = schema.within(path)
+        if place is not None:
+            axis, kind, _ = place
+            places.add((axis, kind))
+    if len(places) == 1:
+        return places.pop()
     return None
 
 

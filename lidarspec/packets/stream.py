@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from itertools import pairwise
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError, UnknownFrame
 from lidarspec.expressions.columns import Batch
-from lidarspec.frames.arrays import alike, repeated, some
+from lidarspec.frames.arrays import alike, repeated
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_codec import Codec
@@ -104,7 +103,10 @@ class PacketStream:
             data_clock = sensor.clock
         else:
             data_clock = None
-        is_in_parts = data_clock is not None and self._has_clock_in_parts()
+        is_in_parts = (
+            data_clock is not None
+            and clock_parts(paths(data_clock), self._codec.schema) is not None
+        )
         self._counter_order: CounterOrder | None = None
         self._clock_order: ClockOrder | None = None
         if is_data and _has_counter(sensor, frame):
@@ -122,11 +124,13 @@ class PacketStream:
             whole: the frames are a whole input: packets before the first frame of another type see
                 that one as state.
         """
-        parts = [_Part.of(frames, self.frame) for frames in found if len(frames)]
+        parts = [OwnFrames.of(frames, self.frame) for frames in found if len(frames)]
         table = self._table(parts)
         skipped = _all_or_joined([self._bytes_skipped(part) for part in parts])
-        state = self._states(parts, len(table), whole=whole)
-        host = _times([part.column(part.frames.at) for part in parts])
+        state: dict[str, StateOf] = {}
+        if self._others:
+            state = self._states(parts, len(table), whole=whole)
+        host = _times([part.frames.at for part in parts])
         breaks = np.zeros(len(table), np.bool_)
         if alike(skipped) != 0:
             breaks = skipped > 0
@@ -160,9 +164,6 @@ class PacketStream:
         for judge in (self._counter_order, self._clock_order, self._arrival_order):
             if judge is not None:
                 judge.forget()
-
-    def _has_clock_in_parts(self) -> bool:
-        return clock_parts(self.sensor, self._codec.schema) is not None
 
     def _step_ns(self, clock: Clock | None) -> float:
         """Return the step of a clock, ns; 0 if it has no fields."""
@@ -232,35 +233,36 @@ class PacketStream:
         self.stats.undated = ""
         return times + self._turn
 
-    def _bytes_skipped(self, part: _Part) -> Integers:
+    def _bytes_skipped(self, part: OwnFrames) -> Integers:
         """Return the bytes in no frame between each of our frames and the one before, (n,)."""
-        gaps = part.frames.gaps
-        own = part.own
+        gaps = part.piece.gaps
+        rows = part.rows
+        number = len(part.frames)
         if alike(gaps) == 0 and not self._skipped:
-            return repeated(0, part.number)
-        if isinstance(own, slice) and part.number:
-            skipped = gaps[own].copy()
-            skipped[0] += self._skipped + int(gaps[: own.start].sum())
-            self._skipped = int(gaps[own.stop :].sum())
+            return repeated(0, number)
+        if isinstance(rows, slice) and number:
+            skipped = gaps[rows].copy()
+            skipped[0] += self._skipped + int(gaps[: rows.start].sum())
+            self._skipped = int(gaps[rows.stop :].sum())
             return skipped
         sums = self._skipped + np.cumsum(gaps)
-        own_sums = sums[own]
-        self._skipped = int(sums[-1]) - (int(own_sums[-1]) if part.number else 0)
+        own_sums = sums[rows]
+        self._skipped = int(sums[-1])
+        if number:
+            self._skipped -= int(own_sums[-1])
         return np.diff(own_sums, prepend=0)
 
-    def _table(self, parts: Sequence[_Part]) -> Table:
-        tables = [
-            self._codec.gather(part.frames if part.where is None else part.frames.only(part.own))
-            for part in parts
-            if part.number
-        ]
+    def _table(self, parts: Sequence[OwnFrames]) -> Table:
+        tables = [self._codec.gather(part.frames) for part in parts if len(part.frames)]
         if tables:
             return joined_tables(tables)
         return self._codec.table([])
 
-    def _states(self, parts: Sequence[_Part], number: int, *, whole: bool) -> dict[str, StateOf]:
+    def _states(
+        self, parts: Sequence[OwnFrames], number: int, *, whole: bool
+    ) -> dict[str, StateOf]:
         """Return the frames of each other type, and which was the last before each packet."""
-        if not self._state and all(part.where is None for part in parts):
+        if not self._state and not any(part.has_others for part in parts):
             return dict.fromkeys(self._others, (None, repeated(-1, number)))
         seen = self._others_in(parts)
         return {
@@ -268,24 +270,24 @@ class PacketStream:
             for name in self._others
         }
 
-    def _others_in(self, parts: Sequence[_Part]) -> dict[str, list[Earlier]]:
+    def _others_in(self, parts: Sequence[OwnFrames]) -> dict[str, list[Earlier]]:
         """Return the frames of other types, by name."""
         seen: dict[str, list[Earlier]] = {}
         number = 0
         for part in parts:
-            if part.where is not None:
-                mask = np.ones(len(part.frames), np.bool_)
-                mask[part.own] = False
+            if part.has_others:
+                mask = np.ones(len(part.piece), np.bool_)
+                mask[part.rows] = False
                 others = np.flatnonzero(mask)
-                kinds = part.frames.kinds[others]
+                kinds = part.piece.kinds[others]
                 before = number + others - np.arange(len(others))
                 for kind in np.unique(kinds).tolist():
-                    name = part.frames.names[kind]
+                    name = part.piece.names[kind]
                     if name in self._others:
                         which = kinds == kind
-                        frames = part.frames.only(others[which])
+                        frames = part.piece.only(others[which])
                         seen.setdefault(name, []).append((frames, before[which]))
-            number += part.number
+            number += len(part.frames)
         return seen
 
     def _codec_of(self, name: str) -> Codec:
@@ -363,7 +365,7 @@ class ImuStream:
         if data is not None and data.sensor.frames[data.frame].imu is not None:
             batches.append(data)
         for name in self._names:
-            if not whole or any(_Part.of(frames, name).number for frames in found):
+            if not whole or any(len(OwnFrames.of(frames, name).frames) for frames in found):
                 batches.append(self._stream(name).add(found, whole=whole))
         parts = list[ImuSamples]()
         for packets in batches:
@@ -391,52 +393,40 @@ class ImuStream:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class OwnFrames:
     """The frames of one type in a piece of input.
 
     Attributes:
-        frames: all frames of the piece.
-        where: the rows of those of the type; None if all are of it.
-        number: how many are of it.
+        frames: those of the type.
+        piece: all frames of the piece.
+        rows: the rows of `frames` in the piece, as a slice if they follow one another.
     """
 
     frames: Frames
-    where: NDArray[np.intp] | None
-    number: int
+    piece: Frames
+    rows: NDArray[np.intp] | slice
 
     @classmethod
-    def of(cls, frames: Frames, name: str) -> _Part:
+    def of(cls, piece: Frames, name: str) -> OwnFrames:
         """Return the frames of one type in a piece."""
-        if name in frames.names:
-            own = frames.names.index(name)
-        else:
-            own = -1
-        kind = alike(frames.kinds)
-        if kind is not None and kind == own:
-            return cls(frames, None, len(frames))
-        is_own = frames.kinds == own
-        if is_own.all():
-            return cls(frames, None, len(frames))
-        where = np.flatnonzero(is_own)
-        return cls(frames, where, len(where))
+        own_kind = -1
+        if name in piece.names:
+            own_kind = piece.names.index(name)
+        kind = alike(piece.kinds)
+        if kind is not None and kind == own_kind:
+            return cls(piece, piece, slice(0, len(piece)))
+        indices = np.flatnonzero(piece.kinds == own_kind)
+        rows: NDArray[np.intp] | slice = indices
+        if not len(indices):
+            rows = slice(0, 0)
+        elif indices.item(-1) - indices.item(0) == len(indices) - 1:
+            rows = slice(indices.item(0), indices.item(-1) + 1)
+        return cls(piece.only(rows), piece, rows)
 
-    @cached_property
-    def own(self) -> NDArray[np.intp] | slice:
-        """The rows of the type, as a slice if they follow one another."""
-        where = self.where
-        if where is None or not len(where):
-            return slice(0, self.number)
-        first = where.item(0)
-        last = where.item(-1)
-        if last - first == len(where) - 1:
-            return slice(first, last + 1)
-        return where
-
-    def column(self, array: Integers) -> Integers:
-        """Return the rows of the type from an array of the piece."""
-        if self.where is None:
-            return array
-        return some(array, self.own)
+    @property
+    def has_others(self) -> bool:
+        """Whether there are frames of other types in the piece."""
+        return len(self.frames) < len(self.piece)
 
 
 def data_frame(sensor: Sensor, found: Sequence[Frames]) -> str | None:
@@ -491,20 +481,31 @@ def _has_field(sensor: Sensor, frame: str, path: str) -> bool:
     return frame in having or not having
 
 
-def _offsets(parts: Sequence[_Part]) -> Numbers:
+def _offsets(parts: Sequence[OwnFrames]) -> Numbers:
     """Return the offsets of frames in the input.
 
     They are a range if all frames have one size and follow one another.
     """
-    runs = [part.frames.places for part in parts if part.where is None]
-    ranges = [places for places in runs if isinstance(places, range)]
-    are_joined = all(
-        before.stop == after.start and before.step == after.step
-        for before, after in pairwise(ranges)
-    )
-    if ranges and len(ranges) == len(parts) and are_joined:
-        return range(ranges[0].start, ranges[-1].stop, ranges[0].step)
-    return _joined([part.column(part.frames.offsets) for part in parts], np.int64)
+    places = _join_ranges(parts)
+    if places is None:
+        return _joined([part.frames.offsets for part in parts], np.int64)
+    return places
+
+
+def _join_ranges(parts: Sequence[OwnFrames]) -> range | None:
+    """Return the offsets of frames as one range; None if they are not in equal steps."""
+    joined: range | None = None
+    for part in parts:
+        places = part.frames.places
+        if not isinstance(places, range):
+            return None
+        if joined is None:
+            joined = places
+        elif joined.stop == places.start and joined.step == places.step:
+            joined = range(joined.start, places.stop, joined.step)
+        else:
+            return None
+    return joined
 
 
 def _times(parts: Sequence[Integers]) -> Integers:

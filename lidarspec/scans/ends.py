@@ -117,7 +117,7 @@ class EndFinder:
             ends = starts[found]
             if _is_per_packet(column):
                 rows = found
-        return _make_ends(ends, rows, [self._is_leap(step) for step in steps.tolist()])
+        return _make_ends(ends, rows, map(self._is_leap, steps.tolist()))
 
     def _cut_angle(self, rule: OnWrap, full: float) -> float:
         """Return the angle at which scans are cut, in the unit in which a turn is `full`."""

@@ -20,7 +20,7 @@ import pytest
 import lidarspec as ls
 import lidarspec.device.arrivals
 import lidarspec.transports.files
-from lidarspec.device.arrivals import fed
+from lidarspec.device.arrivals import decode_chunks
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.format import Recording
 from lidarspec.spec import Chunk, Udp
@@ -105,9 +105,19 @@ def test_frames_have_the_time_of_the_chunk_that_completes_them() -> None:
     ]
     decoder = TURNING.decoder()
     decoder.feed(b"\x00" * 7)
-    assert np.concatenate([spans.at for spans in fed(decoder, chunks)]).tolist() == [10, 20, 30, 40]
+    assert np.concatenate([spans.at for spans in decode_chunks(decoder, chunks)]).tolist() == [
+        10,
+        20,
+        30,
+        40,
+    ]
     whole = [Chunk(stream[:size], 50), Chunk(stream[size:], 60)]
-    assert np.concatenate([spans.at for spans in fed(decoder, whole)]).tolist() == [50, 60, 60, 60]
+    assert np.concatenate([spans.at for spans in decode_chunks(decoder, whole)]).tolist() == [
+        50,
+        60,
+        60,
+        60,
+    ]
 
 
 def test_datagrams_and_their_gaps(line: Port) -> None:
