@@ -10,6 +10,7 @@ All times are the caller's, in ns of one monotonic clock.
 from __future__ import annotations
 
 import bisect
+import functools
 import heapq
 import math
 import random
@@ -26,7 +27,7 @@ from lidarspec.simulation.faults import Faults, Line
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Scene, furnished
 from lidarspec.simulation.simulator import Rest, Simulation, simulation
-from lidarspec.spec.description import Answer, Command
+from lidarspec.spec.description import Answer, Command, Frame
 from lidarspec.spec.links import is_datagram
 from lidarspec.spec.sensor import Sensor, with_frames
 from lidarspec.spec.tree import FieldInfo
@@ -175,11 +176,20 @@ class Answering:
 def _listening(sensor: Sensor, link: str) -> Decoder:
     """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
     frames = {
-        name: replace(frame, direction="in")
+        name: _as_incoming(frame)
         for name, frame in sensor.frames.items()
         if frame.direction == "out"
     }
     return Decoder(with_frames(sensor, frames), stream=not is_datagram(sensor.links.get(link)))
+
+
+@functools.lru_cache(maxsize=256)
+def _as_incoming(frame: Frame) -> Frame:
+    """Return an outgoing frame type as the sensor receives it.
+
+    It is kept, because its layout is kept with it.
+    """
+    return replace(frame, direction="in")
 
 
 def _physical(info: FieldInfo, value: Any) -> Any:
