@@ -37,7 +37,7 @@ from lidarspec.packets.imu import joined
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import EVERYTHING, Selection, Times, received
+from lidarspec.scans.selection import EVERYTHING, Selection, Times, iter_received
 from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import found
 from lidarspec.transports.open_url import is_live, transport
@@ -253,7 +253,7 @@ def _write_packets(
             sensor = _detect_sensor(source, target)
         try:
             with recorder_like(opened, source, str(part), sensor, overwrite=True) as file:
-                for chunk in received(opened, times, source):
+                for chunk in iter_received(opened, times, source):
                     file.keep_up()
                     file.write(chunk)
                     progress(lambda: f"{target}: {file.records} packets", opened.place)

@@ -38,7 +38,7 @@ from lidarspec.errors import (
 from lidarspec.frames.parse import identify
 from lidarspec.plugins import sensors
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import Selection, Times, received
+from lidarspec.scans.selection import Selection, Times, iter_received
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, unhexed
 from lidarspec.transports.protocol import Chunk, no_bytes
@@ -109,7 +109,7 @@ def _file(path: str, times: Times) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
         if path == "-" and type(file) is FileTransport:
             chunks = _standard_input(file)
         else:
-            chunks = received(file, times, path)
+            chunks = iter_received(file, times, path)
         with _beginning(path, chunks, datagrams=file.datagrams, warnings=file.warnings) as given:
             yield given
         for warning in file.warnings if given[0].chunks else ():

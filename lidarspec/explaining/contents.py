@@ -19,7 +19,7 @@ from lidarspec.detect.identification import Verdict, chosen, declared, names, ve
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, suggest
 from lidarspec.recording.format import Header
-from lidarspec.scans.selection import dated
+from lidarspec.scans.selection import format_date
 from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.bags import BagTransport
 from lidarspec.transports.files import (
@@ -312,10 +312,10 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
         lines.append(("recorded", f"{header.created} from {header.source or 'an unknown source'}"))
     if found.first_ns is not None:
         if found.last_ns is not None:
-            until = f" to {dated(found.last_ns)}, {found.seconds:.3f} s"
+            until = f" to {format_date(found.last_ns)}, {found.seconds:.3f} s"
         else:
             until = ""
-        lines.append(("time", f"{dated(found.first_ns)}{until}"))
+        lines.append(("time", f"{format_date(found.first_ns)}{until}"))
     else:
         lines.append(("time", "it does not say when its bytes arrived"))
     seconds = found.seen_seconds or 0.0

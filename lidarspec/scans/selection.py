@@ -1,9 +1,10 @@
-"""What is wanted of the scans of a source: from when to when, which of them, and what of each.
+"""Select scans of a source by time or number, and parts of each scan.
 
-A `Selection` is a value; a `Sieve` carries it out on one stream, scan by scan as they come, and
-says when no further one is wanted. Where a source can be moved on, what lies before a slice is
-passed over without being read: up to so long before it that the clocks of sensor and host may
-differ, and that a whole scan comes first.
+A `Selection` is a value. A `Sieve` applies it to the scans of one stream as they arrive, and
+reports when no further scan is selected. `iter_received` selects bytes by their arrival.
+
+If a source can seek, the data before a slice is skipped without reading it. Reading starts early
+enough that a whole scan comes before the slice, even if the clocks of sensor and host differ.
 """
 
 from __future__ import annotations
@@ -23,33 +24,36 @@ from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Transport
 
-#: a time: seconds from the first scan, or a date.
+#: seconds from the first scan, or a date.
 Moment = float | datetime
 Times = tuple[Moment | None, Moment | None]
-#: seconds before a slice from which on is read, of its distance the share by which clocks differ,
-#: and seconds that passing over is worth.
-BEFORE = 5.0
-DRIFT = 1e-3
-WORTH = 5.0
-#: ns since 1970 from which on a time is a date, and not that of a clock that began with the sensor.
-DATED = 10**18
+#: how long before a slice reading starts.
+LEAD_S = 5.0
+#: share of the distance by which the clocks of sensor and host may differ.
+MAX_CLOCK_DRIFT = 1e-3
+#: the shortest stretch that is worth seeking.
+MIN_SKIP_S = 5.0
+#: a later time is a date; an earlier one is of a clock that started with the sensor.
+MIN_DATE_NS = 10**18
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which scans are wanted, and what of each.
+    """Which scans to read, and which parts of them.
+
+    A scan is selected if `times`, `scans` and `every` all select it.
 
     Args:
-        times: from which time on, and up to which: seconds from the first scan, or a `datetime`, in
-            UTC where it names no zone; None leaves an end open.
-        scans: from which scan on, and up to which, counted from 0, pieces among them: (5, 10) has
-            five. Both have to be met.
-        every: each so manieth of those, from the first of them on.
-        ranges: metres, from and up to: a return from elsewhere counts as none; its range is -inf
-            where it is nearer, inf where it is farther (REP-117).
-        columns: of the points, by name, in this order; all where there are none.
-        time: whose clock stamps of scans and `times` are by: the "device"'s, or the "host"'s, when
-            the first packet of a scan arrived.
+        times: the first time, and the time after the last one: seconds from the first scan, or a
+            `datetime`, in UTC if it has no zone; None leaves an end open.
+        scans: the first scan, and the scan after the last one, counted from 0 with incomplete
+            scans: (5, 10) selects five.
+        every: the step between selected scans; 1 for all.
+        ranges: the least and the largest range, metres. A return from elsewhere counts as none; its
+            range is -inf if it is nearer, inf if it is farther (REP-117).
+        columns: the columns of the points, by name, in this order; () for all.
+        time: the clock of the stamps and of `times`: "device", or "host" for the arrival of the
+            first packet of a scan.
         beams, frame_id: as in `Scan`.
 
     Raises:
@@ -72,11 +76,8 @@ class Selection:
                 "a scan is counted from the first one: from the last, all of a source would have to"
                 " be read first"
             )
-        times = (
-            moment.replace(tzinfo=moment.tzinfo or UTC) if isinstance(moment, datetime) else moment
-            for moment in self.times
-        )
-        object.__setattr__(self, "times", tuple(times))
+        begin, end = self.times
+        object.__setattr__(self, "times", (_add_zone(begin), _add_zone(end)))
         for low, high in (self.scans, self.times, self.ranges):
             if low is not None and high is not None:
                 _check_order(low, high)
@@ -85,7 +86,7 @@ class Selection:
 
     @property
     def is_timed(self) -> bool:
-        """Whether times decide."""
+        """Whether scans are selected by time."""
         return self.times != (None, None)
 
     @property
@@ -95,6 +96,13 @@ class Selection:
         This is required if scans are selected by number or time.
         """
         return self.is_timed or self.scans != (0, None) or self.every != 1
+
+
+def _add_zone(moment: Moment | None) -> Moment | None:
+    """Return a time, a date without a zone as one in UTC."""
+    if isinstance(moment, datetime) and moment.tzinfo is None:
+        return moment.replace(tzinfo=UTC)
+    return moment
 
 
 def _check_order(low: Any, high: Any) -> None:
@@ -107,16 +115,16 @@ def _check_order(low: Any, high: Any) -> None:
         raise UsageError(f"start and end are equal: {low}")
 
 
-#: all of a source.
+#: selects all scans of a source.
 EVERYTHING = Selection()
 
 
 class Slice:
-    """The times of one stream that are wanted.
+    """The selected times of one stream.
 
     Attributes:
-        first, last: of those that came, ns; None before any.
-        ended: whether all that follow are behind its end.
+        first, last: the first and the last time so far, ns; None before any.
+        ended: whether all further times are behind the end.
     """
 
     def __init__(self, times: Times) -> None:
@@ -126,11 +134,17 @@ class Slice:
         self.last: int | None = None
 
     def holds(self, at: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the next times, (n,) ns, are wanted."""
+        """Return which of the next times are selected, (n,).
+
+        Args:
+            at: the times, (n,) ns.
+        """
         if len(at):
-            self.first = int(at[0]) if self.first is None else self.first
+            if self.first is None:
+                self.first = int(at[0])
             self.last = int(at[-1])
-        begin, end = (self.ns(moment) for moment in self._times)
+        begin = self.ns(self._times[0])
+        end = self.ns(self._times[1])
         self.ended = end is not None and self.last is not None and self.last >= end
         if begin is None:
             wanted = np.ones(len(at), np.bool_)
@@ -150,10 +164,9 @@ class Slice:
         """
         first = self.first or 0
         last = self.last or 0
-        if first > DATED:
-            dates = f" ({dated(first)} to {dated(last)})"
-        else:
-            dates = ""
+        dates = ""
+        if first > MIN_DATE_NS:
+            dates = f" ({format_date(first)} to {format_date(last)})"
         text = (
             f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}, and nothing"
             " of that is asked for"
@@ -162,13 +175,13 @@ class Slice:
 
     @property
     def ahead(self) -> int:
-        """Nanoseconds from the first time to where the slice begins."""
-        if self._times[0] is not None:
-            return (self.ns(self._times[0]) or 0) - (self.first or 0)
-        return 0
+        """The time from the first time to the start of the slice, ns."""
+        if self._times[0] is None:
+            return 0
+        return (self.ns(self._times[0]) or 0) - (self.first or 0)
 
     def ns(self, moment: Moment | None) -> int | None:
-        """A moment as a time of the stream, of which one has come."""
+        """Return a moment as a time of the stream, ns; None if no time of the stream is known."""
         if isinstance(moment, datetime):
             return round(moment.timestamp() * 1e6) * 1000
         if moment is None or self.first is None:
@@ -176,16 +189,19 @@ class Slice:
         return self.first + round(moment * 1e9)
 
 
-def dated(ns: int) -> str:
-    """A time as a date in UTC, as `--slice` takes it."""
+def format_date(ns: int) -> str:
+    """Return a time as a date in UTC, in the form that `--slice` accepts."""
     return f"{datetime.fromtimestamp(ns // 10**9, UTC):%Y-%m-%dT%H:%M:%S}.{ns // 10**6 % 1000:03}Z"
 
 
-def received(source: Transport, times: Times, name: object) -> Iterator[Chunk]:
-    """What a source received, or only at some times, by their arrival.
+def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chunk]:
+    """Yield the chunks of a source that arrived at some times.
+
+    Args:
+        name: of the source, for messages.
 
     Raises:
-        UsageError: where nobody knows when it was, or nothing was received then.
+        UsageError: if the times of arrival are unknown, or nothing arrived at these times.
     """
     if times == (None, None):
         yield from source.chunks()
@@ -199,7 +215,7 @@ def received(source: Transport, times: Times, name: object) -> Iterator[Chunk]:
         if wanted.holds(np.array([chunk.at]))[0]:
             any_came = True
             yield chunk
-        elif is_first and wanted.ahead > WORTH * 1e9:
+        elif is_first and wanted.ahead > MIN_SKIP_S * 1e9:
             source.skip(chunk.at + wanted.ahead)
         if wanted.ended:
             break
@@ -207,88 +223,93 @@ def received(source: Transport, times: Times, name: object) -> Iterator[Chunk]:
         raise wanted.missed(name)
 
 
-def never(at: int) -> bool:
-    """No source is moved on."""
-    return False
-
-
 class Sieve:
-    """A selection, carried out on the scans of one stream.
+    """Applies a selection to the scans of one stream.
 
     Args:
-        source: what it is called in messages.
-        skip: moves the source on to what arrived at a time, ns since 1970, where it can: whether it
-            did.
+        source: its name in messages.
+        skip: skips the data of the source that arrived before a time, ns since 1970, and returns
+            whether it has done so; None if the source cannot seek.
 
     Attributes:
-        ended: whether no further scan is wanted.
-        slice: the times that are.
+        ended: whether no further scan is selected.
+        slice: the selected times.
     """
 
     def __init__(
         self,
         selection: Selection,
         source: object = "the source",
-        skip: Callable[[int], bool] = never,
+        skip: Callable[[int], bool] | None = None,
     ) -> None:
         self._selection = selection
         self._source = source
         self._skip = skip
-        self._seen = self._kept = 0
-        self._skipped = False
+        self._seen = 0
+        self._selected = 0  # by time and number, whatever `every` is
+        self._has_skipped = False
         self.ended = False
         self.slice = Slice(selection.times)
 
     def of(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
-        """What is wanted of some scans; None, for a turn of the caller's, is handed on.
+        """Yield the selected scans, with their selected parts; None is passed on.
 
         Raises:
-            UsageError: where there were scans, and none of them was wanted.
+            UsageError: if there were scans, and none of them was selected.
         """
         for scan in scans:
-            wanted = None if scan is None else self.take(scan)
-            if scan is None or wanted is not None:
-                del scan  # nobody is to keep it but the caller
-                yield wanted
-            del wanted
+            selected = None
+            if scan is not None:
+                selected = self.take(scan)
+            if scan is None or selected is not None:
+                del scan  # only the caller may keep it alive
+                yield selected
+            del selected
             if self.ended:
                 break
         if self.is_empty:
             raise self.missing()
 
     def take(self, scan: Scan) -> Scan | None:
-        """What is wanted of the next scan, None where it is not.
+        """Return the selected parts of the next scan, None if it is not selected.
 
         Raises:
-            UsageError: where nobody knows the time that is asked for, or the points have not the
-                columns.
+            UsageError: if its time is needed and unknown, or if the points do not have the columns.
         """
         selection = self._selection
         number = self._seen
         start, stop = selection.scans
         self._seen += 1
-        wanted = start <= number and (stop is None or number < stop)
+        is_selected = start <= number and (stop is None or number < stop)
         self.ended = stop is not None and self._seen >= stop
         if selection.is_timed:
-            wanted &= bool(self.slice.holds(np.array([self._time(scan)]))[0])
+            is_in_slice = bool(self.slice.holds(np.array([self._time(scan)]))[0])
+            is_selected = is_selected and is_in_slice
             self.ended = self.ended or self.slice.ended
             if not number:
-                self._pass_over(scan)
-        self._kept += wanted
-        if wanted and (self._kept - 1) % selection.every == 0:
-            return self._shaped(scan)
-        return None
+                self._skip_to_slice(scan)
+        if not is_selected:
+            return None
+        self._selected += 1
+        if (self._selected - 1) % selection.every:
+            return None
+        return self._select_parts(scan)
 
     @property
     def is_empty(self) -> bool:
-        """Whether there were scans, and none of them was wanted."""
-        return self._seen > 0 and not self._kept
+        """Whether there were scans, and none of them was selected."""
+        return self._seen > 0 and not self._selected
 
     def missing(self) -> UsageError:
-        """That no scan was wanted, and which there are."""
-        number = f"{self._seen} scan{'s' * (self._seen != 1)}"
+        """Return the error that no scan was selected; it names those of the source."""
+        if self._seen == 1:
+            number = "1 scan"
+        else:
+            number = f"{self._seen} scans"
+        if self._selection.is_timed and self._has_skipped:
+            return self.slice.missed(self._source, "scans")
         if self._selection.is_timed:
-            return self.slice.missed(self._source, "scans" if self._skipped else f"{number},")
+            return self.slice.missed(self._source, f"{number},")
         return UsageError(
             f"{self._source} has {number}, from 0 to {self._seen - 1}, and none of them is"
             " asked for"
@@ -305,24 +326,20 @@ class Sieve:
             return scan.host_ns
         return scan.stamp_ns
 
-    def _pass_over(self, scan: Scan) -> None:
-        """Move the source on to a little before the slice."""
-        ahead = self.slice.ahead * 1e-9
+    def _skip_to_slice(self, scan: Scan) -> None:
+        """Skip the data of the source up to a little before the slice, if that is possible."""
+        if self._skip is None or not scan.host_ns or self._selection.scans != (0, None):
+            return
         clock = scan.sensor.clock
-        near = BEFORE + DRIFT * ahead
-        is_followed = (
-            clock is None or not clock.wraps_at or clock.wraps_at >= 1
-        )  # a quicker one cannot be followed over a gap
-        if (
-            ahead - near > WORTH
-            and scan.host_ns
-            and is_followed
-            and self._selection.scans == (0, None)
-        ):
-            self._skipped = self._skip(scan.host_ns + round((ahead - near) * 1e9))
+        if clock is not None and clock.wraps_at and clock.wraps_at < 1:
+            return  # its wraps cannot be counted over a gap
+        distance_s = self.slice.ahead * 1e-9
+        skipped_s = distance_s - LEAD_S - MAX_CLOCK_DRIFT * distance_s
+        if skipped_s > MIN_SKIP_S:
+            self._has_skipped = self._skip(scan.host_ns + round(skipped_s * 1e9))
 
-    def _shaped(self, scan: Scan) -> Scan:
-        """A scan with what is wanted of it."""
+    def _select_parts(self, scan: Scan) -> Scan:
+        """Return the selected parts of a scan."""
         selection = self._selection
         cloud = scan.points
         if selection.time == "host":
@@ -330,7 +347,7 @@ class Sieve:
         else:
             stamp_ns = cloud.stamp_ns
         if selection.ranges != (0.0, math.inf):
-            cloud = LazyCloud.of(_Within(cloud, *selection.ranges), stamp_ns)
+            cloud = LazyCloud.of(_LimitedRanges(cloud, *selection.ranges), stamp_ns)
         elif stamp_ns != cloud.stamp_ns:
             cloud = LazyCloud.of(CloudColumns(cloud), stamp_ns)
         if selection.columns:
@@ -343,8 +360,8 @@ class Sieve:
         )
 
 
-class _Within(CloudColumns):
-    """The columns of a cloud, of which returns outside some metres count as none."""
+class _LimitedRanges(CloudColumns):
+    """The columns of a cloud in which returns outside some ranges, metres, count as none."""
 
     def __init__(self, cloud: PointCloud, near: float, far: float) -> None:
         super().__init__(cloud)
@@ -361,5 +378,7 @@ class _Within(CloudColumns):
         too_far = valid & (ranges > self._far)
         if name == "valid":
             return np.asarray(column & ~too_near & ~too_far)
-        near, far = (-np.inf, np.inf) if name == "range" else (np.nan, np.nan)
-        return np.where(too_near, np.float32(near), np.where(too_far, np.float32(far), column))
+        if name == "range":
+            column = np.where(too_far, np.float32(np.inf), column)
+            return np.where(too_near, np.float32(-np.inf), column)
+        return np.where(too_near | too_far, np.float32(np.nan), column)

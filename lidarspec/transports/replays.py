@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 from lidarspec.errors import UsageError, WireError
 from lidarspec.recording.appending import Appender
-from lidarspec.scans.selection import Times, received
+from lidarspec.scans.selection import Times, iter_received
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import Outlet
 from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, sender_names
@@ -163,7 +163,7 @@ class Replay:
         opened = self._source or transport(self._file)
         self._source = None
         with contextlib.closing(opened) as source:
-            chunks = self._check_times(received(source, self._times, self._file))
+            chunks = self._check_times(iter_received(source, self._times, self._file))
             try:
                 for chunk, late_ns in iter_paced(chunks, speed=self._speed):
                     self._send(chunk)

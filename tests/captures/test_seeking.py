@@ -195,7 +195,7 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_slice_of_a_capture_has_the_scans_that_reading_all_of_it_gives(
     captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("BEFORE", "WORTH"):  # seconds: the margin before a slice, and what is worth a seek
+    for name in ("LEAD_S", "MIN_SKIP_S"):
         monkeypatch.setattr(selection, name, 0.5)
     packed = tmp_path / "drive.pcap.gz"
     packed.write_bytes(gzip.compress(captured.read_bytes(), 1))  # a reader cannot seek in it
