@@ -1,9 +1,8 @@
-"""The vocabulary of `points` functions: what NumPy's ufuncs do not say about angles, order and
-tables.
+"""Functions for `points`, in addition to NumPy's ufuncs: angles, stream order, tables.
 
-Each works on NumPy arrays and on the columns that the engine passes; a column knows where packets
-and losses are, an array is taken as one run of values. The engine's other evaluators understand the
-same names.
+Each works on NumPy arrays and on the columns that the engine passes. A column knows the borders of
+packets and the losses; an array counts as one run of values. The engine's other evaluators
+implement the same functions.
 """
 
 from __future__ import annotations
@@ -22,17 +21,18 @@ Array = Any
 #: a step between blocks may be longer than the fastest one by this factor: in captures of rotating
 #: sensors, steps at a constant speed vary by 5 %.
 STEP_TOLERANCE = 1.25
-#: NumPy functions that work element by element, and so keep axes; others see plain arrays.
+#: NumPy functions that work element by element and keep axes; all others get plain arrays.
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
 
 
 class Along(NDArrayOperatorsMixin):
-    """Numbers that all packets share, along arrays of the frame; NumPy's ufuncs apply, among
-    themselves and with columns.
+    """Numbers that all packets share, along arrays of the frame.
+
+    NumPy's ufuncs combine them with each other and with columns.
 
     Attributes:
-        axes: the arrays, by the last part of their paths or the whole of it.
-        array: the numbers, with an axis for each.
+        axes: the arrays, by the last part of their paths or the whole path.
+        array: the numbers, with an axis for each array.
     """
 
     def __init__(self, axes: tuple[str, ...], array: NDArray[Any]) -> None:
@@ -43,7 +43,7 @@ class Along(NDArrayOperatorsMixin):
         return len(self.array)
 
     def __getitem__(self, which: Any) -> Any:
-        """Of the plain array."""
+        """Return an element or part of the plain array."""
         return self.array[which]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -70,8 +70,9 @@ class Along(NDArrayOperatorsMixin):
         )
 
     def applied(self, function: Callable[..., Any], *values: Any) -> Any:
-        """`function` of arrays, lined up by the arrays that they are along; of columns too, if one
-        is among the values.
+        """Return `function` of values that are aligned by the arrays that they are along.
+
+        If a column is among the values, the column applies the function.
         """
         for value in values:
             if hasattr(value, "applied") and not isinstance(value, Along):
@@ -92,8 +93,10 @@ class Along(NDArrayOperatorsMixin):
         return Along(tuple(axes.values()), array)
 
     def lined_up(self, names: tuple[str, ...]) -> NDArray[Any]:
-        """The numbers with an axis for each of these names, last parts of paths, among which its
-        own are.
+        """Return the numbers with an axis for each name; axes of other arrays have length 1.
+
+        Args:
+            names: last parts of paths; the own axes are among them.
         """
         own = [name.rpartition(".")[2] for name in self.axes]
         ordered = self.array.transpose([own.index(name) for name in names if name in own])
@@ -102,17 +105,17 @@ class Along(NDArrayOperatorsMixin):
 
 
 def along(axis: str | tuple[str, ...], values: Array) -> Any:
-    """Numbers that all packets share, along an array of the frame: ``along("pixels", ELEVATIONS)``.
+    """Return numbers that all packets share: ``along("pixels", ELEVATIONS)``.
 
     Args:
-        axis: the array, by its name; or several, outermost first.
-        values: as many numbers as the array has elements; with an axis for each of several arrays.
+        axis: the name of an array of the frame, or several, outermost first.
+        values: as many numbers as the array has elements, with an axis for each array.
 
     Returns:
-        What lines up with columns by the array's name, wherever it stands in the frame.
+        Numbers that are aligned with columns by the name of the array.
 
     Raises:
-        SpecError: for values with more or fewer axes than are named.
+        SpecError: for values with more or fewer axes than names.
     """
     axes = (axis,) if isinstance(axis, str) else tuple(axis)
     array = np.asarray(values)
@@ -125,7 +128,7 @@ def along(axis: str | tuple[str, ...], values: Array) -> Any:
 
 
 def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
-    """Even steps from start to end, both included, for each packet.
+    """Return even steps from start to end, both included, for each packet.
 
     Args:
         start, end: first and last angle of each packet, shape (n, 1), in the unit of `full`.
@@ -133,12 +136,12 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
         full: the whole circle in that unit; an end below the start is one turn further.
 
     Returns:
-        float64, shape (n, count), not wrapped, so that differences stay positive; with a column as
-        `count`, the longest one, and what is beyond a packet's own count is never used.
+        float64, shape (n, count), not wrapped, so that differences are positive. With a column as
+        `count`, as many as the longest packet has; those beyond the count of a packet are not used.
 
     Raises:
-        SpecError: where every end that differs from its start is whole turns away, so that all
-            points have one angle.
+        SpecError: if every end that differs from its start is whole turns away, so that all points
+            of a packet have one angle.
     """
     turn = end - start
     _refuse_folded(turn, full)
@@ -148,11 +151,12 @@ def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
 
 
 def steps(count: Array) -> Array:
-    """The index of each sample of a packet: 0, 1, 2 ... up to the largest count, such as for times,
-    ``steps(f.count) / RATE``.
+    """Return the index of each sample of a packet: 0, 1, 2 ... up to the largest count.
+
+    For times, for example: ``steps(f.count) / RATE``.
 
     Args:
-        count: samples of each packet, a number or a column; it has to be that of the innermost
+        count: samples of each packet, a number or a column; it has to be the count of the innermost
             array.
 
     Returns:
@@ -165,15 +169,22 @@ def steps(count: Array) -> Array:
 
 
 def wrap(a: Array, full: float) -> Array:
-    """Angles within [0, full), float64, the shape of `a`; `full` is the whole circle in the unit of
-    `a`.
+    """Return angles within [0, full).
+
+    Args:
+        full: the whole circle in the unit of `a`.
+
+    Returns:
+        float64, the shape of `a`.
     """
     turned = np.mod(a, full)
     return np.where(turned >= full, 0.0, turned)
 
 
 def following(a: Array, step: int = 1) -> Array:
-    """The value `step` places later in stream order, over packet borders, padding left out.
+    """Return the value `step` places later in stream order, over packet borders.
+
+    Padding is left out.
 
     Returns:
         float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at
@@ -183,7 +194,9 @@ def following(a: Array, step: int = 1) -> Array:
 
 
 def previous(a: Array, step: int = 1) -> Array:
-    """The value `step` places earlier in stream order, over packet borders, padding left out.
+    """Return the value `step` places earlier in stream order, over packet borders.
+
+    Padding is left out.
 
     Returns:
         float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at
@@ -193,10 +206,10 @@ def previous(a: Array, step: int = 1) -> Array:
 
 
 def last(a: Array, where: Array | None = None) -> Array:
-    """The most recent value, this one included, at which `where` was true.
+    """Return the most recent value, this one included, for which `where` was true.
 
     Args:
-        where: a condition of the shape of `a`; by default where `a` is a number.
+        where: a condition of the shape of `a`; by default that `a` is not nan.
 
     Returns:
         float64, the shape of `a`; nan before the first.
@@ -243,18 +256,22 @@ def between_blocks(
 
 
 def stack(*columns: Array) -> Array:
-    """Several columns side by side as a new innermost axis: (n, b) each gives (n, b, k)."""
+    """Return columns side by side on a new innermost axis: k of shape (n, b) give (n, b, k)."""
     return _applied(side_by_side, *columns)
 
 
 def side_by_side(*arrays: Any) -> Any:
-    """Arrays that broadcast, as a new innermost axis."""
+    """Return arrays, broadcast, side by side on a new innermost axis."""
     return np.stack(np.broadcast_arrays(*arrays), axis=-1)
 
 
 def running(a: Array) -> Array:
-    """The sum of the values so far along the innermost array that they are in, for differences on
-    the wire: float64, the shape of `a`.
+    """Return the sums of the values so far along the innermost array.
+
+    They are needed if the wire has differences.
+
+    Returns:
+        float64, the shape of `a`.
     """
     if hasattr(a, "running"):
         return a.running()
@@ -262,15 +279,15 @@ def running(a: Array) -> Array:
 
 
 def take(table: Array, index: Array) -> Array:
-    """The entries of a table at `index`; nan where the index is not in the table.
+    """Return the entries of a table at `index`; nan if an index is not in the table.
 
     Args:
-        table: (m,), a number for each index; or (m, k), a row for each, along the array of k
-            elements that stands in those of `index`.
+        table: (m,), a number for each index; or (m, k), a row for each index, along the array of k
+            elements inside those of `index`.
 
     Returns:
-        float64, the shape of `index`; of rows with k in place of that array's length: of columns
-        numbered (n, 16, 1), (n, 16, k).
+        float64, the shape of `index`; for rows with k as the length of the inner array: an index of
+        shape (n, 16, 1) gives (n, 16, k).
     """
     entries = np.asarray(table, np.float64)
     if entries.ndim == 1:
@@ -282,26 +299,27 @@ def take(table: Array, index: Array) -> Array:
 
 
 def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
-    """The rows of a table for indices, of their shape; the last one, which is nan, for those that
-    it does not have.
+    """Return the rows of a table for indices, the shape of `index`.
+
+    An index that the table does not have gives its last row, which is nan.
     """
     return np.where((index >= 0) & (index < rows - 1), index, rows - 1).astype(np.intp)
 
 
 class LookUp:
-    """The function of an index that gives the entries of a table, (m,); nan where there is none."""
+    """Function of an index that returns the entries of a table, (m,); nan if there is none."""
 
     def __init__(self, entries: Any) -> None:
         self.entries = entries
         self.__name__ = "take"
 
-    def __call__(self, spots: Any) -> Any:
-        inside = (spots >= 0) & (spots < len(self.entries))
+    def __call__(self, index: Any) -> Any:
+        inside = (index >= 0) & (index < len(self.entries))
         if len(self.entries):
-            found = self.entries[np.where(inside, spots, 0).astype(np.intp)]
+            entries = self.entries[np.where(inside, index, 0).astype(np.intp)]
         else:
-            found = np.zeros(np.shape(spots))
-        return np.where(inside, found, np.nan)
+            entries = np.zeros(np.shape(index))
+        return np.where(inside, entries, np.nan)
 
 
 def _refuse_folded(turn: Array, full: float) -> None:
