@@ -156,7 +156,7 @@ class CaptureReader(Closing):
         self._form: Form | None = None
         self._datagrams: Iterator[Datagram] | None = None
         try:
-            magic = bytes(self._source.ahead(4))
+            magic = bytes(self._source.peek(4))
             if not is_capture(magic):
                 if magic:
                     seen = f"it begins with {magic.hex(' ')}"

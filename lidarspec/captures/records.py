@@ -207,7 +207,7 @@ class PcapRecords:
         Raises:
             Truncated, Damaged: nothing can be read from `source.record` on.
         """
-        head = self._source.ahead(self._head.size)
+        head = self._source.peek(self._head.size)
         if len(head) < self._head.size:
             raise Truncated
         seconds, fraction, captured, original = self._head.unpack(head)
@@ -267,7 +267,7 @@ class PcapRecords:
         """
         size = self._head.size + captured
         within = max(captured, min(original, LARGEST_PACKET) + 1)
-        data = self._source.ahead(self._head.size + within + _REACH)
+        data = self._source.peek(self._head.size + within + _REACH)
         is_end = len(data) < self._head.size + within + _REACH
         if len(data) == size or self.first_place(data[size:], 1, is_end=is_end) is not None:
             return False
@@ -332,7 +332,7 @@ class PcapngBlocks:
         Raises:
             Truncated, Damaged: nothing can be read from `source.record` on.
         """
-        head = bytes(self._source.ahead(12))
+        head = bytes(self._source.peek(12))
         if len(head) < 12:
             raise Truncated
         if head[:4] == _SECTION:
@@ -389,7 +389,7 @@ class PcapngBlocks:
         if not _can_be(length) or (length > LARGEST_BLOCK and kind in _PACKETS | {_INTERFACE}):
             return True
         size = _REACH if length > LARGEST_BLOCK else length
-        data = self._source.ahead(size)
+        data = self._source.peek(size)
         if len(data) == length:
             return data[-4:] != data[4:8]
         return self.first_place(data[4:], size, is_end=True) is not None
@@ -405,7 +405,7 @@ def records(source: Source) -> Form:
     Raises:
         Truncated: the head of the file is cut.
     """
-    if source.ahead(4) == _SECTION:
+    if source.peek(4) == _SECTION:
         return PcapngBlocks(source)
     return PcapRecords(source)
 
@@ -414,8 +414,8 @@ def resume(source: Source, form: Form) -> bool:
     """Goes to the next place where records begin, behind one that is damaged; False where there is
     none, at the end.
     """
-    source.skip(len(source.ahead(1)))
-    while data := source.ahead(_STEP + _REACH):
+    source.skip(len(source.peek(1)))
+    while data := source.peek(_STEP + _REACH):
         found = form.first_place(data, _STEP, is_end=len(data) < _STEP + _REACH)
         source.skip(min(_STEP, len(data)) if found is None else found)
         if found is not None:
@@ -439,10 +439,10 @@ def sought(source: Source, form: Form, at: int) -> bool:
     high = source.size
     if high is None:
         return False
-    first = _captured(source.apart(here), form, high)
+    first = _captured(source.open_at(here), form, high)
     while first is not None and high - low > NEAR:
         middle = (low + high) // 2
-        found = _captured(source.apart(middle), form, high)
+        found = _captured(source.open_at(middle), form, high)
         if found is None or found[0] >= at or abs(found[0] - first[0]) > _YEAR * _SECOND:
             high = middle
         else:

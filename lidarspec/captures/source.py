@@ -1,9 +1,10 @@
-"""The bytes of a capture, from a file or a pipe: read in bounded steps, so that a length in the
-file never becomes an allocation.
+"""Read the bytes of a capture from a file or a pipe.
 
-`Source` reads into buffers that can be lent out: one is not written to again while an array that
-was `lent`, or anything made from it without a copy, is alive. So whoever needs the bytes for longer
-just keeps them.
+Reads are done in bounded steps. The buffer grows with the bytes that have been read, never with a
+length field of the file, so a corrupt length cannot cause a large allocation.
+
+Callers can use the buffer without a copy. `Source.lent` returns it as a read-only array, and
+`Source` does not write to that buffer again while the array, or a view of it, is alive.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SourceError
 
-#: bytes of a buffer at first, and most of those that are passed over at once.
+#: initial size of a buffer, and the largest step of `skip`, in bytes.
 SMALLEST = 1 << 16
-#: bytes behind what was read that may be looked at, whatever they are, so that records can be
-#: compared in words.
+#: bytes behind the filled part that callers may read, whatever their values are, so that they can
+#: compare records in words of several bytes.
 SLACK = 256
-#: buffers kept for use again.
+#: the number of lent buffers that are remembered for reuse.
 MOST_KEPT = 2
 
 
@@ -35,23 +36,22 @@ class Truncated(Exception):
 
 
 class Source:
-    """Bytes of a file or pipe, in buffers that can be lent out: what is held follows what is there,
-    never a length that it claims.
+    """A buffered reader of a file or pipe.
 
     Args:
-        largest: bytes that a buffer grows to where the file has so many; a record that does not fit
-            makes it longer.
+        largest: buffer size in bytes up to which the buffer grows if the file is that long. It
+            grows further only for a record that does not fit.
 
     Attributes:
-        storage: the buffer in use, `SLACK` bytes longer than it is ever filled.
-        at: where in `storage` the next byte stands.
-        record: file offset of the record that was begun last.
+        storage: the current buffer; its last `SLACK` bytes are never filled.
+        at: offset of the next byte in `storage`.
+        record: file offset of the current record, set by `begin_record`.
         place: file offset of the next byte.
     """
 
     def __init__(self, file: BinaryIO, *, largest: int = SMALLEST) -> None:
         self._file = file
-        self._into = _into(file)
+        self._read_into = _read_into(file)
         self._largest = largest
         self._kept: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
         self._lent: weakref.ref[Any] | None = None
@@ -73,16 +73,17 @@ class Source:
     def place(self) -> int:
         return self._passed + self.at
 
-    def apart(self, place: int) -> Source:
-        """The same file's bytes from a place on, in a buffer apart; this one then has to `go` to
-        where it goes on.
+    def open_at(self, place: int) -> Source:
+        """Return a second source of the same file that starts at a file offset.
+
+        Both sources share the file position: call `go` on this one before it is used again.
         """
         return _source_at(self._file, SMALLEST, place)
 
     def go(self, place: int) -> None:
         """Go on from a place of a file that can be sought."""
         self._file.seek(place)
-        self._lent = None  # what is held elsewhere is not written to: the buffer is another
+        self._lent = None  # the new buffer has not been lent
         self._adopt(np.empty_like(self.storage), 0)
         self.record = self._passed = place
 
@@ -96,13 +97,13 @@ class Source:
         self._file.seek(here)
         return size
 
-    def ahead(self, size: int) -> memoryview:
-        """The next `size` bytes, which stay there; fewer at the end."""
+    def peek(self, size: int) -> memoryview:
+        """Return the next `size` bytes without consuming them; fewer at the end of the input."""
         self._has(size)
         return self._data[self.at : self.at + size]
 
     def begin_record(self) -> bool:
-        """Whether a record begins here, rather than the end of the input."""
+        """Mark the start of a record; return False at the end of the input."""
         self.record = self.place
         return self._has(1)
 
@@ -131,12 +132,16 @@ class Source:
             size -= step
 
     def more(self) -> bool:
-        """Whether bytes came after those that are there; they may all move."""
+        """Read at least one more byte into the buffer; return False at the end of the input.
+
+        This can replace `storage` and reset `at`.
+        """
         return self._has(len(self._data) - self.at + 1)
 
     def lent(self) -> NDArray[np.uint8]:
-        """The bytes in the buffer, (n,), read-only: not written to again while this array or a view
-        of it is alive.
+        """Return the bytes in the buffer, (n,), uint8, read-only.
+
+        The buffer is not reused while this array, or a view of it, is alive.
         """
         array = np.frombuffer(self._view[: len(self._data)], np.uint8)
         array.flags.writeable = False
@@ -147,12 +152,12 @@ class Source:
         have = len(self._data) - self.at
         if have >= size:
             return True
-        self._turn(have)
+        self._move_unread(have)
         while have < size:
             if have == len(self.storage) - SLACK:
-                self._turn(have)
+                self._move_unread(have)
             try:
-                count = self._into(self._view[have : len(self.storage) - SLACK])
+                count = self._read_into(self._view[have : len(self.storage) - SLACK])
             except OSError as error:
                 raise SourceError(f"cannot read the capture: {error}") from error
             if not count:
@@ -161,8 +166,11 @@ class Source:
             self._data = self._view[:have]
         return have >= size
 
-    def _turn(self, have: int) -> None:
-        """Puts what is not read yet to the front of a buffer that nobody holds."""
+    def _move_unread(self, have: int) -> None:
+        """Move the unread bytes to the start of a buffer that can be written.
+
+        The buffer is the current one unless it was lent, or is too small.
+        """
         size = len(self.storage) - SLACK
         tail = self.storage[self.at : self.at + have]
         at = self.at
@@ -203,9 +211,10 @@ def _source_at(file: BinaryIO, largest: int, place: int) -> Source:
     return source
 
 
-def _into(file: BinaryIO) -> Callable[[memoryview], int | None]:
-    """What fills a buffer with the bytes that have arrived: of a pipe, others would wait for as
-    many as there is room for.
+def _read_into(file: BinaryIO) -> Callable[[memoryview], int | None]:
+    """Return a function that reads the available bytes into a buffer.
+
+    `readinto` of a buffered pipe would block until the buffer is full; `readinto1` does not.
     """
     if isinstance(file, io.BufferedIOBase):
         return file.readinto1

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import nearest_fault, no_frame, opened
+from lidarspec.cli.inputs import nearest_fault, no_frame, open_input
 from lidarspec.cli.listing import emit_lines
 from lidarspec.cli.options import OFFSET, count_option, selecting, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_options, table
@@ -46,7 +46,7 @@ def parse(
 
     With --slice, which goes by the times of arrival, offsets count from its beginning.
     """
-    with opened(words, selection.times) as (given, chunks):
+    with open_input(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id)
         wanted = Selection(sensor, count=count)
         found = wanted.frames(pieces(sensor, chunks, datagrams=given.datagrams))
@@ -143,7 +143,7 @@ def explain(
     """
     if at is not None and stretch is not None:
         raise UsageError("--at is for one byte, and --bytes for several: leave out one of them")
-    with opened(words, selection.times) as (given, chunks):
+    with open_input(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id, damaged=True)
         if not given.data:
             raise no_frame(sensor, given)
@@ -356,7 +356,7 @@ def _compare(
         if other is None:
             raise UsageError(f"the input has no second {first.frame} frame to compare with")
     else:
-        with opened([diff]) as (heard, chunks):
+        with open_input([diff]) as (heard, chunks):
             second = pieces(sensor, chunks, datagrams=heard.datagrams, frame=frame)
             other = next(
                 (piece for piece in second if piece.frame == first.frame),

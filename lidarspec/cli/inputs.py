@@ -1,8 +1,9 @@
-"""Read the input of verbs, bytes as text, files and live sources, and explain input without a
-frame.
+"""Read the input of commands, and make the error if it contains no frame.
 
-Sources, files and the search for a sensor are imported by the functions that need them: the bytes
-of a named sensor need none of them.
+The input is hexadecimal text, a file, standard input or a configured device.
+
+Modules for sources, files and sensor identification are imported inside functions, because
+commands on hexadecimal text for a named sensor start faster without them.
 """
 
 from __future__ import annotations
@@ -47,26 +48,30 @@ if TYPE_CHECKING:
     from lidarspec.device.device import Device
     from lidarspec.transports.files import FileTransport
 
-#: longest hexadecimal text that is repeated in the next command, and of other text in a message.
+#: maximum length of hexadecimal text that is copied into the suggested command.
 REPEATED = 400
+#: maximum length of other input that is quoted in a message.
 QUOTED = 64
-#: bytes of an input of which the beginning is enough.
+#: maximum number of bytes that `read` returns.
 MOST = 1 << 20
-#: seconds that a device is given for its first frame.
+#: timeout for the first frame of a device, in seconds.
 PATIENCE = 10.0
-#: seconds between two looks at a source that sends nothing.
+#: polling interval for a source that sends nothing, in seconds.
 LOOK = 0.1
 
 
 @contextlib.contextmanager
-def opened(
+def open_input(
     words: Sequence[str], times: Times = (None, None)
 ) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
-    """The beginning of the input that the words of a command line stand for, and all of it, which
-    is read as it is asked for.
+    """Open the input that command-line arguments name.
+
+    Yields:
+        The first bytes of the input, and an iterator over all its chunks, which reads lazily.
 
     Args:
-        times: of a file only what arrived then.
+        words: the arguments: hexadecimal text, "-", a file name, or the name of a device.
+        times: the time range to read of a file.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -87,7 +92,7 @@ def opened(
 
             if (device := named(text)) is None:
                 raise _no_bytes(words, error) from None
-            reading = opened([device.source], times)
+            reading = open_input([device.source], times)
     with reading as given:
         yield given
 
@@ -162,7 +167,7 @@ def read(words: Sequence[str]) -> Heard:
         UsageError: for text that is neither hexadecimal nor a file.
         SourceError: for a file that cannot be read.
     """
-    with opened(words) as (given, chunks):
+    with open_input(words) as (given, chunks):
         return replace(given, chunks=tuple(chunk.data for chunk in leading(chunks, MOST)))
 
 
@@ -184,15 +189,17 @@ def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
 def refuse_overwriting(
     target: str | Sequence[str] | None, *inputs: str | Path | Sensor | None, force: bool = True
 ) -> None:
-    """Nothing, where a file is written to that is none of those that are read, by whatever name,
-    and with `force` off is new.
+    """Raise an error if an output file is also an input, or exists and `force` is off.
+
+    Files are compared by identity, not by name.
 
     Args:
-        target: the file, or files.
-        inputs: words that may be a SOURCE or a file; sensors, whose options may be.
+        target: the output file or files.
+        inputs: SOURCEs and file names; sensors, whose options may be file names.
+        force: allow existing files that are not inputs.
 
     Raises:
-        UsageError: where it is not.
+        UsageError: if a file would be overwritten.
     """
     existing = [
         file
@@ -269,7 +276,10 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
 
 
 def nearest_fault(given: Heard) -> WireError:
-    """No sensor fits: what the one that came farthest says, with its id, or that none came far."""
+    """Return the error for input that no sensor fits.
+
+    It is the error of the sensor that parsed most of the input, or a general one.
+    """
     from lidarspec.detect.identification import nearest
     from lidarspec.detect.uninstalled import suggest_installation
 
@@ -306,8 +316,10 @@ def _never_right(given: Heard) -> WireError | None:
 
 
 def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
-    """Why there is nothing to show: a plugin that raises, no data frame in a file, a silent device,
-    or one whose bytes are no frames.
+    """Return the error for a source without a scan.
+
+    The cause is an exception of the plugin, a file without data frames, a device that sends
+    nothing, or bytes that are not frames.
     """
     sensor = device.sensor
     stats = device.stats
@@ -336,30 +348,31 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     else:
         waited = f" within {seconds:.1f} s".replace(".0 s", " s")
     if stats.bytes_in == 0:
-        others = f", and others {stats.foreign} datagrams" * bool(stats.foreign)
+        others = ""
+        if stats.foreign:
+            others = f", other senders sent {stats.foreign} datagrams"
         return suggest(
             CommandError(f"{sensor.id} on {source} sent nothing{waited}{others}"),
             f"lidarspec doctor {quote(source)} -s {sensor.id}",
         )
     error = WireError(
-        f"{source}: {stats.bytes_in} bytes{waited}, and not a scan of data frames among them:"
-        f" {stats}",
+        f"{source}: received {stats.bytes_in} bytes{waited}, but no complete scan: {stats}",
         sensor=sensor.id,
     )
     return suggest(error, f"lidarspec detect {quote(source)}")
 
 
 def conclude(device: Device) -> None:
-    """Say what there is to be said of a source that was read; exit code 1 where bytes of it are
-    damaged, and could not be.
+    """Print learned values and warnings after a source was read.
 
     Raises:
-        PluginError: where a function of the plugin raised at some of the packets.
+        PluginError: if plugin code raised for some packets.
+        click.exceptions.Exit: with exit code 1, if corrupt bytes of the source could not be read.
     """
     failure = device.stats.failure(device.sensor.id)
     for name, value in device.learned.items():
         note(
-            f"{device.sensor.id} has said its {name}:"
+            f"{device.sensor.id} reported its {name}:"
             f" {f'{len(value)} bytes' if isinstance(value, bytes) else value}"
         )
     for warning in device.warnings:
@@ -372,7 +385,7 @@ def conclude(device: Device) -> None:
 
 
 def again(source: str) -> Heard | None:
-    """The beginning of a file once more; None for what can be read only once."""
+    """Read the beginning of a file a second time; return None if that is not possible."""
     from lidarspec.transports.open_url import transport
 
     if not Path(source.partition("?")[0]).is_file():
@@ -386,8 +399,11 @@ def again(source: str) -> Heard | None:
 
 
 def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
-    """What a file holds that has no data frame of a sensor, and the options with which it is read;
-    None where nothing fits.
+    """Identify a file that has no data frame of `sensor`.
+
+    Returns:
+        A description of its content, and the command-line options that read it; None if no sensor
+        fits.
     """
     from lidarspec.detect.identification import chosen, verdict
 
@@ -412,8 +428,10 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
 
 
 class Patience:
-    """The time in which a live source has to send its first data frame, or first one of another
-    type.
+    """A timeout for the first frame of a live source.
+
+    Args:
+        frame: the frame type to wait for; by default any data frame.
     """
 
     def __init__(self, device: Device, source: str, frame: str | None = None) -> None:
@@ -426,7 +444,7 @@ class Patience:
             self._awaited = (frame,)
 
     def check(self) -> None:
-        """Nothing, while there is hope.
+        """Raise an error if the timeout has passed without a data frame.
 
         Raises:
             CommandError, WireError: where the device has sent nothing, or nothing of the sensor's,

@@ -1,8 +1,7 @@
-"""Bytes out of any source, to find out whose they are: the beginning of a file, or a second of what
-comes over a live one.
+"""Read sample bytes from a source, to identify the sensor that sent them.
 
-Some sensors keep silent until they are started: `probe` sends their start commands, and hears what
-comes back.
+`hear` reads the beginning of a file, or listens to a live source for about a second. Some sensors
+send nothing until they are started: `probe` sends their start commands and records the replies.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from pathlib import Path
 
 from lidarspec.detect.heard import LOOKED_AT, Heard, beginning
 from lidarspec.device.session import Pending, Session
-from lidarspec.errors import LidarSpecError
+from lidarspec.errors import LidarSpecError, SourceError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
 from lidarspec.spec.links import Serial, Udp
@@ -26,20 +25,26 @@ from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live, live_address, transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
 
-#: datagrams that are looked at; of a live source, bytes that are enough.
+#: maximum number of datagrams read from a file.
 DATAGRAMS = 400
+#: number of bytes of a live source after which listening stops.
 PLENTY = 1 << 14
-#: seconds to listen for, and between two looks.
+#: time to listen to a live source, in seconds.
 LISTEN = 1.2
+#: maximum duration of one read while listening, in seconds.
 LOOK = 0.1
-#: seconds to wait for data: of a device that has answered, and a motor may have to come up; and of
-#: one that has not.
+#: time to wait for data of a device that has replied, in seconds: its motor may have to start.
 ANSWERED = 4.0
+#: time to wait for data of a device that has not replied, in seconds.
 UNANSWERED = 1.0
-#: seconds that one read takes at most, and after which the line counts as silent.
+#: maximum duration of one read while probing, in seconds; the line is idle if nothing arrives.
 TURN = 0.05
-#: seconds for the commands that stop it again.
+#: time to wait for replies to the stop commands, in seconds.
 STOPPING = 2.0
+#: baud rate for a pseudo-terminal, at which it has no meaning, and for examples.
+ANY_BAUD = 115_200
+#: UDP port for an example.
+EXAMPLE_PORT = 2368
 
 
 def bauds() -> list[int]:
@@ -61,33 +66,39 @@ def udp_ports() -> list[int]:
 
 
 def ignore(_: str) -> None:
-    """Do nothing with what is being listened to: nobody watches."""
+    """Ignore a progress message: the default of `hear(tell=...)`."""
 
 
 def hear(
     source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore
 ) -> Iterator[Heard]:
-    """What comes from a source; a serial port whose baud rate is not given, once for each that
-    installed sensors declare.
+    """Yield the bytes of each sender of a source.
 
-    If a serial port is silent at the commonest, the lowest and the highest rate, no other rate is
-    tried: what is sent at one rate arrives at another one as wrong bytes, but it arrives.
+    A serial port without a baud rate is tried at each rate that installed sensors declare. If it
+    is silent at the most common, the lowest and the highest rate, the other rates are not tried:
+    data sent at another rate arrives as invalid bytes, but not as silence.
 
     Args:
-        seconds: to listen for, each time.
-        tell: called with what is being listened to, before each time.
+        seconds: time to listen to a live source, for each baud rate.
+        tell: called before each attempt with a description of the source.
 
     Raises:
-        SourceError: where it cannot be opened.
+        SourceError: if the source cannot be opened, or if it needs a baud rate or port and no
+            installed sensor declares one.
     """
     text = str(source)
     address = live_address(source)
     if address is not None and address.scheme == "serial" and "baud" not in address.options:
         if has_no_baud(address.place):
             tell(text)
-            yield from _heard(with_option(text, "baud", bauds()[0]), seconds, None, text)
+            yield from _heard(with_option(text, "baud", ANY_BAUD), seconds, None, text)
             return
         rates = bauds()
+        if not rates:
+            example = with_option(text, "baud", ANY_BAUD)
+            raise SourceError(
+                f"{text}: no installed sensor declares a baud rate; name one: {example}"
+            )
         first_rates = list(dict.fromkeys([rates[0], min(rates), max(rates)]))
         other_rates = [baud for baud in rates if baud not in first_rates]
         is_silent = True
@@ -104,18 +115,16 @@ def hear(
         and not address.host_and_port()[1]
         and "port" not in address.options
     ):
-        yield from _heard(
-            with_option(text, "port", ",".join(map(str, udp_ports()))), seconds, None, text
-        )
+        ports = ",".join(map(str, udp_ports()))
+        if not ports:
+            example = with_option(text, "port", EXAMPLE_PORT)
+            raise SourceError(f"{text}: no installed sensor declares a port; name one: {example}")
+        yield from _heard(with_option(text, "port", ports), seconds, None, text)
     else:
-        yield from _heard(
-            text,
-            seconds,
-            int(address.options["baud"])
-            if address is not None and "baud" in address.options
-            else None,
-            text,
-        )
+        baud = None
+        if address is not None and "baud" in address.options:
+            baud = int(address.options["baud"])
+        yield from _heard(text, seconds, baud, text)
 
 
 def has_no_baud(port: str) -> bool:
@@ -126,29 +135,30 @@ def has_no_baud(port: str) -> bool:
 def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
     with contextlib.closing(transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
+        warnings: tuple[str, ...] = ()
         if isinstance(opened, LiveTransport):
             chunks = _listened(opened, seconds)
+            if not chunks:
+                warnings = _strangers(opened)
         else:
             chunks = beginning(opened, LOOKED_AT, number=number)
-        if not isinstance(opened, LiveTransport):
-            said = tuple(opened.warnings)
-        elif chunks:
-            said = ()
-        else:
-            said = _strangers(opened)
-    yield from _by_sender(Heard(name, (), opened.datagrams, baud, warnings=said), chunks)
+            warnings = tuple(opened.warnings)
+    yield from _by_sender(Heard(name, (), opened.datagrams, baud, warnings=warnings), chunks)
 
 
 def _strangers(opened: LiveTransport) -> tuple[str, ...]:
-    """That others send, and not the one that is asked for."""
+    """Return a warning if only other senders sent datagrams."""
     if opened.stranger is None:
         return ()
     others = f"{opened.foreign} datagrams came from others, such as {endpoint(opened.stranger)}"
-    return (f"{opened.label}: nothing came from the sender that is asked for, and {others}",)
+    return (f"{opened.label}: no data from the requested sender; {others}",)
 
 
 def _by_sender(heard: Heard, chunks: Sequence[Chunk]) -> Iterator[Heard]:
-    """What was heard, of each sender; of a single one without a name."""
+    """Yield a copy of `heard` with the chunks of each sender.
+
+    If there is only one sender, its name is left empty.
+    """
     names = sender_names((chunk.sender, chunk.receiver) for chunk in chunks)
     by_sender: dict[str, list[Chunk]] = {name: [] for name in names.values()} or {"": []}
     for chunk in chunks:
@@ -160,8 +170,10 @@ def _by_sender(heard: Heard, chunks: Sequence[Chunk]) -> Iterator[Heard]:
 
 
 def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
-    """What comes over a live source within some seconds, of each sender, where it is opened as a
-    sensor declares; [] where nothing does.
+    """Listen to a live source with the link settings of a sensor.
+
+    Returns:
+        The bytes of each sender; [] if nothing arrives within `seconds`.
     """
     address = live_address(source)
     chunks = list[Chunk]()
@@ -179,7 +191,7 @@ def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
 
 
 def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
-    """What comes within some seconds, or as soon as it is plenty."""
+    """Read chunks for some seconds, or until `PLENTY` bytes have arrived."""
     chunks: list[Chunk] = []
     end = time.monotonic() + seconds
     with contextlib.suppress(Disconnected):
@@ -191,7 +203,7 @@ def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
 
 
 def started_first() -> list[Sensor]:
-    """The installed sensors on a serial port that send nothing before they are told to."""
+    """Return the installed serial sensors that send nothing before a start command."""
     told = [
         sensor
         for sensor in sensors().values()
@@ -201,11 +213,12 @@ def started_first() -> list[Sensor]:
 
 
 def probe(source: str | Path) -> Iterator[Heard]:
-    """What comes after the start commands of each sensor that needs them, at each of its baud
-    rates; it is stopped again.
+    """Start each sensor that must be started, at each of its baud rates, and yield its bytes.
+
+    The stop commands of the sensor are sent afterwards.
 
     Raises:
-        SourceError: where the port cannot be opened.
+        SourceError: if the port cannot be opened.
     """
     address = live_address(source)
     tried = set[object]()
@@ -241,25 +254,25 @@ class _Probe:
     def run(self) -> list[bytes]:
         """Everything that was heard between start and stop."""
         try:
-            started = self._asked(self._sensor.on_open)
+            started = self._request(self._sensor.on_open)
             self._turns(lambda: all(pending.done for pending in started), ANSWERED)
             self._turns(
                 lambda: sum(map(len, self._heard)) >= PLENTY,
                 ANSWERED if any(map(_answered, started)) else UNANSWERED,
             )
             found = list(self._heard)
-            stopped = self._asked(self._sensor.on_close)
+            stopped = self._request(self._sensor.on_close)
             self._turns(lambda: all(pending.done for pending in stopped), STOPPING)
         except LidarSpecError:
             return self._heard
         return found
 
-    def _asked(self, names: tuple[str, ...]) -> list[Pending]:
+    def _request(self, names: tuple[str, ...]) -> list[Pending]:
         self._session.abandon("asked for something else")
         return [self._session.request(name, time.monotonic_ns()) for name in names]
 
     def _turns(self, done: Callable[[], bool], seconds: float) -> None:
-        """Send, listen and keep time until something is so, or the time is up."""
+        """Send and receive until `done` returns True, or the time is up."""
         end = time.monotonic() + seconds
         while not done() and time.monotonic() < end:
             self._session.tick(time.monotonic_ns())

@@ -1,11 +1,13 @@
-"""A Wireshark dissector: what a spec says as Lua tables, and the Lua code that walks them.
+"""Write a Wireshark dissector in Lua for a sensor.
 
-``wireshark.lua``, beside this module, is the same for all sensors: it finds frames, measures them,
-checks them and fills Wireshark's tree. What depends on the sensor is written here: each node of a
-frame tree becomes a table that says what kind it is, which field of Wireshark shows it (`_Writer`),
-which values later formulas ask for (`keep`), and how many bytes may be skipped where a frame is
-only measured. Formulas are Lua functions of the values kept so far. Lua counts in floats there, so
-that what Python does with integers is called by name.
+A dissector has two parts. ``wireshark.lua``, beside this module, is the same for all sensors: it
+finds frames, measures and checks them, and fills Wireshark's tree. This module writes the part
+that depends on the sensor: a Lua table for each node of a frame tree (`_Writer`). A table has the
+kind of the node, the Wireshark field that shows it, a `keep` entry if later formulas use its value,
+and a `skip` entry with the number of bytes to skip when a frame is only measured.
+
+A formula becomes a Lua function of the values kept so far. Numbers are floats in Wireshark's Lua,
+so integer operations are calls of functions in ``wireshark.lua`` (`int.div`, `int.band`).
 """
 
 from __future__ import annotations
@@ -67,8 +69,10 @@ def formula(value: tree.Formula) -> Code:
 
 
 def _function(value: tree.Formula, missing: str = "") -> Code:
-    """A formula as a function of the values of fields; `missing`: what is added to each, for one
-    that may not be there.
+    """Return a formula as a Lua function of the field values.
+
+    Args:
+        missing: Lua text after each value, such as `" or 0"` for fields that can be missing.
     """
     return Code(
         "function(v) return"
@@ -116,7 +120,7 @@ def quoted(text: str | bytes) -> str:
     )
 
 
-#: elements of arrays say what is in them, where it is no more than this.
+#: an array element with at most this many fields shows their values in its own line.
 SUMMED = 4
 Table = dict[str, Any]
 
@@ -125,10 +129,10 @@ class _Writer:
     """Writes the tables of one frame type.
 
     Attributes:
-        prefix: that the names of its fields in Wireshark's filters begin with.
-        kept: paths of the fields whose values are asked for later.
-        marked: paths of the parts at which what a checksum covers begins or ends.
-        types: name of a field of Wireshark -> family of its type.
+        prefix: prefix of the names of its fields in Wireshark's filters.
+        kept: paths of the fields whose values later formulas or checksums use.
+        marked: paths of the first and last part that a checksum covers.
+        types: type family of each Wireshark field, by its filter name.
     """
 
     def __init__(self, message: Message, prefix: str) -> None:
@@ -140,8 +144,9 @@ class _Writer:
         self.types: dict[str, str] = {}
 
     def node(self, node: tree.Node, path: str = "") -> Table:
-        """A node as a table; `skip` says how many bytes it takes where it need not be looked at to
-        measure the frame.
+        """Return a node as a table.
+
+        `skip` is its size in bytes if measuring the frame does not require its values, else None.
         """
         match node:
             case tree.Number():
@@ -200,7 +205,7 @@ class _Writer:
         table: Table = {"kind": "number", "name": node.name, "type": node.kind, "size": node.size}
         table |= {
             "le": (node.order == "little" and node.size > 1) or None,
-            **self._described(node.info, kind),
+            **self._number_entries(node.info, kind),
         }
         return table | {"skip": self._skip(node.info, node.size)}
 
@@ -245,13 +250,14 @@ class _Writer:
 
     def _part(self, block: tree.Block, part: tree.Part, order: str | None) -> Table:
         offsets = [segment.byte for segment in part.bits.segments]
-        letters = "INT" if part.bits.signed else "UINT"
         is_masked = order is not None and part.bits.width < 8 * block.size
-        kind = f"{letters}{8 * block.size if is_masked else _width(part.bits.width)}"
-        if is_masked and order:
+        if order is not None and is_masked:
+            bits = 8 * block.size
             mask = ((1 << part.bits.width) - 1) << (_run(part.bits, block.size, order) or 0)
         else:
+            bits = _width(part.bits.width)
             mask = None
+        kind = f"INT{bits}" if part.bits.signed else f"UINT{bits}"
         label = ".".join(part.names) + "".join(f"[{index}]" for index in part.indices)
         return {
             "name": part.info.name,
@@ -264,7 +270,7 @@ class _Writer:
             "segments": [
                 [one.byte, one.low, one.mask.bit_count(), one.target] for one in part.bits.segments
             ],
-            **self._described(part.info, kind, mask),
+            **self._number_entries(part.info, kind, mask),
         }
 
     def _struct(self, node: tree.Struct) -> Table:
@@ -327,17 +333,17 @@ class _Writer:
                 }
             )
         rules = {"count": node.count, "size": node.size, "within": node.within}
-        said = {name: None if rule is None else formula(rule) for name, rule in rules.items()}
+        formulas = {name: None if rule is None else formula(rule) for name, rule in rules.items()}
         return {
             "kind": "parts",
             "name": node.name,
             "total": self._keep(node.total.path),
-            **said,
+            **formulas,
             "kinds": kinds,
         }
 
-    def _described(self, info: tree.FieldInfo, kind: str, mask: int | None = None) -> Table:
-        """What a number says of itself, and its fields in Wireshark."""
+    def _number_entries(self, info: tree.FieldInfo, kind: str, mask: int | None = None) -> Table:
+        """Return the unit, scale, labels and limits of a number, and its Wireshark fields."""
         is_hex = (info.path in self.message.seals or info.const is not None) and kind.startswith(
             "UINT"
         )
@@ -380,8 +386,14 @@ class _Writer:
         labels: Any = None,
         mask: int | None = None,
     ) -> Code:
-        """A field of Wireshark; one name stands for numbers of one family only."""
-        family = "".join(letter for letter in kind if letter.isalpha()) + "64" * kind.endswith("64")
+        """Return Lua code that makes a Wireshark field.
+
+        Wireshark requires the same type family for all fields with one name, so a name that is used
+        with another family gets "_" appended.
+        """
+        family = "".join(letter for letter in kind if letter.isalpha())
+        if kind.endswith("64"):
+            family += "64"
         abbreviation = f"{self.prefix}.{path}"
         while self.types.setdefault(abbreviation, family) != family:
             abbreviation += "_"
@@ -452,7 +464,7 @@ def _algorithm(algorithm: Checksum) -> Table:
 
 
 def _leaves(node: tree.Node) -> list[tree.Node | tree.Part]:
-    """The numbers in a node; none where it holds arrays or parts that come and go."""
+    """Return the numbers in a node, or [] if it contains arrays or conditional parts."""
     below = list(tree.nodes(node))
     if any(isinstance(part, tree.Repeat | tree.When | tree.Select) for part in below):
         return []
@@ -483,8 +495,9 @@ def _width(bits: int) -> int:
 
 
 def _word_order(block: tree.Block) -> str | None:
-    """The byte order by which all parts are runs of bits of one word, which Wireshark can draw;
-    None where there is none.
+    """Return the byte order in which each part of a block is contiguous bits of one word.
+
+    Wireshark can draw such parts as masks. Returns None if no byte order fits.
     """
     orders = (
         order
@@ -497,8 +510,9 @@ def _word_order(block: tree.Block) -> str | None:
 
 
 def _run(bits: BitField, size: int, order: str) -> int | None:
-    """The lowest bit of a field in the word that a block is, None where it is no run of bits in
-    order.
+    """Return the lowest bit of a field within a block read as one word.
+
+    Returns None if the bits of the field are not contiguous in that word.
     """
     places = (
         (run, run.byte if order == "little" else size - 1 - run.byte) for run in bits.segments
@@ -562,8 +576,9 @@ def dissector(sensor: Sensor) -> str:
         raise Refused(
             f"{sensor.id}: messages in several datagrams, which the dissector does not join"
         )
-    # the first that fits is shown: what goes either way came in, and the one with more constants
-    # says more
+    # The dissector shows the first type that matches. Incoming types come first, so bytes that
+    # match both directions are shown as incoming. Types with more constants come before others,
+    # because they match less often by chance.
     by_direction = sorted(
         messages(sensor),
         key=lambda message: (message.frame.direction, -len(codec(message.frame).prefix)),

@@ -1,11 +1,13 @@
-"""The layouts of a frame type: where each field stands, for each kind of header.
+"""Compute the layouts of a frame type: the offset of each field, for each variant of the header.
 
-Counts, conditions and keys make the layout of a frame depend on some of its own header fields.
-`layout_of` walks the frame's tree with a cursor, for given values of these fields, and says with
-`Unknown` which further one it needs. A `HeaderTree` keeps what it found: each node of it is one
-field, each branch one of its values, each end a `Layout`, or the reason why there is none.
-Candidates are sorted through it in bulk, by value, so that the frame's tree is walked once for each
-distinct header.
+A count, condition or key in a struct makes the layout depend on header fields, here called
+*selectors*. `layout_of` walks the tree of the struct with a cursor, for given values of the
+selectors. If it needs another selector, it raises `Unknown`.
+
+`HeaderTree` is a decision tree that caches the results. Each inner node is a selector, each branch
+is a value of it, and each leaf is a `Layout`, or a `Refused` with the reason why there is none.
+`HeaderTree.classify` sorts many candidates through the tree at once, so the struct is walked only
+once for each distinct header.
 """
 
 from __future__ import annotations
@@ -46,11 +48,11 @@ class Unknown(Exception):
 
 
 class TooLong(Exception):
-    """The header claims more than the longest length that the frame declares, or no byte at all.
+    """The header has an invalid length: longer than the maximum of the frame type, or 0.
 
     Attributes:
-        path: of the part that is too long.
-        number: the count or length that cannot be, None if all parts together are too long.
+        path: path of the part that is too long.
+        number: the invalid count or length; None if only the sum of all parts is too long.
     """
 
     def __init__(self, path: str, number: int | None = None) -> None:
@@ -60,11 +62,11 @@ class TooLong(Exception):
 
 
 class Unlike(Exception):
-    """A part has the constants of no kind."""
+    """The constants of a part match no kind of parts."""
 
 
 class CutOff(Exception):
-    """A frame is longer than the bytes that there are of it, and there will be no more."""
+    """The input ends before the end of a frame."""
 
 
 def layout_of(
@@ -123,9 +125,9 @@ class Walk:
     values: Mapping[str, int]
     limit: int
     given: Mapping[str, int] = field(default_factory=dict)
-    #: gives the value of a field that is not among them, and may set `values`.
+    #: called for the value of a field that is not in `values`; may replace `values`.
     asked: Asked = _unknown
-    #: the bytes that there are, where there will be no more.
+    #: number of bytes of the frame if no more follow; None if more may follow.
     room: int | None = None
     cursor: int = 0
     leaves: dict[str, Leaf] = field(default_factory=dict)
@@ -135,7 +137,7 @@ class Walk:
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
     regions: dict[str, Region] = field(default_factory=dict)
-    #: those whose size is not known yet.
+    #: regions whose size is not known yet.
     open_regions: dict[str, Region] = field(default_factory=dict)
     #: what values have to meet; each once, as a key.
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
@@ -481,17 +483,19 @@ FEW = 4
 
 @dataclass(eq=False)
 class HeaderNode:
-    """A field that decides the layout, or what the values of those before it lead to.
+    """A node of a `HeaderTree`: the next field that decides the layout, or the result.
 
     Attributes:
-        values: those, raw, by path.
-        above: the node that they lead from; None for the first.
-        leaf, before: the field, and all fields up to it.
-        constants: those that stand before it, without those that all frames begin with; where a
-            frame is cut off, those up to there.
-        least: the bytes that a frame with these values has at least, as far as is known.
-        told: which of its values are told apart.
-        result: what the values lead to, where no further field decides.
+        values: raw values of the deciding fields above this node, by path.
+        above: the parent node; None for the root.
+        leaf: the deciding field of this node; None if not known yet, or if there is a result.
+        before: all fields found before `leaf`, by path.
+        constants: the constants found before `leaf`, or before the end of a frame that is cut off.
+            Constants that all frames begin with are left out.
+        least: known minimum size in bytes of a frame with these values; 0 if not known.
+        value_classes: the values of `leaf` that lead to different layouts.
+        children: child nodes by value of `leaf`.
+        result: the layout, or why there is none; None if not known yet.
     """
 
     values: Mapping[str, int] = field(default_factory=dict)
@@ -500,15 +504,15 @@ class HeaderNode:
     before: Mapping[str, Leaf] = field(default_factory=dict)
     constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     least: int = 0
-    told: _Told | None = None
+    value_classes: _ValueClasses | None = None
     children: dict[int, HeaderNode] = field(default_factory=dict)
     result: Layout | Refused | None = None
 
     def meant(self, value: int) -> int:
-        """The value of its field that stands for one that means the same."""
-        if self.told is None:
+        """Return the representative of all values with the same layout as `value`."""
+        if self.value_classes is None:
             return value
-        return self.told.one(value)
+        return self.value_classes.one(value)
 
     def child(self, value: int) -> HeaderNode:
         """The branch of a value."""
@@ -525,18 +529,19 @@ Group = tuple[Layout | Refused, NDArray[np.intp]]
 
 
 @dataclass(frozen=True)
-class _Told:
-    """The values of a header field that lead to different layouts.
+class _ValueClasses:
+    """Maps the values of a selector to the values that lead to different layouts.
 
-    They are all from `low` to `high`, or `keys` and any other.
+    Noise in place of a header can contain any of billions of lengths or keys. Values that lead to
+    the same result are therefore mapped to one value, and share one branch of the tree.
 
-    A header may claim any of some billion lengths, or have any key, and garbage does: those that
-    mean the same are one branch.
+    If `keys` is not empty, all values that are no key are mapped to `other`. Otherwise, values are
+    clipped to `low` and `high`.
 
     Attributes:
-        limits: of the field itself.
-        rises: the value from which on a frame never gets shorter, so that what is too long stays
-            so; None where there is none.
+        limits: lowest and highest value of the field.
+        rises: from this value on, a larger value never makes the frame shorter, so if a value makes
+            it too long, all larger ones do; None if no such value is known.
     """
 
     limits: tuple[int, int]
@@ -547,7 +552,7 @@ class _Told:
     rises: int | None = None
 
     @classmethod
-    def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _Told:
+    def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _ValueClasses:
         """Return the values of a field that the formulas of a frame distinguish.
 
         Returns all its values if this cannot be derived from the formulas.
@@ -603,7 +608,7 @@ class _Told:
             )
         return cls(info.limits, low, high)
 
-    def refused(self, value: int) -> _Told:
+    def refused(self, value: int) -> _ValueClasses:
         """The same, where the frame of a value is known to be too long."""
         if self.rises is not None and self.rises <= value < self.high:
             return replace(self, high=value)
@@ -670,8 +675,8 @@ class _Places:
     Frames have at most `limit` bytes.
 
     Attributes:
-        refuted: those whose header is cut off, or that are too long, and have a wrong constant
-            before.
+        refuted: indices of candidates that are incomplete or too long, and in which a constant
+            before that point is wrong.
     """
 
     def __init__(
@@ -746,7 +751,7 @@ class HeaderTree:
         self._given = given or {}
         self._root = HeaderNode()
         self._size = 0
-        self._told: dict[str, _Told] = {}
+        self._told: dict[str, _ValueClasses] = {}
 
     @functools.cached_property
     def _prefix(self) -> dict[int, tuple[int, int]]:
@@ -768,7 +773,7 @@ class HeaderTree:
         """
         places = _Places(buffer, offsets, stops, self.limit)
         groups: list[Group] = []
-        for result, which in self.sorted(len(offsets), places.read, places):
+        for result, which in self.group_by_layout(len(offsets), places.read, places):
             groups.append((result, which))
             if isinstance(result, Refused) and result.constants:
                 wrong = places.wrong(result.constants, which)
@@ -778,11 +783,16 @@ class HeaderTree:
             (Refused(by_constant=True), which) for which in places.refuted if len(which)
         ]
 
-    def sorted(self, number: int, read: Reader, places: _Places | None = None) -> list[Group]:
-        """So many candidates by layout, as `classify` has them, whose header fields `read` reads.
+    def group_by_layout(
+        self, number: int, read: Reader, places: _Places | None = None
+    ) -> list[Group]:
+        """Group candidates by layout, as `classify` does.
 
         Args:
-            places: where they are, if their fields can be read one by one as well.
+            number: number of candidates.
+            read: reads the field of a node for some candidates.
+            places: the candidates in their buffer, if single headers can be read as well. If None,
+                only `read` is used.
         """
         self._forget_many()
         groups: list[Group] = []
@@ -802,16 +812,14 @@ class HeaderTree:
                 continue
             there, values = read(node, which)
             which = which if there is None else which[there]
-            if node.told is not None:
-                values = node.told.all(values)
+            if node.value_classes is not None:
+                values = node.value_classes.all(values)
             if not len(which):
                 continue
             if np.count_nonzero(values == values[0]) == len(values):
                 stack.append((node.child(values.item(0)), which))
             else:
-                stack += [
-                    (node.child(value), which[places]) for value, places in by_value(values, FEW)
-                ]
+                stack += [(node.child(value), which[rows]) for value, rows in by_value(values, FEW)]
         return groups
 
     def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
@@ -838,8 +846,8 @@ class HeaderTree:
             if isinstance(leaf, Leaf) and leaf.offset + leaf.size > rows.shape[1]:
                 return None
             values = leaf.load(rows)
-            if node.told is not None:
-                values = node.told.all(values)
+            if node.value_classes is not None:
+                values = node.value_classes.all(values)
             if np.count_nonzero(values == values[0]) < len(rows) or (
                 isinstance(leaf, Measure) and values[0] < 0
             ):
@@ -924,7 +932,7 @@ class HeaderTree:
 
         def asked(leaf: Leaf | Measure, walk: Walk) -> int:
             nonlocal node
-            node.leaf, node.before, node.told, node.constants = (
+            node.leaf, node.before, node.value_classes, node.constants = (
                 leaf,
                 dict(walk.leaves),
                 self._telling(leaf),
@@ -960,11 +968,11 @@ class HeaderTree:
         above = node.above
         if (
             above is not None
-            and above.told is not None
+            and above.value_classes is not None
             and isinstance(node.result, Refused)
             and not node.result.error
         ):
-            above.told = above.told.refused([*node.values.values()][-1])
+            above.value_classes = above.value_classes.refused([*node.values.values()][-1])
         return node
 
     def _behind(self, walk: Walk) -> dict[int, tuple[int, int]]:
@@ -976,11 +984,11 @@ class HeaderTree:
             spot: known for spot, known in walk.constants.items() if self._prefix.get(spot) != known
         }
 
-    def _telling(self, leaf: Leaf | Measure) -> _Told | None:
+    def _telling(self, leaf: Leaf | Measure) -> _ValueClasses | None:
         if not isinstance(leaf, Leaf):
             return None  # nothing is known of parts before they are walked
         if leaf.info.path not in self._told:
-            self._told[leaf.info.path] = _Told.of(leaf.info, self.root, self.limit)
+            self._told[leaf.info.path] = _ValueClasses.of(leaf.info, self.root, self.limit)
         return self._told[leaf.info.path]
 
 

@@ -8,16 +8,25 @@ asked for its `batch`.
 `words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight bytes
 of every row.
 
-A CRC is linear. A register of one byte is computed by halves: the bytes of a row in front are each
-advanced as far as the bytes behind them are away, by a table of 256, and XORed onto them, until one
-byte is left. Where rows are many, their words become one word before, without tables: eight bytes
-on, a byte counts as the sum of itself at fewer bytes on, which ones is what the polynomial says
-(its eighth power has the same terms, eight times as far apart). So each word is XORed onto sums for
-0 to 7 bytes on, and these are moved and added up. Where rows are few and short, each byte is looked
-up by its place. A wider register runs along all rows at once, two bytes a step, by a table of
-65,536; long rows are cut into segments that run side by side and are joined in pairs. Rows of the
-usual CRC-32 that are not short are left to `zlib`. Tables depend on the polynomial and the distance
-alone. Registers are in wire order, see `Crc`.
+A CRC is linear: the register after a row is the XOR of the contributions of its bytes. To *advance*
+a byte by d is to compute its contribution d bytes later. `registers` chooses one of four methods:
+
+* `_by_place`: for few and short rows. One table lookup for each byte; the table depends on the
+  position of the byte in the row.
+* `_by_zlib`: for longer rows of the usual CRC-32. One call of `zlib.crc32` for each row.
+* `_narrow`: for registers of at most one byte. The front half of each row is advanced to the back
+  half, by a table of 256 entries, and XORed onto it. This is repeated until one byte is left. For
+  many rows, `_summed` first reduces each row to one word without tables.
+* `_wide`: for all others. The register of all rows advances two bytes at a time, by a table of
+  65,536 entries. Long rows are split into segments that are computed side by side and then joined
+  in pairs.
+
+`_summed` uses that in GF(2) the eighth power of a polynomial p(x) is p(x**8). A byte advanced by
+eight is therefore the XOR of the same byte advanced by n, for each term x**n of the polynomial with
+n < 8. So each word is XORed onto some of eight sums, one for each n from 0 to 7, and these are
+advanced and combined.
+
+The tables depend only on the polynomial and the distance. Registers are in wire order, see `Crc`.
 """
 
 from __future__ import annotations
@@ -45,15 +54,20 @@ from lidarspec.spec.checksums import (
     byte_table,
 )
 
-LOOP_BYTES = 2048  # below this, a Python loop over bytes is done before NumPy's calls have started
-NARROW_LOOP_BYTES = 256  # the same where the register is a byte
-ONE_BY_ONE = 4  # rows that are done one by one sooner than together
-BLOCK_BYTES = (
-    1 << 20
-)  # rows taken at a time: few enough for the caches, and many enough to hide NumPy's cost per call
+#: below this number of bytes in all rows, a Python loop is faster than NumPy.
+LOOP_BYTES = 2048
+#: the same for registers of at most one byte.
+NARROW_LOOP_BYTES = 256
+#: below this number of rows, one call for each row is faster (checksums other than CRCs).
+ONE_BY_ONE = 4
+#: bytes of rows per block: small enough for the caches, large enough to hide NumPy's cost per call.
+BLOCK_BYTES = 1 << 20
+#: `_by_place` is used up to this number of bytes in all rows ...
 FEW = 1 << 13
-SHORT = 1 << 7  # bytes of all rows, and of one, for which a table for each place pays
-MANY = 1024  # rows whose words are summed in less time than tables take
+#: ... and up to this number of bytes in one row. Longer rows of the usual CRC-32 use zlib.
+SHORT = 1 << 7
+#: from this number of rows on, `_summed` is faster than tables.
+MANY = 1024
 
 #: width, polynomial and reflection of the one CRC that `zlib` has: on rows that are not short, one
 #: by one, it is several times as fast.
@@ -91,7 +105,7 @@ def over(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> Values:
 
 
 def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
-    """Whether the rows are done one by one sooner than together."""
+    """Return whether one call for each row is faster than NumPy for all rows."""
     if not isinstance(algorithm, Crc):
         return len(rows) < ONE_BY_ONE
     length = sum(stop - start for start, stop in spans)
@@ -99,14 +113,18 @@ def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool
 
 
 def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    return finished(
+    return finalize(
         algorithm,
         registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin),
     )
 
 
-def finished(algorithm: Crc, left: NDArray[Any]) -> Values:
-    """The checksums, (n,), by the registers after all bytes, of their type."""
+def finalize(algorithm: Crc, left: NDArray[Any]) -> Values:
+    """Return the checksums, (n,), uint64, for the final registers.
+
+    Args:
+        left: the registers after all bytes, (n,), in the smallest unsigned dtype that holds them.
+    """
     if not algorithm.refin:
         left = left.byteswap() >> 8 * left.itemsize - algorithm.width
     values = left.astype(np.uint64)
@@ -171,8 +189,12 @@ def _zero_padded(algorithm: ZeroPadded, rows: NDArray[np.uint8], spans: Spans) -
 
 
 _TOGETHER: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values]] = {
-    **{Crc: _crc, Xor: _xor, Sum: _sum, WordXor: _word_xor},
-    **{Fold15: _fold15, ZeroPadded: _zero_padded},
+    Crc: _crc,
+    Xor: _xor,
+    Sum: _sum,
+    WordXor: _word_xor,
+    Fold15: _fold15,
+    ZeroPadded: _zero_padded,
 }
 
 
@@ -194,9 +216,9 @@ def words(
     found = np.empty((number, count), "<u8")
     begun = -1
     for first, length, start in runs:
-        words = rows[:, start : start + 8].view("<u8")[:, 0]
+        first_words = rows[:, start : start + 8].view("<u8")[:, 0]
         found[first : first + length] = np.lib.stride_tricks.as_strided(
-            words, (length, count), (8, rows.strides[0])
+            first_words, (length, count), (8, rows.strides[0])
         )
     for word, start, right, mask, left in parts:
         part = rows[:, start : start + 8].view("<u8")[:, 0] >> right
@@ -214,12 +236,12 @@ def words(
 def _pieces(
     spans: Spans, size: int, zeros_first: bool
 ) -> tuple[int, list[tuple[int, int, int]], list[tuple[Any, ...]]]:
-    """What `words` of rows of a size are made of.
+    """Return how to assemble the words of a row from the bytes of spans.
 
     Returns:
-        How many there are; runs of whole ones: first word, number, place in the row; and parts of
-        words: word, place of eight bytes in the row that hold the part, and how it comes to its
-        place: shifted right, masked (None: needless), shifted left.
+        The number of words; the runs of whole words, as (first word, number of words, offset in the
+        row); and the parts of words, as (word, offset of the eight bytes that hold the part, right
+        shift, mask or None, left shift), in the order of these operations.
     """
     total = sum(stop - start for start, stop in spans)
     number = -(-total // 8)
@@ -271,7 +293,7 @@ def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """The sum of all bytes of each row; (n,)."""
     total = np.zeros(columns.shape[1], np.uint64)
     even = np.uint64(0x00FF00FF00FF00FF)
-    for first in range(0, len(columns), 128):  # so many pairs of bytes fit into 16 bits
+    for first in range(0, len(columns), 128):  # 128 * 2 * 255 is less than 2**16
         some = columns[first : first + 128]
         pairs = np.add.reduce((some & even) + (some >> np.uint64(8) & even), axis=0)
         for bits in (48, 32, 16, 0):
@@ -336,13 +358,14 @@ def _by_place(
 def places(
     length: int, start: int, width: int, poly: int, refin: bool
 ) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
-    """Return a table of the contribution of each byte to the final register.
+    """Return the contribution of each byte value at each position to the final register.
 
-    All other bytes are 0.
+    The contribution is the register after a row in which all other bytes are 0.
 
     Returns:
-        All of them, (256 * length,); where those of each place begin; and the register after
-        `start` and as many zeros.
+        The table, (256 * length,), with 256 entries for each position; the index at which the
+        entries of each position begin, (length,); and the register after `length` zero bytes from
+        `start`.
     """
     table = np.array(
         byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width] if width > 8 else 1}"
@@ -405,9 +428,9 @@ def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _shares(number: int, poly: int) -> tuple[int, ...]:
-    """Return the shift of each word relative to the last one, as sums of bytes.
+    """Return for each word which of the eight sums of `_summed` it is XORed onto.
 
-    Bit n of a value, from 0 to 7, stands for a shift by n bytes.
+    Bit n of a value stands for the sum that is advanced by n bytes, n from 0 to 7.
     """
     found = [1]
     while len(found) < number:
@@ -424,11 +447,10 @@ def _wide(
     """`registers` of any width."""
     rows = cut(rows, spans)
     (count, length), table = rows.shape, _word_table(width, poly, refin)
-    segment = min(
-        max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2
-    )  # enough of them to hide NumPy's cost per call
-    # Zero bytes in front change nothing while the register is 0; so `start` is met in the row's
-    # first bytes.
+    # A power of two, small enough that there are many segments, to hide NumPy's cost per call.
+    segment = min(max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2)
+    # Rows are padded in front with zeros, which leave a register of 0 unchanged. So the register
+    # starts as 0, and `start` is XORed onto the first bytes of the row.
     padded = np.zeros((count, -(-length // segment) * segment), np.uint8)
     padded[:, -length:] = rows
     padded[:, -length:][:, :8] ^= np.frombuffer(start.to_bytes(8, "little"), np.uint8)[:length]
@@ -450,7 +472,10 @@ def _wide(
 
 @lru_cache(maxsize=1024)
 def _advance(distance: int, width: int, poly: int, refin: bool) -> bytes:
-    """What a byte becomes that many bytes further on, for a register of at most one byte."""
+    """Return the table, 256 bytes, that advances a byte by `distance` bytes.
+
+    The register has at most one byte.
+    """
     if distance == 1:
         return bytes(byte_table(width, poly, refin))
     half = _advance(distance // 2, width, poly, refin)

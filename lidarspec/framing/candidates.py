@@ -1,11 +1,14 @@
 """Find and judge the candidates in a piece of a stream.
 
-A candidate is an offset with the constants of a type.
+A candidate is an offset at which the constants of a frame type match.
 
-A type with `after` is looked for only while the frame that it names is the last seen of those named
-by any `after`. All candidates of a piece are judged in bulk, those of each type once, when the type
-is looked for first: the types that are looked for may change with every frame. Weak types are
-judged as all others; of their candidates, those that begin a run are live (`weak_frames`).
+A frame type with `after` is active only after the frame that it names, until another frame that
+some `after` names is found. The active types can therefore change with every frame. To keep this
+fast, all candidates of one type in a piece are checked in one call, when the type first becomes
+active.
+
+Weak types (`confirm` > 1) are checked in the same way, but only the first frame of a run is a live
+candidate (`weak_frames`).
 """
 
 from __future__ import annotations
@@ -32,16 +35,16 @@ Offsets = NDArray[np.intp]
 
 
 @dataclass
-class Mode:
-    """What is remembered between pieces.
+class SearchState:
+    """Search state that is kept between the pieces of a stream.
 
     Attributes:
-        after: the last frame named by any `after`.
-        changed: where in the stream what is looked for changed last.
-        run: the weak type of the last run that was taken.
-        run_end: where in the stream that run ends so far.
-        size: of the last frame.
-        steady: frames of that size seem to follow one another without a byte between.
+        after: name of the last frame that some `after` names; None before the first one.
+        changed: stream offset at which the active types last changed.
+        run: name of the weak type of the last accepted run.
+        run_end: stream offset of the end of that run.
+        size: size of the last frame in bytes.
+        steady: whether the last frames had this size and no bytes between them.
     """
 
     after: str | None = None
@@ -57,12 +60,12 @@ class Piece:
     """The result for one piece of a stream.
 
     Attributes:
-        frames: those that are taken; their places are those in the piece.
-        end: where the rest begins, which has to be searched again.
-        waiting: whether the rest can only be judged with bytes that follow the piece.
-        need: the shortest rest that is worth a search; 0 if unknown.
-        rejected: number of rejected candidates by counter.
-        errors: failures of the plugin.
+        frames: the accepted frames; their offsets count from the start of the piece.
+        end: offset of the first byte that must be searched again.
+        waiting: whether more bytes are required to decide about the candidate at `end`.
+        need: number of bytes from `end` that the next search requires; 0 if unknown.
+        rejected: number of rejected candidates by counter name.
+        errors: exceptions raised by plugin code.
     """
 
     frames: Frames
@@ -86,8 +89,9 @@ class Framing:
     """The frame types of one stream, ready to be looked for.
 
     Args:
-        codecs: those of the incoming frame types, by name, in the order that decides at one offset.
-        sums: what computes checksums; by default their algorithms.
+        codecs: codecs of the incoming frame types by name. If several types match at one offset,
+            the first one in this order is used.
+        sums: function that computes checksums; by default the algorithm of each checksum is used.
     """
 
     def __init__(self, codecs: Mapping[str, Codec], sums: Sums | None = None) -> None:
@@ -103,14 +107,14 @@ class Framing:
             for own in self.words
         ]
         lengths = [codec.frame.max_length for codec in self.codecs]
-        #: no candidate waits for more bytes than these.
+        #: upper bound on the number of bytes required to decide about one candidate.
         self.reach = max(lengths) + max(
             codec.frame.max_length * codec.frame.confirm for codec in self.codecs
         )
         self._weak = {kind for kind, codec in enumerate(self.codecs) if codec.frame.confirm > 1}
         self._active: dict[str | None, list[int]] = {}
 
-    def active(self, mode: Mode) -> list[int]:
+    def active(self, mode: SearchState) -> list[int]:
         """Return the types that are looked for now, in order."""
         active = self._active.get(mode.after)
         if active is None:
@@ -126,11 +130,11 @@ class Framing:
         """Return whether frames of a type are accepted only in runs."""
         return kind in self._weak
 
-    def switches(self, kind: int, mode: Mode) -> bool:
+    def switches(self, kind: int, mode: SearchState) -> bool:
         """Return whether a frame of a type changes which types are looked for."""
         return self.names[kind] in self.named and self.names[kind] != mode.after
 
-    def switching(self, mode: Mode) -> NDArray[np.bool_]:
+    def switching(self, mode: SearchState) -> NDArray[np.bool_]:
         """Return whether a frame of each type changes the types searched, (types + 1,).
 
         The index is the type. The last value, for -1, is False.
@@ -155,20 +159,27 @@ class Framing:
         )
 
 
-def matches(buffer: Bytes1D, constants: Marks) -> Offsets:
-    """Return the offsets at which the constants are right as far as the bytes go, ascending."""
+def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
+    """Return the ascending offsets at which no available byte differs from the constants.
+
+    A constant behind the end of the buffer counts as matching.
+    """
     if not constants:
         return np.arange(len(buffer))
     length = len(buffer)
     (first, _, _), *rest = constants
     match = _right(buffer, *constants[0])
-    for spot, mask, value in rest[:1]:  # two together leave few offsets of noise to look at
+    # Two constants already exclude nearly all offsets, so only these are compared on whole arrays.
+    for spot, mask, value in rest[:1]:
         inside = min(len(match), max(length - spot, 0))
         match[:inside] &= _right(buffer, spot, mask, value)[:inside]
-    offsets = fitting(buffer, np.flatnonzero(match), tuple(rest[1:]))
+    offsets = filter_by_constants(buffer, np.flatnonzero(match), tuple(rest[1:]))
     if first:
         offsets = np.concatenate(
-            [offsets, fitting(buffer, np.arange(max(length - first, 0), length), tuple(rest))]
+            [
+                offsets,
+                filter_by_constants(buffer, np.arange(max(length - first, 0), length), tuple(rest)),
+            ]
         )
     return offsets
 
@@ -181,7 +192,7 @@ def _right(buffer: Bytes1D, spot: int, mask: int, value: int) -> NDArray[np.bool
     return np.asarray(values == np.uint8(value))
 
 
-def fitting(buffer: Bytes1D, offsets: Offsets, constants: Marks) -> Offsets:
+def filter_by_constants(buffer: Bytes1D, offsets: Offsets, constants: Marks) -> Offsets:
     """Return the offsets at which the constants match, as far as the bytes go.
 
     The offsets are ascending.
@@ -204,10 +215,10 @@ class Live:
     """The candidates of a piece that may be taken while the same types are looked for.
 
     Attributes:
-        frames: those that are valid or wait for bytes, by offset, at each the one whose type comes
-            first; of weak types the heads of runs.
-        ends: where each ends, (n,); of a head, where its run ends.
-        runs: those of weak types, by the index of the type.
+        frames: valid and incomplete candidates in order of offset, at most one per offset: that of
+            the first type in declaration order. Of a weak type, only the first frame of each run.
+        ends: end offset of each candidate, (n,); for the first frame of a run, the end of the run.
+        runs: the runs of each weak type, by type index.
     """
 
     frames: Frames
@@ -219,22 +230,25 @@ class Candidates:
     """The candidates in a piece of a stream.
 
     Args:
-        buffer: the bytes not yet decided and those after them.
-        mode: what is looked for at first.
-        final: give up candidates that need more bytes than there are.
+        buffer: the bytes to search.
+        mode: the search state at the start of the buffer.
+        final: no more bytes follow: reject incomplete candidates.
 
     Attributes:
-        buffer: the bytes; fewer of them if there are too many candidates.
-        is_whole: whether these are all.
-        judged: the candidates of each type that was looked for and has some, by its index.
+        buffer: the bytes to search, shortened if there are too many candidates.
+        is_whole: whether `buffer` was not shortened.
+        judged: the candidates of each type searched so far, by type index; types without candidates
+            are missing.
     """
 
-    def __init__(self, framing: Framing, buffer: Bytes1D, mode: Mode, *, final: bool) -> None:
+    def __init__(
+        self, framing: Framing, buffer: Bytes1D, mode: SearchState, *, final: bool
+    ) -> None:
         self._framing = framing
         self.buffer = buffer
         if not all(framing.marks[kind] for kind in framing.active(mode)):
             self.buffer = buffer[: max(MAX_CANDIDATES, framing.reach)]  # each offset is one
-        self._begun: dict[Marks, Offsets] = {}
+        self._offsets_by_prefix: dict[Marks, Offsets] = {}
         self.judged: dict[int, Frames] = {}
         self._known: set[int] = set()
         found = self._find(mode)
@@ -248,7 +262,7 @@ class Candidates:
         )
         if limit < len(self.buffer):
             self.buffer = self.buffer[: max(limit, framing.reach)]
-            self._begun.clear()
+            self._offsets_by_prefix.clear()
             found = {
                 kind: offsets[: int(np.searchsorted(offsets, len(self.buffer)))]
                 for kind, offsets in found.items()
@@ -257,7 +271,7 @@ class Candidates:
         self.final = final and self.is_whole
         self._judge(found)
 
-    def live(self, mode: Mode) -> Live | None:
+    def live(self, mode: SearchState) -> Live | None:
         """Return the candidates that may be taken; None if there are too many."""
         found = self._find(mode)
         if any(len(offsets) > MAX_CANDIDATES for offsets in found.values()):
@@ -292,16 +306,18 @@ class Candidates:
             return merged(parts, final=self.final)
         return Frames.none(self.buffer)
 
-    def _find(self, mode: Mode) -> dict[int, Offsets]:
+    def _find(self, mode: SearchState) -> dict[int, Offsets]:
         """Return where the constants of types stand that have not been looked for before."""
         found: dict[int, Offsets] = {}
         for kind in self._framing.active(mode):
             if kind not in self._known:
                 marks = self._framing.marks[kind]
-                begin = marks[:2]  # many types begin alike
-                if begin not in self._begun:
-                    self._begun[begin] = matches(self.buffer, begin)
-                found[kind] = fitting(self.buffer, self._begun[begin], marks[2:])
+                begin = marks[:2]  # the cache key: many types share their first two constants
+                if begin not in self._offsets_by_prefix:
+                    self._offsets_by_prefix[begin] = find_by_constants(self.buffer, begin)
+                found[kind] = filter_by_constants(
+                    self.buffer, self._offsets_by_prefix[begin], marks[2:]
+                )
         return found
 
     def _judge(self, found: Mapping[int, Offsets]) -> None:
@@ -329,5 +345,7 @@ def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
     live = Frames.joined([part for part in parts if len(part)] or parts[:1])
     if len(parts) == 1:
         return live
-    order = np.argsort(live.starts, kind="stable")  # at each offset still in the order of the types
-    return live.only(order[np.diff(live.starts[order], prepend=-1) > 0])
+    # A stable sort keeps the order of the types at equal offsets; the first of these is kept.
+    order = np.argsort(live.starts, kind="stable")
+    is_first = np.diff(live.starts[order], prepend=-1) > 0
+    return live.only(order[is_first])

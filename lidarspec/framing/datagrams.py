@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.arrays import alike, repeated
 from lidarspec.frames.layout import Layout, equal
-from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
+from lidarspec.framing.candidates import Bytes1D, Framing, Piece, SearchState
 from lidarspec.framing.results import (
     CONSTANT,
     LENGTH,
@@ -35,7 +35,7 @@ from lidarspec.framing.steady import steady_datagrams, step_between
 
 
 def sorted_datagrams(
-    framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: Mode
+    framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: SearchState
 ) -> Piece:
     """The type of each datagram.
 
@@ -76,7 +76,7 @@ class _Batch:
         self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
         self._piece = Piece(Frames.none(buffer), len(buffer))
 
-    def sorted(self, mode: Mode) -> Piece:
+    def sorted(self, mode: SearchState) -> Piece:
         """All of them."""
         position = 0
         parts = list[Frames]()
@@ -88,7 +88,7 @@ class _Batch:
             self._piece.frames = Frames.joined(parts)
         return self._piece
 
-    def _from(self, position: int, mode: Mode) -> Frames:
+    def _from(self, position: int, mode: SearchState) -> Frames:
         """The types from here up to the datagram that changes what is looked for."""
         if mode.after not in self._known:
             frames, reasons = self._judged(self._starts[position:], self._sizes[position:], mode)
@@ -117,7 +117,7 @@ class _Batch:
             mode.after = self._framing.names[int(frames.kinds[-1])]
         return frames
 
-    def _judged(self, starts: Indices, sizes: Indices, mode: Mode) -> tuple[Frames, Status]:
+    def _judged(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
         """The type and layout of each datagram while nothing changes what is looked for.
 
         Returns:
@@ -186,7 +186,9 @@ class _Batch:
             return steady
         return self._framing.survey(kind, self._buffer, starts, starts + sizes, gathered=False)
 
-    def _rejected(self, frames: Frames, lost: Indices, reasons: Status, mode: Mode) -> Frames:
+    def _rejected(
+        self, frames: Frames, lost: Indices, reasons: Status, mode: SearchState
+    ) -> Frames:
         """Count datagrams that are no frames; judge again those with a plugin failure.
 
         Returns the datagrams up to a frame that changes which types are searched.
@@ -208,7 +210,7 @@ class _Batch:
             return Frames.joined([*parts, frames.only(slice(begun, None))])
         return frames
 
-    def _judged_alone(self, datagram: Frames, mode: Mode) -> Frames | None:
+    def _judged_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
         """One datagram as a frame, None where it is none; counts why."""
         rejected = 0
         start = datagram.starts
@@ -227,7 +229,7 @@ class _Batch:
         self._count(np.array([rejected], np.uint8), size, mode)
         return None
 
-    def _count(self, reasons: NDArray[np.uint8], sizes: Indices, mode: Mode) -> None:
+    def _count(self, reasons: NDArray[np.uint8], sizes: Indices, mode: SearchState) -> None:
         """Count datagrams as rejected.
 
         Without the constants of a frame they count as such, or as too short to have them.

@@ -21,7 +21,7 @@ from lidarspec.errors import PluginError, UsageError, refuse_text
 from lidarspec.frames.arrays import alike, keep_freed_memory, repeated
 from lidarspec.frames.layout import Sums
 from lidarspec.framing.assembly import Assembly, Joined
-from lidarspec.framing.candidates import Bytes1D, Framing, Mode, Piece
+from lidarspec.framing.candidates import Bytes1D, Framing, Piece, SearchState
 from lidarspec.framing.datagrams import sorted_datagrams
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
@@ -96,7 +96,9 @@ class Decoder:
         answer = sensor.options.get(
             "answer", ""
         )  # as if the frame that the answer comes after had been seen
-        self._mode = Mode(after=sensor.frames[answer].after if answer in sensor.frames else None)
+        self._mode = SearchState(
+            after=sensor.frames[answer].after if answer in sensor.frames else None
+        )
         self._pending = b""
         self._base = 0
         self._need = 0

@@ -22,9 +22,9 @@ from lidarspec.framing.candidates import (
     Candidates,
     Framing,
     Live,
-    Mode,
     Offsets,
     Piece,
+    SearchState,
 )
 from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
 
@@ -33,7 +33,9 @@ from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
 MIN_STAY_BYTES = 1 << 12
 
 
-def leftmost(framing: Framing, buffer: Bytes1D, mode: Mode, base: int, *, final: bool) -> Piece:
+def leftmost(
+    framing: Framing, buffer: Bytes1D, mode: SearchState, base: int, *, final: bool
+) -> Piece:
     """Cut one piece.
 
     Args:
@@ -85,7 +87,7 @@ class _Walk:
     """
 
     def __init__(
-        self, framing: Framing, candidates: Candidates, live: Live, mode: Mode, base: int
+        self, framing: Framing, candidates: Candidates, live: Live, mode: SearchState, base: int
     ) -> None:
         self._framing = framing
         self._mode = mode
@@ -208,7 +210,7 @@ def _rows_of(runs: Offsets) -> Offsets:
     return rows
 
 
-def _remember_size(mode: Mode, frames: Frames, since: int) -> None:
+def _remember_size(mode: SearchState, frames: Frames, since: int) -> None:
     """Store the regularity of the frames for the next piece.
 
     Only frames since the last change of the mode count.

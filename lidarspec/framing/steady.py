@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.arrays import alike, repeated
 from lidarspec.frames.layout import Bytes2D, Layout, Marks, exclude, right
-from lidarspec.framing.candidates import Framing, Mode, Piece
+from lidarspec.framing.candidates import Framing, Piece, SearchState
 from lidarspec.framing.results import Frames, Indices, Numbers
 
 #: rows whose constants are compared before those of all rows.
@@ -26,7 +26,7 @@ DISTINCTIVE_CONSTANTS = 4
 
 
 def steady_stream(
-    framing: Framing, buffer: NDArray[np.uint8], mode: Mode, base: int
+    framing: Framing, buffer: NDArray[np.uint8], mode: SearchState, base: int
 ) -> Piece | None:
     """Return the frames of a piece from its first byte on; None if it has to be searched.
 
@@ -67,7 +67,7 @@ def steady_stream(
 
 
 def steady_datagrams(
-    framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: Mode
+    framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: SearchState
 ) -> Frames | None:
     """Return datagrams of one size at equal distances, judged as frames of one type and layout.
 
@@ -142,7 +142,7 @@ def step_between(starts: Indices) -> int:
     return 0
 
 
-def _piece(framing: Framing, mode: Mode, frames: Frames) -> Piece:
+def _piece(framing: Framing, mode: SearchState, frames: Frames) -> Piece:
     """Return a piece that ends with some frames, and waits for a next one that has begun."""
     end = len(frames) * mode.size
     rest = frames.buffer[end:]
@@ -152,7 +152,9 @@ def _piece(framing: Framing, mode: Mode, frames: Frames) -> Piece:
     return Piece(frames, end, need > 0, need)
 
 
-def _count_needed(framing: Framing, mode: Mode, kind: int, layout: Layout, rest: bytes) -> int:
+def _count_needed(
+    framing: Framing, mode: SearchState, kind: int, layout: Layout, rest: bytes
+) -> int:
     """Return how many bytes are needed to judge an incomplete frame of a layout.
 
     Returns 0 if the bytes may be another frame.
@@ -194,7 +196,7 @@ def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D
     return np.ndarray((count, size), np.uint8, buffer, int(starts[0]), (step, 1))
 
 
-def _likely(framing: Framing, rows: Bytes2D, mode: Mode) -> int | None:
+def _likely(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | None:
     """Return the type with the constants of the first datagram.
 
     Returns None if there is none, or if any datagram has the constants of an earlier type as well.

@@ -23,7 +23,7 @@ from lidarspec.errors import SpecError
 from lidarspec.frames.parse import parse
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
-from lidarspec.simulation.faults import Faults, Line
+from lidarspec.simulation.faults import Faults, FaultyLink
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Scene, furnished
 from lidarspec.simulation.simulator import Rest, Simulation, simulation
@@ -320,12 +320,12 @@ class SimulatedDevice:
         self._plug: int | None = None
         self._simulation(sensor.data_frame)
 
-    def _line(self, name: str, seed: int) -> Line:
+    def _line(self, name: str, seed: int) -> FaultyLink:
         """The way of a link; one beside the data over which bytes come in order is TCP or HTTP,
         which bring them all.
         """
         stream = not is_datagram(self.sensor.links[name])
-        return Line(
+        return FaultyLink(
             Faults() if stream and name != "data" else self.faults, seed=seed, stream=stream
         )
 

@@ -1,7 +1,8 @@
-"""What goes wrong with a simulated sensor, and between it and its reader, on request: damaged
-bytes, lost and reordered packets, a pulled plug, a blocked rotor.
+"""Inject faults into the data of a simulated sensor.
 
-The same seed does the same harm to the same packets, however they are cut into batches.
+The faults are corrupt bytes, lost and reordered packets, disconnections, a blocked rotor and IMU
+noise. The same seed causes the same faults in the same packets, however they are split into
+batches.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from typing import Any
 from lidarspec.errors import OutOfRange, UsageError
 from lidarspec.spec.fields import duration, share
 
-#: share of the datagrams that come late where any are reordered.
+#: fraction of datagrams that are delayed if `reorder` is set.
 LATE = 0.1
-#: what a rotor can be that does not turn.
+#: the value of `rotor` for a rotor that does not turn.
 BLOCKED = "blocked"
 
 
@@ -27,19 +28,18 @@ class Faults:
     """What goes wrong.
 
     Args:
-        errors: share of the bytes that are damaged; changed, in a byte stream also lost or
-            followed by one too many.
-        loss: share of the packets that are lost whole.
-        reorder: how many places late a datagram may come, one in ten does.
-        unplug: seconds after which the sensor is unplugged, again and again; 0: never.
-        absent: seconds that it is away then.
-        shake: standard deviation of the noise on what an IMU feels, m/s2 and rad/s; 0: it is at
-            rest.
-        rotor: "blocked": it does not turn, and the angles stay as they are; "" where it does.
+        errors: fraction of corrupt bytes, 0 to 1. A bit of the byte is flipped; in a byte stream
+            the byte can also be dropped, or a random byte inserted after it.
+        loss: fraction of packets that are dropped, 0 to 1.
+        reorder: maximum delay of a datagram, in packets. One datagram in ten is delayed; 0: none.
+        unplug: interval between disconnections, in seconds; 0: never.
+        absent: duration of each disconnection, in seconds.
+        shake: standard deviation of the noise on IMU readings, in m/s2 and rad/s; 0: at rest.
+        rotor: "blocked" if the rotor does not turn and the angles are constant; "" if it turns.
 
     Raises:
-        OutOfRange: for a share that is none, or a negative number.
-        UsageError: for a rotor that is something else.
+        OutOfRange: if a fraction is not between 0 and 1, or a number is negative.
+        UsageError: for another value of `rotor`.
     """
 
     errors: float = 0.0
@@ -63,14 +63,14 @@ class Faults:
             if not 0 <= value <= high:
                 raise OutOfRange(name, value, 0, high, place="faults")
         if self.rotor not in ("", BLOCKED):
-            raise UsageError(f"the rotor turns, or is {BLOCKED!r}, not {self.rotor!r}")
+            raise UsageError(f"invalid rotor {self.rotor!r}: expected {BLOCKED!r} or nothing")
 
 
 def faults_of(options: Mapping[str, str]) -> Faults:
-    """The faults that options name by text: ``{"errors": "1%", "loss": "0.01", "unplug": "30s"}``.
+    """Parse options such as ``{"errors": "1%", "loss": "0.01", "unplug": "30s"}``.
 
     Raises:
-        UsageError: for a value that is not of its kind.
+        UsageError: if a value cannot be parsed.
     """
     read: dict[str, Any] = {
         "errors": share,
@@ -86,7 +86,7 @@ def faults_of(options: Mapping[str, str]) -> Faults:
         try:
             values[name] = read[name](text)
         except ValueError:
-            raise UsageError(f"{name} is a number, not {text!r}") from None
+            raise UsageError(f"invalid {name}: expected a number, got {text!r}") from None
     return Faults(**values)
 
 
@@ -94,19 +94,19 @@ def faults_of(options: Mapping[str, str]) -> Faults:
 FAULTS = tuple(field.name for field in fields(Faults))
 
 
-class Line:
-    """The way from a sensor to its reader.
+class FaultyLink:
+    """A link that corrupts, drops and reorders packets.
 
     Args:
-        stream: a byte stream; else datagrams.
+        stream: whether the link is a byte stream; otherwise it carries datagrams.
 
     Attributes:
-        sent: number of packets given to `carry`.
-        intact: packets of which every byte arrives, in order and with nothing between.
-        lost: packets of which no byte arrives.
+        sent: number of packets passed to `carry`.
+        intact: number of packets that arrive without a fault inside them.
+        lost: number of packets that are dropped.
 
     Raises:
-        UsageError: for reordering on a byte stream, which has no such fault.
+        UsageError: if a byte stream is to be reordered.
     """
 
     def __init__(self, faults: Faults, *, seed: int = 0, stream: bool) -> None:
@@ -115,14 +115,15 @@ class Line:
         self._faults = faults
         self._stream = stream
         self._source = random.Random(f"line {seed}")
-        self._clean = self._gap()
+        self._valid_bytes_left = self._draw_gap()
         self._number = 0
         self._late: list[tuple[int, int, str, bytes]] = []
         self.sent = self.intact = self.lost = 0
 
     def carry(self, packets: Sequence[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
-        """What arrives of these packets, each a name and its bytes; those that are late come with a
-        later call.
+        """Return the packets that arrive, as (frame name, bytes).
+
+        A later call returns delayed packets. Packets still delayed at the end are never returned.
         """
         self.sent += len(packets)
         if not (self._faults.errors or self._faults.loss or self._faults.reorder):
@@ -133,41 +134,41 @@ class Line:
             if self._faults.loss and self._source.random() < self._faults.loss:
                 self.lost += 1
             else:
-                harmed = self._harmed(data)
-                if data in harmed:  # a byte inserted after the frame leaves it whole
+                corrupted = self._corrupt(data)
+                if data in corrupted:  # a byte inserted after the frame does not corrupt it
                     self.intact += 1
                 depth = self._faults.reorder
                 if depth and self._source.random() < LATE:
                     delay = self._source.randint(1, depth)
                 else:
                     delay = 0
-                heapq.heappush(self._late, (self._number + delay, self._number, name, harmed))
+                heapq.heappush(self._late, (self._number + delay, self._number, name, corrupted))
             while self._late and self._late[0][0] <= self._number:
                 arrived.append(heapq.heappop(self._late)[2:])
             self._number += 1
         return arrived
 
-    def _gap(self) -> int:
-        """Sound bytes up to the next damaged one."""
+    def _draw_gap(self) -> int:
+        """Return the number of valid bytes before the next corrupt one."""
         rate = self._faults.errors
         if rate in (0.0, 1.0):
             return 0
         return int(math.log(1 - self._source.random()) / math.log1p(-rate))
 
-    def _harmed(self, frame: bytes) -> bytes:
+    def _corrupt(self, frame: bytes) -> bytes:
         if not self._faults.errors:
             return frame
         out = bytearray()
         start = 0
-        while start + self._clean < len(frame):
-            spot = start + self._clean
-            out += frame[start:spot] + self._byte(frame[spot])
+        while start + self._valid_bytes_left < len(frame):
+            spot = start + self._valid_bytes_left
+            out += frame[start:spot] + self._corrupt_byte(frame[spot])
             start = spot + 1
-            self._clean = self._gap()
-        self._clean -= len(frame) - start
+            self._valid_bytes_left = self._draw_gap()
+        self._valid_bytes_left -= len(frame) - start
         return bytes(out + frame[start:])
 
-    def _byte(self, byte: int) -> bytes:
+    def _corrupt_byte(self, byte: int) -> bytes:
         changed = bytes([byte ^ 1 << self._source.randrange(8)])
         if self._stream:
             return self._source.choice((b"", changed, bytes([byte, self._source.randrange(256)])))

@@ -1,4 +1,4 @@
-"""Send bytes in the place of a sensor, over pseudo-terminals, UDP, TCP and HTTP.
+"""Send bytes as a sensor does, over pseudo-terminals, UDP, TCP and HTTP.
 
 Simulated sensors and replays use the same mechanism. A `Line` is the sensor's end of one link: it
 sends without waiting and returns the commands that have arrived. An `Outlet` holds the line of the
@@ -31,7 +31,7 @@ try:
     import fcntl
     import termios
     import tty
-except ImportError:  # no POSIX
+except ImportError:  # not a POSIX system; `has_terminals` checks this
     termios = None  # type: ignore[assignment]
 
 LOCALHOST = "127.0.0.1"
@@ -53,7 +53,7 @@ _ABSENT_READER_POLL_S = 0.005
 FETCH_TIMEOUT_S = 5.0
 #: A pseudo-terminal counts as read after so many checks without waiting bytes.
 _EMPTY_CHECKS = 3
-#: A port without a server, for finding the address of a host.
+#: Port for the lookup of a host's address; nothing is sent to it.
 _DISCARD_PORT = 9
 
 
@@ -61,7 +61,7 @@ class Line:
     """The sensor's end of one link.
 
     Attributes:
-        place: the SOURCE that a listener on this computer opens.
+        place: the SOURCE string with which a program on this computer opens the link.
         port: the port that it listens on, 0 for none.
         has_listener: whether somebody listens, as far as this is known.
         unsent_bytes: the number of bytes that nobody read in time.
@@ -74,7 +74,7 @@ class Line:
 
     @property
     def source(self) -> str:
-        """The SOURCE that a listener on the destination computer opens."""
+        """The SOURCE string with which a program on the destination computer opens the link."""
         return self.place
 
     @property
@@ -91,7 +91,10 @@ class Line:
         return ()
 
     def receive(self) -> list[bytes]:
-        """Return the commands that have arrived, and write bytes that wait; does not block."""
+        """Return the commands that have arrived, without blocking.
+
+        Also writes bytes from the backlog, and accepts and drops connections.
+        """
         return []
 
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
@@ -107,7 +110,10 @@ class Line:
         raise NotImplementedError
 
     def await_listener(self) -> None:
-        """Wait for a listener that can receive everything from the beginning, if it is known."""
+        """Wait for a listener that can receive everything from the beginning.
+
+        Returns at once if the link cannot tell whether there is a listener, as over UDP.
+        """
 
     def unplug(self) -> None:
         """Disconnect every listener until `plug` is called."""
@@ -116,7 +122,7 @@ class Line:
         """Let listeners connect again."""
 
     def finish(self) -> None:
-        """Wait until the last bytes have been read, or nobody reads them."""
+        """Wait until the listeners have read the last bytes, for at most `FETCH_TIMEOUT_S`."""
 
     def close(self) -> None:
         """Close the line."""
@@ -256,7 +262,7 @@ class UdpLine(Line):
     def receive(self) -> list[bytes]:
         commands = []
         for one in self._sockets:
-            # Also raised because an earlier datagram met a closed port.
+            # An earlier datagram to a closed port also raises an error here.
             with contextlib.suppress(OSError):
                 data, sender = one.recvfrom(_READ_BYTES)
                 if not self._host:
@@ -289,25 +295,36 @@ class UdpLine(Line):
         return self._host, port
 
     def _send(self, data: bytes, receiver: Sender, *, patient: bool) -> bool:
+        """Return whether a datagram could be sent."""
         attempts = itertools.count() if patient else range(_SEND_ATTEMPTS)
-        return any(self._try_send(data, receiver) for _ in attempts)
+        for _ in attempts:
+            try:
+                self._sockets[0].sendto(data, receiver)
+            except OSError as error:
+                if not self._may_succeed_later(error):
+                    return False
+            else:
+                return True
+        return False
 
-    def _try_send(self, data: bytes, receiver: Sender) -> bool:
-        """Send a datagram; return False if another attempt may succeed."""
-        try:
-            self._sockets[0].sendto(data, receiver)
-        except OSError as error:
-            if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
-                wait_ready([], [self._sockets[0]], POLL)
-            elif error.errno == errno.ENOBUFS:
-                time.sleep(_LISTENER_POLL_S)
-            elif error.errno != errno.ECONNREFUSED and self._host:
-                # ECONNREFUSED is the answer to an earlier datagram.
-                raise SourceError(
-                    f"{self.place}: nothing can be sent: {system_reason(error)}"
-                ) from None
-            return False
-        return True
+    def _may_succeed_later(self, error: OSError) -> bool:
+        """Wait after a temporary error and return True; return False for other errors.
+
+        Raises:
+            SourceError: for other errors, if there is only one receiver.
+        """
+        if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
+            wait_ready([], [self._sockets[0]], POLL)
+            return True
+        if error.errno == errno.ENOBUFS:
+            time.sleep(_LISTENER_POLL_S)
+            return True
+        if error.errno == errno.ECONNREFUSED:
+            return True  # the answer to an earlier datagram
+        if self._host:
+            reason = system_reason(error)
+            raise SourceError(f"{self.place}: nothing can be sent: {reason}") from None
+        return False
 
 
 class TcpLine(Line):
@@ -381,8 +398,8 @@ class TcpLine(Line):
     def finish(self) -> None:
         """Disconnect after the last bytes have been sent.
 
-        Closing a socket with unread input would discard bytes that are on their way. The limit
-        holds for a client that keeps sending as well as for a silent one.
+        Closing a socket with unread input would discard bytes that have not been delivered yet, so
+        input is read and ignored until the client closes the connection or the time is up.
         """
         limit = time.monotonic() + FETCH_TIMEOUT_S
         for client in list(self._clients):
@@ -439,7 +456,7 @@ class PtyLine(Line):
         link: a symbolic link to the terminal, which is created and removed with it.
 
     Attributes:
-        path: the path of the terminal, which is another one after each `plug`.
+        path: the path of the terminal; it changes with each `plug`.
 
     Raises:
         SourceError: if there is no free terminal, or the link cannot be made.
@@ -550,7 +567,7 @@ class PtyLine(Line):
             time.sleep(_LISTENER_POLL_S)
 
     def _is_alone(self) -> bool:
-        """Return whether nobody has the terminal open."""
+        """Return whether no program has the terminal open."""
         poller = select.poll()
         poller.register(self._master, select.POLLIN)
         return any(event & select.POLLHUP for _, event in poller.poll(0))
@@ -565,7 +582,10 @@ class PtyLine(Line):
             self._handle_hangup()
 
     def _handle_hangup(self) -> None:
-        """Discard all bytes for the closed reader, so that the next one never gets them."""
+        """Discard the bytes for a reader that closed the terminal.
+
+        The next reader must not receive them.
+        """
         self.unsent_bytes += len(self._backlog)
         self._backlog.clear()
         if not self.has_listener:
@@ -619,7 +639,7 @@ class Outlet:
 
     @property
     def source(self) -> str:
-        """The SOURCE that a listener on the destination computer opens, with `control=`."""
+        """The SOURCE string for the destination computer, with a `control=` option if required."""
         ports = {line.port for line in self.controls.values()}
         if not ports:
             return self.data.source
@@ -714,11 +734,11 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         server = socket.create_server((host, port), family=family)
     except OSError as error:
-        following = f"the same with tcp://{LOCALHOST}:{port}"
+        next_step = f"the same with tcp://{LOCALHOST}:{port}"
         if error.errno == errno.EADDRINUSE:
-            following = f"ss -ltnp 'sport = :{port}'"
+            next_step = f"ss -ltnp 'sport = :{port}'"
         raise source_error(
-            f"tcp://{host}:{port}: cannot listen there: {system_reason(error)}", following
+            f"tcp://{host}:{port}: cannot listen there: {system_reason(error)}", next_step
         ) from None
     server.setblocking(False)
     return server

@@ -442,6 +442,18 @@ def test_a_pseudo_terminal_is_listened_to_once() -> None:
     assert heard.size > 47
 
 
+def test_without_sensors_the_rate_or_port_has_to_be_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listen, "sensors", dict)
+    with port(tmp_path) as made:
+        assert list(hear(made.name, seconds=0.1))
+    with pytest.raises(SourceError, match=r"serial:///dev/ttyUSB0\?baud="):
+        next(hear("serial:///dev/ttyUSB0"))
+    with pytest.raises(SourceError, match=r"udp://\?port="):
+        next(hear("udp://"))
+
+
 def test_of_sensors_with_the_same_frames_those_of_the_vendor_with_most_of_them_come_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

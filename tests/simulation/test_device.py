@@ -16,7 +16,7 @@ import lidarspec as ls
 from lidarspec import Sensor, UsageError
 from lidarspec.errors import OutOfRange
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.simulation.faults import Faults, Line, faults_of
+from lidarspec.simulation.faults import Faults, FaultyLink, faults_of
 from lidarspec.simulation.simulator import Rest
 from lidarspec.spec import Command, Frame, Scaled
 from lidarspec.spec.fields import duration
@@ -294,18 +294,20 @@ def test_lost_packets_are_missing_and_reordered_ones_are_late() -> None:
 
 
 def test_damage_in_datagrams_keeps_their_length() -> None:
-    line = Line(Faults(errors=0.1), stream=False)
+    line = FaultyLink(Faults(errors=0.1), stream=False)
     out = line.carry([("data", bytes(100))] * 50)
     assert [len(data) for _, data in out] == [100] * 50
     assert 0.07 < np.mean([sum(map(bool, data)) for _, data in out]) / 100 < 0.13
 
 
 def test_every_byte_of_a_line_can_be_damaged() -> None:
-    out = Line(Faults(errors=1.0), stream=True).carry([("", bytes(300))])
+    out = FaultyLink(Faults(errors=1.0), stream=True).carry([("", bytes(300))])
     assert 150 < len(out[0][1]) < 450
     assert all(
         a or b
-        for a, b in pairwise(Line(Faults(errors=1.0), stream=False).carry([("", bytes(300))])[0][1])
+        for a, b in pairwise(
+            FaultyLink(Faults(errors=1.0), stream=False).carry([("", bytes(300))])[0][1]
+        )
     )
 
 

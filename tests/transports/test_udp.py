@@ -14,6 +14,7 @@ from lidarspec.spec import Chunk
 from lidarspec.transports.addresses import parse_origin
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import transport
+from lidarspec.transports.outlets import UdpLine
 from lidarspec.transports.protocol import Origin, endpoint
 from lidarspec.transports.udp import BUFFER, UdpTransport, _order_times, _Socket, shortfall
 from tests.lines import free_port, udp, until
@@ -286,3 +287,17 @@ def test_what_cannot_be_opened_says_why(
         with pytest.raises(error, match=text.format(**names)) as caught:
             transport(source.format(**names))
     assert not following or caught.value.__notes__ == [f"next: {following.format(**names)}"]
+
+
+def test_a_datagram_that_is_too_long_for_udp_is_dropped_and_counted() -> None:
+    """A patient sender waits for room, but never for what cannot be sent at all."""
+    line = UdpLine.replying("127.0.0.1", 0)
+    try:
+        with udp() as reader:
+            reader.sendto(b"command", ("127.0.0.1", line.port))
+            until(line.receive)
+            line.send([Chunk(bytes(70_000)), Chunk(b"short")], patient=True)
+            assert reader.recv(100) == b"short"
+        assert line.unsent_bytes == 70_000
+    finally:
+        line.close()

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D, Seal, Sums
-from lidarspec.frames.row_checksums import batch, finished, places
+from lidarspec.frames.row_checksums import batch, finalize, places
 from lidarspec.points.numba_kernels.kernels import function_of, require
 from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
@@ -117,7 +117,7 @@ def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) ->
     function_of(_ALONG)(
         rows.reshape(-1), rows.shape[1], edges, table.astype(np.uint64).view(np.int64), start, found
     )
-    return finished(algorithm, found.view(np.uint64).astype(table.dtype))
+    return finalize(algorithm, found.view(np.uint64).astype(table.dtype))
 
 
 class _Shares:

@@ -1,8 +1,11 @@
-"""A struct read off as nodes (`lidarspec.spec.tree`), once for each frame.
+"""Translate a construct struct to the nodes of `lidarspec.spec.tree`, once for each frame type.
 
-Expressions are called with symbols in place of fields and what they do with them is written down,
-and the bits of a bit block are found out by parsing it with construct, so that no rule about bit
-order stands anywhere else. What no node stands for stays a part of construct's, with the reason.
+* Expressions (counts, conditions, keys) are traced: they are called with symbols in place of
+  fields, and the operations on the symbols are recorded as a formula.
+* The bit positions of a bit block are found by parsing test patterns with construct, so this
+  project has no bit order rules of its own.
+* A construct that no node can represent becomes `tree.Opaque`, with the reason. Only construct can
+  parse it, one frame at a time.
 """
 
 from __future__ import annotations
@@ -54,12 +57,14 @@ def frame_tree(con: Construct) -> tree.Node:
     Raises:
         SpecError: for a constant that its Enum has no value for.
     """
-    return _twice(lambda builder: builder.node(con, _Place(tree.FieldInfo(""), None)))[0]
+    return _twice(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[0]
 
 
 def _twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
-    """What a builder makes, and the builder; where values follow from later fields, one that knows
-    these.
+    """Return the node that `made` builds, and the builder.
+
+    If rebuilt values depend on later fields, the node is built a second time by a builder that
+    knows the fields and sizes of the first pass.
     """
     builder = _Builder()
     root = made(builder)
@@ -70,8 +75,10 @@ def _twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
 
 
 def _traced(expression: Any, scope: tree.Scope) -> Any:
-    """What an expression comes to; construct's own are walked, since its ``~`` asks for the truth
-    of a value.
+    """Return the value of an expression whose fields are symbols.
+
+    Expressions of construct are walked here instead of called, since calling ``~`` evaluates
+    ``not value``, and the truth of a symbol is not known.
     """
     if isinstance(expression, BinExpr):
         return expression.op(_traced(expression.lhs, scope), _traced(expression.rhs, scope))
@@ -129,35 +136,39 @@ def unnamed(raw: int) -> Any:
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where in the tree a construct stands: what is said of it, what its expressions see, and
-    whether it is a part of a bit block.
+class _Context:
+    """The context of a construct.
+
+    Attributes:
+        info: what its wrappers and parents declare about the field.
+        scope: the fields that its expressions can refer to.
+        name: its name in the parent struct; "" if it has none.
+        in_bits: whether it is inside a bit block.
     """
 
     info: tree.FieldInfo
     scope: tree.Scope | None
     name: str = ""
     in_bits: bool = False
-    #: bytes that are left where something else says how many there are.
+    #: number of bytes up to the end of the enclosing part, if its length is declared elsewhere.
     room: tree.Formula | None = None
 
-    def inside(self, **changes: Any) -> _Place:
+    def inside(self, **changes: Any) -> _Context:
         """The place with some facts of the field changed."""
         info = replace(self.info, **changes)
-        return _Place(info, self.scope, self.name, self.in_bits, self.room)
+        return _Context(info, self.scope, self.name, self.in_bits, self.room)
 
 
 class _Builder:
     """Makes the nodes of a struct.
 
     Args:
-        before: that has made them once, where values follow from what stands behind them: it knows
-            this.
+        before: the builder of the first pass, if this is the second one (`_twice`).
 
     Attributes:
-        scopes: what was known at the end of each struct.
-        sizes: the sizes that fields of the struct have to say, in the order of these fields.
-        rebuilding: whether values follow from others.
+        scopes: the complete scope of each struct, by its path.
+        sizes: the formulas of all SizeOf fields, in the order of these fields; None until known.
+        rebuilding: whether a second pass is required, because values depend on other fields.
     """
 
     def __init__(self, before: _Builder | None = None) -> None:
@@ -167,13 +178,13 @@ class _Builder:
         self.sizes: list[tree.Formula | None] = []
         self.rebuilding = False
         self._asked: list[tree.Ref] = []
-        #: of each struct that is being made, those that measure a part of it: which they are, and
-        #: what they measure.
+        #: the SizeOf fields that measure a part of each struct under construction, as (index in
+        #: `sizes`, field).
         self._measured: dict[tree.Scope, list[tuple[int, Sizing]]] = {}
 
-    def node(self, con: Construct, place: _Place) -> tree.Node:
+    def node(self, con: Construct, place: _Context) -> tree.Node:
         """The node of a construct, whatever it is."""
-        inner, place = self._peeled(con, place)
+        inner, place = self._unwrap_describing(con, place)
         name = place.name
         info = place.info
         is_block = isinstance(inner, construct.Transformed | construct.Restreamed)
@@ -217,9 +228,11 @@ class _Builder:
             return tree.Empty(name)
         return self._leaf(inner, place)
 
-    def _peeled(self, con: Construct, place: _Place) -> tuple[Construct, _Place]:
-        """What is below the wrappers that only describe (name, unit, labels, constant), and what
-        they say.
+    def _unwrap_describing(self, con: Construct, place: _Context) -> tuple[Construct, _Context]:
+        """Remove the wrappers that only describe a field, such as its name, unit and labels.
+
+        Returns:
+            The wrapped construct, and the place with the facts that the wrappers declare.
         """
         while True:
             if isinstance(con, construct.Renamed):
@@ -252,7 +265,7 @@ class _Builder:
                 return con, place
             con = con.subcon
 
-    def _default(self, value: Any, place: _Place) -> Any:
+    def _default(self, value: Any, place: _Context) -> Any:
         """Return the value of a construct Default: itself, or a formula of a function."""
         if callable(value):
             return self._formula(value, place)
@@ -261,7 +274,7 @@ class _Builder:
     def _formula(
         self,
         expression: Any,
-        place: _Place,
+        place: _Context,
         known: tree.Scope | None = None,
         *,
         is_key: bool = False,
@@ -295,7 +308,7 @@ class _Builder:
         path = place.info.path
         return tree.Untraced(f"{path}: {reason}", _spelled(expression, path))
 
-    def _select(self, con: construct.Switch, place: _Place) -> tree.Select:
+    def _select(self, con: construct.Switch, place: _Context) -> tree.Select:
         key = self._formula(con.keyfunc, place, is_key=True)
         labels = key.info.labels if isinstance(key, tree.Ref) else {}
         raw = {name: value for value, name in labels.items()}
@@ -320,10 +333,10 @@ class _Builder:
         )
         return tree.Select(place.name, key, cases, self._branch(con.default, place))
 
-    def _branch(self, con: Construct, place: _Place) -> tree.Node:
+    def _branch(self, con: Construct, place: _Context) -> tree.Node:
         return self.node(con, place.inside(optional=True))
 
-    def _struct(self, con: Struct, place: _Place) -> tree.Struct:
+    def _struct(self, con: Struct, place: _Context) -> tree.Struct:
         info = place.info
         scope = tree.Scope(place.scope, info.path, self._asked)
         if place.name and place.scope is not None:
@@ -343,7 +356,7 @@ class _Builder:
                 optional=info.optional,
                 default=default,
             )
-            inside = _Place(said, scope, child.name or "", place.in_bits)
+            inside = _Context(said, scope, child.name or "", place.in_bits)
             part = unwrap(child)
             if isinstance(
                 filler := (
@@ -372,7 +385,7 @@ class _Builder:
         return made
 
     def _padding(
-        self, con: Filler, place: _Place, size: tree.Formula | None
+        self, con: Filler, place: _Context, size: tree.Formula | None
     ) -> tree.Formula | None:
         """The bytes behind a part of this size."""
         number = self._formula(con.modulus if con.to is None else con.to, place)
@@ -382,8 +395,11 @@ class _Builder:
             return size
         return tree.calculated("%", tree.calculated("-", size), number)
 
-    def _measuring(self, con: Sizing, place: _Place) -> tree.Formula | None:
-        """What a part will add up to, once it is known."""
+    def _measuring(self, con: Sizing, place: _Context) -> tree.Formula | None:
+        """Return the formula for the size of a part, None in the first pass.
+
+        Registers the SizeOf field, so that `_struct` computes the size when the struct is complete.
+        """
         scope = place.scope
         self.rebuilding = True
         for _ in range(con.out):
@@ -398,11 +414,12 @@ class _Builder:
         self._measured[scope].append((index, con))
         self.sizes.append(None)
         size = self._sizes[index] if self._sizes else None
+        # The length of the part is declared by this very field: keep the value that is given.
         if isinstance(size, tree.Ref) and size.path == place.info.path:
             return None
-        return size  # what it says itself holds
+        return size
 
-    def _filling(self, con: construct.GreedyRange, place: _Place) -> tree.Node:
+    def _filling(self, con: construct.GreedyRange, place: _Context) -> tree.Node:
         """As many elements as fill a part, where all are of one size."""
         axis = axis_path(place.info)
         element = self.node(
@@ -417,7 +434,7 @@ class _Builder:
             return tree.Opaque(place.name, place.info, "GreedyRange", reason, (element,))
         return tree.Repeat(place.name, axis, tree.calculated("//", place.room, size), element)  # type: ignore[arg-type]
 
-    def _parts(self, con: Partition, place: _Place) -> tree.Parts:
+    def _parts(self, con: Partition, place: _Context) -> tree.Parts:
         info = place.info
         scope = place.scope
         axis = axis_path(place.info)
@@ -457,12 +474,12 @@ class _Builder:
         return tree.Parts(place.name, axis, tuple(kinds), count, size, within, tuple(outer), total)
 
     def _alone(
-        self, case: Construct, following: Any, place: _Place
+        self, case: Construct, following: Any, place: _Context
     ) -> tuple[tree.Node, tree.Formula | None]:
         """A part as a frame in itself, and the size of the one behind it."""
 
-        def around(builder: _Builder) -> _Place:
-            return _Place(tree.FieldInfo(""), tree.Outside(place.scope, builder._asked))  # type: ignore[arg-type]
+        def around(builder: _Builder) -> _Context:
+            return _Context(tree.FieldInfo(""), tree.Outside(place.scope, builder._asked))  # type: ignore[arg-type]
 
         root, builder = _twice(lambda builder: builder.node(case, around(builder)))
         if following is None:
@@ -471,7 +488,7 @@ class _Builder:
             rule = builder._formula(following, replace(around(builder), scope=builder.scopes[""]))
         return root, rule
 
-    def _check(self, con: construct.Check, place: _Place) -> tree.Node:
+    def _check(self, con: construct.Check, place: _Context) -> tree.Node:
         """A condition on fields that stand side by side, as far as 64-bit integers hold what it
         comes to.
         """
@@ -506,7 +523,7 @@ class _Builder:
             f"{reason.partition(': ')[2]}: plausible=lambda f: ... is judged in bulk",
         )
 
-    def _sealed(self, con: Sealing, place: _Place) -> tree.Node:
+    def _sealed(self, con: Sealing, place: _Context) -> tree.Node:
         body = self.node(con.subcon, place)
         if not isinstance(body, tree.Struct | tree.Sealed):
             return tree.Opaque(
@@ -529,7 +546,7 @@ class _Builder:
             tuple(sorted(con.absent)),
         )
 
-    def _leaf(self, con: Construct, place: _Place) -> tree.Node:
+    def _leaf(self, con: Construct, place: _Context) -> tree.Node:
         name = place.name
         info = _typed(con, place.info)
         if name and place.scope is not None:
@@ -563,7 +580,7 @@ class _Builder:
             return tree.Blob("", info, con.length, con.build(info.const))
         return node
 
-    def _block(self, con: Construct, place: _Place) -> tree.Node:
+    def _block(self, con: Construct, place: _Context) -> tree.Node:
         """A bit block: the bits of each field come from probing construct itself."""
         inside = self.node(con, replace(place, in_bits=True))
         try:
@@ -597,8 +614,9 @@ class _Builder:
 
 
 def _is_whole(formula: tree.Formula) -> bool:
-    """Whether an operation gives an integer whatever its fields are: it neither divides by one nor
-    shifts by one.
+    """Return whether an operation is defined for all values of its fields.
+
+    Division, modulo and shifts are only if the right operand is a positive constant.
     """
     return not (isinstance(formula, tree.Op) and formula.symbol in ("//", "%", "<<", ">>")) or (
         isinstance(formula.args[1], int) and formula.args[1] > 0
@@ -800,12 +818,13 @@ def _probed(con: Construct, size: int) -> list[BitField] | None:
     """
     if _is_even(con):
         return probe(lambda block: dict(leaves(con.parse(block, _verify=False))), size)
-    return None  # every pattern is tried
+    return None
 
 
 def _is_even(con: Construct) -> bool:
-    """Whether every block is read in the same way: what a value decides on shows with few blocks
-    only, and probing could miss it.
+    """Return whether a bit block has the same fields for all bit patterns.
+
+    If a value decides which fields follow, probing with a few patterns could miss a variant.
     """
     if isinstance(con, Struct):
         return all(map(_is_even, con.subcons))
