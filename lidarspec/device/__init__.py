@@ -9,8 +9,9 @@ warnings. Modules in reading order:
 * `first_frames`: frames of a file that apply from its start: its first state, and the first
   reference of its clock.
 * `file_scans`: the scans of a file, in pieces that other processes read.
-* `senders`: whose datagrams these are, and which of them are read.
-* `live_input`: frames as they come, decoded every few milliseconds; how the source is doing.
+* `senders`: the senders of datagrams, and which of them are read.
+* `live_input`: frames as they arrive, decoded every few milliseconds.
+* `link_state`: data, silence, bytes without frames, or a lost device; and what to do next.
 * `capture_thread`: the thread behind it, which reads, records and queues.
 * `session`: commands and their replies, sans-IO.
 * `async_device`: `Device` for asyncio.

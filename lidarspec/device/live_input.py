@@ -1,12 +1,11 @@
-"""Live input: decode queued chunks in the consumer's thread.
+"""Live input: decode queued chunks in the thread of the consumer.
 
-The chunks that the capture threads queue are decoded every few milliseconds.
+The capture threads queue chunks, which are decoded together every few milliseconds.
 
-`next` takes what has arrived, decodes it in one go and hands it on; while it waits it also drives
-the `Session`: sends what is to be sent, gives it the frames that may be answers, and lets it know
-the time. Whoever calls it has the decoders for himself; `send` from another thread waits for its
-answer while they do the work. `Watch` says how the source is doing: data, silence, bytes that are
-no frames, a device that went away; and what to type next.
+`next` takes what has arrived, decodes it and returns it. While it waits it drives the `Session`: it
+sends requests, passes on the frames that may be replies, and reports the time. Only one thread may
+run the decoders at a time; `send` from another thread waits for its reply while they run.
+`LinkState` watches the data link.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 from lidarspec.device.arrivals import Arrival, Input, answers, decode_chunks
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
-from lidarspec.device.senders import Kept, frame_senders
+from lidarspec.device.link_state import LinkState
+from lidarspec.device.senders import SenderFilter, frame_senders
 from lidarspec.device.session import Outgoing, Pending, Reply, Session, learned
 from lidarspec.errors import (
     CommandError,
@@ -39,162 +38,23 @@ from lidarspec.recording.appending import Log
 from lidarspec.spec.arguments import Address
 from lidarspec.spec.links import Http, Link, Udp
 from lidarspec.spec.sensor import Sensor
-from lidarspec.transports.addresses import find_own_address, with_option
+from lidarspec.transports.addresses import find_own_address
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import control_link, has_control
-from lidarspec.transports.protocol import Chunk, LiveTransport, Sender, endpoint
+from lidarspec.transports.protocol import Chunk, LiveTransport
 
-#: seconds of bytes without a frame that are worth a word.
-PATIENCE = 0.9
-#: seconds after which a source is silent; a computer that stalls for a second is no reason.
-SILENT_AFTER_S = 3.0
-#: seconds between two decodings of what has come, and the longest that a wait goes on before others
-#: have their turn.
+#: seconds between two decodings of the data that has arrived.
 PERIOD = 0.02
-TURN = 0.05
-#: chunks decoded together.
-TOGETHER = 4096
-#: batches that are kept for whoever iterates next, while commands are sent.
-KEPT = 4096
-#: seconds that the commands at the end may take altogether.
-FAREWELL = 4.0
-
-
-class Watch:
-    """The state of the data link of a device.
-
-    Attributes:
-        streams: whether a data frame has come, ever.
-    """
-
-    def __init__(
-        self,
-        source: str | Path,
-        sensor: Sensor,
-        opened: LiveTransport,
-        capture: Capture,
-        decoder: Decoder,
-        kept: Kept,
-    ) -> None:
-        self._source = source
-        self._sensor = sensor
-        self._transport = opened
-        self._capture = capture
-        self._decoder = decoder
-        self._kept = kept
-        self._framed = time.monotonic()
-        self._bytes = 0
-        self._unframed_since: float | None = None
-        self._strangers_since: float | None = None
-        self.streams = False
-
-    def heard(self, *, ours: bool) -> None:
-        """Take note that something came: of the sensor, or of strangers alone."""
-        if ours:
-            self._strangers_since = None
-        else:
-            self._strangers_since = self._strangers_since or time.monotonic()
-
-    def saw(self, found: Sequence[Frames]) -> None:
-        """Take note of what was decoded."""
-        if any(map(len, found)):
-            self._framed = time.monotonic()
-            self._bytes = self._decoder.stats.bytes_in
-            self._unframed_since = None
-            if not self.streams:
-                self.streams = any(
-                    frame.data and name in self._decoder.stats.frames
-                    for name, frame in self._sensor.frames.items()
-                )
-        elif self._unframed_since is None and self._decoder.stats.bytes_in > self._bytes:
-            self._unframed_since = time.monotonic()
-
-    @property
-    def silent_for(self) -> float:
-        """Seconds since something last arrived from the sensor."""
-        return time.monotonic() - min(
-            self._capture.last, self._strangers_since or self._capture.last
-        )
-
-    @property
-    def state(self) -> str:
-        """The state of the source.
-
-        One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and
-        "streaming".
-        """
-        if not self._capture.connected:
-            return "disconnected"
-        if self.silent_for > SILENT_AFTER_S:
-            return "silent"
-        longest = max(
-            (frame.max_length * frame.confirm for frame in self._sensor.frames.values()), default=0
-        )
-        if (
-            self._unframed_since is not None
-            and time.monotonic() - self._unframed_since > PATIENCE
-            and self._unframed > longest
-        ):
-            return "no frames"
-        if self._decoder.stats.frames:
-            return "streaming"
-        return "waiting"
-
-    @property
-    def warnings(self) -> list[str]:
-        """What is wrong, with the next command."""
-        if self._transport.baud:
-            baud = f": {self._transport.baud} baud is likely wrong"
-        else:
-            baud = ""
-        text = {
-            "disconnected": f"{self._source}: the device is gone; waiting for it to come back",
-            "silent": (
-                f"{self._source}: nothing has arrived{self._from_others} for"
-                f" {self.silent_for:.1f} s"
-            ),
-            "no frames": (
-                f"{self._source}: {self._unframed} bytes, and no frame of {self._sensor.id} among"
-                f" them{baud}"
-            ),
-        }.get(self.state)
-        if text:
-            return [f"{text}; next: {self.following()}"]
-        return []
-
-    def following(self) -> str:
-        """The command that finds out more."""
-        if self._stranger is not None and self.state == "silent":
-            return (
-                f"the same with {quote(with_option(self._source, 'src', endpoint(self._stranger)))}"
-                " to read that one"
-            )
-        if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
-            return f"lidarspec detect {quote(str(self._source).partition('?')[0])}"
-        return f"lidarspec doctor {quote(str(self._source))} -s {self._sensor.id}"
-
-    @property
-    def foreign(self) -> int:
-        """Datagrams of others than the sensor, so far."""
-        return self._kept.foreign + self._transport.foreign
-
-    @property
-    def _stranger(self) -> Sender | None:
-        return self._kept.stranger or self._transport.stranger
-
-    @property
-    def _from_others(self) -> str:
-        """What else has come, in words."""
-        if self._stranger is None:
-            return ""
-        return (
-            f" from the sensor, and {self.foreign} datagrams from others, such as"
-            f" {endpoint(self._stranger)},"
-        )
-
-    @property
-    def _unframed(self) -> int:
-        return self._decoder.stats.bytes_in - self._bytes
+#: the longest wait for data, after which another thread may run the decoders.
+MAX_TURN_S = 0.05
+#: how long `write` waits for the first datagram, if only that shows the address of the sensor.
+SENDER_TIMEOUT_S = 0.9
+#: chunks decoded together at most.
+MAX_CHUNKS = 4096
+#: batches that are kept for the next iteration while commands are sent.
+MAX_READY_BATCHES = 4096
+#: the time for all commands at the end.
+SHUTDOWN_TIMEOUT_S = 4.0
 
 
 class LiveInput(Input):
@@ -248,9 +108,9 @@ class LiveInput(Input):
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders = {"data": self.decoder}
         self._captures = {}
-        self._kept = Kept(source, sensor, datagrams=opened.datagrams)
+        self._senders = SenderFilter(source, sensor, datagrams=opened.datagrams)
         self._ready = deque[Arrival]()
-        self._answering: dict[str, Kept] = {}  # who answers what was broadcast, by link
+        self._answering: dict[str, SenderFilter] = {}  # who answers what was broadcast, by link
         self._clock = HostClock()
         self._turn = threading.RLock()
         self._talk = threading.RLock()
@@ -263,8 +123,8 @@ class LiveInput(Input):
         self._captures["data"] = Capture(opened, self.queue, log=self._recorder)
         self._checked = list[Pending]()
         self._silent = list[CommandError]()
-        self._watch = Watch(
-            source, sensor, opened, self._captures["data"], self.decoder, self._kept
+        self._link_state = LinkState(
+            source, sensor, opened, self._captures["data"], self.decoder, self._senders
         )
 
     @property
@@ -274,10 +134,10 @@ class LiveInput(Input):
 
     @property
     def state(self) -> str:
-        """What `Watch` says, or "closed"."""
+        """What `LinkState` says, or "closed"."""
         if self._closed:
             return "closed"
-        return self._watch.state
+        return self._link_state.name
 
     @property
     def warnings(self) -> list[str]:
@@ -286,9 +146,9 @@ class LiveInput(Input):
             for capture in self._captures.values()
             for warning in (*capture.transport.warnings, *capture.warnings)
         ]
-        said += [
-            warning for kept in (self._kept, *self._answering.values()) for warning in kept.warnings
-        ] + self._said
+        for senders in (self._senders, *self._answering.values()):
+            said += senders.warnings
+        said += self._said
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
         silent = [
@@ -297,7 +157,7 @@ class LiveInput(Input):
         ]
         if self._closed:
             return said
-        return said + silent + self._watch.warnings
+        return said + silent + self._link_state.warnings
 
     @property
     def stats(self) -> Counters:
@@ -306,7 +166,7 @@ class LiveInput(Input):
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
         others = sum(kept.foreign for kept in self._answering.values())
         stats.foreign = (
-            self._kept.foreign + others + sum(capture.transport.foreign for capture in captures)
+            self._senders.foreign + others + sum(capture.transport.foreign for capture in captures)
         )
         stats.disconnects = sum(capture.disconnects for capture in captures)
         stats.queue_dropped = self.queue.dropped
@@ -330,10 +190,10 @@ class LiveInput(Input):
                     self._said.append(
                         f"{error}; it is read as it stands, without what it would say of itself"
                     )
-                elif isinstance(error, ReplyTimeout) and self._watch.streams:
+                elif isinstance(error, ReplyTimeout) and self._link_state.has_data:
                     self._said.append(f"{error}; data come all the same")
                 else:
-                    raise suggest(error, self._watch.following()) from None
+                    raise suggest(error, self._link_state.suggest_command()) from None
             else:
                 self.learned |= learned(self.sensor, reply)
             if self._teachers and name == self._teachers[-1]:
@@ -350,7 +210,7 @@ class LiveInput(Input):
         with self._turn, self._talk:
             data = self._captures["data"]
             self._session.sensor = self.sensor
-            self._kept.configured(self.sensor)
+            self._senders.configure(self.sensor)
             self._decoders = {
                 link: self.sensor.decoder(stream=decoder.stream, backend=self._backend)
                 for link, decoder in self._decoders.items()
@@ -359,8 +219,8 @@ class LiveInput(Input):
             self._recorder = self._record(self.sensor)
             data.record(self._recorder)
             self._ready.clear()
-            self._watch = Watch(
-                self._source, self.sensor, data.transport, data, self.decoder, self._kept
+            self._link_state = LinkState(
+                self._source, self.sensor, data.transport, data, self.decoder, self._senders
             )
 
     def next(self, wait: float) -> Arrival | None:
@@ -374,7 +234,7 @@ class LiveInput(Input):
                 left = deadline - time.monotonic()
                 if self._closed or (left <= 0 and wait > 0):
                     return None
-                self._pump(min(max(left, 0.0), TURN))
+                self._pump(min(max(left, 0.0), MAX_TURN_S))
                 if wait <= 0 and not self._ready:
                     return None
 
@@ -438,7 +298,7 @@ class LiveInput(Input):
             )
         if self._closed:
             raise SourceError(f"{self._source}: the device is closed")
-        self._await_sender(link, PATIENCE)
+        self._await_sender(link, SENDER_TIMEOUT_S)
         with self._talk:
             self._write(Outgoing(link, bytes(data)))
 
@@ -461,14 +321,14 @@ class LiveInput(Input):
         if self._closed:
             return
         try:
-            self._farewell()
+            self._shut_down()
         finally:
             self._closed = True
             self.queue.close()
             for capture in self._captures.values():
                 capture.close()
 
-    def _farewell(self) -> None:
+    def _shut_down(self) -> None:
         """Send the commands for the end, as far as the device still listens."""
         if self.stays_on:
             return
@@ -488,7 +348,7 @@ class LiveInput(Input):
             names = self.sensor.on_close or stopping
             waiting = [self._session.request(name, self._clock.now()) for name in names]
             self._speak()
-        limit = time.monotonic() + FAREWELL
+        limit = time.monotonic() + SHUTDOWN_TIMEOUT_S
         while not all(pending.done for pending in waiting) and time.monotonic() < limit:
             self._help(next(pending for pending in waiting if not pending.done))
             self._ready.clear()
@@ -498,14 +358,14 @@ class LiveInput(Input):
 
     def _help(self, pending: Pending | None = None) -> None:
         """Do a turn of the work, unless another thread is at it."""
-        if not self._turn.acquire(timeout=TURN / 5):
+        if not self._turn.acquire(timeout=MAX_TURN_S / 5):
             return
         try:
             if pending is None or not pending.done:
-                self._pump(TURN)
+                self._pump(MAX_TURN_S)
         finally:
             self._turn.release()
-        while len(self._ready) > KEPT:
+        while len(self._ready) > MAX_READY_BATCHES:
             self._ready.popleft()
 
     def _pump(self, wait: float) -> None:
@@ -520,8 +380,8 @@ class LiveInput(Input):
             left = wait
         else:
             left = (deadline - self._clock.now()) / 1e9
-        wait = wait if left < -TURN else min(wait, max(left, 0.0))
-        events = self.queue.take(wait, until=self._due, chunks=TOGETHER)
+        wait = wait if left < -MAX_TURN_S else min(wait, max(left, 0.0))
+        events = self.queue.take(wait, until=self._due, chunks=MAX_CHUNKS)
         if events:
             self._due = time.monotonic() + self._period
         for link, run in _runs(events):
@@ -582,9 +442,9 @@ class LiveInput(Input):
         found = decode_chunks(decoder, chunks)
         if not decoder.stream:
             senders = frame_senders(chunks, found[0], decoder.stats.bytes_in)
-            found = [self._kept.of_ports(senders, found[0])]
-        if self._kept.address is not None:
-            self._captures["data"].transport.accept(self._kept.address)
+            found = [self._senders.select_ports(senders, found[0])]
+        if self._senders.address is not None:
+            self._captures["data"].transport.accept(self._senders.address)
         self._hand_on("data", found)
 
     def _of_the_sensor(self, chunks: list[Chunk]) -> list[Chunk]:
@@ -592,19 +452,19 @@ class LiveInput(Input):
 
         If another sensor is selected now, incomplete frames of the previous one are given up.
         """
-        mine = self._kept.ours(chunks)
-        self._watch.heard(ours=bool(mine))
-        if self._kept.has_changed:
+        mine = self._senders.select(chunks)
+        self._link_state.record_senders(is_sensor=bool(mine))
+        if self._senders.has_changed:
             self.decoder.rest()
             self._ready.append(Arrival(interrupted=True, replaced=True))
         return mine
 
     def _of_who_answered(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
         """What the first one that answered a broadcast sent: it is the sensor, on every link."""
-        mine = self._answering[link].ours(chunks)
+        mine = self._answering[link].select(chunks)
         if (address := self._answering[link].address) is not None:
             self._captures[link].transport.accept(address)
-            self._kept.choose(address)
+            self._senders.choose(address)
         return mine
 
     def _host(self) -> str | None:
@@ -624,7 +484,7 @@ class LiveInput(Input):
             if awaited:
                 self._speak()
         if link == "data":
-            self._watch.saw(found)
+            self._link_state.record_frames(found)
             if interrupted or any(map(len, found)):
                 self._ready.append(Arrival(found, interrupted=interrupted))
 
@@ -683,7 +543,7 @@ class LiveInput(Input):
                 self._source, link, self.sensor.links[link], self._host()
             )
             if _is_broadcast(self.sensor.links[link]):
-                self._answering[link] = Kept(self._source, self.sensor, datagrams=True)
+                self._answering[link] = SenderFilter(self._source, self.sensor, datagrams=True)
             self._decoders[link] = self.sensor.decoder(
                 stream=not opened.datagrams, backend=self._backend
             )

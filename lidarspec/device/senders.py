@@ -1,10 +1,10 @@
 """Select the datagrams of one sensor, so that frames of two are never mixed.
 
-A sensor is an address: its data, calibration and answers come from there. The frames of one type
-come from one port of it, from another one only after a restart; two ports that take turns are two
-sensors. A file with frames of two is refused (`Senders`), since one can be chosen at leisure. Of a
-live source the first that sends data is kept (`Kept`): what others send is left out before it is
-decoded.
+A sensor is an address: its data, calibration and replies come from there. The frames of one type
+come from one port of it, and from another port only after a restart; two ports that take turns are
+two sensors. A file with frames of two sensors is refused (`Senders`): the user can select one.
+From a live source the first sender of data is read (`SenderFilter`): datagrams of others are left
+out before they are decoded.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import Chunk, Sender, endpoint
 
-#: senders that are looked at while nobody knows the sensor, and ports that are remembered of it.
-SENDERS = 16
+#: senders that are examined while the sensor is unknown, and ports of it that are remembered.
+MAX_SENDERS = 16
 
 
 class Senders:
-    """Who sends the frames of a file.
+    """Checks that one sensor sends the frames of a file.
 
     Args:
         source: for messages.
@@ -41,10 +41,13 @@ class Senders:
         self._before: dict[str, dict[Sender, None]] = {}
 
     def see(self, sent: Iterable[tuple[str, Sender]]) -> None:
-        """Look who sent frames: the type of each, and the sender.
+        """Check the senders of frames.
+
+        Args:
+            sent: the type and the sender of each frame.
 
         Raises:
-            UsageError: where two sensors send frames.
+            UsageError: if two sensors send frames.
         """
         for name, sender in sent:
             self._owner = self._owner or sender
@@ -63,7 +66,7 @@ class Senders:
             if sender == known:
                 return None
             return known
-        if len(before) == SENDERS:
+        if len(before) == MAX_SENDERS:
             del before[next(iter(before))]
         before[known], self._now[name] = None, sender
         return None
@@ -80,18 +83,18 @@ class Senders:
         return suggest(error, f"the same with {quote(chosen)}")
 
 
-class Kept(Senders):
-    """The sensor that is read from a live source.
+class SenderFilter(Senders):
+    """Selects the datagrams of one sensor from a live source.
 
-    It is the first sender of data frames, and before that the first sender of any frame.
+    The sensor is the first sender of data frames, and before that the first sender of any frame.
 
     Args:
         datagrams: whether each datagram is a whole frame, not a piece of a stream.
 
     Attributes:
         foreign: datagrams of others, so far; `stranger` sent the first of them.
-        has_changed: whether the last call of `ours` has found that it is another one than what was
-            read before.
+        has_changed: whether the last call of `select` has selected another sender than the one read
+            before.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, *, datagrams: bool) -> None:
@@ -109,22 +112,22 @@ class Kept(Senders):
 
     @property
     def address(self) -> Sender | None:
-        """Where the sensor is, None while nobody has sent a frame."""
+        """The address and port of the sensor, None until a frame has arrived."""
         return self._owner
 
-    def configured(self, sensor: Sensor) -> None:
-        """Go on with a sensor that is configured now."""
+    def configure(self, sensor: Sensor) -> None:
+        """Continue with a sensor that has been configured."""
         self._sensor = sensor
         self._probes.clear()
 
     def choose(self, sender: Sender) -> None:
-        """Take a sender for the sensor, since it has answered on another link."""
+        """Select a sender, since it has answered on another link."""
         self._owner = self._owner if self._is_sure else sender
         self._is_sure = True
 
     @property
     def warnings(self) -> list[str]:
-        """Whom the device is made of, where others send as well."""
+        """A warning about another sender on the same port."""
         if self.stranger is None or self._owner is None:
             return []
         text = (
@@ -136,7 +139,7 @@ class Kept(Senders):
             f" {quote(with_option(self._source, 'src', endpoint(self.stranger)))} to read that one"
         ]
 
-    def ours(self, chunks: Sequence[Chunk]) -> list[Chunk]:
+    def select(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Return the datagrams that the sensor sent.
 
         Until a sender has sent a frame, all datagrams are returned, of a stream those of the first
@@ -156,8 +159,8 @@ class Kept(Senders):
                 self._leave_out(chunk.sender)
         return mine
 
-    def of_ports(self, sent: Sequence[tuple[str, Sender]], found: Frames) -> Frames:
-        """Those of these frames, of the sensor's address, that come from its ports.
+    def select_ports(self, sent: Sequence[tuple[str, Sender]], found: Frames) -> Frames:
+        """Return those of the frames from the address of the sensor that its ports sent.
 
         Args:
             sent: the type and the sender of each frame, or, where one sender sent them all, of each
@@ -212,12 +215,15 @@ class Kept(Senders):
         return sender == self._owner
 
     def _is_near(self, sender: Sender, owner: Sender) -> bool:
-        """Whether a sender may be the sensor at another port."""
+        """Return whether a sender may be the sensor at another port."""
         return sender[0] == owner[0] and sender not in self._strangers
 
     def _names(self, sender: Sender, chunk: Chunk) -> set[str]:
-        """The types of the frames that a datagram completes, of the first few senders."""
-        if sender not in self._probes and len(self._probes) >= SENDERS:
+        """Return the types of the frames that a datagram completes.
+
+        Only the first few senders are examined.
+        """
+        if sender not in self._probes and len(self._probes) >= MAX_SENDERS:
             return set()
         decoder = self._probes.setdefault(sender, self._sensor.decoder(stream=not self._datagrams))
         return {item.frame for item in decoder.feed(chunk.data)}
@@ -231,7 +237,7 @@ class Kept(Senders):
         if younger is not None:
             self._strangers |= dict.fromkeys([*self._before[name], younger])
             del self._strangers[sender]
-            while len(self._strangers) > SENDERS:
+            while len(self._strangers) > MAX_SENDERS:
                 del self._strangers[next(iter(self._strangers))]
             self._now[name], self._before[name] = sender, {}
         return self._now[name]

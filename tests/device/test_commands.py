@@ -252,7 +252,7 @@ def test_a_command_under_way_fails_when_the_device_goes_away(line: Port) -> None
 def test_closing_without_a_device_waits_for_no_reply(
     line: Port, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_input, "FAREWELL", 10 * TIMEOUT_S)
+    monkeypatch.setattr(live_input, "SHUTDOWN_TIMEOUT_S", 10 * TIMEOUT_S)
     device = Obedient(line)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR) as opened:
         line.unplug()

@@ -1,0 +1,148 @@
+"""Watch the data link of a live sensor: data, silence, bytes without frames, or a lost device.
+
+`LinkState` describes each problem in a warning, with the command to type next.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from shlex import quote
+
+from lidarspec.device.capture_thread import Capture
+from lidarspec.device.senders import SenderFilter
+from lidarspec.framing.decoder import Decoder
+from lidarspec.framing.results import Frames
+from lidarspec.spec.sensor import Sensor
+from lidarspec.transports.addresses import with_option
+from lidarspec.transports.protocol import LiveTransport, Sender, endpoint
+
+#: bytes without a frame for longer are reported.
+FRAMELESS_WARNING_S = 0.9
+#: a source is silent after this time, which is longer than a busy computer may stall.
+SILENT_AFTER_S = 3.0
+
+
+class LinkState:
+    """The state of the data link of a sensor.
+
+    Attributes:
+        has_data: whether a data frame has ever arrived.
+    """
+
+    def __init__(
+        self,
+        source: str | Path,
+        sensor: Sensor,
+        transport: LiveTransport,
+        capture: Capture,
+        decoder: Decoder,
+        senders: SenderFilter,
+    ) -> None:
+        self._source = source
+        self._sensor = sensor
+        self._transport = transport
+        self._capture = capture
+        self._decoder = decoder
+        self._senders = senders
+        self._framed_bytes = 0  # bytes decoded when the last frame was found
+        self._frameless_since: float | None = None
+        self._only_others_since: float | None = None
+        self._longest_frame = max(
+            (frame.max_length * frame.confirm for frame in sensor.frames.values()), default=0
+        )
+        self.has_data = False
+
+    def record_senders(self, *, is_sensor: bool) -> None:
+        """Record that datagrams arrived, from the sensor or from other senders alone."""
+        if is_sensor:
+            self._only_others_since = None
+        elif self._only_others_since is None:
+            self._only_others_since = time.monotonic()
+
+    def record_frames(self, found: Sequence[Frames]) -> None:
+        """Record what was decoded."""
+        stats = self._decoder.stats
+        if any(map(len, found)):
+            self._framed_bytes = stats.bytes_in
+            self._frameless_since = None
+            if not self.has_data:
+                self.has_data = any(name in stats.frames for name in self._sensor.data_frames)
+        elif self._frameless_since is None and stats.bytes_in > self._framed_bytes:
+            self._frameless_since = time.monotonic()
+
+    @property
+    def silent_for(self) -> float:
+        """Seconds since something last arrived from the sensor."""
+        last = self._capture.last
+        if self._only_others_since is not None:
+            last = min(last, self._only_others_since)
+        return time.monotonic() - last
+
+    @property
+    def name(self) -> str:
+        """The state in one or two words.
+
+        One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and
+        "streaming".
+        """
+        if not self._capture.connected:
+            return "disconnected"
+        if self.silent_for > SILENT_AFTER_S:
+            return "silent"
+        if self._is_frameless():
+            return "no frames"
+        if self._decoder.stats.frames:
+            return "streaming"
+        return "waiting"
+
+    @property
+    def warnings(self) -> list[str]:
+        """The present problem of the link, with the next command; empty if there is none."""
+        name = self.name
+        if name == "disconnected":
+            text = "the device is gone; waiting for it to come back"
+        elif name == "silent":
+            text = f"nothing has arrived{self._describe_others()} for {self.silent_for:.1f} s"
+        elif name == "no frames":
+            text = f"{self._frameless_bytes} bytes, and no frame of {self._sensor.id} among them"
+            if self._transport.baud:
+                text = f"{text}: {self._transport.baud} baud is likely wrong"
+        else:
+            return []
+        return [f"{self._source}: {text}; next: {self.suggest_command()}"]
+
+    def suggest_command(self) -> str:
+        """Return the command that finds out more."""
+        other = self._other_sender
+        if other is not None and self.name == "silent":
+            chosen = with_option(self._source, "src", endpoint(other))
+            return f"the same with {quote(chosen)} to read that one"
+        if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
+            return f"lidarspec detect {quote(str(self._source).partition('?')[0])}"
+        return f"lidarspec doctor {quote(str(self._source))} -s {self._sensor.id}"
+
+    @property
+    def _other_sender(self) -> Sender | None:
+        return self._senders.stranger or self._transport.stranger
+
+    def _describe_others(self) -> str:
+        """Return a part of a sentence about datagrams of other senders."""
+        other = self._other_sender
+        if other is None:
+            return ""
+        count = self._senders.foreign + self._transport.foreign
+        return f" from the sensor, and {count} datagrams from others, such as {endpoint(other)},"
+
+    @property
+    def _frameless_bytes(self) -> int:
+        """Bytes since the last frame."""
+        return self._decoder.stats.bytes_in - self._framed_bytes
+
+    def _is_frameless(self) -> bool:
+        """Return whether bytes without a frame have arrived for long, and more than fit in one."""
+        if self._frameless_since is None:
+            return False
+        seconds = time.monotonic() - self._frameless_since
+        return seconds > FRAMELESS_WARNING_S and self._frameless_bytes > self._longest_frame
