@@ -712,13 +712,6 @@ def _scaled(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     return [part.times(factor) for part in parts]
 
 
-def split_level(parts: Sequence[Term], depth: int) -> tuple[int, bool]:
-    """The axis from which on only rows vary, and whether they vary before it too."""
-    level = max((last_axis(part.low.shape) for part in parts if part.low is not None), default=0)
-    lengths = ((1,) * (depth - part.row.ndim) + part.row.shape for part in parts)
-    return level, any(length > 1 for row in lengths for length in row[:level])
-
-
 def last_axis(shape: tuple[int, ...]) -> int:
     """One more than the last axis that is longer than 1."""
     return max((index + 1 for index, length in enumerate(shape) if length > 1), default=0)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +29,67 @@ from lidarspec.expressions.graph import (
     only_field,
     traverse,
 )
+from lidarspec.frames.layout import Leaf
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import Beam, beam_of, every_value, is_number, possible, window
+from lidarspec.points.windows import every_value, is_number, possible, window
 from lidarspec.spec.vocabulary import LookUp, side_by_side
 
 #: points of which the scratch arrays stay in the fastest cache.
 CHUNK = 2048
 #: half turns up to which an angle is kept in float32 in a table.
 SMALL = 0.125
+#: bits of an integer up to which float32 resolves the steps of a distance.
+MAX_DISTANCE_BITS = 21
+
+
+class Beam(NamedTuple):
+    """A coordinate of points along beams.
+
+    It is a measured distance times a row of a table, plus a row of another table for the start.
+
+    Attributes:
+        distance: as the sensor sent it, in such steps of metres; or nan.
+        direction, start: the rows.
+    """
+
+    distance: Node
+    direction: Node
+    start: Node
+    step: float
+
+
+def beam_of(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
+    """Return the beam of a sum.
+
+    Returns None for other sums, and if float32 does not resolve the steps of the distance.
+    """
+    if node.function is not np.add or not all(isinstance(arg, Node) for arg in node.args):
+        return None
+    product, start = node.args
+    if (
+        product.function is not np.multiply
+        or start.kind != "rows"
+        or not all(isinstance(arg, Node) for arg in product.args)
+    ):
+        return None
+    distance, direction = product.args
+    field = distance
+    while is_nan_where(field) or field.function is returned_range:
+        field = field.args[-1]
+    if field.kind == "field" and direction.kind == "rows":
+        leaf = leaves.get(field.path)
+    else:
+        leaf = None
+    if (
+        leaf is None
+        or leaf.info.kind != "int"
+        or leaf.info.bits > MAX_DISTANCE_BITS
+        or leaf.info.offset
+    ):
+        return None
+    return Beam(distance, direction, start, leaf.info.scale)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import FACTORS, Node, key, last_axis, traverse
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
-from lidarspec.points.windows import CHEAP, every_value, raw_values, window, word_of
+from lidarspec.points.windows import CHEAP, every_value, raw_values, window
 from lidarspec.spec.bits import whole_bytes
 
 _SIGNS = {
@@ -216,6 +216,55 @@ class Wanted:
     arrays: list[NDArray[Any]] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)
     nodes: list[Node] = field(default_factory=list)
+
+
+def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
+    """Return the place of a field of unsigned contiguous bits in up to four bytes.
+
+    The place is byte order, first byte, number of bytes and lowest bit. Returns None for other
+    fields.
+    """
+    if len(leaf.shape) > len(leaf.strides):
+        return None
+    if leaf.wire is not None:
+        is_whole = leaf.wire.kind == "u" and leaf.size <= 4
+        if is_whole:
+            return (">" if leaf.wire.byteorder == ">" else "<", leaf.offset, leaf.size, 0)
+        return None
+    if len(leaf.elements) != 1 or leaf.elements[0].signed:
+        run = None
+    else:
+        run = leaf.elements[0].run
+    if run is None or run[2] > 4:
+        return None
+    return (run[0], leaf.offset + run[1], run[2], run[3])
+
+
+def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
+    """Return the 4-byte little-endian word of its element that holds a field.
+
+    It is given as offset, shift and mask. Returns None if there is no such word.
+    """
+    run = run_of(leaf)
+    if run is None or (run[0] == ">" and run[2] > 1) or not leaf.strides or leaf.strides[-1] % 4:
+        return None
+    beside = [
+        other
+        for other in layout.leaves.values()
+        if (other.info.axes, other.shape) == (leaf.info.axes, leaf.shape)
+    ]
+    _, first, count, lowest = run
+    start = first - (first - min(other.offset for other in beside)) % 4
+    last = (
+        start
+        + sum(
+            (length - 1) * stride for length, stride in zip(leaf.shape, leaf.strides, strict=True)
+        )
+        + 4
+    )
+    if first + count <= start + 4 and last <= layout.size:
+        return (start, 8 * (first - start) + lowest, (1 << leaf.info.bits) - 1)
+    return None
 
 
 class Writer:

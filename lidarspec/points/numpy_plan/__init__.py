@@ -2,13 +2,10 @@
 
 This back end compiles the columns of a plan to calls on arrays that stay in the cache.
 
-In: a `points.plan.Plan`. Out: what fills its columns, by `compile`; nobody needs to know more of
-this package. Modules in reading order:
+In: a `points.plan.Plan`. Out: an object that fills its columns, by `compile`. Modules in reading
+order:
 
-* `blocks`: frames compacted, so that each field is one long array.
-* `registers`: the memory that is computed in, used again and again.
 * `program`: calls on registers, chunk by chunk.
-* `products`: sums and angles of packets and blocks as matrix products.
 * `compiler`: from expressions to the steps of a program.
 """
 
@@ -18,13 +15,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from lidarspec.expressions.graph import traverse
 from lidarspec.points.numpy_plan.compiler import Compiler
 from lidarspec.points.plan import Maker, Plan
 
 
 def compile(plan: Plan, names: tuple[str, ...]) -> Maker:
-    """What makes these columns of the plan's points; kept with the plan."""
+    """Return a program for these columns of the plan's points; the plan keeps it."""
     if names not in plan.programs:
         plan.programs[names] = _compiled(plan, names, plan.tables).program
     return plan.programs[names]
@@ -32,19 +28,12 @@ def compile(plan: Plan, names: tuple[str, ...]) -> Maker:
 
 def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Compiler:
     compiler = Compiler(plan, tables)
-    if plan.sent.keys() & set(names):
-        read = {
-            node.path: None
-            for node in traverse(*(plan.expressions[name] for name in names))
-            if node.kind == "field"
-        }
-        compiler.share(plan.layout.leaves[path] for path in read if path in plan.layout.leaves)
     for name in names:
         if name in plan.sent:
-            compiler.want_sent(name, plan.sent[name])
+            compiler.add_integers(name, plan.sent[name])
             continue
         kind = "double" if name == "azimuth" else "single"
-        compiler.want(name, plan.expressions[name], kind, exact=plan.is_exact(name))
+        compiler.add_column(name, plan.expressions[name], kind, exact=plan.is_exact(name))
     return compiler
 
 
