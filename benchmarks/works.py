@@ -22,7 +22,7 @@ from remote import prepare_in
 
 import lidarspec as ls
 from lidarspec.packets.packets import Packets
-from lidarspec.points.plain import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.simulation.simulator import opening
 from lidarspec_ouster import nominal
 
@@ -99,7 +99,7 @@ def points_of(sensor: ls.Sensor, data: Any, backend: str) -> Callable[[], Any]:
 
 def plainly(sensor: ls.Sensor, data: Any) -> Callable[[], Any]:
     """The same with the plain evaluation of `points`."""
-    return lambda: columns(evaluate(sensor.decode(data, backend="numpy")).cloud)
+    return lambda: columns(evaluate_plainly(sensor.decode(data, backend="numpy")).cloud)
 
 
 def evaluating(packets: Packets) -> Callable[[], Any]:

@@ -101,7 +101,6 @@ PAGE_MAY_IMPORT = {
     "formats",
     "frames.commands",
     "framing.results",
-    "points.cloud",
     "points.conventions",
     "points.look",
     "recording.switch",

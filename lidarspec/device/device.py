@@ -27,7 +27,7 @@ from lidarspec.framing.results import Counters, Found
 from lidarspec.packets.imu import ImuSamples, joined
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.points.cloud import Mount
+from lidarspec.points.mount import Mount
 from lidarspec.recording.appending import Log
 from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scan import Scan

@@ -26,7 +26,7 @@ from lidarspec.frames.wire_fields import examine
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
-from lidarspec.points.plain import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.scans.ends import first_points
 from lidarspec.spec import Sensor
 
@@ -226,7 +226,7 @@ def _with_points(
         )
         if not len(packets):
             return rows, tuple(notes)
-        evaluated = evaluate(packets)
+        evaluated = evaluate_plainly(packets)
     except LidarSpecError as error:
         return rows, (*notes, f"no points: {error}")
     notes += ["defaults stand in for what a frame of another type would say"] * bool(

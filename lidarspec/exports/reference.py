@@ -19,7 +19,7 @@ from lidarspec.frames.wire_table import frame_size, wire_table
 from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.plain import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.timing import Clock, Every, OnFlag, Split
@@ -243,7 +243,8 @@ def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
     """The points of an example frame; None where it has none of its own."""
     try:
         frames = packed([Found(name, 0, sensor.example(name))])
-        return evaluate(PacketStream(sensor, name, Counters()).add([frames]).with_points).cloud
+        packets = PacketStream(sensor, name, Counters()).add([frames]).with_points
+        return evaluate_plainly(packets).cloud
     except LidarSpecError:
         return None
 

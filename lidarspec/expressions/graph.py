@@ -8,7 +8,7 @@ the plain result for two sample packets, so shapes and axes need no rules of the
 be noted down (a branch on data, reductions, attributes of arrays) is `Untraceable`, with the
 reason.
 
-Whoever works with a graph goes through it with `traverse`, and computes it with `evaluate`: the
+Whoever works with a graph goes through it with `traverse`, and computes it with `compute`: the
 plain evaluation of a batch, tables of all values that a field can have, tests of plausibility and
 clocks differ only in what they say the fields are. The compilers of points (`points.numpy_plan`,
 `points.numba_kernels`) write a graph down in another form; what they ask of it stands here, too:
@@ -423,7 +423,7 @@ def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> 
             waiting += node.args if into(node) else ()
 
 
-def evaluate(
+def compute(
     node: Node, known: dict[Node, Any], source: Callable[[Node], Any] = lambda node: None
 ) -> Any:
     """What a node comes to, by what the fields are.
@@ -442,10 +442,7 @@ def evaluate(
         value = source(node)
         if value is None:
             value = node.value(
-                [
-                    evaluate(arg, known, source) if isinstance(arg, Node) else arg
-                    for arg in node.args
-                ]
+                [compute(arg, known, source) if isinstance(arg, Node) else arg for arg in node.args]
             )
         known[node] = value
     return value
@@ -493,7 +490,7 @@ class Expression:
                 info.path: info.physical(np.asarray(raw.get(info.path, np.nan), np.float64))
                 for info in self.fields
             }
-            return np.asarray(evaluate(self.node, {}, lambda node: columns.get(node.path)))
+            return np.asarray(compute(self.node, {}, lambda node: columns.get(node.path)))
 
 
 #: values of a term that are remembered.

@@ -21,7 +21,8 @@ from numpy.typing import DTypeLike, NDArray
 from lidarspec.formats.rows import NAMES, Rows, write_rows
 from lidarspec.formats.writing import Spool, picture, written
 from lidarspec.libraries import import_library
-from lidarspec.points.cloud import structured_type, units_of
+from lidarspec.points.cloud import units_of
+from lidarspec.points.table_types import structured_type
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 

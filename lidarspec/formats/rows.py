@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.formats.writing import behind, columns_of, picture
-from lidarspec.points.cloud import STRUCTURED, PointCloud
+from lidarspec.points.cloud import PointCloud
+from lidarspec.points.table_types import STRUCTURED
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import handed_out
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from lidarspec.formats.writing import behind, written
 from lidarspec.libraries import import_library
-from lidarspec.points.cloud import PointCloud, arrow_schema
+from lidarspec.points.cloud import PointCloud, units_of
+from lidarspec.points.table_types import arrow_schema
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
@@ -94,7 +95,8 @@ def _of_scans(path: Path | None) -> list[Any]:
 
 def _schema(arrow: Any, scan: Scan, cloud: PointCloud, of_scans: Sequence[Any]) -> Any:
     """The fields of a scan."""
-    known = arrow_schema(cloud, scan.facts)
+    facts = {**scan.facts, "calibration": cloud.calibration}
+    known = arrow_schema(cloud.columns, units_of(cloud), facts)
     return arrow.schema([*known, *of_scans], known.metadata)
 
 

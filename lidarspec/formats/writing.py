@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import SourceError, UsageError, suggest, system_errors
-from lidarspec.points.cloud import COLUMNS, PointCloud, source_of
+from lidarspec.points.cloud import COLUMNS, PointCloud
 from lidarspec.scans.scan import Scan
 from lidarspec.stores import take_away
 from lidarspec.unfinished import path_while_written, remove_abandoned
@@ -126,7 +126,7 @@ def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[s
     """
     cloud = scan.points
     named = tuple(name for name in names if name == "valid" or cloud.shows(name))
-    source_of(cloud).prepare((*named, "valid"))
+    cloud.load(*named, "valid")
     columns = {
         name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name)
         for name in named

@@ -18,17 +18,18 @@ from lidarspec.errors import PluginError, SpecError
 from lidarspec.expressions.columns import Batch, Carry, Column, Fields
 from lidarspec.expressions.graph import Node
 from lidarspec.frames.frame_table import Group, Rows, ascends
+from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.conventions import Grids, grid_of
-from lidarspec.points.lazy_columns import BatchColumns, Plain, Share
-from lidarspec.points.plain import Evaluated, PacketBatch, evaluate, stamp_of
+from lidarspec.points.plain import Evaluated, PacketBatch, evaluate_plainly, stamp_of
 from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
+from lidarspec.points.shares import PlainValues, Share
 
 #: numbers that are looked at together, so that they stay in the cache.
 _AT_ONCE = 1 << 15
 
 
-def evaluated(
+def evaluate(
     packets: PacketBatch,
     carry: Carry | None = None,
     *,
@@ -37,7 +38,7 @@ def evaluated(
 ) -> Evaluated:
     """Return the points of a batch by the fastest applicable evaluation.
 
-    The columns equal those of `plain.evaluate` within a few units in the last place.
+    The columns equal those of `evaluate_plainly` within a few units in the last place.
 
     Args:
         carry: what the batch before left.
@@ -52,7 +53,7 @@ def evaluated(
     planned = _planned(packets, carry, final=final, epoch=epoch)
     if planned is not None:
         return planned
-    return evaluate(packets, carry, final=final, epoch=epoch)
+    return evaluate_plainly(packets, carry, final=final, epoch=epoch)
 
 
 def _planned(
@@ -83,7 +84,7 @@ def _planned(
         return None  # the plain evaluation says what is wrong
     if len(plans) < len(table.groups):
         return None
-    whole = Plain(batch)
+    whole = PlainValues(batch)
     try:
         simple = alone and len(plans) == 1 and ascends(table.groups[0].where)
         remembered = {
@@ -112,7 +113,7 @@ def _planned(
 
 
 def _share(
-    plan: Plan, batch: Batch, group: Group, whole: Plain, remembered: Mapping[int, Column]
+    plan: Plan, batch: Batch, group: Group, whole: PlainValues, remembered: Mapping[int, Column]
 ) -> Share:
     """A group with its plain results; those that remember other packets are of the whole batch."""
     is_whole = len(group.where) == len(batch) and ascends(group.where)
@@ -126,11 +127,10 @@ def _holds(share: Share) -> bool:
 
     Their counts, and the values of factors and floating-point fields, are checked.
     """
-    if any(
-        len(share.known.column(node).steps()) != number for node, number in share.plan.tape.steps
-    ):
+    values = share.plain_values
+    if any(len(values.column(node).steps()) != number for node, number in share.plan.tape.steps):
         return False
-    lows = (share.known.array(node) for node in share.plan.positive)
+    lows = (values.array(node) for node in share.plan.positive)
     return all(bool(((low > 0) & np.isfinite(low)).all()) for low in lows) and all(
         _moderate(share, node) for node in share.plan.floats
     )
@@ -218,7 +218,7 @@ def guarded(
         epoch: the time that the cloud's stamp is, int64 ns.
     """
     try:
-        points = evaluated(packets, carry, final=final, epoch=epoch)
+        points = evaluate(packets, carry, final=final, epoch=epoch)
     except SpecError as error:
         packets.stats.error(PluginError.of(error, f"points of {packets.frame}"), len(packets))
         return None
@@ -229,4 +229,4 @@ def guarded(
 def cloud_of(packets: PacketBatch) -> PointCloud:
     """The points of packets that stand alone."""
     planned = _planned(packets, None, final=True, epoch=None, alone=True)
-    return (planned if planned is not None else evaluate(packets)).cloud
+    return (planned if planned is not None else evaluate_plainly(packets)).cloud

@@ -80,7 +80,7 @@ class Evaluated:
     axes: tuple[str | None, ...]
 
 
-def evaluate(
+def evaluate_plainly(
     packets: PacketBatch,
     carry: Carry | None = None,
     *,

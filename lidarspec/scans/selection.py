@@ -10,7 +10,7 @@ enough that a whole scan comes before the slice, even if the clocks of sensor an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from shlex import quote
@@ -368,17 +368,15 @@ class _LimitedRanges(CloudColumns):
         self._near = near
         self._far = far
 
-    def column(self, name: str) -> NDArray[Any] | None:
-        column = super().column(name)
-        if name not in ("x", "y", "z", "range", "valid") or column is None:
-            return column
-        ranges = self._cloud.range
-        valid = self._cloud.valid
+    def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        columns = super().columns((*names, "range", "valid"), start, stop)
+        ranges = columns["range"]
+        valid = columns["valid"]
         too_near = valid & (ranges < self._near)
         too_far = valid & (ranges > self._far)
-        if name == "valid":
-            return np.asarray(column & ~too_near & ~too_far)
-        if name == "range":
-            column = np.where(too_far, np.float32(np.inf), column)
-            return np.where(too_near, np.float32(-np.inf), column)
-        return np.where(too_near | too_far, np.float32(np.nan), column)
+        columns["valid"] = valid & ~too_near & ~too_far
+        near_range = np.where(too_near, np.float32(-np.inf), ranges)
+        columns["range"] = np.where(too_far, np.float32(np.inf), near_range)
+        for name in columns.keys() & {"x", "y", "z"}:
+            columns[name] = np.where(too_near | too_far, np.float32(np.nan), columns[name])
+        return columns

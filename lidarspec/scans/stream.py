@@ -17,8 +17,10 @@ from lidarspec.packets.imu import ImuSamples, Waiting
 from lidarspec.packets.masked_sector import AngleReader
 from lidarspec.packets.packets import Packets, joined
 from lidarspec.packets.reorder import Reorder
-from lidarspec.points.cloud import LazyCloud, Mount, PointCloud, Stretch, Stretches, source_of
+from lidarspec.points.cloud import LazyCloud, PointCloud, source_of
+from lidarspec.points.column_sources import Stretch, Stretches
 from lidarspec.points.evaluate import guarded
+from lidarspec.points.mount import Mount
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter
 from lidarspec.scans.ends import first_points

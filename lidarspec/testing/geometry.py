@@ -32,7 +32,7 @@ from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
-from lidarspec.points.plain import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Room, furnished
 from lidarspec.simulation.simulator import simulation
@@ -378,7 +378,7 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
     )
     if not frames:
         return
-    found = evaluate(read(subject, name, frames).with_points)
+    found = evaluate_plainly(read(subject, name, frames).with_points)
     if found.counts.ndim > 1:
         counts = found.counts.reshape(len(found.counts), -1).sum(axis=1)
     else:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found, packed
 from lidarspec.packets.stream import PacketStream
-from lidarspec.points.plain import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import scans_of
 from lidarspec.spec.sensor import Sensor
@@ -62,8 +62,8 @@ def the_same_bytes_give_the_same_points(subject: Subject) -> None:
     `points` is called for each run: the plan of a traced function would not call it again.
     """
     data = material.delivery(subject.sensor, subject.conversation(rounds=1))
-    one = evaluate(subject.sensor.decode(data).with_points).cloud
-    other = evaluate(subject.sensor.decode(data).with_points).cloud
+    one = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
+    other = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
     require(len(one) == len(other), "LS415", "two runs give different numbers of points")
     for name, column in one.columns.items():
         require(

@@ -13,7 +13,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import Scan
 from lidarspec.device import settings
-from lidarspec.points.cloud import Mount
+from lidarspec.points.mount import Mount
 from lidarspec.simulation.simulator import simulate
 from tests.cli.running import ran
 

@@ -14,16 +14,16 @@ import lidarspec
 from lidarspec.expressions.columns import Batch
 from lidarspec.expressions.graph import (
     Node,
+    compute,
     conjuncts,
-    evaluate,
     node_of,
     only_field,
     sample_of,
     trace,
     traverse,
 )
-from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate as plainly
+from lidarspec.points.evaluate import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.spec import Fields, Polar, stack, take
 from tests.agreement import assert_same_points
 
@@ -39,7 +39,7 @@ def graph_of(function: Any) -> Node:
 
 def computed(node: Node, batch: Batch) -> Any:
     fields = Fields(batch)
-    return evaluate(node, {}, lambda node: node.function(fields) if node.kind == "field" else None)
+    return compute(node, {}, lambda node: node.function(fields) if node.kind == "field" else None)
 
 
 def test_a_field_that_is_read_twice_is_one_node() -> None:
@@ -63,7 +63,7 @@ def test_columns_and_arrays_come_to_the_same() -> None:
     }
     arrays |= {path: PACKETS[path][:, None] for path in ("start_angle", "end_angle")}
     np.testing.assert_array_equal(
-        evaluate(node, {}, lambda node: arrays.get(node.path)), column.array
+        compute(node, {}, lambda node: arrays.get(node.path)), column.array
     )
 
 
@@ -101,7 +101,7 @@ def test_one_field_beside_itself_has_points() -> None:
     packets = dataclasses.replace(STL27L, points=echoes).decode(
         b"".join(STL27L.example("data", seed=seed) for seed in range(5))
     )
-    assert_same_points(evaluated(packets).cloud, plainly(packets).cloud)
+    assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
 
 def test_a_test_of_plausibility_may_put_fields_side_by_side() -> None:

@@ -16,7 +16,7 @@ import pytest
 from lidarspec import PointCloud, Scan, UsageError, simulate
 from lidarspec.errors import LibraryError
 from lidarspec.formats import write
-from lidarspec.points.cloud import STRUCTURED
+from lidarspec.points.table_types import STRUCTURED
 from tests.formats.readers import FOREIGN, NAMES, OWN, READERS, Columns, pcd_header, read_pcd
 from tests.formats.test_formats import scan
 from tests.shapes import SHAPES

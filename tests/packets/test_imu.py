@@ -16,7 +16,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SpecError
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
-from lidarspec.points.cloud import Mount
+from lidarspec.points.mount import Mount
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Cartesian, Clock, Fields, Frame, Imu

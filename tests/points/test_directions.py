@@ -12,8 +12,8 @@ import pytest
 import lidarspec
 from lidarspec import Sensor, simulate
 from lidarspec.expressions.columns import remainder
-from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate
+from lidarspec.points.evaluate import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.spec import Fields, Polar, spread
 from tests.agreement import assert_same_points
 
@@ -60,7 +60,7 @@ def test_points_are_those_of_the_plain_evaluation(
         else [stl27l.example("data", seed=seed) for seed in range(40)]
     )
     packets = sensor.decode(b"".join(frames))
-    assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+    assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
 
 @pytest.mark.parametrize("azimuth", [turning, fixed])

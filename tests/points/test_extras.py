@@ -25,9 +25,10 @@ import lidarspec
 from lidarspec import PointCloud, Sensor, SpecError, simulate
 from lidarspec.errors import UnknownName
 from lidarspec.packets.packets import Packets
-from lidarspec.points.cloud import LazyCloud, Mount
-from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate
+from lidarspec.points.cloud import LazyCloud
+from lidarspec.points.evaluate import evaluate
+from lidarspec.points.mount import Mount
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.spec import Cartesian, Extra, Fields, Frame, Polar, Scaled, Simulation, along, take
 from lidarspec.testing.clouds import assert_well_formed
 from tests.agreement import assert_same_points
@@ -56,7 +57,7 @@ def packets(number: int = 40, backend: str = "numpy") -> Packets:
 @EVERY_BACKEND
 def test_columns_have_the_values_types_and_units_of_the_plain_evaluation(backend: str) -> None:
     read = packets(backend=backend)
-    found, plain = evaluated(read).cloud, evaluate(read).cloud
+    found, plain = evaluate(read).cloud, evaluate_plainly(read).cloud
     assert isinstance(found, LazyCloud) == (backend != "construct")
     assert list(found.extra) == list(plain.extra) == list(KINDS)
     for cloud in (found, plain):
@@ -96,9 +97,9 @@ def test_a_column_that_nobody_reads_is_not_made() -> None:
     assert cloud.xyz.shape == (len(cloud), 3)
     assert len(cloud.extra) == len(cloud.units) == 6
     assert "velocity" in repr(cloud.extra)
-    assert not any(cloud.source.holds(name) for name in cloud.extra)
+    assert not any(name in cloud.computed for name in cloud.extra)
     assert cloud.extra["velocity"] is cloud.extra["velocity"]
-    assert [name for name in cloud.extra if cloud.source.holds(name)] == ["velocity"]
+    assert [name for name in cloud.extra if name in cloud.computed] == ["velocity"]
     with pytest.raises(KeyError, match="velocty: there are velocity, near_ir"):
         cloud.extra["velocty"]
 
@@ -167,7 +168,7 @@ def test_types_and_units_can_be_declared_and_low_values_are_spread() -> None:
     read = dataclasses.replace(SENSOR, points=points).decode(
         [SENSOR.example("data", seed=seed) for seed in range(9)]
     )
-    found, plain = read.points(), evaluate(read).cloud
+    found, plain = read.points(), evaluate_plainly(read).cloud
     assert [(column.dtype.str[1:], found.units[name]) for name, column in found.extra.items()] == [
         ("f8", ""),
         ("u1", ""),
@@ -260,7 +261,7 @@ def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(
         .decode([sensor.example(sensor.data_frame, seed=seed) for seed in range(9)])
         .with_points
     )
-    plain = evaluate(read).cloud
+    plain = evaluate_plainly(read).cloud
     names = [*plain.columns, "valid"]
     for which in (..., slice(5, len(plain) - 5)):
         cloud = read.points() if which is ... else read.points()[which]
@@ -283,4 +284,4 @@ def test_asking_whether_there_is_a_column_makes_none() -> None:
     assert isinstance(cloud, LazyCloud)
     assert "velocity" in cloud.extra
     assert "speed" not in cloud.extra
-    assert not any(cloud.source.holds(name) for name in cloud.extra)
+    assert not any(name in cloud.computed for name in cloud.extra)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from lidarspec import PointCloud, Sensor, simulate
 from lidarspec.points.cloud import LazyCloud
-from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate
+from lidarspec.points.evaluate import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.spec import Cartesian
 from lidarspec.testing.clouds import assert_well_formed
 from tests.agreement import assert_same_points
@@ -72,7 +72,7 @@ def test_coordinates_are_the_same_bit_by_bit(name: str, points: Any, backend: st
         for spot, (x, y, z) in enumerate(edges)
     ]
     packets = sensor.decode(frames_of(sensor, given), backend=backend)
-    found, plain = evaluated(packets).cloud, evaluate(packets).cloud
+    found, plain = evaluate(packets).cloud, evaluate_plainly(packets).cloud
     assert isinstance(found, LazyCloud)
     for column in ("x", "y", "z", "intensity"):
         np.testing.assert_array_equal(bits(found.columns[column]), bits(plain.columns[column]))
@@ -117,9 +117,9 @@ def test_coordinates_may_lie_in_a_plane_and_be_turned(
         packets = sensor.decode(
             [shape.example("data", seed=seed) for seed in range(3)], backend=backend
         )
-        found = evaluated(packets).cloud
+        found = evaluate(packets).cloud
         assert isinstance(found, LazyCloud)
-        assert_same_points(found, evaluate(packets).cloud)
+        assert_same_points(found, evaluate_plainly(packets).cloud)
         assert found.valid.any()
 
 
@@ -136,7 +136,7 @@ def scaled(backend: str, **values: Any) -> tuple[PointCloud, PointCloud]:
         sensor.build("data", **usual) + sensor.build("data", **{**usual, **values}), backend=backend
     )
     assert len(packets) == 2
-    return evaluated(packets).cloud, evaluate(packets).cloud
+    return evaluate(packets).cloud, evaluate_plainly(packets).cloud
 
 
 @BACKENDS
@@ -195,9 +195,9 @@ def test_floats_at_random(backend: str) -> None:
             )
             frames.append(shape.build("data", **values))
         packets = shape.decode(b"".join(frames), backend=backend)
-        found = evaluated(packets).cloud
+        found = evaluate(packets).cloud
         assert isinstance(found, LazyCloud) is not odd
-        assert_same_points(found, evaluate(packets).cloud, ulps=6)
+        assert_same_points(found, evaluate_plainly(packets).cloud, ulps=6)
 
 
 def test_scans_of_coordinates_are_those_of_all_points() -> None:

@@ -22,10 +22,10 @@ from lidarspec import Packets, Sensor, UsageError, simulate
 from lidarspec.frames.frame_table import Rows
 from lidarspec.frames.layout import Seal
 from lidarspec.frames.row_checksums import batch
-from lidarspec.points.evaluate import evaluated
+from lidarspec.points.evaluate import evaluate
 from lidarspec.points.numba_kernels import checksums as kernelsums
 from lidarspec.points.numba_kernels.source import written
-from lidarspec.points.plain import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import opening
 from lidarspec.spec import Checksum, Checksummed, Crc, Fields, Polar, WordXor, Xor
@@ -109,10 +109,10 @@ def test_kernels_give_what_the_plain_evaluation_gives(name: str) -> None:
     for number in (1, 7, MANY):
         packets = packets_of(name, number)
         if len(packets):
-            assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=ULPS)
+            assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud, ulps=ULPS)
             one, other = (
-                evaluated(packets, final=False, epoch=5),
                 evaluate(packets, final=False, epoch=5),
+                evaluate_plainly(packets, final=False, epoch=5),
             )
             assert_same_points(one.cloud, other.cloud, ulps=ULPS)
 
@@ -123,7 +123,7 @@ def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     sensor = sensor_of(name)
     packets = sensor.decode(Subject(sensor).stream(), backend="jit").with_points
     if len(packets):
-        assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=ULPS)
+        assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud, ulps=ULPS)
 
 
 def answers_in(module: str) -> list[tuple[Sensor, str]]:
@@ -174,7 +174,7 @@ def test_kernels_of_every_sensor_give_the_plain_points(module: str) -> None:
 def assert_kernel_gives_the_plain_points(sensor: Sensor, answer: str) -> None:
     packets = simulated(sensor, answer, "jit")
     cloud = packets.points()
-    assert_same_points(cloud, evaluate(packets).cloud, ulps=ULPS)
+    assert_same_points(cloud, evaluate_plainly(packets).cloud, ulps=ULPS)
     assert cloud.valid.any(), sensor.id
     assert any(kernel.is_ready for kernel in plan(packets).kernels.values()), sensor.id
 
@@ -225,7 +225,7 @@ def test_it_is_chosen_by_itself_once_enough_points_were_made(
     used = []
     for _ in range(4):
         cloud = packets.points()
-        assert_same_points(cloud, evaluate(packets).cloud, ulps=ULPS)
+        assert_same_points(cloud, evaluate_plainly(packets).cloud, ulps=ULPS)
         used.append(any(kernel.is_ready for kernel in plan(packets).kernels.values()))
     assert used == [False, False, True, True]
 

@@ -15,8 +15,8 @@ from construct import Array, Int8ul, Int16ul, Struct, this
 import lidarspec
 from lidarspec import Packets, Sensor, simulate
 from lidarspec.frames.frame_table import Rows
-from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate
+from lidarspec.points.evaluate import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.spec import Fields, Polar, Scaled, take
 from lidarspec.spec.links import is_datagram
@@ -86,10 +86,10 @@ def assert_sensors_have_a_plan(sensors: list[Sensor]) -> None:
 def assert_planned_points_are_the_plain_ones(packets: Packets) -> None:
     """Fail unless plan and plain evaluation agree on points, counts and values carried over."""
     if len(packets):
-        assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+        assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
         one, other = (
-            evaluated(packets, final=False, epoch=5),
             evaluate(packets, final=False, epoch=5),
+            evaluate_plainly(packets, final=False, epoch=5),
         )
         assert one.ready == other.ready
         assert_same_points(one.cloud, other.cloud)
@@ -111,13 +111,13 @@ def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     sensor = SHAPES[name]
     packets = sensor.decode(Subject(sensor).stream()).with_points
     if len(packets):
-        assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+        assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
 
 @pytest.mark.parametrize("frame", ["rep103", "vendor"])
 def test_the_vendors_axes(frame: str) -> None:
     packets = packets_of(lidarspec.sensor("velodyne-vlp16").configure(frame=frame), 9)
-    assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+    assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
 
 def branching(f: Fields) -> Polar:
@@ -143,7 +143,7 @@ def test_what_cannot_be_traced_says_so_and_runs_all_the_same(points: Any, reason
     found = plan(packets)
     assert not isinstance(found, Plan)
     assert reason in str(found)
-    assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+    assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
 
 def test_a_factor_that_is_zero_or_negative_leaves_no_point_behind() -> None:
@@ -154,7 +154,7 @@ def test_a_factor_that_is_zero_or_negative_leaves_no_point_behind() -> None:
         parsed.dis_unit = unit
         frames.append(sensor.build("data", parsed))
     table = sensor.decode(frames)
-    assert_same_points(evaluated(table).cloud, evaluate(table).cloud)
+    assert_same_points(evaluate(table).cloud, evaluate_plainly(table).cloud)
 
 
 @pytest.mark.parametrize(

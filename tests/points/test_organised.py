@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from lidarspec import PointCloud, UsageError, simulate
-from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate
+from lidarspec.points.evaluate import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.spec import Fields, Polar, stack
 from tests.agreement import assert_same_points
 from tests.by_construct import reader
@@ -88,7 +88,7 @@ def test_rows_of_tables_are_looked_at_where_they_are_or_gathered() -> None:
     beyond, mixed = [frame(TURN - 1)], [frame(0), frame(32)]
     for frames in (in_order, beyond, mixed, in_order * 40 + beyond):
         read = reader(SENSOR, "numpy").decode(frames)
-        assert_same_points(evaluated(read).cloud, evaluate(read).cloud)
+        assert_same_points(evaluate(read).cloud, evaluate_plainly(read).cloud)
 
 
 @EVERY_BACKEND

@@ -14,8 +14,8 @@ import pytest
 
 import lidarspec
 from lidarspec import Packets, simulate
-from lidarspec.points.evaluate import evaluated
-from lidarspec.points.plain import evaluate
+from lidarspec.points.evaluate import evaluate
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.spec import Fields, Polar, following, previous, spread, take, wrap
 from tests.agreement import assert_same_points
@@ -156,7 +156,7 @@ def test_a_plan_of_a_random_function_gives_the_plain_points(name: str, seed: int
     packets = packets_of(name, seed, "numpy")
     found = plan_for(packets.sensor.points_of("data"), packets.batch(), packets.table.groups[0])  # type: ignore[attr-defined]
     assert isinstance(found, Plan), found
-    assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud)
+    assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
 
 @pytest.mark.parametrize("name", list(PARTS))
@@ -167,4 +167,4 @@ def test_a_plan_of_a_random_function_gives_the_plain_points(name: str, seed: int
 def test_kernels_of_a_random_function_give_the_plain_points(name: str, seed: int) -> None:
     pytest.importorskip("numba")
     packets = packets_of(name, seed, "jit")
-    assert_same_points(evaluated(packets).cloud, evaluate(packets).cloud, ulps=6)
+    assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud, ulps=6)

@@ -13,7 +13,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import LaserScan, Scan, UsageError, simulate
-from lidarspec.points.cloud import Mount
+from lidarspec.points.mount import Mount
 from lidarspec.scans.planes import Planes
 
 

@@ -25,7 +25,7 @@ from lidarspec.captures.records import capture_head
 from lidarspec.errors import UsageError
 from lidarspec.frames.frame_table import Rows
 from lidarspec.packets.stream import PacketStream
-from lidarspec.points import lazy_columns
+from lidarspec.points import batch_columns
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.scans.stream import ScanStream, scans_of
 from lidarspec.spec import OnChange, OnWrap, Udp
@@ -89,8 +89,8 @@ def assert_cut_from(
 def test_scans_are_the_points_of_the_whole_cut(
     name: str, least: int, backend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lazy_columns, "LEAST", least)
-    monkeypatch.setattr(lazy_columns, "SHARED", 5000)
+    monkeypatch.setattr(batch_columns, "MIN_OWN_POINTS", least)
+    monkeypatch.setattr(batch_columns, "BLOCK_POINTS", 5000)
     packets = packets_of(name, 700, backend)
     scans = list(scans_of(packets.sensor, batches(packets, 1, 300, 2, 333)))
     assert len(scans) > 1

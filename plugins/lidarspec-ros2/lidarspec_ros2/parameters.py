@@ -18,7 +18,7 @@ from lidarspec.device.device import Device
 from lidarspec.device.settings import named
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.points.cloud import Mount
+from lidarspec.points.mount import Mount
 from lidarspec.recording.appending import Log
 from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.planes import Planes

@@ -26,7 +26,7 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream
-from lidarspec.points.cloud import Mount
+from lidarspec.points.mount import Mount
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Sieve
 from lidarspec.spec.sensor import Sensor

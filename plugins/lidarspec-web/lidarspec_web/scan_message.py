@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec import PointCloud, Scan
-from lidarspec.points.cloud import source_of
 from lidarspec.points.conventions import UNITS
 
 #: header and columns begin at a multiple of this in the message.
@@ -44,7 +43,7 @@ def message(scan: Scan, number: int, *, position: float, sent: float, most: int)
         most: the most points; of more points an even selection is sent, always the same one.
     """
     points = scan.points
-    source_of(points).prepare((*COLUMNS, "valid"))
+    points.load(*COLUMNS, "valid")
     returns = np.flatnonzero(points.valid)
     indices = returns
     if len(returns) > most:

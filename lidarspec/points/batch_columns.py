@@ -1,0 +1,307 @@
+"""The columns of the points of a batch, computed from plans when they are first read.
+
+`BatchColumns.columns` decides for which points columns are computed: for the whole batch, for a
+large scan alone, or for a block of points that small scans share. `_compute` decides which columns
+are computed together. A program of `points.numpy_plan` or a kernel of `points.numba_kernels` fills
+them for each `Share` of the batch.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.expressions.graph import Node
+from lidarspec.frames.arrays import deep
+from lidarspec.points import numpy_plan
+from lidarspec.points.column_sources import ColumnSource
+from lidarspec.points.conventions import (
+    TYPES,
+    Grids,
+    grid_of,
+    narrowed,
+    numbers_of,
+    seconds_since,
+    turned_azimuth,
+    vendor_turn,
+)
+from lidarspec.points.plain import PacketBatch
+from lidarspec.points.plan import Maker, Plan
+from lidarspec.points.shares import Share
+
+#: columns that are computed together.
+MAIN_COLUMNS = ("x", "y", "z", "intensity")
+#: points from which on a range has its columns computed for itself. Smaller ranges share those of a
+#: block of `BLOCK_POINTS` points.
+MIN_OWN_POINTS = 1 << 14
+BLOCK_POINTS = 1 << 16
+
+
+class Block(NamedTuple):
+    """Points of a batch, from `start` to `stop`, and their columns computed so far."""
+
+    start: int
+    stop: int
+    computed: dict[str, NDArray[Any]]
+
+
+class BatchColumns(ColumnSource):
+    """The columns of the points of a batch.
+
+    Args:
+        packets: of the batch.
+        shares: the packets by their layouts.
+        size: the number of points, without those of packets that wait.
+        base: the time that times count from, ns.
+        grids, nominal: as of all sources.
+    """
+
+    def __init__(
+        self,
+        packets: PacketBatch,
+        shares: Sequence[Share],
+        size: int,
+        base: int,
+        *,
+        grids: Grids | None,
+        nominal: bool,
+    ) -> None:
+        self._packets = packets
+        self._shares = shares
+        self._plan = shares[0].plan
+        self._turn = vendor_turn(packets.sensor)
+        # Packets of one layout in order have all their points one after another.
+        self._is_regular = len(shares) == 1 and shares[0].first is None
+        self.extra = self._plan.extra
+        self.size = size
+        self.base = base
+        self.grids = grids
+        self.nominal = nominal
+        if grids:
+            self.grid = grids.between(0, size)
+        else:
+            self.grid = grid_of(self._plan.shape, self._plan.axes)
+        self._computed: dict[str, NDArray[Any]] = {}
+        self._blocks: list[Block] = []
+
+    def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        missing = [name for name in names if name not in self._computed]
+        is_whole = not self._is_regular or self.size <= BLOCK_POINTS or stop - start == self.size
+        if is_whole or not missing:
+            self._computed |= self._compute(missing, 0, self.size)
+            return _part(self._computed, names, slice(start, stop))
+        # A range at an end of the batch is a part of a scan over several batches.
+        is_at_end = start == 0 or stop == self.size
+        if is_at_end or stop - start >= MIN_OWN_POINTS:
+            return self._compute(names, start, stop)
+        return self._from_blocks(names, start, stop)
+
+    def _from_blocks(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        pieces: list[dict[str, NDArray[Any]]] = []
+        index = start
+        while index < stop:
+            block = self._block_at(index)
+            missing = [name for name in names if name not in block.computed]
+            block.computed.update(self._compute(missing, block.start, block.stop))
+            inside = slice(index - block.start, stop - block.start)
+            pieces.append(_part(block.computed, names, inside))
+            index = block.stop
+        if len(pieces) == 1:
+            return pieces[0]
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+    def _block_at(self, index: int) -> Block:
+        """Return the block of points around an index. Blocks do not overlap."""
+        place = bisect.bisect(self._blocks, index, key=lambda block: block.start)
+        if place and index < self._blocks[place - 1].stop:
+            return self._blocks[place - 1]
+        if place < len(self._blocks):
+            limit = self._blocks[place].start
+        else:
+            limit = self.size
+        width = self._plan.width
+        start = index // width * width
+        length = max(BLOCK_POINTS // width, 1) * width
+        block = Block(start, min(start + length, limit), {})
+        self._blocks.insert(place, block)
+        return block
+
+    def _compute(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        """Compute columns of the points from `start` to `stop`, and those that go with them."""
+        main = [name for name in MAIN_COLUMNS if name in self._plan.expressions]
+        needs_main = not {*main, "valid"}.isdisjoint(names)
+        if self._turn is None and all(share.plan.level for share in self._shares):
+            main.remove("z")  # zero, computed on request
+        together = main if needs_main else []
+        sent = [name for name in names if all(name in share.plan.sent for share in self._shares)]
+        if sent and len(sent) + len(together) > 1 and self._turn is None:
+            together = [*together, *sent]
+        columns: dict[str, NDArray[Any]] = {}
+        if together:
+            columns = self._filled(tuple(together), start, stop)
+            if needs_main and self._turn is not None:
+                columns |= self._turned(columns, self._turn)
+        for name in names:
+            if name not in columns:
+                columns |= self._compute_single(name, columns, start, stop)
+        return columns
+
+    def _compute_single(
+        self, name: str, columns: dict[str, NDArray[Any]], start: int, stop: int
+    ) -> dict[str, NDArray[Any]]:
+        """Compute a column by itself; nothing if the sensor does not have it.
+
+        Args:
+            columns: computed before.
+        """
+        if name == "valid":
+            return {name: ~np.isnan(columns["x"])}
+        if name == "z" and name in self._plan.expressions:
+            return {name: np.where(np.isnan(columns["x"]), columns["x"], np.float32(0))}
+        if name == "time":
+            first, last = self._packet_range(start, stop)
+            times = [self._times(share, first, last) for share in self._shares]
+            return {name: self._flat(times, np.dtype(np.float64), start, stop)}
+        if name in self._plan.expressions and name not in self._plan.sent:
+            return self._compute_compiled(name, start, stop)
+        if name in self._plan.parts:
+            return {name: self._compute_plainly(name, start, stop)}
+        return {}
+
+    def _compute_compiled(self, name: str, start: int, stop: int) -> dict[str, NDArray[Any]]:
+        names: tuple[str, ...] = (name,)
+        if name in ("range", "azimuth") and self._packets.backend == "jit":
+            names = ("range", "azimuth")  # one kernel in place of two
+        columns = self._filled(names, start, stop)
+        if "azimuth" in columns:
+            angles = columns["azimuth"]
+            if self._turn is not None:
+                columns["azimuth"] = narrowed(turned_azimuth(angles, self._turn))
+            elif angles.dtype != np.float32:
+                columns["azimuth"] = narrowed(angles)
+        return columns
+
+    def _compute_plainly(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        first, last = self._packet_range(start, stop)
+        values = [share.plain(name, first, last) for share in self._shares]
+        column = self._flat(values, np.result_type(*values), start, stop)
+        if name in self._plan.extra:
+            return self._plan.extra[name].column(column)
+        if name == "elevation":
+            return column.astype(TYPES[name], copy=False)
+        return numbers_of(column, TYPES[name])
+
+    def _turned(
+        self, columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]
+    ) -> dict[str, NDArray[Any]]:
+        """Return x, y and z in the vendor's axes, each one of REP-103's or its opposite."""
+        turned = {}
+        for axis, row in zip("xyz", turn, strict=True):
+            source = int(np.flatnonzero(row)[0])
+            turned[axis] = columns["xyz"[source]] * np.float32(row[source])
+        return turned
+
+    def _filled(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        """Return columns that a program or a kernel computes."""
+        first, last = self._packet_range(start, stop)
+        filled = []
+        for share in self._shares:
+            count = len(share.group.rows[first:last])
+            maker = maker_of(share.plan, names, self._packets.backend, count)
+            filled.append(share.filled(maker, first, last))
+        return {
+            name: self._flat([columns[name] for columns in filled], column.dtype, start, stop)
+            for name, column in filled[0].items()
+        }
+
+    def _packet_range(self, start: int, stop: int) -> tuple[int, int | None]:
+        """Return the range of packets of some points; all if they have several layouts."""
+        if not self._is_regular:
+            return 0, None
+        width = self._plan.width
+        return start // width, -(-stop // width)
+
+    def _flat(
+        self, values: Sequence[NDArray[Any]], dtype: np.dtype[Any], start: int, stop: int
+    ) -> NDArray[Any]:
+        """Return the points from `start` to `stop` in stream order.
+
+        Args:
+            values: of all points of the packets of each share, see `_packet_range`.
+        """
+        if self._is_regular:
+            skipped = start % self._plan.width
+            column = values[0].reshape(-1)[skipped : skipped + stop - start]
+            return column.astype(dtype, copy=False)
+        column = np.empty(self.size, dtype)
+        for share, part in zip(self._shares, values, strict=True):
+            assert share.first is not None
+            spread_out(part, share.first, share.plan.width, column)
+        return column
+
+    def _times(self, share: Share, first: int, last: int | None) -> NDArray[np.float64]:
+        """Return the times of all points of some packets, (packets, *shape), s since `base`."""
+        times = self._packets.time_ns[share.group.where[first:last]]
+        offsets = seconds_since(times, self.base)
+        return np.asarray(share.plain("time", first, last) + deep(offsets, len(share.plan.shape)))
+
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        if not self._is_regular or "time" in self._computed:
+            return super().times_at(indices)
+        share = self._shares[0]
+        packets, places = np.divmod(indices, self._plan.width)
+        if isinstance(self._plan.parts["time"], Node):
+            few = share.some(packets).plain("time")
+        else:
+            few = share.plain("time")[packets]
+        offsets = seconds_since(self._packets.time_ns[packets], self.base)
+        return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
+
+
+def _part(
+    columns: dict[str, NDArray[Any]], names: Sequence[str], part: slice
+) -> dict[str, NDArray[Any]]:
+    return {name: columns[name][part] for name in names if name in columns}
+
+
+def maker_of(plan: Plan, names: tuple[str, ...], backend: str, number: int) -> Maker:
+    """Return an object that computes columns for `number` frames.
+
+    It is a kernel if `backend` requires one, or if it allows one and that pays.
+    """
+    if backend in ("auto", "jit"):
+        try:
+            from lidarspec.points import numba_kernels
+        except ImportError:  # a back end that may be left out
+            if backend == "jit":
+                raise
+        else:
+            kernel = numba_kernels.compile(plan, names, None if backend == "jit" else number)
+            if kernel is not None:
+                return kernel
+    return numpy_plan.compile(plan, names)
+
+
+def spread_out(
+    values: NDArray[Any], first: NDArray[np.intp], width: int, column: NDArray[Any]
+) -> None:
+    """Write the points of packets, `width` each, at the index of each packet's first.
+
+    Index -1 leaves a packet out.
+    """
+    kept = first >= 0
+    rows = np.ascontiguousarray(values.reshape(len(first), width), column.dtype)
+    starts = first
+    if not kept.all():
+        rows = rows[kept]
+        starts = first[kept]
+    if rows.size:
+        piece = np.dtype((np.void, rows.shape[1] * rows.itemsize))
+        windows: NDArray[Any] = np.ndarray(
+            (len(column) - width + 1,), piece, column.data, 0, column.strides
+        )
+        windows[starts] = rows.view(piece).reshape(-1)

@@ -1,0 +1,144 @@
+"""Sources of the columns of consecutive points.
+
+A cloud or a scan takes its columns from a `ColumnSource` when they are first read. A source has one
+method that computes columns for a range of points. The points of a batch of packets are a source
+(`batch_columns.BatchColumns`), those of a cloud that has its columns (`cloud.CloudColumns`), and
+stretches of other sources one after another (`Stretches`), as slices and scans are. So scans are
+cut out of batches without computing a column.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.points.conventions import Grid, Grids, Kind, whole_columns
+
+
+class ColumnSource:
+    """A source of the columns of consecutive points.
+
+    Attributes:
+        size: the number of points.
+        base: the time from which their times count, int64 ns.
+        grid: the organisation of the points, all together.
+        grids: the organisation of the points of each packet, if packets have several shapes.
+        nominal: whether a default calibration stood in for the sensor's own.
+        extra: the type and unit of the columns under names of the sensor's own, by name.
+    """
+
+    size: int
+    base: int
+    grid: Grid = Grid()
+    grids: Grids | None = None
+    nominal: bool = False
+    extra: Mapping[str, Kind] = {}
+
+    def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        """Return columns of the points from `start` to `stop`, (stop - start,) each.
+
+        Columns that the sensor does not have are missing. Others that were computed together with
+        the requested ones may be included.
+
+        Args:
+            names: of columns of `PointCloud`, "valid", or columns in `extra`.
+        """
+        raise NotImplementedError
+
+    def grid_between(self, start: int, stop: int) -> Grid:
+        """Return the organisation of the points from `start` to `stop`."""
+        if self.grids:
+            return self.grids.between(start, stop)
+        return whole_columns(self.grid, start, stop - start)
+
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the times of the points at some indices, in their shape.
+
+        Times are in seconds since `base`.
+        """
+        picked: NDArray[np.float64] = self.columns(("time",), 0, self.size)["time"][indices]
+        return picked
+
+    def seconds_after(self, time_ns: int) -> float:
+        """Return the seconds from a time to the base of this source."""
+        return (self.base - time_ns) * 1e-9
+
+
+class Stretch(NamedTuple):
+    """Consecutive points of a source."""
+
+    source: ColumnSource
+    start: int
+    stop: int
+
+    @property
+    def size(self) -> int:
+        """The number of points."""
+        return self.stop - self.start
+
+
+class Stretches(ColumnSource):
+    """Stretches of sources, one after another, at least one.
+
+    Args:
+        from_first: times count from the first point; else from the base of the first source.
+    """
+
+    def __init__(self, parts: Sequence[Stretch], *, from_first: bool = False) -> None:
+        self._parts = parts
+        self._from_first = from_first
+        self.size = sum(part.size for part in parts)
+        self.base = parts[0].source.base
+        grids = {part.source.grid_between(part.start, part.stop) for part in parts}
+        if len(grids) == 1:
+            self.grid = grids.pop()
+        self.nominal = any(part.source.nominal for part in parts)
+        self.extra = {
+            name: kind
+            for name, kind in parts[0].source.extra.items()
+            if all(name in part.source.extra for part in parts)
+        }
+
+    def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        pieces = [self._piece(part, names) for part in self._parts]
+        columns = {
+            name: _joined([piece[name] for piece in pieces])
+            for name in pieces[0]
+            if all(name in piece for piece in pieces)
+        }
+        if self._from_first and "time" in columns:
+            columns["time"] = columns["time"] - columns["time"][0]
+        return {name: column[start:stop] for name, column in columns.items()}
+
+    def _piece(self, part: Stretch, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Return columns of one stretch, with times since the base of the first source."""
+        piece = part.source.columns(names, part.start, part.stop)
+        if "time" in piece:
+            piece["time"] = piece["time"] + part.source.seconds_after(self.base)
+        return piece
+
+    def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        times = self._times_since_base(indices)
+        if self._from_first:
+            times -= self._times_since_base(np.zeros(1, np.intp))
+        return times
+
+    def _times_since_base(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        times = np.empty(len(indices))
+        first = 0
+        for part in self._parts:
+            is_inside = (indices >= first) & (indices < first + part.size)
+            if is_inside.any():
+                found = part.source.times_at(indices[is_inside] - first + part.start)
+                times[is_inside] = found + part.source.seconds_after(self.base)
+            first += part.size
+        return times
+
+
+def _joined(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    if len(pieces) == 1:
+        return pieces[0]
+    return np.concatenate(pieces)

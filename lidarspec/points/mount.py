@@ -1,0 +1,92 @@
+"""The mounting of a sensor on its carrier: it turns and moves the points of a cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.points.cloud import PointCloud
+from lidarspec.points.conventions import narrowed
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Position and orientation of a sensor on its carrier; both have REP-103 axes.
+
+    The sensor is turned over first if it is `inverted`, then by roll, pitch and yaw about the
+    carrier's fixed axes.
+
+    Attributes:
+        x, y, z: the sensor's origin, metres forward, left and up.
+        roll_deg, pitch_deg, yaw_deg: about x, y and z, right-handed: a yaw of 90 makes the sensor
+            look to the left.
+        inverted: whether it hangs upside down, turned by half a turn about its forward axis.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    yaw_deg: float = 0.0
+    inverted: bool = False
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """The (3, 3) matrix from the sensor's axes to the carrier's."""
+        roll, pitch, yaw = np.deg2rad(
+            [self.roll_deg + 180.0 * self.inverted, self.pitch_deg, self.yaw_deg]
+        )
+        about_x = np.array(
+            [[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]]
+        )
+        about_y = np.array(
+            [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+        )
+        about_z = np.array(
+            [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
+        )
+        return np.asarray(about_z @ about_y @ about_x)
+
+    def applied(self, cloud: PointCloud) -> PointCloud:
+        """Return a cloud, given in the sensor's axes, in those of the carrier.
+
+        Returns:
+            x y z from the carrier's origin; azimuth and elevation of the beams in its axes. `range`
+            stays what the sensor measured, from the sensor.
+        """
+        turn = self.rotation
+        azimuth = cloud.azimuth.astype(np.float64)
+        elevation = cloud.elevation.astype(np.float64)
+        level = np.cos(elevation)
+        beam = turn @ np.stack(
+            [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+        )
+        xyz = turn @ np.stack([cloud.x, cloud.y, cloud.z]).astype(np.float64) + np.array(
+            [[self.x], [self.y], [self.z]]
+        )
+        x, y, z = xyz.astype(np.float32)
+        # arcsin is coarse where beams point straight up; the other two sides of the triangle are
+        # not
+        raised = np.arctan2(beam[2], np.hypot(beam[0], beam[1])).astype(np.float32)
+        same = {f.name: getattr(cloud, f.name) for f in fields(cloud)}
+        turned = {
+            "x": x,
+            "y": y,
+            "z": z,
+            "azimuth": narrowed(np.arctan2(beam[1], beam[0])),
+            "elevation": raised,
+        }
+        return PointCloud(**{**same, **turned})
+
+    def __str__(self) -> str:
+        given = [
+            f"{f.name}={getattr(self, f.name):g}"
+            for f in fields(self)[:-1]
+            if getattr(self, f.name)
+        ]
+        return (
+            ", ".join([*given, *(["inverted"] if self.inverted else [])]) or "as the sensor stands"
+        )

@@ -1,0 +1,191 @@
+"""The packets of one layout in a batch, with their plan and plain results.
+
+A batch has a `Share` for each layout. `PlainValues` evaluates nodes of the plan plainly for its
+packets, each node once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.expressions.columns import Batch, Column, Fields, field_array
+from lidarspec.expressions.graph import Node, compute
+from lidarspec.frames.arrays import deep
+from lidarspec.frames.frame_table import Group
+from lidarspec.points.plan import REMEMBERING, Maker, Plan
+
+#: bytes of an integer that float64 holds exactly.
+MAX_EXACT_BYTES = 4
+
+
+class PlainValues:
+    """The plain results of nodes for one batch, each computed once.
+
+    Results are columns if axes have to be named, else arrays.
+    """
+
+    def __init__(self, batch: Batch) -> None:
+        self._fields = Fields(batch)
+        self._table = batch.table
+        self._columns: dict[Node, Any] = {}
+        self._arrays: dict[Node, Any] = {}
+
+    def column(self, node: Node) -> Column:
+        """The result of a node."""
+        if node not in self._columns:
+            with np.errstate(all="ignore"):
+                compute(node, self._columns, self._read)
+        return self._columns[node]  # type: ignore[no-any-return]
+
+    def array(self, node: Node) -> NDArray[Any]:
+        """The array of a node's result, (n or 1, ...)."""
+        if node not in self._arrays:
+            with np.errstate(all="ignore"):
+                compute(node, self._arrays, self._loaded)
+        return self._arrays[node]  # type: ignore[no-any-return]
+
+    def sent(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
+        """Return the whole numbers of a field as sent, (n, ...).
+
+        They are those of the packets from `first` to `stop`.
+
+        None for what is no such field, or not in every packet.
+        """
+        if node.kind == "field":
+            info = self._table.schema.fields.get(node.path)
+        else:
+            info = None
+        if (
+            info is None
+            or info.scaled
+            or info.dtype is None
+            or info.dtype.kind not in "iu"
+            or info.dtype.itemsize > MAX_EXACT_BYTES
+        ):
+            return None
+        if self._table.present(info.path) is not None:
+            return None
+        if stop - first == len(self._table):
+            some = self._table
+        else:
+            some = self._table.take(np.arange(first, stop))
+        return field_array(info, some, self._table.schema.depth(), raw=True)
+
+    def know(self, node: Node, column: Column) -> None:
+        """Take a result as given."""
+        self._columns[node] = column
+
+    def _read(self, node: Node) -> Any:
+        if node.kind in ("field", "state"):
+            return node.function(self._fields)
+        return None
+
+    def _loaded(self, node: Node) -> Any:
+        if node in self._columns:
+            return self._columns[node].array
+        if node.kind == "field":
+            return field_array(
+                self._table.schema.fields[node.path], self._table, self._table.schema.depth()
+            )
+        if node.kind == "call":
+            return None
+        return self.column(node).array
+
+
+@dataclass(eq=False)
+class Share:
+    """The packets of one layout in a batch, with their plan and plain results.
+
+    `first` is the index of the first point of each packet, -1 for none.
+    """
+
+    plan: Plan
+    group: Group
+    plain_values: PlainValues
+    batch: Batch
+    first: NDArray[np.intp] | None = None
+
+    def __len__(self) -> int:
+        return len(self.group.where)
+
+    def filled(self, maker: Maker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
+        """Return columns of the packets from `first` to `stop` (None: all)."""
+        rows = self.group.rows[first:stop]
+        columns = maker.columns(len(rows))
+
+        def values(node: Node) -> NDArray[Any]:
+            array = self.plain_values.array(node)
+            if len(array) > 1:
+                return array[first:stop]
+            return array
+
+        maker.run(rows, values, columns)
+        return columns
+
+    def plain(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """Return a part of the result of `points`, evaluated plainly.
+
+        It has every point of the packets from `first` to `stop` (None: all).
+
+        Its shape is that of the plan, behind the packets.
+
+        A further column of whole numbers that is a field as it stands is of their type, all others
+        of float64.
+        """
+        stop = len(self) if stop is None else stop
+        part = self.plan.parts[name]
+        shape = (stop - first, *self.plan.shape)
+        if isinstance(part, Node) and name in self.plan.extra:
+            array = self.plain_values.sent(part, first, stop)
+        else:
+            array = None
+        if array is None:
+            if isinstance(part, Node):
+                array = self.plain_values.array(part)
+            else:
+                array = np.asarray(part)
+            if isinstance(part, Node) and len(array) > 1:
+                array = array[first:stop]
+        return np.broadcast_to(
+            deep(array, len(shape) - 1) if isinstance(part, Node) else array, shape
+        )
+
+    @classmethod
+    def part(
+        cls, plan: Plan, batch: Batch, group: Group, remembered: Mapping[int, Column]
+    ) -> Share:
+        """Return the share of some packets of a batch.
+
+        Args:
+            remembered: results for all packets, by the number of a node that uses other packets.
+        """
+        own = batch.of(group)
+        share = cls(plan, group, PlainValues(own), own)
+        for number, column in remembered.items():
+            node = plan.tape.nodes[number]
+            if len(column.array) > 1:
+                array = column.array[group.where]
+            else:
+                array = column.array
+            corner = (slice(None), *(slice(0, length) for length in node.shape))
+            share.plain_values.know(node, Column(array[corner], node.sample.axes, own))
+        return share
+
+    def some(self, which: NDArray[np.intp]) -> Share:
+        """The share of some of the packets, by index, with what is known of them plainly."""
+        remembered = {
+            node.number: self.plain_values.column(node)
+            for node in self.plan.eager
+            if node.kind in REMEMBERING
+        }
+        return Share.part(
+            self.plan,
+            self.batch,
+            Group(self.group.layout, which, self.group.rows[which]),
+            remembered,
+        )

@@ -1,0 +1,70 @@
+"""The types of tables of points: PCL's structured layout and the schema of Arrow."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.libraries import import_library
+
+#: x y z intensity ring time at PCL's offsets.
+STRUCTURED = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "time"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<f4"],
+        "offsets": [0, 4, 8, 16, 20, 24],
+        "itemsize": 32,
+    }
+)
+#: the size of a structured point is a multiple of this.
+ALIGNMENT_BYTES = 16
+
+
+def structured_type(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
+    """Return PCL's layout with further columns behind it, each aligned to its size."""
+    formats = {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()}
+    end = STRUCTURED.itemsize
+    for name, dtype in extra.items():
+        start = end + -end % dtype.itemsize
+        end = start + dtype.itemsize
+        formats[name] = (dtype.newbyteorder("<"), start)
+    return np.dtype(
+        {
+            "names": list(formats),
+            "formats": [dtype for dtype, _ in formats.values()],
+            "offsets": [offset for _, offset in formats.values()],
+            "itemsize": end + -end % ALIGNMENT_BYTES,
+        }
+    )
+
+
+def arrow_schema(
+    columns: Mapping[str, NDArray[Any]], units: Mapping[str, str], facts: Mapping[str, str]
+) -> Any:
+    """Return the `pyarrow.Schema` of some columns of points.
+
+    Float columns are not nullable, which is faster to write: nan marks a missing value.
+
+    Args:
+        units: the units of columns by name, without plain numbers. The metadata of each field has
+            its unit, that of the schema all of them as JSON.
+        facts: further metadata of the schema.
+
+    Raises:
+        UsageError: pyarrow is not installed.
+    """
+    arrow = import_library("pyarrow", "arrow")
+    fields = [
+        arrow.field(
+            name,
+            arrow.from_numpy_dtype(column.dtype),
+            column.dtype.kind != "f",
+            {"unit": units.get(name, "")},
+        )
+        for name, column in columns.items()
+    ]
+    return arrow.schema(fields, {**facts, "units": json.dumps(units)})
