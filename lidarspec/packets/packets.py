@@ -18,7 +18,7 @@ from lidarspec.framing.results import Counters, Numbers, array_of
 from lidarspec.packets.clocks import part_times
 from lidarspec.packets.imu import ImuSamples, samples
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.evaluate import cloud_of
+from lidarspec.points.evaluate import evaluate
 from lidarspec.spec.sensor import Sensor
 
 #: what is known of each packet besides its fields.
@@ -178,7 +178,7 @@ class Packets:
             SpecError: where the sensor's `points` function fails, or returns columns that do not
                 fit.
         """
-        return cloud_of(self.with_points)
+        return evaluate(self.with_points).cloud
 
     def imu(self) -> ImuSamples:
         """Return the samples of the sensor's IMU in all packets, in stream order.

@@ -17,5 +17,6 @@ plainly, by NumPy on a plan, and by compiled kernels. Modules in reading order:
 * `shares`: the packets of one layout in a batch, with their plan and plain results.
 * `batch_columns`: the columns of planned points, computed when they are first read.
 * `evaluate`: the points of a batch, by plans where there are such, else plainly.
-* `numpy_plan`, `numba_kernels`: back ends, each behind one function `compile(plan, ...)`.
+* `numpy_plan`, `numba_kernels`: back ends, each behind one function `compile(plan, names)`.
+* `backends`: the choice between them.
 """

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lidarspec.expressions.graph import Node
 from lidarspec.frames.arrays import deep
-from lidarspec.points import numpy_plan
+from lidarspec.points.backends import choose_maker
 from lidarspec.points.column_sources import ColumnSource
 from lidarspec.points.conventions import (
     TYPES,
@@ -30,11 +30,10 @@ from lidarspec.points.conventions import (
     vendor_turn,
 )
 from lidarspec.points.plain import PacketBatch
-from lidarspec.points.plan import Maker, Plan
 from lidarspec.points.shares import Share
 
-#: columns that are computed together.
-MAIN_COLUMNS = ("x", "y", "z", "intensity")
+#: columns that one program or kernel computes.
+COMPILED_TOGETHER = ("x", "y", "z", "intensity")
 #: points from which on a range has its columns computed for itself. Smaller ranges share those of a
 #: block of `BLOCK_POINTS` points.
 MIN_OWN_POINTS = 1 << 14
@@ -74,6 +73,8 @@ class BatchColumns(ColumnSource):
         self._shares = shares
         self._plan = shares[0].plan
         self._turn = vendor_turn(packets.sensor)
+        self._is_level = self._turn is None and all(share.plan.level for share in shares)
+        self._main_columns = self._plan.expressions.keys() & COMPILED_TOGETHER
         # Packets of one layout in order have all their points one after another.
         self._is_regular = len(shares) == 1 and shares[0].first is None
         self.extra = self._plan.extra
@@ -132,36 +133,29 @@ class BatchColumns(ColumnSource):
 
     def _compute(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Compute columns of the points from `start` to `stop`, and those that go with them."""
-        main = [name for name in MAIN_COLUMNS if name in self._plan.expressions]
-        needs_main = not {*main, "valid"}.isdisjoint(names)
-        if self._turn is None and all(share.plan.level for share in self._shares):
-            main.remove("z")  # zero, computed on request
-        together = main if needs_main else []
+        main: list[str] = []
+        if not self._main_columns.isdisjoint(names):
+            main = [name for name in COMPILED_TOGETHER if name in self._plan.expressions]
+            if self._is_level:
+                main.remove("z")
         sent = [name for name in names if all(name in share.plan.sent for share in self._shares)]
-        if sent and len(sent) + len(together) > 1 and self._turn is None:
-            together = [*together, *sent]
+        if len(sent) + len(main) == 1 or self._turn is not None:
+            sent = []
         columns: dict[str, NDArray[Any]] = {}
-        if together:
-            columns = self._filled(tuple(together), start, stop)
-            if needs_main and self._turn is not None:
-                columns |= self._turned(columns, self._turn)
+        if main or sent:
+            columns = self._filled((*main, *sent), start, stop)
+        if main:
+            if self._is_level:
+                columns["z"] = columns["x"] - columns["x"]  # 0, or nan like x
+            if self._turn is not None:
+                columns |= _turned(columns, self._turn)
         for name in names:
             if name not in columns:
-                columns |= self._compute_single(name, columns, start, stop)
+                columns |= self._compute_single(name, start, stop)
         return columns
 
-    def _compute_single(
-        self, name: str, columns: dict[str, NDArray[Any]], start: int, stop: int
-    ) -> dict[str, NDArray[Any]]:
-        """Compute a column by itself; nothing if the sensor does not have it.
-
-        Args:
-            columns: computed before.
-        """
-        if name == "valid":
-            return {name: ~np.isnan(columns["x"])}
-        if name == "z" and name in self._plan.expressions:
-            return {name: np.where(np.isnan(columns["x"]), columns["x"], np.float32(0))}
+    def _compute_single(self, name: str, start: int, stop: int) -> dict[str, NDArray[Any]]:
+        """Compute a column by itself; nothing if the sensor does not have it."""
         if name == "time":
             first, last = self._packet_range(start, stop)
             times = [self._times(share, first, last) for share in self._shares]
@@ -195,23 +189,13 @@ class BatchColumns(ColumnSource):
             return column.astype(TYPES[name], copy=False)
         return numbers_of(column, TYPES[name])
 
-    def _turned(
-        self, columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]
-    ) -> dict[str, NDArray[Any]]:
-        """Return x, y and z in the vendor's axes, each one of REP-103's or its opposite."""
-        turned = {}
-        for axis, row in zip("xyz", turn, strict=True):
-            source = int(np.flatnonzero(row)[0])
-            turned[axis] = columns["xyz"[source]] * np.float32(row[source])
-        return turned
-
     def _filled(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return columns that a program or a kernel computes."""
         first, last = self._packet_range(start, stop)
         filled = []
         for share in self._shares:
             count = len(share.group.rows[first:last])
-            maker = maker_of(share.plan, names, self._packets.backend, count)
+            maker = choose_maker(share.plan, names, self._packets.backend, count)
             filled.append(share.filled(maker, first, last))
         return {
             name: self._flat([columns[name] for columns in filled], column.dtype, start, stop)
@@ -268,24 +252,6 @@ def _part(
     return {name: columns[name][part] for name in names if name in columns}
 
 
-def maker_of(plan: Plan, names: tuple[str, ...], backend: str, number: int) -> Maker:
-    """Return an object that computes columns for `number` frames.
-
-    It is a kernel if `backend` requires one, or if it allows one and that pays.
-    """
-    if backend in ("auto", "jit"):
-        try:
-            from lidarspec.points import numba_kernels
-        except ImportError:  # a back end that may be left out
-            if backend == "jit":
-                raise
-        else:
-            kernel = numba_kernels.compile(plan, names, None if backend == "jit" else number)
-            if kernel is not None:
-                return kernel
-    return numpy_plan.compile(plan, names)
-
-
 def spread_out(
     values: NDArray[Any], first: NDArray[np.intp], width: int, column: NDArray[Any]
 ) -> None:
@@ -305,3 +271,12 @@ def spread_out(
             (len(column) - width + 1,), piece, column.data, 0, column.strides
         )
         windows[starts] = rows.view(piece).reshape(-1)
+
+
+def _turned(columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    """Return x, y and z in the vendor's axes, each one of REP-103's or its opposite."""
+    turned = {}
+    for axis, row in zip("xyz", turn, strict=True):
+        source = int(np.flatnonzero(row)[0])
+        turned[axis] = columns["xyz"[source]] * np.float32(row[source])
+    return turned

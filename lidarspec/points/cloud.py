@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 from lidarspec.display import drawn
 from lidarspec.errors import UnknownName, UsageError
 from lidarspec.libraries import import_library
-from lidarspec.points.column_sources import ColumnSource, Stretch, Stretches
+from lidarspec.points.column_sources import ColumnSource, LazyColumns, Stretch, Stretches
 from lidarspec.points.conventions import TYPES, UNITS, Floats, Grid, Grids, Kind, whole_columns
 from lidarspec.points.table_types import STRUCTURED, arrow_schema, structured_type
 
@@ -386,7 +386,7 @@ class CloudColumns(ColumnSource):
         else:
             self.grid = grid_of(cloud)
         if isinstance(cloud, LazyCloud):
-            self.extra = cloud.source.extra
+            self.extra = cloud.lazy.source.extra
         else:
             self.extra = {
                 name: Kind(column.dtype, cloud.units.get(name, ""))
@@ -402,8 +402,8 @@ class CloudColumns(ColumnSource):
         return {name: column[start:stop] for name, column in columns.items() if column is not None}
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        if isinstance(self._cloud, LazyCloud) and "time" not in self._cloud.computed:
-            return self._cloud.source.times_at(indices)
+        if isinstance(self._cloud, LazyCloud) and "time" not in self._cloud.lazy.computed:
+            return self._cloud.lazy.source.times_at(indices)
         return super().times_at(indices)
 
 
@@ -411,37 +411,32 @@ class LazyCloud(PointCloud):
     """A cloud whose columns are computed when they are first read.
 
     Attributes:
-        source: of the columns.
-        computed: the columns computed so far, by name; None for those that the sensor lacks.
+        lazy: the columns. The cloud and its `extra` share them, without a reference cycle that
+            would keep the memory of the columns until the next garbage collection.
     """
 
-    source: ColumnSource
-    computed: dict[str, Any]
+    lazy: LazyColumns
 
     @classmethod
     def of(cls, source: ColumnSource, stamp_ns: int) -> LazyCloud:
         """Return the cloud of a source; its times count from `stamp_ns`."""
+        lazy = LazyColumns(source)
         cloud = object.__new__(cls)
         cloud.__dict__.update(
-            source=source,
-            computed={},
+            lazy=lazy,
             stamp_ns=stamp_ns,
             shape=organised(source.size, source.grid),
             nominal=np.bool_(source.nominal),
-            extra=ExtraColumns(cloud),
+            extra=ExtraColumns(lazy),
             units={name: kind.unit for name, kind in source.extra.items()},
         )
         return cloud
 
     def load(self, *names: str) -> None:
-        missing = [name for name in names if name not in self.computed]
-        if missing:
-            found = self.source.columns(missing, 0, len(self))
-            for name, column in (found | dict.fromkeys(missing - found.keys())).items():
-                self.computed.setdefault(name, column)
+        self.lazy.load(*names)
 
     def __len__(self) -> int:
-        return self.source.size
+        return self.lazy.source.size
 
     def __getitem__(self, which: Any) -> PointCloud:
         if not isinstance(which, slice) or which.step not in (None, 1):
@@ -461,30 +456,29 @@ class LazyCloud(PointCloud):
 class ExtraColumns(Mapping[str, NDArray[Any]]):
     """The columns of a cloud under names of the sensor's own, computed when they are first read."""
 
-    def __init__(self, cloud: LazyCloud) -> None:
-        self._cloud = cloud
+    def __init__(self, lazy: LazyColumns) -> None:
+        self._lazy = lazy
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         if name in self:
-            self._cloud.load(name)
-            column: NDArray[Any] | None = self._cloud.computed[name]
+            column = self._lazy.read(name)
             if column is not None:
                 return column
         raise KeyError(f"{name}: there are {', '.join(self) or 'none'}")
 
     def __contains__(self, name: object) -> bool:
-        return name in self._cloud.source.extra  # without computing the column
+        return name in self._lazy.source.extra  # without computing the column
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._cloud.source.extra)
+        return iter(self._lazy.source.extra)
 
     def __len__(self) -> int:
-        return len(self._cloud.source.extra)
+        return len(self._lazy.source.extra)
 
     def __repr__(self) -> str:
         names = [
             f"{name} [{kind.unit}]" if kind.unit else name
-            for name, kind in self._cloud.source.extra.items()
+            for name, kind in self._lazy.source.extra.items()
         ]
         return f"Extras({', '.join(names)})"
 
@@ -498,9 +492,7 @@ class _LazyColumn:
     def __get__(self, cloud: Any, owner: Any) -> Any:
         if cloud is None:
             return self
-        if self._name not in cloud.computed:
-            cloud.load(self._name)
-        return cloud.computed[self._name]
+        return cloud.lazy.read(self._name)
 
 
 for _name in (*COLUMNS, "valid"):
@@ -510,5 +502,5 @@ for _name in (*COLUMNS, "valid"):
 def source_of(cloud: PointCloud) -> ColumnSource:
     """Return the source of the columns of a cloud."""
     if isinstance(cloud, LazyCloud):
-        return cloud.source
+        return cloud.lazy.source
     return CloudColumns(cloud)

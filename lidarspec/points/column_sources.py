@@ -41,10 +41,10 @@ class ColumnSource:
         """Return columns of the points from `start` to `stop`, (stop - start,) each.
 
         Columns that the sensor does not have are missing. Others that were computed together with
-        the requested ones may be included.
+        the requested ones may be included. A source may leave out "valid", which follows from x.
 
         Args:
-            names: of columns of `PointCloud`, "valid", or columns in `extra`.
+            names: of columns of `PointCloud`, or of columns in `extra`.
         """
         raise NotImplementedError
 
@@ -65,6 +65,37 @@ class ColumnSource:
     def seconds_after(self, time_ns: int) -> float:
         """Return the seconds from a time to the base of this source."""
         return (self.base - time_ns) * 1e-9
+
+
+class LazyColumns:
+    """The columns of a source, each computed when it is first read.
+
+    Attributes:
+        source: of the columns.
+        computed: the columns computed so far, by name; None for those that the sensor lacks.
+    """
+
+    def __init__(self, source: ColumnSource) -> None:
+        self.source = source
+        self.computed: dict[str, NDArray[Any] | None] = {}
+
+    def load(self, *names: str) -> None:
+        """Compute the columns that are missing, together."""
+        missing = [name for name in names if name not in self.computed]
+        if not missing:
+            return
+        found = self.source.columns(missing, 0, self.source.size)
+        if "valid" in missing and "valid" not in found:
+            x = self.read("x")
+            assert x is not None  # since every cloud has it
+            found["valid"] = ~np.isnan(x)  # x is nan unless a point is valid
+        self.computed = dict.fromkeys(missing) | found | self.computed
+
+    def read(self, name: str) -> NDArray[Any] | None:
+        """Return a column, None if the sensor lacks it."""
+        if name not in self.computed:
+            self.load(name)
+        return self.computed[name]
 
 
 class Stretch(NamedTuple):

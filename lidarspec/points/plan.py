@@ -340,15 +340,15 @@ _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDic
 
 
 def plan_for(function: PointsFunction, batch: Batch, group: Group) -> Plan | Untraceable:
-    """The plan for frames of a group's layout, or why there is none; kept with the layout."""
-    if function not in group.layout.notes:
-        group.layout.notes[function] = _planned(function, batch, group)
-    plan: Plan | Untraceable = group.layout.notes[function]
+    """Return the plan for frames of a group's layout, or the reason why there is none.
+
+    The layout keeps it.
+    """
+    notes = group.layout.notes
+    if function not in notes:
+        try:
+            notes[function] = Plan(function, graph.sample_of(batch, group), group.layout)
+        except Untraceable as reason:
+            notes[function] = reason
+    plan: Plan | Untraceable = notes[function]
     return plan
-
-
-def _planned(function: PointsFunction, batch: Batch, group: Group) -> Plan | Untraceable:
-    try:
-        return Plan(function, graph.sample_of(batch, group), group.layout)
-    except Untraceable as reason:
-        return reason

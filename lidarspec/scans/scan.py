@@ -12,8 +12,8 @@ from lidarspec.display import drawn
 from lidarspec.errors import UsageError
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.mount import Mount
 from lidarspec.points.conventions import axes_of
+from lidarspec.points.mount import Mount
 from lidarspec.scans.laserscan import FULL_TURN, LaserScan, find_nearest_returns, fit_times
 from lidarspec.scans.provenance import Provenance
 from lidarspec.spec.sensor import Sensor

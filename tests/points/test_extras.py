@@ -97,9 +97,9 @@ def test_a_column_that_nobody_reads_is_not_made() -> None:
     assert cloud.xyz.shape == (len(cloud), 3)
     assert len(cloud.extra) == len(cloud.units) == 6
     assert "velocity" in repr(cloud.extra)
-    assert not any(name in cloud.computed for name in cloud.extra)
+    assert not any(name in cloud.lazy.computed for name in cloud.extra)
     assert cloud.extra["velocity"] is cloud.extra["velocity"]
-    assert [name for name in cloud.extra if name in cloud.computed] == ["velocity"]
+    assert [name for name in cloud.extra if name in cloud.lazy.computed] == ["velocity"]
     with pytest.raises(KeyError, match="velocty: there are velocity, near_ir"):
         cloud.extra["velocty"]
 
@@ -284,4 +284,4 @@ def test_asking_whether_there_is_a_column_makes_none() -> None:
     assert isinstance(cloud, LazyCloud)
     assert "velocity" in cloud.extra
     assert "speed" not in cloud.extra
-    assert not any(name in cloud.computed for name in cloud.extra)
+    assert not any(name in cloud.lazy.computed for name in cloud.extra)

@@ -22,6 +22,7 @@ from lidarspec import Packets, Sensor, UsageError, simulate
 from lidarspec.frames.frame_table import Rows
 from lidarspec.frames.layout import Seal
 from lidarspec.frames.row_checksums import batch
+from lidarspec.points import backends
 from lidarspec.points.evaluate import evaluate
 from lidarspec.points.numba_kernels import checksums as kernelsums
 from lidarspec.points.numba_kernels.source import written
@@ -215,10 +216,8 @@ def test_it_is_chosen_by_itself_once_enough_points_were_made(
     )
     packets = sensor.decode(b"".join(frames_of("ldrobot-stl27l")))
     enough = 3 * 12 * len(packets)
-    monkeypatch.setattr("lidarspec.points.numba_kernels.kernels.WARM", enough if compiled else 0)
-    monkeypatch.setattr(
-        "lidarspec.points.numba_kernels.kernels.COLD", 10 * enough if compiled else enough
-    )
+    monkeypatch.setattr(backends, "MIN_WARM_KERNEL_POINTS", enough if compiled else 0)
+    monkeypatch.setattr(backends, "MIN_COLD_KERNEL_POINTS", 10 * enough if compiled else enough)
     monkeypatch.setattr(
         "lidarspec.points.numba_kernels.kernels.compiled_before", lambda source: compiled
     )

@@ -5,6 +5,8 @@ the last place.
 from __future__ import annotations
 
 import dataclasses
+import gc
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -186,6 +188,18 @@ def test_columns_are_made_once_and_slices_share_them() -> None:
     assert part.x.base is cloud.x or part.x.base is cloud.x.base
     assert part.shape == (25, 5)
     assert isinstance(packets.batch().table, Rows)
+
+
+def test_a_cloud_is_freed_without_garbage_collection() -> None:
+    cloud = packets_of(lidarspec.sensor("ldrobot-stl27l"), 3).points()
+    assert len(cloud.x) == 36
+    known = weakref.ref(cloud)
+    gc.disable()
+    try:
+        del cloud
+        assert known() is None
+    finally:
+        gc.enable()
 
 
 def test_threads_that_decode_with_one_sensor_do_not_meet() -> None:

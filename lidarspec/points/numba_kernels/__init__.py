@@ -16,22 +16,6 @@ that runs, not with this package. Modules in reading order:
 from __future__ import annotations
 
 from lidarspec.points.numba_kernels.checksums import compiled as compiled_sums
-from lidarspec.points.numba_kernels.kernels import kernel_of, pays
-from lidarspec.points.plan import Maker, Plan
+from lidarspec.points.numba_kernels.kernels import is_available, kernel_of as compile
 
-__all__ = ["compile", "compiled_sums"]
-
-
-def compile(plan: Plan, names: tuple[str, ...], frames: int | None = None) -> Maker | None:
-    """What makes these columns of the plan's points, compiled; kept with the plan.
-
-    Args:
-        frames: how many are to be made, where a kernel is wanted only if it pays; else it is wanted
-            in any case.
-
-    Returns:
-        None where a kernel does not pay, or Numba is missing.
-    """
-    if frames is not None and not pays(plan, names, frames):
-        return None
-    return kernel_of(plan, names)
+__all__ = ["compile", "compiled_sums", "is_available"]

@@ -1,4 +1,4 @@
-"""Compile or load kernels, call them, and decide when they pay.
+"""Compile or load kernels, and call them.
 
 A kernel is called by one thread or several.
 
@@ -37,17 +37,8 @@ THREADS = "LIDARSPEC_THREADS"
 #: points below which a second thread costs more than it saves.
 SHARE = 1 << 16
 
-#: points of a job that earn loading Numba with a kernel compiled before, and with one to be
-#: compiled; about a second's worth each.
-WARM = 1 << 26
-COLD = 1 << 28
-#: a count that nothing brings up to them.
-NEVER = -(1 << 62)
-
 #: the size of the frames that were the first to get a kernel.
 _OWN: WeakKeyDictionary[PointsFunction, int] = WeakKeyDictionary()
-#: points made so far, by the names of their columns.
-_MADE: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
 
 
 class Kernel(Maker):
@@ -148,29 +139,6 @@ def kernel_of(plan: Plan, names: tuple[str, ...]) -> Kernel:
     return kernel
 
 
-def pays(plan: Plan, names: tuple[str, ...], frames: int) -> bool:
-    """Return whether the kernel of a `points` function pays, and compile it if so.
-
-    It pays after a number of points, those of these frames included.
-    """
-    made = _MADE.setdefault(plan.function, {})
-    made[names] = made.get(names, 0) + frames * plan.width
-    if made[names] < WARM:
-        return False
-    if not available():
-        made[names] = NEVER
-        return False
-    try:
-        kernel = kernel_of(plan, names)
-        if made[names] < COLD and not kernel.is_compiled:
-            return False
-        kernel.compile()
-    except Exception:  # whatever is wrong with Numba or its cache here, NumPy does without
-        made[names] = NEVER
-        return False
-    return True
-
-
 def threads() -> int:
     """How many threads a kernel is given: LIDARSPEC_THREADS, by default 1.
 
@@ -190,8 +158,8 @@ def _pool(number: int) -> Any:
     return ThreadPoolExecutor(number, "lidarspec")
 
 
-def available() -> bool:
-    """Whether Numba is installed; it is not imported for that."""
+def is_available() -> bool:
+    """Return whether Numba is installed, without importing it."""
     return importlib.util.find_spec("numba") is not None
 
 

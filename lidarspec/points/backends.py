@@ -1,0 +1,63 @@
+"""Choose the back end that computes columns: NumPy, or compiled kernels once they pay.
+
+Loading Numba and compiling a kernel take about a second. With the back end "auto" a kernel is used
+after so many points that it saves this time.
+"""
+
+from __future__ import annotations
+
+from weakref import WeakKeyDictionary
+
+from lidarspec.points import numpy_plan
+from lidarspec.points.plan import Maker, Plan, PointsFunction
+
+#: points after which a kernel compiled before pays, and one that has to be compiled.
+MIN_WARM_KERNEL_POINTS = 1 << 26
+MIN_COLD_KERNEL_POINTS = 1 << 28
+#: a count of points that stays below these limits.
+_NEVER = -(1 << 62)
+
+#: points computed so far, by the names of their columns.
+_POINT_COUNTS: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
+
+
+def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) -> Maker:
+    """Return an object that computes columns of a plan.
+
+    Args:
+        backend: "numpy", "jit" or "auto".
+        frames: the number of frames to compute.
+
+    Raises:
+        LibraryError: for "jit", if Numba is missing or does not work here.
+    """
+    if backend == "jit":
+        from lidarspec.points import numba_kernels
+
+        return numba_kernels.compile(plan, names)
+    if backend == "auto":
+        kernel = _paying_kernel(plan, names, frames)
+        if kernel is not None:
+            return kernel
+    return numpy_plan.compile(plan, names)
+
+
+def _paying_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> Maker | None:
+    """Return a compiled kernel if it pays after the points of these frames, else None."""
+    counts = _POINT_COUNTS.setdefault(plan.function, {})
+    counts[names] = counts.get(names, 0) + frames * plan.width
+    if counts[names] < MIN_WARM_KERNEL_POINTS:
+        return None
+    from lidarspec.points import numba_kernels  # most jobs do not need it
+
+    try:
+        if numba_kernels.is_available():
+            kernel = numba_kernels.compile(plan, names)
+            if counts[names] < MIN_COLD_KERNEL_POINTS and not kernel.is_compiled:
+                return None
+            kernel.compile()
+            return kernel
+    except Exception:  # NumPy does without Numba, whatever is wrong with it or its cache
+        pass
+    counts[names] = _NEVER
+    return None
