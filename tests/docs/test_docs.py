@@ -56,7 +56,7 @@ def test_a_page_can_be_followed_to_its_end(page: str, tmp_path: Path) -> None:
     shells = any(block.language == "sh" for block in pages.blocks(page))
     environment = pages.clean_environment(tmp_path / "environment") if shells else {}
     ran, left_out = pages.follow(
-        page, tmp_path / "here", {**environment, "LIDARSPEC_EXAMPLES": "4"}
+        page, tmp_path / "here", {**environment, "LIDARSPEC_EXAMPLES": "8"}
     )
     assert ran
     if left_out:
