@@ -1,11 +1,11 @@
-"""Frames of one type as columns of raw values, in stream order.
+"""Tables: frames of one type as columns of raw values, in stream order.
 
-Two kinds with one behaviour: `Rows` loads fields from bytes by their layout, `Records` collects
-them from what construct parsed. Arrays of variable length are padded to the longest with zeros;
-`counts` has the lengths.
+There are two tables with the same interface. `Rows` loads fields from bytes by their layout.
+`Records` collects them from Containers that construct parsed. Arrays of variable length are padded
+with zeros to the longest; `counts` returns the lengths.
 
-Parts, which are frames within a frame, are a table of their own, without padding, with the row of
-their frame for each.
+Parts (frames within a frame) form a table of their own, without padding. `parts` also returns the
+frame that contains each part.
 """
 
 from __future__ import annotations
@@ -36,39 +36,44 @@ class Table(Protocol):
     def raw(self, path: str) -> NDArray[Any]:
         """Return raw values, shape (n, *lengths of its axes), in native byte order.
 
-        The value is 0 if a frame lacks the field or element.
+        Values of a missing field or element are 0.
         """
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
-        """Return which frames have the field, (n,), or which elements have it.
+        """Return which frames have the field, (n,), or None if all have it.
 
-        Elements are given if not all elements of a frame have the field. Returns None if all have
-        it.
+        If only some elements of a frame have the field, the result has an entry for each element.
         """
 
     def counts(self, axis: str) -> NDArray[np.intp]:
-        """The length of an array in each frame, (n,)."""
+        """Return the length of an array in each frame, (n,)."""
 
     def length(self, axis: str) -> int:
-        """The longest length of an array."""
+        """Return the maximum length of an array."""
 
     @property
     def sizes(self) -> NDArray[np.intp]:
-        """The bytes of each frame, (n,)."""
+        """The size of each frame in bytes, (n,)."""
 
     def frame(self, index: int) -> bytes:
-        """The bytes of one frame."""
+        """Return the bytes of one frame."""
 
     def take(self, which: NDArray[np.intp]) -> Table:
-        """A table of the frames that indices pick, in their order."""
+        """Return a table of the frames at these indices, in this order."""
 
     def parts(self, axis: str, kind: str = "") -> tuple[Table, NDArray[np.intp]]:
-        """The parts of one kind, in stream order, and the frame that each is in, (k,)."""
+        """Return the parts of one kind, in stream order, and the frame of each, (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Frames of one layout: where they stand in the table, and their bytes, one frame a row."""
+    """Frames of one layout.
+
+    Attributes:
+        layout: their layout.
+        where: their indices in the table, (k,).
+        rows: their bytes, one frame per row, (k, layout.size).
+    """
 
     layout: Layout
     where: NDArray[np.intp]
@@ -82,7 +87,7 @@ class Rows:
         self.schema = schema
         self.groups = [group for group in groups if len(group.where)]
         self._length = sum(len(group.where) for group in self.groups)
-        self._order: NDArray[np.intp] | slice | None = None
+        self._stream_order: NDArray[np.intp] | slice | None = None
         self._walks: dict[str, list[tuple[Group, NDArray[np.uint8], Walked]]] = {}
 
     def __len__(self) -> int:
@@ -99,21 +104,21 @@ class Rows:
             only = self.groups[0].layout.leaves.get(path)
         else:
             only = None
-        if (
-            only is not None and 0 not in only.shape
-        ):  # arrays in an empty one have no length, whatever their count says
-            values = _loaded(only, around, self.groups[0].rows)
-            if self._order is None:
-                self._order = _order(self.groups[0].where)
-            if not isinstance(self._order, slice):
-                values = values[self._order]
+        # The general path handles empty arrays: an array in an empty one has length 0, whatever
+        # its declared length.
+        if only is not None and 0 not in only.shape:
+            values = _load_leaf(only, around, self.groups[0].rows)
+            if self._stream_order is None:
+                self._stream_order = _stream_order(self.groups[0].where)
+            if not isinstance(self._stream_order, slice):
+                values = values[self._stream_order]
             return values.astype(info.dtype, copy=False)
         lengths = [self.length(axis) for axis in info.axes]
         column = np.zeros((len(self), *lengths), info.dtype)
         for group in self.groups:
             leaf = group.layout.leaves.get(path)
             if leaf is not None and 0 not in leaf.shape:
-                values = _loaded(leaf, around, group.rows)
+                values = _load_leaf(leaf, around, group.rows)
                 corner: Any = (group.where, *(slice(0, length) for length in values.shape[1:]))
                 column[corner] = values
         return column
@@ -136,7 +141,7 @@ class Rows:
         return found
 
     def length(self, axis: str) -> int:
-        """The longest length of an array."""
+        """Return the maximum length of an array."""
         declared = self.schema.arrays.get(axis)
         if isinstance(declared, int):
             return declared
@@ -171,21 +176,21 @@ class Rows:
                     self.schema,
                     [Group(only.layout, counted(len(which)), only.rows[which[0] : which[-1] + 1])],
                 )
-        place = np.full(len(self), -1, np.intp)
-        place[which] = np.arange(len(which))
+        new_index = np.full(len(self), -1, np.intp)
+        new_index[which] = np.arange(len(which))
         groups = []
         for group in self.groups:
-            there = place[group.where]
-            kept = there >= 0
-            groups.append(Group(group.layout, there[kept], group.rows[kept]))
+            indices = new_index[group.where]
+            is_kept = indices >= 0
+            groups.append(Group(group.layout, indices[is_kept], group.rows[is_kept]))
         return Rows(self.schema, groups)
 
     def walks(self, axis: str) -> list[tuple[Group, NDArray[np.uint8], Walked]]:
-        """Return the groups that have these parts, with buffer and walked parts.
+        """Return the groups that have these parts, each with a buffer and the parts in it.
 
-        The result is cached.
+        The result is cached, because the clock, the points and each kind of parts use it.
         """
-        if axis not in self._walks:  # the clock, the points and each kind of parts ask for them
+        if axis not in self._walks:
             regions = ((group, group.layout.regions.get(axis)) for group in self.groups)
             self._walks[axis] = [
                 (group, *region.in_rows(group.rows))
@@ -209,23 +214,23 @@ class Rows:
             counts[piece.frames] += 1
         ranks = list[NDArray[np.intp]]()
         following = np.cumsum(counts) - counts
-        for piece in found:  # round after round: in each a frame has one part at most
+        for piece in found:  # in the order of the rounds; each frame has at most one part in each
             ranks.append(following[piece.frames])
             following[piece.frames] += 1
-        return Rows(schema(node.kinds[wanted].root), _by_layout(found, ranks)), np.repeat(
+        return Rows(schema(node.kinds[wanted].root), _group_by_layout(found, ranks)), np.repeat(
             np.arange(len(self)), counts
         )
 
     @staticmethod
     def joined(tables: Sequence[Rows]) -> Rows:
-        """Several tables of one frame type, one after another."""
+        """Return several tables of one frame type as one table, in this order."""
         alone = [table.groups[0] for table in tables if len(table.groups) == 1]
         if (
             len(alone) == len(tables)
             and len({id(group.layout) for group in alone}) == 1
             and all(ascends(group.where) for group in alone)
         ):
-            rows = _stacked([group.rows for group in alone])
+            rows = _stack_rows([group.rows for group in alone])
             return Rows(tables[0].schema, [Group(alone[0].layout, counted(len(rows)), rows)])
         found: dict[int, list[Group]] = {}
         start = 0
@@ -235,14 +240,14 @@ class Rows:
                     Group(group.layout, group.where + start, group.rows)
                 )
             start += len(table)
-        return Rows(tables[0].schema, [_merged(groups) for groups in found.values()])
+        return Rows(tables[0].schema, [_merge_groups(groups) for groups in found.values()])
 
 
-def _loaded(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
-    """Return raw values without the axes of which only one element is requested.
+def _load_leaf(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
+    """Return raw values without the axes that an index of the path selects one element of.
 
     Args:
-        around: the arrays that the field is in.
+        around: the axes of the field without these indices.
     """
     values = leaf.load(rows)
     if len(around) == len(leaf.info.axes):
@@ -261,7 +266,7 @@ def _loaded(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
 class _Piece:
     """Parts of one layout that were found in one round.
 
-    `spots` are their offsets in the buffer, `frames` the frames that they are in, (k,).
+    `spots` are their offsets in the buffer, (k,). `frames` are the indices of their frames, (k,).
     """
 
     buffer: NDArray[np.uint8]
@@ -270,11 +275,11 @@ class _Piece:
     frames: NDArray[np.intp]
 
 
-def _by_layout(pieces: Sequence[_Piece], ranks: Sequence[NDArray[np.intp]]) -> list[Group]:
-    """Return parts as groups, with their rows in stream order.
+def _group_by_layout(pieces: Sequence[_Piece], ranks: Sequence[NDArray[np.intp]]) -> list[Group]:
+    """Return the parts of all pieces as groups of one layout each.
 
     Args:
-        ranks: the positions of the parts of each piece in that order.
+        ranks: for each piece, the indices of its parts in the table of parts.
     """
     members: dict[int, dict[int, list[tuple[_Piece, NDArray[np.intp]]]]] = {}
     for piece, own in zip(pieces, ranks, strict=True):
@@ -282,18 +287,19 @@ def _by_layout(pieces: Sequence[_Piece], ranks: Sequence[NDArray[np.intp]]) -> l
             (piece, own)
         )
     return [
-        _merged([_gathered(parts) for parts in buffers.values()]) for buffers in members.values()
+        _merge_groups([_gather_parts(parts) for parts in buffers.values()])
+        for buffers in members.values()
     ]
 
 
-def _gathered(parts: Sequence[tuple[_Piece, NDArray[np.intp]]]) -> Group:
-    """Parts of one layout in one buffer as a group."""
-    where, spots = (
-        np.concatenate(arrays)
-        for arrays in zip(*((own, piece.spots) for piece, own in parts), strict=True)
-    )
-    order, (first, _) = np.empty(len(where), np.intp), parts[0]
-    if len(where) and where.max() == len(where) - 1:  # these are all: no need to sort
+def _gather_parts(parts: Sequence[tuple[_Piece, NDArray[np.intp]]]) -> Group:
+    """Return pieces of one layout in one buffer as a group, in stream order."""
+    where = np.concatenate([own for _, own in parts])
+    spots = np.concatenate([piece.spots for piece, _ in parts])
+    first, _ = parts[0]
+    if len(where) and where.max() == len(where) - 1:
+        # The group has all parts of the table, so that `where` is a permutation: no need to sort.
+        order = np.empty(len(where), np.intp)
         order[where] = np.arange(len(where))
     else:
         order = np.argsort(where)
@@ -304,18 +310,19 @@ def _gathered(parts: Sequence[tuple[_Piece, NDArray[np.intp]]]) -> Group:
     )
 
 
-def _merged(groups: list[Group]) -> Group:
+def _merge_groups(groups: list[Group]) -> Group:
+    """Return groups of one layout as one group."""
     if len(groups) == 1:
         return groups[0]
     return Group(
         groups[0].layout,
         np.concatenate([g.where for g in groups]),
-        _stacked([g.rows for g in groups]),
+        _stack_rows([g.rows for g in groups]),
     )
 
 
-def _stacked(parts: list[Bytes2D]) -> Bytes2D:
-    """Rows under one another; no copy where they stand so in memory already."""
+def _stack_rows(parts: list[Bytes2D]) -> Bytes2D:
+    """Stack arrays of rows, without a copy if they follow one another in memory."""
     base = parts[0].base
     width = parts[0].shape[1]
     spots = [_address(part) for part in parts]
@@ -343,15 +350,15 @@ def _address(array: NDArray[Any]) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def _order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
-    """What puts the rows of the only group into stream order: nothing, where they are in it."""
+def _stream_order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
+    """Return an index that puts the rows of a single group into stream order."""
     if ascends(where):
         return slice(None)
     return np.argsort(where)
 
 
 def ascends(where: NDArray[np.intp]) -> bool:
-    """Whether frames stand in the table in the order of their rows."""
+    """Return whether indices ascend strictly."""
     return is_counted(where) or bool(
         np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0)
     )
@@ -374,17 +381,19 @@ class Records:
     def raw(self, path: str) -> NDArray[Any]:
         info, (base, indices) = self.schema.fields[path], without_indices(path)
         if indices:
-            return self._element(self.raw(base), base, indices)[0]
-        found = [_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed]
+            return self._take_element(self.raw(base), base, indices)[0]
+        found = [
+            _collect_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed
+        ]
         lengths = [self.length(axis) for axis in info.axes]
         if info.dtype is not None:
             dtype = info.dtype
         else:
-            dtype = _common_type(found, path)
+            dtype = _find_common_dtype(found, path)
         column = np.zeros((len(self), *lengths), dtype)
         try:
             for index, value in enumerate(found):
-                _put(column, index, value)
+                _copy_value(column, index, value)
         except (IndexError, TypeError, ValueError):
             raise SpecError(
                 "its branches give values of different shapes, and a column has one", path=path
@@ -397,24 +406,33 @@ class Records:
         axes, (base, indices) = self.schema.fields[path].axes, without_indices(path)
         if indices:
             known = self.present(base)
-            elements, inside = self._element(
+            elements, inside = self._take_element(
                 self.raw(base) if known is None or known.ndim == 1 else known, base, indices
             )
             if known is None:
                 return inside
             return inside & known if known.ndim == 1 else deep(inside, elements.ndim - 1) & elements
-        there = [_there(_values(parsed, path.split("."), len(axes))) for parsed in self._parsed]
+        there = [
+            _find_present(_collect_values(parsed, path.split("."), len(axes)))
+            for parsed in self._parsed
+        ]
         if not any(isinstance(one, list) for one in there):
             return np.array(there, np.bool_)
         column = np.zeros((len(self), *map(self.length, axes)), np.bool_)
         for index, one in enumerate(there):
-            _put(column, index, one)
+            _copy_value(column, index, one)
         return column
 
-    def _element(
+    def _take_element(
         self, column: NDArray[Any], path: str, indices: Mapping[str, int]
     ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Some element of a field's arrays, and which frames have it, (n,)."""
+        """Return one element of a field's arrays, and which frames have it, (n,).
+
+        Args:
+            column: the values of the whole field, (n, *lengths).
+            path: the path of the field, without indices.
+            indices: the index in each axis to remove. A negative index counts from the end.
+        """
         inside = np.ones(len(self), np.bool_)
         axes = self.schema.fields[path].axes
         for axis in sorted(indices, key=axes.index, reverse=True):
@@ -441,7 +459,7 @@ class Records:
         return np.array([max(found, default=0) for found in lengths], np.intp)
 
     def length(self, axis: str) -> int:
-        """The longest length of an array."""
+        """Return the maximum length of an array."""
         declared = self.schema.arrays.get(axis)
         if isinstance(declared, int):
             return declared
@@ -450,7 +468,7 @@ class Records:
     def _lengths(self, axis: str) -> list[set[int]]:
         brackets = axis.count("[]")
         names = axis.removesuffix("[]" * brackets).split(".")
-        return [_counts(parsed, names, brackets) for parsed in self._parsed]
+        return [_collect_lengths(parsed, names, brackets) for parsed in self._parsed]
 
     @property
     def sizes(self) -> NDArray[np.intp]:
@@ -487,23 +505,28 @@ class Records:
 
     @staticmethod
     def joined(tables: Sequence[Records]) -> Records:
-        """Several tables of one frame type, one after another."""
+        """Return several tables of one frame type as one table, in this order."""
         parsed = [item for table in tables for item in table._parsed]
         return Records(
             tables[0].schema, parsed, [frame for table in tables for frame in table._frames]
         )
 
 
-def _values(parsed: Any, names: list[str], axes: int) -> Any:
-    """The value, or nested lists of values, under a path; None where a branch leaves it out."""
+def _collect_values(parsed: Any, names: list[str], axes: int) -> Any:
+    """Return the value at a path, or nested lists of values; None if a branch omits it.
+
+    Args:
+        names: the names that lead to the value.
+        axes: the number of arrays that the value is in.
+    """
     if isinstance(parsed, list):
-        return _elements(parsed, names, axes)
+        return _collect_elements(parsed, names, axes)
     for index, name in enumerate(names):
         if not isinstance(parsed, dict) or name not in parsed or parsed[name] is None:
             return None
         parsed = parsed[name]
         if isinstance(parsed, list):
-            return _elements(parsed, names[index + 1 :], axes)
+            return _collect_elements(parsed, names[index + 1 :], axes)
     if isinstance(parsed, bytes):
         return list(parsed)
     if not isinstance(parsed, dict):
@@ -511,31 +534,31 @@ def _values(parsed: Any, names: list[str], axes: int) -> Any:
     return None
 
 
-def _elements(parsed: list[Any], names: list[str], axes: int) -> list[Any] | None:
-    found = [_values(element, names, axes) for element in parsed]
+def _collect_elements(parsed: list[Any], names: list[str], axes: int) -> list[Any] | None:
+    found = [_collect_values(element, names, axes) for element in parsed]
     if found and all(part is None for part in found):
         return None
     return found
 
 
-def _there(value: Any) -> Any:
-    """Whether there is a value; lists of that where some elements have one and others not."""
+def _find_present(value: Any) -> Any:
+    """Return whether there is a value; nested lists of booleans if some elements lack it."""
     if not isinstance(value, list):
         return value is not None
-    found = [_there(part) for part in value]
+    found = [_find_present(part) for part in value]
     if all(part is True for part in found):
         return True
     return found
 
 
-def _put(column: NDArray[Any], index: int, value: Any) -> None:
+def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
     """Copy a value or nested lists to an index of a padded array.
 
-    Lists may differ in length.
+    Lists shorter than the array leave the padding as it is.
     """
     if isinstance(value, list) and column.ndim > 2:
         for place, part in enumerate(value):
-            _put(column[index], place, part)
+            _copy_value(column[index], place, part)
     elif isinstance(value, list):
         column[index, : len(value)] = [0 if part is None else part for part in value]
     elif column.ndim == 1 or isinstance(value, bool):
@@ -544,14 +567,18 @@ def _put(column: NDArray[Any], index: int, value: Any) -> None:
         raise ValueError("a value where another frame has an array")
 
 
-def _counts(value: Any, names: list[str], brackets: int) -> set[int]:
-    """Return the lengths of an array under a path in one parsed frame.
+def _collect_lengths(value: Any, names: list[str], brackets: int) -> set[int]:
+    """Return all lengths that an array has in one parsed frame.
 
-    If the array is in another array, the lengths of all its instances are returned.
+    An array inside another array may have several lengths.
+
+    Args:
+        names: the names that lead to the array.
+        brackets: the number of "[]" after the names: how many arrays are directly around it.
     """
     if isinstance(value, list) and (names or brackets):
         below = brackets if names else brackets - 1
-        return {length for part in value for length in _counts(part, names, below)}
+        return {length for part in value for length in _collect_lengths(part, names, below)}
     if names:
         if isinstance(value, dict):
             found = value.get(names[0])
@@ -559,24 +586,28 @@ def _counts(value: Any, names: list[str], brackets: int) -> set[int]:
             found = None
         if found is None:
             return set()
-        return _counts(found, names[1:], brackets)
+        return _collect_lengths(found, names[1:], brackets)
     if isinstance(value, list | bytes):
         return {len(value)}
     return set()
 
 
-def _numbers(value: Any) -> Iterator[Any]:
-    """The values in lists of them."""
+def _iter_numbers(value: Any) -> Iterator[Any]:
+    """Yield the values in nested lists, without None."""
     if isinstance(value, list):
         for part in value:
-            yield from _numbers(part)
+            yield from _iter_numbers(part)
     elif value is not None:
         yield value
 
 
-def _common_type(found: list[Any], path: str) -> np.dtype[Any]:
-    """The type of a column of which the spec does not say one."""
-    values = list(_numbers(found))
+def _find_common_dtype(found: list[Any], path: str) -> np.dtype[Any]:
+    """Return the dtype for the values of a field without a declared dtype.
+
+    Raises:
+        SpecError: if the values are not numbers, or do not fit into 64 bits.
+    """
+    values = list(_iter_numbers(found))
     if not all(isinstance(value, int | float) for value in values):
         raise SpecError(
             "its values are no numbers, and a column holds numbers: declare a text as bytes",

@@ -1,11 +1,11 @@
-"""The places of all fields of a frame, as data, and loading by them.
+"""Layouts: the positions of all fields of a frame, and the functions that load and store by them.
 
-They are offsets, strides, bits, constants and checksums.
+A `Layout` describes the frames of one header variant: offsets, strides, bits, constants and
+checksums. `lidarspec.frames.layout_tree` makes it from the frame tree. A `Leaf` is the position of
+one field. A `Seal` is a checksum with the bytes that it covers.
 
-A `Layout` holds for frames of one kind of header; `lidarspec.frames.layout_tree` makes it from the
-frame tree. A `Leaf` is the place of one field, a `Seal` a checksum with the bytes that it covers.
-All work on many frames at a time, given as rows of bytes; constants are compared in words of up to
-eight bytes.
+Most functions work on many frames at once, given as rows of bytes. Constants are compared in words
+of up to eight bytes.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ def span(rows: Bytes2D) -> NDArray[np.uint8]:
 def rows_at(
     buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True
 ) -> NDArray[np.uint8]:
-    """Return `size` bytes from each of these offsets on, (n, size).
+    """Return `size` bytes from each of these offsets, (n, size).
 
-    Nothing is copied if they are back to back.
+    Nothing is copied if the rows are back to back.
 
     Args:
-        gathered: C-contiguous; else no copy either where they stand at one distance, and each row
-            is contiguous by itself.
+        gathered: True returns a C-contiguous array. False also avoids the copy if the offsets are
+            evenly spaced; then only each row by itself is contiguous.
     """
     count = len(offsets)
     if not count or not size:
@@ -102,16 +102,18 @@ def rows_at(
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
-    """The place of one field.
+    """The position of one field.
 
     Attributes:
-        info: what the field is.
+        info: the field.
         offset: of its first element, in bytes from the start of the frame.
-        shape, strides: number of elements and bytes from one to the next along each of its arrays.
-        wire: its type with byte order where it can be read directly, else None.
-        elements: else the bits of each element of the innermost array (one, if that is not inside
-            the bit block).
-        size: bytes of one element, or of the block that it is a part of.
+        shape: the number of elements along each of its arrays.
+        strides: bytes from one element to the next along each array; an array inside a bit block
+            has no stride.
+        wire: its dtype with byte order if it can be read directly, else None.
+        elements: without `wire`, the bits of each element of the innermost array. One entry if
+            that array is not inside the bit block.
+        size: bytes of one element, or of the bit block that the field is in.
     """
 
     info: FieldInfo
@@ -123,7 +125,11 @@ class Leaf:
     elements: tuple[BitField, ...] = ()
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """The raw values of frames given as rows of bytes, shape (n, *shape), native byte order."""
+        """Return the raw values of frames given as rows of bytes.
+
+        Returns:
+            shape (n, *shape), in native byte order.
+        """
         if self.wire is not None:
             return self._view(rows, self.wire, 0).astype(self._native)
         assert self.info.dtype is not None
@@ -133,7 +139,7 @@ class Leaf:
         return np.stack(columns, axis=-1)
 
     def scalar(self, frame: bytes | memoryview) -> int:
-        """The raw value of an integer field outside arrays, in the bytes of one frame."""
+        """Return the raw value of an integer field outside arrays in one frame."""
         if self.elements:
             return self.elements[0].value(frame[self.offset : self.offset + self.size])
         assert self.wire is not None
@@ -148,12 +154,14 @@ class Leaf:
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None = None,
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """Read an integer outside arrays in the candidates at these offsets.
-
-        Returns the indices of the candidates that have it (None: all), and its values.
+        """Read an integer field outside arrays in the candidates at these offsets.
 
         Args:
-            stops: where the candidates end; by default with the buffer.
+            stops: the offset after the last byte of each candidate; by default the end of the
+                buffer.
+
+        Returns:
+            The indices of the candidates that have the field (None: all), and the values.
         """
         there = offsets + (self.offset + self.size) <= (len(buffer) if stops is None else stops)
         which = None if there.all() else np.flatnonzero(there)
@@ -166,7 +174,7 @@ class Leaf:
         return which, self._alone.load(rows_at(buffer, spots, self.size))
 
     def of(self, frame: bytes | memoryview) -> int | None:
-        """Its value in the first bytes of a frame; None where they end before it does."""
+        """Return its value in the first bytes of a frame, None if they are too few."""
         if self.offset + self.size <= len(frame):
             return self.scalar(frame)
         return None
@@ -188,7 +196,7 @@ class Leaf:
         """Return the offset of each element, row by row.
 
         Args:
-            depth: number of arrays that are followed; by default all outside a bit block.
+            depth: the number of arrays to iterate over; by default all outside a bit block.
         """
         offsets = [self.offset]
         for length, stride in list(zip(self.shape, self.strides, strict=False))[:depth]:
@@ -198,7 +206,8 @@ class Leaf:
     def raw(self, given: Sequence[Any]) -> NDArray[Any]:
         """Return physical values of n frames as raw values, (n, ...).
 
-        The result has room for the arrays that the field is in. Bytes are padded with zeros.
+        Values with fewer axes than the field get trailing axes of length 1. Bytes are padded with
+        zeros.
         """
         if self.info.kind == "bytes":
             size = self.shape[-1]
@@ -224,7 +233,7 @@ class Leaf:
 
     @property
     def _packed(self) -> bool:
-        """Whether the innermost array is inside the bit block, and so has no stride."""
+        """Return whether the innermost array is inside the bit block, and so has no stride."""
         return len(self.shape) > len(self.strides)
 
     def _view(self, rows: Bytes2D, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
@@ -254,7 +263,7 @@ class Leaf:
         return total.astype(self.info.dtype, copy=False)
 
     def _within(self, rows: Bytes2D, part: Segment, wide: np.dtype[Any]) -> NDArray[Any]:
-        """Values of bits within one byte."""
+        """Return values of bits within one byte."""
         total = self._view(rows, np.dtype("u1"), part.byte).astype(wide)
         if part.mask != 0xFF:
             total &= wide.type(part.mask)
@@ -262,9 +271,10 @@ class Leaf:
         return total
 
     def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
-        """Return values of contiguous bits, extracted from words that end with them.
+        """Return values of contiguous bits, read from words that end with the last of these bytes.
 
-        Returns None if there are not enough bytes before them, or if they do not fit into a word.
+        Returns None if the bits are not contiguous, if they do not fit into a word, or if the word
+        would begin before the frame.
         """
         if element.run is None:
             return None
@@ -284,7 +294,7 @@ class Leaf:
     def held(self) -> tuple[int, int]:
         """The offsets of its first byte and of the byte after its last.
 
-        They are those of its first instance in its arrays.
+        In arrays, they belong to the first element.
         """
         if not self.elements:
             return self.offset, self.offset + self.size
@@ -294,17 +304,15 @@ class Leaf:
     def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
         """Return one element of its arrays, None if it does not exist.
 
-        A negative index counts from the last element.
-
-        An array that others stand in remains, with that one element, so that each array keeps its
-        place.
+        A negative index counts from the last element. An array with an index that contains an
+        array without one keeps its axis, with length 1.
         """
         info = element_of(self.info, path, indices)
         if info is None:
             return None
         offset = self.offset
         shape = list(self.shape)
-        elements = self.elements
+        bit_fields = self.elements
         kept = 0
         for place, (axis, length) in enumerate(zip(self.info.axes, self.shape, strict=True)):
             index = indices.get(axis, 0)
@@ -315,7 +323,7 @@ class Leaf:
             elif place < len(self.strides):
                 offset, shape[place] = offset + index % length * self.strides[place], 1
             else:
-                elements = (elements[index],)
+                bit_fields = (bit_fields[index],)
         if self.info.kind == "bytes" and info.kind == "int":
             size = 1
         else:
@@ -327,15 +335,16 @@ class Leaf:
             shape=tuple(shape[:kept]),
             strides=self.strides[:kept],
             size=size,
-            elements=elements,
+            elements=bit_fields,
         )
 
     def at(self, offset: int) -> Leaf:
-        """The field with its place counted from `offset`."""
+        """Return the leaf with its offset counted from `offset`."""
         return replace(self, offset=self.offset - offset)
 
 
-#: the checksums of frames by one of their seals, (n,); None where its algorithm is to compute them.
+#: Computes the checksums of one seal for many frames, (n,). Returns None if the algorithm of the
+#: seal has to compute them.
 Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
 
 
@@ -344,18 +353,18 @@ class Seal:
     """A checksum of the frame.
 
     `leaves` are the fields that hold it, low bits first. `spans` are the byte ranges that it
-    covers.
+    covers. `absent` are stored values that mean "not filled".
     """
 
     leaves: tuple[Leaf, ...]
     spans: tuple[tuple[int, int], ...]
     algorithm: Checksum
     absent: tuple[int, ...]
-    #: the byte after the sealed struct.
+    #: the offset after the last byte of the sealed struct.
     end: int = 0
 
     def covers(self, other: Seal) -> bool:
-        """Whether a field that holds another checksum is among what this one covers."""
+        """Return whether it covers a field that holds the other checksum."""
         return any(
             start < leaf.held[1] and leaf.held[0] < end
             for start, end in self.spans
@@ -363,7 +372,7 @@ class Seal:
         )
 
     def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
-        """The values that stand in the frames, (n,)."""
+        """Return the checksums that the frames contain, (n,)."""
         if len(self.leaves) == 1 and self.leaves[0].info.kind != "bytes":
             return self.leaves[0].load(rows).astype(np.uint64)
         total = np.zeros(len(rows), np.uint64)
@@ -371,23 +380,23 @@ class Seal:
         for leaf in self.leaves:
             values = leaf.load(rows).astype(np.uint64)
             if leaf.info.kind == "bytes":
-                values = np.bitwise_or.reduce(values << self._powers(leaf), axis=1)
+                values = np.bitwise_or.reduce(values << self._byte_shifts(leaf), axis=1)
             total |= values << np.uint64(shift)
             shift += leaf.info.bits
         return total
 
-    def _powers(self, leaf: Leaf) -> NDArray[np.uint64]:
-        """By how many bits each byte of a field of bytes is shifted, (k,)."""
+    def _byte_shifts(self, leaf: Leaf) -> NDArray[np.uint64]:
+        """Return by how many bits to shift each byte of a bytes field, (k,)."""
         powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
         if self.algorithm.order == "little":
             return powers
         return powers[::-1]
 
     def computed(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.uint64]:
-        """The values that should stand there, (n,).
+        """Compute the checksums of the frames, (n,).
 
         Args:
-            sums: asked first, before the algorithm.
+            sums: computes the checksums; if it returns None, the algorithm does.
         """
         values = None if sums is None else sums(self, rows)
         if values is None:
@@ -395,18 +404,18 @@ class Seal:
         return values
 
     def fill(self, rows: Bytes2D) -> None:
-        """Write the right value into each frame."""
+        """Compute the checksums and write them into the frames."""
         values = self.computed(rows)
         shift = 0
         for leaf in self.leaves:
             part = (values >> np.uint64(shift)) & np.uint64((1 << leaf.info.bits) - 1)
             if leaf.info.kind == "bytes":
-                part = part[:, None] >> self._powers(leaf) & np.uint64(0xFF)
+                part = part[:, None] >> self._byte_shifts(leaf) & np.uint64(0xFF)
             leaf.store(rows, part)
             shift += leaf.info.bits
 
     def sound(self, frame: bytes) -> bool:
-        """Whether one frame carries the right value, or one that means "not filled"."""
+        """Return whether one frame has a correct checksum, or a value that means "not filled"."""
         stored = shift = 0
         for leaf in self.leaves:
             if leaf.info.kind == "bytes":
@@ -419,9 +428,9 @@ class Seal:
             else:
                 stored |= (leaf.scalar(frame) & ((1 << leaf.info.bits) - 1)) << shift
             shift += leaf.info.bits
-        parts = [frame[a:b] for a, b in self.spans]
+        covered = [frame[start:end] for start, end in self.spans]
         return stored in self.absent or stored == self._single(
-            parts[0] if len(parts) == 1 else b"".join(parts)
+            covered[0] if len(covered) == 1 else b"".join(covered)
         )
 
     @cached_property
@@ -434,7 +443,7 @@ class Seal:
         A value that means "not filled" counts as correct.
 
         Args:
-            sums: computes the checksums; by default the algorithm does.
+            sums: computes the checksums, as for `computed`.
         """
         stored = self.stored(rows)
         if self.absent:
@@ -455,12 +464,13 @@ class Seal:
 class Condition:
     """A condition that frames have to meet.
 
-    Either one field has one of some values, or a formula of fields is not 0.
+    Without `formula`, the field must have one of its allowed values. With `formula`, the result
+    must not be 0.
     """
 
     fields: tuple[FieldInfo, ...]
     formula: Formula | None
-    #: of a check, its path; else that of the field.
+    #: the path of the check, or of the field.
     path: str = ""
 
     @classmethod
@@ -468,7 +478,7 @@ class Condition:
     def of(cls, what: FieldInfo | Check) -> Condition:
         """Return the condition of a check, or of the allowed values of a field.
 
-        All layouts share one object.
+        The result is cached, so that all layouts share one object.
         """
         if isinstance(what, FieldInfo):
             return cls((what,), None, what.path)
@@ -495,7 +505,7 @@ class Condition:
 
     @cached_property
     def _dtype(self) -> Any:
-        """The smallest type that holds whatever the formula comes to on the way."""
+        """The smallest integer type that holds all intermediate values of the formula."""
         most = max(width(part) for part in parts(self.formula or 0))
         if most < 15:
             return np.int16
@@ -505,22 +515,22 @@ class Condition:
 
 
 class Test(Protocol):
-    """What frames have to pass, field by field."""
+    """A test of fields that valid frames pass."""
 
     @property
     def fields(self) -> tuple[FieldInfo, ...]:
-        """What it is made of."""
+        """The fields that the test reads."""
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
         """Return whether the test holds, element by element.
 
         Args:
-            raw: the raw values of those of its fields that a layout has.
+            raw: the raw values of its fields, by path, without the fields that a layout lacks.
         """
 
 
 def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
-    """In which frames, given as rows of bytes, a test holds everywhere, (n,)."""
+    """Return which frames, given as rows of bytes, pass a test with all elements, (n,)."""
     raw = {
         info.path: leaf.load(rows)
         for info in test.fields
@@ -533,10 +543,13 @@ def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A header that leads to no frame.
+    """The result for a header that leads to no layout.
 
-    The frame is too long (after these `constants`), a constant is wrong, or an expression of the
-    plugin failed.
+    Attributes:
+        error: the error of a plugin expression that failed.
+        by_constant: True if a constant is wrong. Without it and `error`, the frame is too long.
+        constants: if the frame is too long, its constants before that point. A candidate without
+            them is refused because of a constant instead.
     """
 
     error: PluginError | None = None
@@ -546,22 +559,22 @@ class Refused:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A frame of one kind of header.
+    """The layout of the frames of one header variant.
 
     Attributes:
         size: in bytes.
-        leaves: where each field stands, by path.
+        leaves: the position of each field, by path.
         constants: offset -> (mask, value).
         seals: its checksums, inner ones first.
         places: byte range of each named part outside arrays.
-        branches: what each `When` and `Select` chose.
-        following: fields whose values follow from this header in a frame that is made, and those;
-            they are not asked of one that comes.
-        lengths: of each array, by its axis; 0 in an array without elements.
-        regions: where parts are that are frames in themselves, by their axis.
-        held: as constants, what fields have to be that say how long parts are.
-        conditions: that the values of its fields have to meet.
-        notes: what is worked out from the layout and kept with it.
+        branches: the branch that each `When` and `Select` takes.
+        following: fields whose values follow from the header, with these values. They are written
+            when a frame is built, and not checked when it is parsed.
+        lengths: the length of each array, by its axis; 0 for an array inside an empty array.
+        regions: the `Region` of each sequence of parts (frames within the frame), by its axis.
+        held: the values of the fields that declare the sizes of parts, in the form of `constants`.
+        conditions: conditions that the values of its fields have to meet.
+        notes: cache for results derived from the layout.
     """
 
     size: int
@@ -579,9 +592,9 @@ class Layout:
 
     @cached_property
     def known(self) -> Mapping[int, tuple[int, int]]:
-        """The bits of a frame that follow from its header: offset -> (mask, value).
+        """The bits that all frames of this layout have: offset -> (mask, value).
 
-        They belong to constants and lengths.
+        They are the constants and the lengths in `held`.
         """
         both = dict(self.constants)
         for spot, (mask, value) in self.held.items():
@@ -591,11 +604,12 @@ class Layout:
 
     @cached_property
     def _mask(self) -> int:
-        """These bits, as one number."""
+        """The masks of `known` as one little-endian number."""
         return sum(mask << 8 * spot for spot, (mask, _) in self.known.items())
 
     @cached_property
     def _value(self) -> int:
+        """The values of `known` as one little-endian number."""
         return sum(value << 8 * spot for spot, (_, value) in self.known.items())
 
     def sound(self, frame: bytes) -> bool:
@@ -614,7 +628,7 @@ class Layout:
         )
 
     def meets(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Which frames, given as rows of bytes, meet all conditions, (n,)."""
+        """Return which frames, given as rows of bytes, meet all conditions, (n,)."""
         met = np.ones(len(rows), np.bool_)
         for condition in self.conditions:
             met &= self.meets_condition(condition, rows)
@@ -645,38 +659,43 @@ def set_bits(rows: Bytes2D, known: Mapping[int, tuple[int, int]]) -> None:
         rows[:, offsets] = rows[:, offsets] & ~bits[:, 0] | bits[:, 1]
 
 
-#: constants: offset, mask, value.
+#: constant bytes: (offset, mask, value) of each.
 Marks = tuple[tuple[int, int, int], ...]
 
-#: some of them side by side: offset, type, mask (None: all bits), value.
+#: constant bytes that are compared at once: offset, dtype, mask (None: all bits), value.
 Word = tuple[int, np.dtype[Any], Any, Any]
 
 
 def marks(constants: Mapping[int, tuple[int, int]]) -> Marks:
-    """Constants by offset, as mask and value: whole bytes first, which tell the most."""
+    """Return constants sorted by offset, whole bytes first because they are more distinctive."""
     found = [(spot, mask, value) for spot, (mask, value) in constants.items()]
     return tuple(sorted(found, key=lambda mark: (mark[1] != 0xFF, mark[0])))
 
 
 @lru_cache(maxsize=2048)
 def words(constants: Marks) -> tuple[Word, ...]:
-    """Constants as few words of 1, 2, 4 or 8 bytes, each from a byte with a constant to another."""
+    """Return constants merged into words of 1, 2, 4 or 8 bytes.
+
+    The first and the last byte of each word have constant bits.
+    """
     left = {spot: (mask, value) for spot, mask, value in constants}
     found = list[Word]()
     while left:
         first = min(left)
         size = next(size for size in (8, 4, 2, 1) if first + size - 1 in left)
-        parts = [left.pop(spot, (0, 0)) for spot in range(first, first + size)]
+        pairs = [left.pop(spot, (0, 0)) for spot in range(first, first + size)]
         dtype = np.dtype(f"<u{size}")
-        mask, value = (np.frombuffer(bytes(part), dtype)[0] for part in zip(*parts, strict=True))
+        mask, value = (
+            np.frombuffer(bytes(column), dtype)[0] for column in zip(*pairs, strict=True)
+        )
         found.append(
-            (first, dtype, None if all(part[0] == 0xFF for part in parts) else mask, value)
+            (first, dtype, None if all(pair[0] == 0xFF for pair in pairs) else mask, value)
         )
     return tuple(found)
 
 
 def exclude(some: Marks, others: Marks) -> bool:
-    """Whether no frame has some constants and the others as well."""
+    """Return whether two sets of constants contradict each other."""
     known = {spot: (mask, value) for spot, mask, value in others}
     both = [
         (mask & known[spot][0], value ^ known[spot][1])
@@ -687,13 +706,13 @@ def exclude(some: Marks, others: Marks) -> bool:
 
 
 def equal(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
-    """Whether a constant is right, for what stands at its place in each frame, of that shape."""
+    """Return whether values read at the offset of a word match it, element by element."""
     _, _, mask, value = word
     return np.asarray((found if mask is None else found & mask) == value)
 
 
 def right(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
-    """Which rows have all constants, (n,); None where all have."""
+    """Return which rows have all constants, (n,); None if all rows do."""
     held: NDArray[np.bool_] | None = None
     for word in constants:
         spot, dtype, _, _ = word

@@ -1,8 +1,10 @@
-"""Parse one frame: by its layout if it is sound, else with the first fault as a `WireError`.
+"""Parse one frame into a Container of raw values.
 
-All values of a field are unpacked at once, for all elements of the arrays that it is in, and the
-containers and lists around them are made from the innermost ones outwards (`unpacked`). Frames that
-have no layout are parsed by construct (`lidarspec.frames.plain`).
+A valid frame is read by its layout. An invalid frame raises a `WireError` with its first fault.
+
+For each field, the values of all array elements are unpacked at once. The containers and lists are
+then built around them, the innermost first (`unpacked`). construct parses the frames that have no
+layout (`lidarspec.frames.plain`).
 """
 
 from __future__ import annotations
@@ -54,13 +56,13 @@ def parse(
     """Return the Container of raw values of exactly one frame.
 
     Args:
-        frame: its type; found out if left out.
+        frame: the frame type; by default the type that fits.
         verify: False accepts wrong constants, a wrong checksum and trailing bytes.
-        units: scaled values in the units of their fields.
+        units: True converts scaled fields to their units.
 
     Raises:
-        WireError: for bytes that are no such frame.
-        UnknownFrame: for a type that the sensor does not have.
+        WireError: if the bytes are not a valid frame of this type.
+        UnknownFrame: if the sensor has no such frame type.
     """
     data = _as_bytes(data)
     found = _find_sound(sensor, data, frame)
@@ -68,19 +70,19 @@ def parse(
         found = _parse_unsound(sensor, data, frame, verify=verify)
     name, values = found
     if units:
-        return _physical(schema(sensor.frames[name].tree).all_fields, values, "")
+        return _convert_units(schema(sensor.frames[name].tree).all_fields, values, "")
     return values
 
 
 def identify(sensor: Sensor, data: bytes, *, frame: str | None = None) -> str:
-    """Return the name of the frame type that bytes are a frame of.
+    """Return the frame type of one frame.
 
     Args:
-        frame: the only type that is tried; by default all.
+        frame: the only type to try; by default all types.
 
     Raises:
-        WireError: for bytes that are no frame, by the type that they come nearest to.
-        UnknownFrame: for a type that the sensor does not have.
+        WireError: if no type fits; it describes the fault of the closest type.
+        UnknownFrame: if the sensor has no such frame type.
     """
     data = _as_bytes(data)
     found = _find_sound(sensor, data, frame)
@@ -97,7 +99,7 @@ def _as_bytes(data: bytes) -> bytes:
 
 
 def _find_sound(sensor: Sensor, data: bytes, frame: str | None) -> tuple[str, Any] | None:
-    """Return type and values of a frame that nothing is wrong with; else None."""
+    """Return type and values of a frame if it is valid, else None."""
     names = sensor.frames if frame is None or frame not in sensor.frames else (frame,)
     for name in names:
         try:
@@ -105,14 +107,14 @@ def _find_sound(sensor: Sensor, data: bytes, frame: str | None) -> tuple[str, An
         except SpecError:
             raise
         except Exception:
-            continue  # an expression of the plugin failed: the search for the fault meets it again
+            continue  # an expression of the plugin failed: `_parse_unsound` raises its error
         if found is not None:
             return name, found[0]
     return None
 
 
 def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
-    """Return the values of a sound frame; else None."""
+    """Return the values of a frame in a 1-tuple if it is valid, else None."""
     layouts = frame_layouts(frame)
     if isinstance(layouts, NotCompilable):
         values, size = parse_plain(frame, data)
@@ -133,10 +135,10 @@ def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
 def _parse_unsound(
     sensor: Sensor, data: bytes, frame: str | None, *, verify: bool
 ) -> tuple[str, Any]:
-    """Return type and values of a frame that something is wrong with, if that is not verified.
+    """Return type and values of an invalid frame.
 
     Raises:
-        WireError: if it is verified, or the values cannot be read.
+        WireError: if `verify` is True, or if the values cannot be read.
     """
     if frame is not None:
         if frame not in sensor.frames:
@@ -155,11 +157,11 @@ def _parse_unsound(
                 return likely.frame, _parse_unverified(sensor, likely.frame, data)
             except WireError:
                 continue
-    raise _likeliest(sensor, data, faults)
+    raise _find_likeliest(sensor, data, faults)
 
 
 def _find_fault(sensor: Sensor, name: str, data: bytes) -> WireError:
-    """Return what is wrong with the bytes of a frame."""
+    """Return the first fault of an invalid frame as an error."""
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilable):
         return plain_fault(sensor, name, data)
@@ -177,30 +179,30 @@ def _find_fault(sensor: Sensor, name: str, data: bytes) -> WireError:
             data=data,
         )
     examined = examine(frame.tree, decoded.struct, frame.room)
-    return _error_of(sensor, name, data, examined, decoded.offset)
+    return _find_field_fault(sensor, name, data, examined, decoded.offset)
 
 
-def _error_of(
-    sensor: Sensor, name: str, data: bytes, examined: Examined, place: Callable[[int], int]
+def _find_field_fault(
+    sensor: Sensor, name: str, data: bytes, examined: Examined, to_wire_offset: Callable[[int], int]
 ) -> WireError:
-    """Return the first fault of a frame as an error.
+    """Return the first fault of the fields of a frame as an error.
 
     Args:
-        place: from an offset in the frame to one on the wire.
+        to_wire_offset: converts an offset in the frame to an offset on the wire.
     """
-    fault = _search(sensor, name, diagnose.find_fault, examined)
-    if fault is None:  # a plugin's checksum that gives another value each time
+    fault = _run_search(sensor, name, diagnose.find_fault, examined)
+    if fault is None:  # a checksum of a plugin returned a different value this time
         return WireError("not a valid frame", sensor=sensor.id, frame=name, data=data)
-    return _wire_error(sensor, name, data, fault, place)
+    return _to_wire_error(sensor, name, data, fault, to_wire_offset)
 
 
-def _search(
+def _run_search(
     sensor: Sensor,
     name: str,
     find: Callable[[Examined], diagnose.Fault | None],
     examined: Examined,
 ) -> diagnose.Fault | None:
-    """Return what a search finds.
+    """Run a search for a fault and return its result.
 
     Raises:
         SpecError: if an expression or a checksum of the struct raises.
@@ -211,10 +213,14 @@ def _search(
         raise struct_error(error, path=name, sensor=sensor.id) from error
 
 
-def _wire_error(
-    sensor: Sensor, name: str, data: bytes, fault: diagnose.Fault, place: Callable[[int], int]
+def _to_wire_error(
+    sensor: Sensor,
+    name: str,
+    data: bytes,
+    fault: diagnose.Fault,
+    to_wire_offset: Callable[[int], int],
 ) -> WireError:
-    offset = place(fault.offset)
+    offset = to_wire_offset(fault.offset)
     return WireError(
         fault.reason(offset),
         offset=offset,
@@ -228,10 +234,10 @@ def _wire_error(
 
 
 def _parse_unverified(sensor: Sensor, name: str, data: bytes) -> Any:
-    """Return the values of a frame whatever is wrong with it.
+    """Return the values of a frame without verifying it.
 
     Raises:
-        WireError: if its bytes end, or lead to no layout.
+        WireError: if the frame is truncated, or if its header leads to no layout.
     """
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilable):
@@ -241,50 +247,55 @@ def _parse_unverified(sensor: Sensor, name: str, data: bytes) -> Any:
             raise plain_fault(sensor, name, data) from None
     decoded = frame_coder(frame).decode(data)
     examined = examine(frame.tree, decoded.struct, frame.room)
-    shortage = _search(sensor, name, diagnose.find_shortage, examined)
+    shortage = _run_search(sensor, name, diagnose.find_shortage, examined)
     if shortage is not None or examined.layout is None:
         assert shortage is not None
-        raise _wire_error(sensor, name, data, shortage, decoded.offset)
+        raise _to_wire_error(sensor, name, data, shortage, decoded.offset)
     return unpacked(frame.tree, examined.layout, decoded.struct[: examined.layout.size])
 
 
-def _physical(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:
-    """Values with those of scaled fields in their units."""
+def _convert_units(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:
+    """Return values with scaled fields converted to their units."""
     if isinstance(value, dict):
         return Container(
-            (name, _physical(fields, part, f"{path}.{name}".strip(".")))
+            (name, _convert_units(fields, part, f"{path}.{name}".strip(".")))
             for name, part in value.items()
         )
     if isinstance(value, list):
-        return ListContainer(_physical(fields, part, path) for part in value)
+        return ListContainer(_convert_units(fields, part, path) for part in value)
     if value is not None and path in fields and fields[path].scaled:
         return fields[path].physical(value)
     return value
 
 
 def unpacked(root: Node, layout: Layout, frame: bytes) -> Any:
-    """The Container of raw values of a sound frame of this layout."""
-    reader = layout.notes.get(_reader) or layout.notes.setdefault(
-        _reader, _reader(root, "", layout, 1)
+    """Return the Container of raw values of a frame with this layout."""
+    reader = layout.notes.get(_make_reader) or layout.notes.setdefault(
+        _make_reader, _make_reader(root, "", layout, 1)
     )
     return reader(frame)[0]
 
 
-#: the byte orders in which a bit block is a number.
-ENDS: tuple[Literal["little"], Literal["big"]] = ("little", "big")
+#: the byte orders in which a bit block can be read as one number.
+BYTE_ORDERS: tuple[Literal["little"], Literal["big"]] = ("little", "big")
 
-#: from the bytes of a frame (below a bit block: from the numbers in its place) to the values of a
-#: part of it, one for each element of the arrays that it is in, row by row.
+#: Reads one part of a frame, and returns one value for each element of the arrays around the part,
+#: row by row. The argument is the bytes of the frame. For a part of a bit block, it is the numbers
+#: that the blocks are read as.
 Reader = Callable[[Any], Sequence[Any]]
 
 
-def _reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
-    """What reads a part of frames of a layout; `count`: how often it is in one."""
+def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
+    """Return the reader of a part of the frames of one layout.
+
+    Args:
+        count: the number of instances of the part in a frame.
+    """
     if count == 0:
-        return _no_values
+        return _read_no_values
     match node:
         case Sealed():
-            return _reader(node.body, path, layout, count)
+            return _make_reader(node.body, path, layout, count)
         case Struct():
             members = [
                 (member.name, f"{node.path}.{member.name}".strip("."), member)
@@ -292,42 +303,42 @@ def _reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
                 if member.name
             ]
             readers = tuple(
-                (name, _reader(member, below, layout, count)) for name, below, member in members
+                (name, _make_reader(member, below, layout, count))
+                for name, below, member in members
             )
-            return functools.partial(_containers, readers, count)
+            return functools.partial(_read_containers, readers, count)
         case Repeat():
             if not isinstance(node.count, int):
                 length = layout.lengths[node.axis]
             else:
                 length = node.count
             return functools.partial(
-                _lists, _reader(node.element, path, layout, count * length), count, length
+                _read_lists, _make_reader(node.element, path, layout, count * length), count, length
             )
         case Parts():
-            return functools.partial(_parts_of, layout.regions[node.axis])
+            return functools.partial(_read_parts, layout.regions[node.axis])
         case When() | Select():
-            return _reader(layout.branches[node], path, layout, count)
+            return _make_reader(layout.branches[node], path, layout, count)
         case Number() | Blob():
-            return _words(node, layout.leaves[path])
+            return _make_field_reader(node, layout.leaves[path])
         case Block():
-            return _bits(node, path, layout, count)
-    return functools.partial(_nothing, count)
+            return _make_block_reader(node, path, layout, count)
+    return functools.partial(_read_nothing, count)
 
 
-def _no_values(frame: bytes) -> Sequence[Any]:
+def _read_no_values(frame: bytes) -> Sequence[Any]:
     return ()
 
 
-def _nothing(count: int, frame: bytes) -> Sequence[None]:
+def _read_nothing(count: int, frame: bytes) -> Sequence[None]:
     return (None,) * count
 
 
-def _containers(
+def _read_containers(
     members: Sequence[tuple[str, Reader]], count: int, frame: bytes
 ) -> Sequence[Container]:
-    containers = [
-        Container() for _ in range(count)
-    ]  # made empty and filled by name, which takes half the time
+    # Filling empty containers by name takes half the time of making them from their items.
+    containers = [Container() for _ in range(count)]
     if count == 1:
         for name, reader in members:
             containers[0][name] = reader(frame)[0]
@@ -338,7 +349,7 @@ def _containers(
     return containers
 
 
-def _lists(elements: Reader, count: int, length: int, frame: bytes) -> Sequence[ListContainer]:
+def _read_lists(elements: Reader, count: int, length: int, frame: bytes) -> Sequence[ListContainer]:
     values = elements(frame)
     if length:
         return [
@@ -348,7 +359,7 @@ def _lists(elements: Reader, count: int, length: int, frame: bytes) -> Sequence[
     return [ListContainer() for _ in range(count)]
 
 
-def _parts_of(region: Region, frame: bytes) -> Sequence[ListContainer]:
+def _read_parts(region: Region, frame: bytes) -> Sequence[ListContainer]:
     return [
         ListContainer(
             unpacked(kind.node.root, layout, part) for kind, layout, part in region.listed(frame)
@@ -356,8 +367,8 @@ def _parts_of(region: Region, frame: bytes) -> Sequence[ListContainer]:
     ]
 
 
-def _unpack(offsets: Sequence[int], order: str, code: str) -> Reader:
-    """What unpacks a value of this format code at each offset; they ascend."""
+def _make_unpacker(offsets: Sequence[int], order: str, code: str) -> Reader:
+    """Return a reader of one value of a format code at each offset, in ascending order."""
     form = list[str]()
     size = struct.calcsize(order + code)
     end = offsets[0]
@@ -367,55 +378,57 @@ def _unpack(offsets: Sequence[int], order: str, code: str) -> Reader:
     return functools.partial(struct.Struct(order + "".join(form)).unpack_from, offset=offsets[0])
 
 
-def _words(node: Number | Blob, leaf: Leaf) -> Reader:
+def _make_field_reader(node: Number | Blob, leaf: Leaf) -> Reader:
     if isinstance(node, Blob):
-        return _unpack(leaf.offsets(len(leaf.shape) - 1), "<", f"{leaf.size}s")
+        return _make_unpacker(leaf.offsets(len(leaf.shape) - 1), "<", f"{leaf.size}s")
     offsets = leaf.offsets()
     order = "<" if node.order == "little" else ">"
     if leaf.wire is None:
-        raw = _unpack(offsets, order, f"{leaf.size}s")
-        return _labelled(
-            leaf.info, functools.partial(_integers, raw, node.order, node.kind == "int")
+        raw = _make_unpacker(offsets, order, f"{leaf.size}s")
+        return _add_labels(
+            leaf.info, functools.partial(_read_integers, raw, node.order, node.kind == "int")
         )
     if node.kind == "float":
         return functools.partial(
-            _floats, _unpack(offsets, order, leaf.wire.char), offsets, node.size
+            _read_floats, _make_unpacker(offsets, order, leaf.wire.char), offsets, node.size
         )
-    return _labelled(
+    return _add_labels(
         leaf.info,
-        _unpack(
+        _make_unpacker(
             offsets, order, leaf.wire.char if node.size < 8 else "Q" if node.kind == "uint" else "q"
         ),
     )
 
 
-def _integers(
+def _read_integers(
     raw: Reader, order: Literal["little", "big"], signed: bool, frame: bytes
 ) -> Sequence[int]:
     return [int.from_bytes(value, order, signed=signed) for value in raw(frame)]
 
 
-def _floats(numbers: Reader, offsets: Sequence[int], size: int, frame: bytes) -> Sequence[float]:
-    """Floats, of which a NaN keeps its bits."""
+def _read_floats(
+    numbers: Reader, offsets: Sequence[int], size: int, frame: bytes
+) -> Sequence[float]:
+    """Return floats; a NaN becomes a `WireNaN`, which keeps its bits."""
     values = numbers(frame)
     if all(value == value for value in values):
         return values
     return [
-        value if value == value else WireNaN(frame[at : at + size])
-        for value, at in zip(values, offsets, strict=True)
+        value if value == value else WireNaN(frame[offset : offset + size])
+        for value, offset in zip(values, offsets, strict=True)
     ]
 
 
-def _labelled(info: FieldInfo, numbers: Reader) -> Reader:
+def _add_labels(info: FieldInfo, numbers: Reader) -> Reader:
     if info.labels:
-        return functools.partial(_names, _Names(info), numbers)
+        return functools.partial(_look_up_labels, _LabelCache(info), numbers)
     return numbers
 
 
-class _Names(dict[int, Any]):
-    """The results of an Enum by raw value.
+class _LabelCache(dict[int, Any]):
+    """Cache of the values of an Enum, by raw value.
 
-    construct makes a new object for each value; these are made once.
+    construct makes a new object for each value. The cache makes each object once.
     """
 
     def __init__(self, info: FieldInfo) -> None:
@@ -425,44 +438,48 @@ class _Names(dict[int, Any]):
         return unnamed(raw)
 
 
-def _names(names: _Names, numbers: Reader, frame: bytes) -> Sequence[Any]:
+def _look_up_labels(names: _LabelCache, numbers: Reader, frame: bytes) -> Sequence[Any]:
     return [names[value] for value in numbers(frame)]
 
 
-def _bits(node: Block, path: str, layout: Layout, count: int) -> Reader:
-    """Return a reader of bit blocks, which returns the parts of each block.
+def _make_block_reader(node: Block, path: str, layout: Layout, count: int) -> Reader:
+    """Return a reader of bit blocks.
 
-    A block is read as one number, in the byte order that leaves fewer runs of bits.
+    Each block is read as one number. The byte order is the one that splits its parts into fewer
+    runs of bits.
     """
     leaf = layout.leaves[".".join(name for name in (path, *node.parts[0].names) if name)]
     offsets = leaf.offsets()
     orders = [
-        (order, [_runs(part.bits, node.size, order) for part in node.parts]) for order in ENDS
+        (order, [_runs(part.bits, node.size, order) for part in node.parts])
+        for order in BYTE_ORDERS
     ]
     order, numbers = min(orders, key=lambda each: sum(len(runs) for runs in each[1]))
     readers = [
-        _labelled(part.info, _part(part.bits, runs))
+        _add_labels(part.info, _make_bits_reader(part.bits, runs))
         for part, runs in zip(node.parts, numbers, strict=True)
     ]
-    parts = _grouped(
+    parts = _group_parts(
         [(part.bits.keys, reader) for part, reader in zip(node.parts, readers, strict=True)], count
     )
     code = {1: "B", 2: "H", 4: "I", 8: "Q"}.get(node.size)
     if code is not None:
-        blocks = _unpack(offsets, "<" if order == "little" else ">", code)
+        blocks = _make_unpacker(offsets, "<" if order == "little" else ">", code)
     else:
-        blocks = functools.partial(_integers, _unpack(offsets, "<", f"{node.size}s"), order, False)
-    return functools.partial(_parts, parts, blocks)
+        blocks = functools.partial(
+            _read_integers, _make_unpacker(offsets, "<", f"{node.size}s"), order, False
+        )
+    return functools.partial(_read_block_parts, parts, blocks)
 
 
-def _parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[Any]:
+def _read_block_parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[Any]:
     return parts(blocks(frame))
 
 
 def _runs(
     field: BitField, size: int, order: Literal["little", "big"]
 ) -> list[tuple[int, int, int]]:
-    """Return the runs of bits of a part, if its block is read as one number.
+    """Return the runs of bits of a part in a block that is read as one number.
 
     Each run is (lowest bit in the block, mask, lowest bit of the value).
     """
@@ -484,19 +501,19 @@ def _runs(
     return runs
 
 
-def _part(field: BitField, runs: Sequence[tuple[int, int, int]]) -> Reader:
-    """What takes the values of a part out of its blocks."""
+def _make_bits_reader(field: BitField, runs: Sequence[tuple[int, int, int]]) -> Reader:
+    """Return a reader of one part from the numbers of its blocks."""
     low, mask, target = runs[0]
     if len(runs) > 1 or field.signed or field.flag or target:
-        return functools.partial(_joined, field, runs)
-    return functools.partial(_masked, low, mask)
+        return functools.partial(_join_runs, field, runs)
+    return functools.partial(_extract_bits, low, mask)
 
 
-def _masked(low: int, mask: int, blocks: Sequence[int]) -> Sequence[int]:
+def _extract_bits(low: int, mask: int, blocks: Sequence[int]) -> Sequence[int]:
     return [block >> low & mask for block in blocks]
 
 
-def _joined(
+def _join_runs(
     field: BitField, runs: Sequence[tuple[int, int, int]], blocks: Sequence[int]
 ) -> Sequence[int]:
     values = [
@@ -510,20 +527,20 @@ def _joined(
     return values
 
 
-def _grouped(parts: Sequence[tuple[tuple[str | int, ...], Reader]], count: int) -> Reader:
-    """The structs and arrays of a bit block around its parts."""
+def _group_parts(parts: Sequence[tuple[tuple[str | int, ...], Reader]], count: int) -> Reader:
+    """Return a reader that builds the structs and arrays of a bit block from its parts."""
     if not parts[0][0]:
         return parts[0][1]
     groups: dict[str | int, list[tuple[tuple[str | int, ...], Reader]]] = {}
     for (key, *below), reader in parts:
         groups.setdefault(key, []).append((tuple(below), reader))
-    readers = tuple((key, _grouped(group, count)) for key, group in groups.items())
+    readers = tuple((key, _group_parts(group, count)) for key, group in groups.items())
     if isinstance(readers[0][0], str):
-        return functools.partial(_containers, readers, count)  # type: ignore[arg-type]
-    return functools.partial(_rows, tuple(reader for _, reader in readers))
+        return functools.partial(_read_containers, readers, count)  # type: ignore[arg-type]
+    return functools.partial(_read_rows, tuple(reader for _, reader in readers))
 
 
-def _rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContainer]:
+def _read_rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContainer]:
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
 
 
@@ -539,9 +556,9 @@ def layout_of(sensor: Sensor, name: str, data: bytes) -> Layout | Refused | None
 
 
 def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
-    """Return how far a frame type matched before it failed.
+    """Return a sort key for how far a frame type matched before it failed.
 
-    A frame of exactly this size, or one at the start, precedes all others.
+    It is highest for a whole frame with trailing bytes, or with a wrong checksum only.
     """
     if sensor.frames[fault.frame].wire is not None:
         return 0, fault.offset
@@ -555,7 +572,7 @@ def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
     return (0, fault.offset)
 
 
-def _likeliest(sensor: Sensor, data: bytes, faults: list[WireError]) -> WireError:
+def _find_likeliest(sensor: Sensor, data: bytes, faults: list[WireError]) -> WireError:
     best = max(faults, key=functools.partial(_progress, sensor))
     if best.offset > 0 or len(sensor.frames) == 1:
         return best

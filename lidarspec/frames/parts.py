@@ -1,10 +1,11 @@
-"""Parts, which are frames within a frame: where each stands, in many frames at once.
+"""Find the parts of many frames at once. Parts are frames within a frame.
 
-What comes next is known when the part before it is: its size says where it begins. So frames are
-walked through side by side, a part of each in every round: which kind it is, by its constants;
-which layout its header has; and whether there is a further one. What is found is places in a
-buffer, as frames are, so that parts have layouts, rows and tables like any frame
-(`frame_table.Rows.parts`).
+The offset of a part is known as soon as the size of the part before it is. So the search runs in
+rounds, and each round finds the next part of every frame: its kind, by its constants; its layout,
+by its header; and whether another part follows.
+
+The results are offsets in a buffer, as for frames. So parts have layouts, rows and tables like
+frames (`frame_table.Rows.parts`).
 """
 
 from __future__ import annotations
@@ -33,15 +34,23 @@ from lidarspec.spec import tree
 
 Offsets = NDArray[np.intp]
 
-#: what became of the parts of a frame: all are there, the bytes end before, a length that cannot
-#: be, constants of no kind, a plugin failed.
-FOUND, CUT_OFF, LENGTH, CONSTANT, FAILED = range(5)
-#: of a part whose own struct alone says how long it is.
+#: status of a frame: all parts were found.
+FOUND = 0
+#: status of a frame: its bytes end before its last part does.
+CUT_OFF = 1
+#: status of a frame: a part has an impossible length.
+LENGTH = 2
+#: status of a frame: a part matches the constants of no kind.
+CONSTANT = 3
+#: status of a frame: an expression of a plugin failed.
+FAILED = 4
+
+#: announced size of a part if nothing outside its own struct declares its size.
 ANY = -1
 
 
 class Layouts(Protocol):
-    """The layouts of a frame type or kind of parts, as a `HeaderTree` has them."""
+    """Lookup of the layouts of a frame type or of a kind of parts (implemented by `HeaderTree`)."""
 
     root: tree.Node
     limit: int
@@ -49,21 +58,30 @@ class Layouts(Protocol):
     def classify(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> list[tuple[Layout | Refused, Offsets]]:
-        """Return the candidates at these offsets by layout.
+        """Return the candidates at these offsets, grouped by layout.
 
-        Candidates with an incomplete header are left out. `stops` are the offsets after their last
-        bytes.
+        Candidates with an incomplete header are left out.
+
+        Args:
+            stops: the offset after the last byte of each candidate; by default the end of the
+                buffer.
+
+        Returns:
+            Each layout, or reason for refusal, with the indices of its candidates.
         """
 
     def layout_for(self, read: Callable[[Leaf | Measure], int]) -> Layout:
-        """Return the layout that values of header fields lead to."""
+        """Return the layout for the values of the header fields that `read` returns."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """A kind of parts: its layouts, fields and first constants.
+    """A kind of parts.
 
-    It also has the formula for the length of the next part.
+    Attributes:
+        node: its fields, and the formula for the size of the part after it.
+        layouts: its layouts.
+        prefix: the constants that all its parts begin with: offset -> (mask, value).
     """
 
     node: tree.Kind
@@ -72,36 +90,41 @@ class Kind:
 
     @cached_property
     def start(self) -> tuple[Word, ...]:
-        """The constants that it begins with."""
+        """The constants in `prefix` as words."""
         return words(marks(self.prefix))
 
     @cached_property
     def is_checked(self) -> bool:
-        """Whether it has a checksum of its own, or conditions, or parts with such."""
-        found = tree.nodes(self.node.root)
+        """Whether it has a checksum or conditions, also in parts within it."""
         return any(
             isinstance(node, tree.Sealed | tree.Check)
             or any(info.allowed for info in tree.infos(node))
-            for node in found
+            for node in tree.nodes(self.node.root)
         )
 
     def further(self, layout: Layout) -> tuple[Word, ...]:
-        """The constants of a layout behind those that all begin with."""
-        known = layout.notes.get(Kind)
-        if known is None:
-            left = {
-                spot: byte
-                for spot, byte in layout.constants.items()
-                if self.prefix.get(spot) != byte
+        """Return the constants of a layout that are not in `prefix`."""
+        cached = layout.notes.get(Kind)
+        if cached is None:
+            constants = {
+                offset: constant
+                for offset, constant in layout.constants.items()
+                if self.prefix.get(offset) != constant
             }
-            known = layout.notes[Kind] = words(marks(left))
-        further: tuple[Word, ...] = known
+            cached = layout.notes[Kind] = words(marks(constants))
+        further: tuple[Word, ...] = cached
         return further
 
 
 @dataclass(frozen=True)
 class Rule:
-    """What says where the last part is, as `tree.Parts` does, for one header."""
+    """The values of the formulas of a `tree.Parts` for one header.
+
+    Attributes:
+        count: the number of parts.
+        size: the bytes of the first part.
+        within: the bytes of all parts.
+    """
 
     count: int | None = None
     size: int | None = None
@@ -112,7 +135,10 @@ class Rule:
 class Piece:
     """Parts of one layout that were found in one round.
 
-    `owners` are the frames that they are in, `spots` their offsets in the buffer.
+    Attributes:
+        kind: the index of their kind.
+        owners: the indices of the frames that contain them.
+        spots: their offsets in the buffer.
     """
 
     kind: int
@@ -123,9 +149,13 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Walked:
-    """The parts of n frames, by round.
+    """The parts of n frames.
 
-    `status` is `FOUND` or the reason why not, (n,). `sizes` are the bytes of the parts found, (n,).
+    Attributes:
+        status: `FOUND`, or the reason why not all parts were found, (n,).
+        sizes: the bytes of the parts found in each frame, (n,).
+        rounds: the parts found in each round.
+        errors: errors of plugin expressions.
     """
 
     status: NDArray[np.uint8]
@@ -136,15 +166,16 @@ class Walked:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where the parts of a frame of one kind of header stand.
+    """The position of the parts in frames of one header variant.
 
     Attributes:
-        kinds: of its parts.
-        start: their first byte.
-        rule: what says where the last one is.
-        limit: the longest frame.
-        given: values of fields of the frame around them that they ask for.
-        size: the bytes of all parts; of a region that is still measured, None.
+        node: the parts in the frame tree.
+        kinds: the kinds of parts, in the order in which they are tried.
+        start: the offset of the first part.
+        rule: determines the last part.
+        limit: the maximum size of a frame, in bytes.
+        given: values of the fields of the outer frame that formulas of the parts use.
+        size: the bytes of all parts; None if they are not measured yet.
     """
 
     node: tree.Parts
@@ -157,9 +188,10 @@ class Region:
 
     @property
     def is_measured(self) -> bool:
-        """Whether frames of this layout are known to have these parts.
+        """Whether the layout was chosen by the measured size of its parts.
 
-        Checksums and conditions of the parts may still fail.
+        Then all frames of this layout have these parts. Their checksums and conditions may still
+        fail.
         """
         return self.rule.within is None
 
@@ -174,16 +206,16 @@ class Region:
         """Return the parts of the frames at these offsets.
 
         Args:
-            stops: the offsets after their last bytes; by default the end of the buffer.
+            stops: the offset after the last byte of each frame; by default the end of the buffer.
         """
-        return _Walk(self, buffer, offsets + self.start, stops).walked()
+        return _Walk(self, buffer, offsets + self.start, stops).run()
 
     def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], Walked]:
-        """The parts of whole frames, given as rows of bytes, and the buffer that they stand in."""
+        """Return a buffer with whole frames, given as rows of bytes, and their parts."""
         return span(rows), self.walked(span(rows), np.arange(len(rows)) * rows.strides[0])
 
     def sound(self, frame: bytes) -> bool:
-        """Whether the parts of one frame are sound, and as long as they have to be."""
+        """Return whether all parts of one frame are valid and fill the region exactly."""
         _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
         return (
             not walked.status[0]
@@ -192,7 +224,7 @@ class Region:
         )
 
     def listed(self, frame: bytes) -> list[tuple[Kind, Layout, bytes]]:
-        """The parts of one frame: kind, layout and bytes of each."""
+        """Return kind, layout and bytes of each part of one frame."""
         _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
         pieces = ((piece, int(piece.spots[0])) for pieces in walked.rounds for piece in pieces)
         return [
@@ -202,7 +234,12 @@ class Region:
 
 
 class _Walk:
-    """One walk through the parts of frames that begin at `starts` of a buffer."""
+    """A search for the parts of frames in a buffer.
+
+    Args:
+        starts: the offset of the first part of each frame.
+        stops: the offset after the last byte of each frame; by default the end of the buffer.
+    """
 
     def __init__(
         self, region: Region, buffer: NDArray[np.uint8], starts: Offsets, stops: Offsets | None
@@ -223,16 +260,20 @@ class _Walk:
         self._status = np.zeros(len(starts), np.uint8)
         self._errors = list[PluginError]()
 
-    def walked(self) -> Walked:
-        """What is found."""
+    def run(self) -> Walked:
+        """Find all parts, round by round."""
         rounds = list[list[Piece]]()
         active = np.arange(len(self._starts))
-        while len(active := self._going_on(active, len(rounds))):
-            rounds.append(self._round(active))
+        while len(active := self._select_unfinished(active, len(rounds))):
+            rounds.append(self._find_next_parts(active))
         return Walked(self._status, self._ends - self._starts, rounds, tuple(self._errors))
 
-    def _going_on(self, active: Offsets, number: int) -> Offsets:
-        """The frames that have a further part."""
+    def _select_unfinished(self, active: Offsets, number: int) -> Offsets:
+        """Return the frames that have another part.
+
+        Args:
+            number: of parts that were found in each.
+        """
         if np.count_nonzero(self._status):
             active = active[self._status[active] == FOUND]
         if self._rule.count is not None:
@@ -245,42 +286,43 @@ class _Walk:
             active = active[self._announced[active] != 0]
         return active
 
-    def _round(self, active: Offsets) -> list[Piece]:
+    def _find_next_parts(self, active: Offsets) -> list[Piece]:
         """Find the next part of each frame.
 
-        The first kind with the right constants, as far as the bytes go, takes it.
+        Its kind is the first one with matching constants. In a truncated part, the constants are
+        compared up to its end.
         """
         pieces = list[Piece]()
         for number, kind in enumerate(self._region.kinds):
             if not len(active):
                 break
-            held = self._right(active, kind.start)
-            if held is not None and not np.count_nonzero(held):
-                continue  # one of many kinds, that none of these parts is of
-            if held is None:
+            matches = self._match_constants(active, kind.start)
+            if matches is not None and not np.count_nonzero(matches):
+                continue  # no part in this round is of this kind
+            if matches is None:
                 own = active
                 others = [active[:0]]
             else:
-                own = active[held]
-                others = [active[~held]]
-            seen = np.zeros(len(own), np.bool_)
+                own = active[matches]
+                others = [active[~matches]]
+            has_header = np.zeros(len(own), np.bool_)
             for layout, which in kind.layouts.classify(
                 self._buffer, self._ends[own], self._stops_of(own)
             ):
-                seen[which] = True
+                has_header[which] = True
                 if isinstance(layout, Refused):
-                    self._refused(layout, own[which])
+                    self._set_refusal(layout, own[which])
                     continue
-                theirs = own[which]
-                held = self._right(theirs, kind.further(layout))
-                if held is not None:
-                    others.append(theirs[~held])
-                    theirs = theirs[held]
-                theirs = self._whole(layout, self._measured(layout, theirs))
-                if len(theirs):
-                    pieces.append(Piece(number, layout, theirs, self._ends[theirs]))
-                    self._taken(kind, layout, theirs)
-            self._status[own[~seen]] = CUT_OFF
+                owners = own[which]
+                matches = self._match_constants(owners, kind.further(layout))
+                if matches is not None:
+                    others.append(owners[~matches])
+                    owners = owners[matches]
+                owners = self._check_bounds(layout, self._check_declared_sizes(layout, owners))
+                if len(owners):
+                    pieces.append(Piece(number, layout, owners, self._ends[owners]))
+                    self._advance(kind, layout, owners)
+            self._status[own[~has_header]] = CUT_OFF
             if len(others) == 1:
                 active = others[0]
             else:
@@ -293,13 +335,15 @@ class _Walk:
             return None
         return self._stops[which]
 
-    def _right(self, which: Offsets, constants: tuple[Word, ...]) -> NDArray[np.bool_] | None:
-        """In which frames constants of the next part are right, as `right_at` has it."""
+    def _match_constants(
+        self, which: Offsets, constants: tuple[Word, ...]
+    ) -> NDArray[np.bool_] | None:
+        """Return in which frames the next part has these constants, None if in all."""
         if constants:
             return right_at(self._buffer, self._ends[which], constants, self._stops_of(which))
         return None
 
-    def _refused(self, refused: Refused, which: Offsets) -> None:
+    def _set_refusal(self, refused: Refused, which: Offsets) -> None:
         if refused.error:
             self._status[which] = FAILED
         elif refused.by_constant:
@@ -308,19 +352,24 @@ class _Walk:
             self._status[which] = LENGTH
         self._errors += [refused.error] if refused.error else []
 
-    def _measured(self, layout: Layout, which: Offsets) -> Offsets:
-        """Those whose lengths are right, as far as the bytes go; the status of the others."""
-        if layout.held:
-            held = self._right(which, words(marks(layout.held)))
-        else:
-            held = None
-        if held is None:
-            return which
-        self._status[which[~held]] = LENGTH
-        return which[held]
+    def _check_declared_sizes(self, layout: Layout, which: Offsets) -> Offsets:
+        """Return the frames in which the next part declares its sizes correctly.
 
-    def _whole(self, layout: Layout, which: Offsets) -> Offsets:
-        """Those that have their part whole, and as long as was said; the status of the others."""
+        Sets the status of the others.
+        """
+        if not layout.held:
+            return which
+        matches = self._match_constants(which, words(marks(layout.held)))
+        if matches is None:
+            return which
+        self._status[which[~matches]] = LENGTH
+        return which[matches]
+
+    def _check_bounds(self, layout: Layout, which: Offsets) -> Offsets:
+        """Return the frames in which the next part is complete and has the announced size.
+
+        Sets the status of the others.
+        """
         ends = self._ends[which] + layout.size
         announced = self._announced[which]
         wrong = (ends - self._starts[which] > self._room) | (layout.size == 0)
@@ -334,8 +383,8 @@ class _Walk:
         which = which[self._status[which] == FOUND]
         return which
 
-    def _taken(self, kind: Kind, layout: Layout, which: Offsets) -> None:
-        """Go on behind parts of one layout."""
+    def _advance(self, kind: Kind, layout: Layout, which: Offsets) -> None:
+        """Move to the end of the parts of one layout, and read the size of the next part."""
         formula = kind.node.following
         spots = self._ends[which]
         self._ends[which] = spots + layout.size
@@ -345,13 +394,13 @@ class _Walk:
             announced = layout.leaves[formula.path].read(self._buffer, spots)[1].astype(np.int64)
         else:
             announced = np.array(
-                [self._computed(kind, layout, formula, spot) for spot in spots.tolist()], np.int64
+                [self._evaluate(kind, layout, formula, spot) for spot in spots.tolist()], np.int64
             )
         self._announced[which] = announced
         self._status[which[announced < 0]] = LENGTH
 
-    def _computed(self, kind: Kind, layout: Layout, formula: tree.Formula, spot: int) -> int:
-        """What a formula says in one part; -1 where it fails."""
+    def _evaluate(self, kind: Kind, layout: Layout, formula: tree.Formula, spot: int) -> int:
+        """Return the value of a formula in one part, -1 if it fails."""
         part = self._buffer[spot : spot + layout.size].tobytes()
 
         def read(path: str) -> int | None:
@@ -377,9 +426,13 @@ def right_at(
 ) -> NDArray[np.bool_] | None:
     """Return which candidates have the right constants, (n,); None if all have.
 
-    Constants are compared as far as the bytes go, up to these `stops` or to the end of the buffer.
+    In a truncated candidate, the constants are compared up to its end.
+
+    Args:
+        spots: the offsets of the candidates.
+        stops: the offset after the last byte of each candidate; by default the end of the buffer.
     """
-    held: NDArray[np.bool_] | None = None
+    matches: NDArray[np.bool_] | None = None
     for word in constants:
         spot, dtype, _, _ = word
         room = len(buffer) - spot - dtype.itemsize
@@ -392,17 +445,17 @@ def right_at(
             else:
                 ends = stops.tolist()
             parts = (
-                buffer[at + spot : min(at + spot + dtype.itemsize, end)]
-                for at, end in zip(spots.tolist(), ends, strict=True)
+                buffer[start + spot : min(start + spot + dtype.itemsize, end)]
+                for start, end in zip(spots.tolist(), ends, strict=True)
             )
-            each = np.array([_begins(part.tobytes(), word) for part in parts], np.bool_)
+            each = np.array([_is_start_of(part.tobytes(), word) for part in parts], np.bool_)
         if np.count_nonzero(each) < len(each):
-            held = each if held is None else held & each
-    return held
+            matches = each if matches is None else matches & each
+    return matches
 
 
-def _begins(data: bytes, word: Word) -> bool:
-    """Whether bytes are those of a constant, as far as they go."""
+def _is_start_of(data: bytes, word: Word) -> bool:
+    """Return whether the bytes are the beginning of a constant."""
     mask, value = word[2:]
     every = (1 << 8 * len(data)) - 1
     return (
@@ -413,7 +466,10 @@ def _begins(data: bytes, word: Word) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """The bytes of all parts, read like a field of the header."""
+    """The size of all parts of a region, in the form of a header field.
+
+    A layout is chosen by the values of header fields, and by this size.
+    """
 
     info: tree.FieldInfo
     region: Region
@@ -421,7 +477,7 @@ class Measure:
     def read(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> tuple[Offsets | None, NDArray[Any]]:
-        """As `Leaf.read`; a negative number, of the status, for what cannot be a frame."""
+        """Return sizes as `Leaf.read` does; the negative status if it cannot be a frame."""
         walked = self.region.walked(buffer, offsets, stops)
         values = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))
         cut_off = walked.status == CUT_OFF
@@ -429,19 +485,19 @@ class Measure:
             return None, values
         is_all = cut_off & (
             offsets + self.region.limit <= (len(buffer) if stops is None else stops)
-        )  # no frame is so long that more bytes would help
+        )  # these have as many bytes as the longest frame: more bytes would not help
         values[is_all] = -LENGTH
         there = np.flatnonzero(~cut_off | is_all)
         return there, values[there]
 
     def of(self, frame: bytes | memoryview) -> int | None:
-        """As `Leaf.of`."""
+        """Return the size as `Leaf.of` does."""
         values = self.read(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))[1]
         if len(values):
             return int(values[0])
         return None
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """As `Leaf.load`; -1 where parts are cut off."""
+        """Return sizes as `Leaf.load` does; the negative status if not all parts were found."""
         walked = self.region.in_rows(rows)[1]
         return np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))
