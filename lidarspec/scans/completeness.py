@@ -9,7 +9,8 @@ it counts in one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +106,7 @@ class PacketCounts:
             self.is_broken[row] = False
 
 
-@dataclass(frozen=True)
-class OpenScan:
+class OpenScan(NamedTuple):
     """The counts of a scan that has not ended.
 
     Attributes:
@@ -140,17 +140,18 @@ class OpenScan:
         since = self.since
         if not self.packets:
             since = packets.times.item(0)
-        return replace(
-            self.add_gap(packets),
-            since=since,
-            packets=self.packets + _sum(packets.counts),
-            size=self.size + _sum(packets.sizes),
+        return OpenScan(
+            self.has_start,
+            since,
+            self.packets + _sum(packets.counts),
+            self.size + _sum(packets.sizes),
+            self.lost + _sum(packets.missing),
+            self.is_broken or bool(packets.is_broken.any()),
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
         """Return the scan with only what is missing before some packets."""
-        return replace(
-            self,
+        return self._replace(
             lost=self.lost + _sum(packets.missing),
             is_broken=self.is_broken or bool(packets.is_broken.any()),
         )
