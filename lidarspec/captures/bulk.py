@@ -1,12 +1,11 @@
-"""Datagrams of a capture by the hundred, as arrays: where they stand in one buffer, when they came
-and from whom.
+"""Read the datagrams of a capture in batches: arrays of offsets, times and senders.
 
 Consecutive datagrams of a device differ in their payloads, their times and little else. So
-`CaptureBatches` reads one record as `CaptureReader` does; what was found there holds for every
-record of the same length whose headers have the same bytes, except for those that its headers and
-the file's format name as free. `walked` finds where the records of a buffer begin, and all that are
-`Alike` are then found at once. Whatever is not alike is read one by one, so that the datagrams,
-their order and what is counted are the same, whatever is in the file.
+`CaptureBatches` parses one record as `CaptureReader` does. The result is valid for every record of
+the same length with the same header bytes, apart from the bytes that may vary (see `Pattern` and
+`Headers`). `find_records` returns the offsets of the records in a buffer, and a `RecordKind`
+selects all records of its kind at once. All other records are read one by one, so that datagrams,
+their order and the statistics are those of `CaptureReader` for any file.
 """
 
 from __future__ import annotations
@@ -26,33 +25,34 @@ from lidarspec.frames.layout import rows_at
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
 
-#: bytes of a record, from its start, that are compared at most; longer headers are read plainly.
+#: Largest size of the headers of a record that are compared; records with longer ones are read one
+#: by one.
 WIDEST = 128
 
-#: bytes that a buffer grows to, where the file has so many.
+#: Largest size of a buffer in bytes.
 LARGEST = 2 * LARGEST_BLOCK
 _TRAILER = 4
-# bytes of a record of either format, as far as they tell the length and whether that is sure
+#: Number of bytes at the start of a record, in both formats, that determine its length.
 _HEAD = 16
-#: records of one length in a row for which looking at all of them at once is worth while.
+#: Smallest number of records of one length in a row for which a vectorized check pays.
 _RUN = 16
-#: kinds of datagrams that are known at a time, and that become known in one batch: nobody's capture
-#: makes this slow.
+#: Largest number of kinds that are compared, and that one batch adds. It bounds the work per batch
+#: for any file.
 MOST_KNOWN = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Alike:
-    """What records like one that is known have in common.
+class RecordKind:
+    """The common properties of records that carry datagrams of one sender and size.
 
     Attributes:
-        length: bytes from its start to that of the next one.
-        start, size: of the payload in the record.
-        source: address and port.
-        times: how its time is read.
-        value, mask: its first bytes, in words, and which of their bits count.
-        trailer: type of the word at its end that repeats the length, with its byte order; None
-            where there is none.
+        length: length of the record, bytes.
+        start, size: offset of the payload in the record, and its length.
+        source: address and port of the sender.
+        times: the encoding of the time.
+        value, mask: the first bytes of a record as words, and the bits that have to be equal.
+        trailer: NumPy type of the word at the end that repeats the length, with the byte order;
+            None if there is none.
     """
 
     length: int
@@ -67,8 +67,13 @@ class Alike:
     def find(
         self, storage: NDArray[np.uint8], starts: Indices, lengths: Indices
     ) -> tuple[NDArray[np.bool_] | None, NDArray[np.int64]]:
-        """Which of these records are like it, (n,), or None where all are, and their times, (n,)
-        ns; 128 bytes behind each can be read.
+        """Return which of n records are of this kind, and the times of the matching records.
+
+        Args:
+            storage: the buffer, with at least `WIDEST` bytes from each start on.
+
+        Returns:
+            An (n,) mask, or None if all records match; and the times of those that match, ns.
         """
         same = lengths == self.length
         if not same.all():
@@ -96,24 +101,26 @@ class Alike:
             else:
                 good = np.asarray(good & whole, np.bool_)
         if differs.any():
-            alike: NDArray[np.bool_] = np.asarray(~differs.any(axis=1), np.bool_)
+            equal: NDArray[np.bool_] = np.asarray(~differs.any(axis=1), np.bool_)
             if good is None:
-                good = alike
+                good = equal
             else:
-                good = np.asarray(alike & good, np.bool_)
+                good = np.asarray(equal & good, np.bool_)
         if good is None or good.all():
             return (None, at)
         return (good, at[good])
 
 
-def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike | None:
-    """What records like this one have in common; None where that cannot be told from their first
-    bytes.
+def make_record_kind(
+    record: bytes, headers: Headers, source: Sender, form: Form
+) -> RecordKind | None:
+    """Return the kind of a record; None if its first bytes do not determine the kind.
 
     Args:
-        record: all its bytes.
-        headers, source: what was found in it.
-        form: the file it stands in.
+        record: all bytes of the record.
+        headers: the headers of its packet.
+        source: the sender of its datagram.
+        form: the reader of its file.
     """
     pattern = form.pattern(record)
     if pattern is None:
@@ -125,10 +132,12 @@ def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike 
     size = start + -start % 8
     mask = np.zeros(size, np.uint8)
     mask[:start] = 0xFF
-    told = pattern.uncut if headers.size else ()  # headers say how long the payload is
-    mask[[*pattern.free, *told, *(head + offset for offset in headers.variable_offsets)]] = 0
+    # If the packet has headers, they determine the length of the payload; the original length of
+    # the packet may then vary.
+    uncut = pattern.uncut if headers.size else ()
+    mask[[*pattern.free, *uncut, *(head + offset for offset in headers.variable_offsets)]] = 0
     value = np.frombuffer(record[:start].ljust(size, b"\0"), np.uint64)
-    return Alike(
+    return RecordKind(
         len(record),
         start,
         headers.payload_size,
@@ -140,38 +149,43 @@ def alike(record: bytes, headers: Headers, source: Sender, form: Form) -> Alike 
     )
 
 
-def walked(storage: NDArray[np.uint8], start: int, stop: int, form: Form) -> tuple[Indices, bool]:
-    """Where whole records begin from `start` to `stop`, and where the last one ends; and whether
-    what follows has to be read plainly.
+def find_records(
+    storage: NDArray[np.uint8], start: int, stop: int, form: Form
+) -> tuple[Indices, bool]:
+    """Return the offsets of the whole records from `start` to `stop`.
+
+    Returns:
+        The start of each record, followed by the end of the last one; and whether the next record
+        has to be read by `form.read`.
     """
     pieces: list[Indices] = []
     single: list[int] = []
     at = start
     before = 0
-    patience = 0
+    singles_left = 0  # records to read one by one after a run that ended early
     length = -1
     view = storage.data
     if stop - at < _HEAD:
         return np.array([at], np.intp), False
     while stop - at >= _HEAD and (length := form.length(view, at)) and at + length <= stop:
-        if length == before and not patience and stop - at >= _RUN * length:
-            run = _same(storage, at, (stop - at) // length, length, form)
+        if length == before and not singles_left and stop - at >= _RUN * length:
+            run = _count_equal_lengths(storage, at, (stop - at) // length, length, form)
             pieces += [np.array(single, np.intp), np.arange(at, at + run * length, length)]
             single = []
             at = at + run * length
-            patience = 2 * _RUN if run < _RUN else 0
+            singles_left = 2 * _RUN if run < _RUN else 0
             continue
         single.append(at)
         at = at + length
         before = length
-        patience = max(patience - 1, 0)
+        singles_left = max(singles_left - 1, 0)
     return np.concatenate([*pieces, np.array([*single, at], np.intp)]), length == 0
 
 
-def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form) -> int:
-    """How many of `count` records that would begin every `length` bytes do have that length, until
-    the first that has not.
-    """
+def _count_equal_lengths(
+    storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form
+) -> int:
+    """Return the number of consecutive records of one length, at most `count`."""
     place, kind, claim = form.claim(length)
     claims: NDArray[Any] = np.ndarray((count,), kind, storage, at + place, (length,))
     others = claims != claim
@@ -181,7 +195,7 @@ def _same(storage: NDArray[np.uint8], at: int, count: int, length: int, form: Fo
 
 
 def _windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray[np.uint8]:
-    """The bytes from each start on, (n, width)."""
+    """Return the bytes from each start on, (n, width)."""
     everywhere: NDArray[np.void] = np.ndarray(
         (len(storage) - width + 1,), f"V{width}", storage, 0, (1,)
     )
@@ -193,13 +207,13 @@ class Batch:
     """n datagrams in the order of their arrival.
 
     Attributes:
-        buffer: the bytes that they stand in. Whoever holds it or a view of it keeps it; otherwise
-            it is used again.
-        starts, sizes: (n,) of each payload in the buffer.
-        at: (n,) int64 arrival times, ns since 1970; -1 where nobody knows.
+        buffer: the bytes that contain the payloads. The buffer is reused for later batches unless
+            it or a view of it is still referenced.
+        starts, sizes: (n,) offset and length of each payload in the buffer.
+        at: (n,) int64 arrival times, ns since 1970; -1 if unknown.
         senders: (n,) indices into `names`.
         names: address and port of each sender.
-        gap: whether datagrams before them were passed over.
+        gap: whether datagrams before this batch were skipped.
     """
 
     buffer: NDArray[np.uint8]
@@ -214,19 +228,19 @@ class Batch:
         return len(self.starts)
 
     def data(self, index: int) -> bytes:
-        """The bytes of one datagram."""
+        """Return the bytes of one datagram."""
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
 
     @property
     def joined(self) -> bytes:
-        """The bytes of all of them."""
+        """The bytes of all datagrams, concatenated."""
         size = self.sizes.item(0) if len(self) else 0
         if (self.sizes == size).all():
             return rows_at(self.buffer, self.starts, size).tobytes()
         return b"".join(map(self.data, range(len(self))))
 
     def of(self, origin: Origin) -> Batch:
-        """The datagrams of the batch that come from one address, or one port of it."""
+        """Return the datagrams from one address, or from one port of it."""
         if all(name in origin for name in self.names):
             return self
         wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
@@ -240,7 +254,7 @@ class Batch:
         )
 
     def parts(self, size: int) -> Iterator[Batch]:
-        """The datagrams in stretches of about so many bytes."""
+        """Split the batch into parts of about `size` bytes."""
         ends = np.cumsum(self.sizes)
         start = 0
         while start < len(self):
@@ -260,8 +274,9 @@ class Batch:
             start = stop
 
     def sent(self, found: Frames) -> Iterator[tuple[str, Sender]]:
-        """The types of frames found in these datagrams, and who sent them: of each type again where
-        the sender changes.
+        """Yield the type and sender of the frames found in these datagrams.
+
+        A type is repeated each time its sender changes.
         """
         if len(self.names) == 1:
             yield from (
@@ -278,19 +293,20 @@ class Batch:
 
 
 class CaptureBatches(CaptureReader):
-    """The datagrams of a capture in batches of arrays, which say of each what `CaptureReader` says;
-    read either way, not both.
+    """Reads the datagrams of a capture in batches of arrays.
+
+    Iteration yields single datagrams as in `CaptureReader`. Use only one of both ways.
     """
 
     largest = LARGEST
 
     def batches(self) -> Iterator[Batch]:
-        """The datagrams of the file, as many at once as were read at once."""
-        known: list[Alike] = []
+        """Yield the datagrams of the file, one batch for each buffer that was read."""
+        known: list[RecordKind] = []
         with self._count_end():
             form = self._form = self._form or records(self._source)
             while self._source.begin_record():
-                starts, stuck = walked(
+                starts, stuck = find_records(
                     self._source.storage, self._source.at, self._source.stop, form
                 )
                 if len(starts) < 2 and not stuck and self._source.more():
@@ -304,23 +320,28 @@ class CaptureBatches(CaptureReader):
                     self.stats.datagrams += len(batch)
                     yield batch
                 if self._source.place != place:
-                    continue  # somebody has gone on to another time
+                    continue  # the consumer of the batch called `skip`
                 if isinstance(ended, Damaged):
                     self._skip_damage(form)
                 elif ended is not None:
                     raise ended
-                known = found.still_known()
+                known = found.select_known()
 
 
 class StreamBatches(StreamReader, CaptureBatches):
-    """The packets of a capture of a byte stream, in batches."""
+    """Reads the packets of a capture of a byte stream in batches."""
 
 
 class _Records:
-    """The records that are whole in the window; where there are none, the one that comes next."""
+    """The whole records in the buffer; if there are none, the next record alone."""
 
     def __init__(
-        self, reader: CaptureReader, source: Source, form: Form, starts: Indices, known: list[Alike]
+        self,
+        reader: CaptureReader,
+        source: Source,
+        form: Form,
+        starts: Indices,
+        known: list[RecordKind],
     ) -> None:
         self._reader = reader
         self._source = source
@@ -334,26 +355,25 @@ class _Records:
         )
         self._kinds = np.full(number, -1, np.intp)  # indices into `_known`
         self._at = np.zeros(number, np.int64)
-        self._plain: dict[int, Datagram] = {}
-        self._learnt = self._counted = (
-            0  # kinds; packets that were read plainly and are known all the same
-        )
-        self._only: Alike | None = None  # what all records are like
+        self._singles: dict[int, Datagram] = {}
+        self._kinds_added = 0  # number of kinds that these records added
+        # Packets that were read one by one, are already in the statistics and match a kind.
+        self._matched_singles = 0
+        self._only: RecordKind | None = None  # the kind of all records, if there is only one
         self._section = form.sections
         self._storage = source.storage
-        self._buffer = (
-            source.lent()
-        )  # of another the source may be, once it has looked further ahead
+        # Taken now: the source may switch to another buffer when it reads ahead.
+        self._buffer = source.lent()
 
     def read(self) -> Exception | None:
-        """What ended the reading of the file, if it ended here."""
+        """Read the records; return the exception if one of them cannot be read."""
         if not any(self._match(kind) for kind in range(len(self._known))):
             for index in np.flatnonzero(self._kinds < 0).tolist():
                 if self._kinds[index] >= 0:
-                    continue  # like one that became known meanwhile
+                    continue  # of a kind that an earlier record of the loop added
                 self._source.at = int(self._starts[index])
                 try:
-                    self._read_plainly(index)
+                    self._read_single(index)
                 except (Damaged, Truncated) as ended:
                     self._kinds = self._kinds[:index]
                     return ended
@@ -366,8 +386,8 @@ class _Records:
             self._source.at = int(self._starts[-1])
         return None
 
-    def still_known(self) -> list[Alike]:
-        """What is worth comparing the next records with, most frequent first."""
+    def select_known(self) -> list[RecordKind]:
+        """Return the kinds to compare the next records with, most frequent first."""
         if self._form.sections != self._section:
             return []
         if len(self._known) == 1:
@@ -378,11 +398,11 @@ class _Records:
         ]
 
     def batch(self) -> Batch:
-        """The datagrams of these records."""
-        if self._only is not None and not self._plain:
+        """Return the datagrams of these records."""
+        if self._only is not None and not self._singles:
             return self._uniform(self._only)
         known = np.flatnonzero(self._kinds >= 0)
-        self._reader.stats.packets += len(known) - self._counted
+        self._reader.stats.packets += len(known) - self._matched_singles
         kinds = self._kinds[known]
         names: dict[Sender, int] = {}
         facts = np.array(
@@ -401,16 +421,14 @@ class _Records:
             buffer = self._buffer
         else:
             buffer = np.empty(0, np.uint8)
-        if self._plain:
-            buffer = self._with_plain(buffer, columns, known, names)
+        if self._singles:
+            buffer = self._append_singles(buffer, columns, known, names)
         return Batch(buffer, columns[0], columns[1], columns[2], columns[3], tuple(names))
 
-    def _uniform(self, kind: Alike) -> Batch:
-        """What was read at once, as a batch, where all records are of one kind; columns are of
-        shape (n,).
-        """
+    def _uniform(self, kind: RecordKind) -> Batch:
+        """Return the batch if all records are of one kind."""
         number = len(self._at)
-        self._reader.stats.packets += number - self._counted
+        self._reader.stats.packets += number - self._matched_singles
         sizes, senders = (np.broadcast_to(np.intp(fact), number) for fact in (kind.size, 0))
         return Batch(
             self._buffer,
@@ -421,26 +439,27 @@ class _Records:
             (kind.source,),
         )
 
-    def _with_plain(
+    def _append_singles(
         self,
         buffer: NDArray[np.uint8],
         columns: list[NDArray[Any]],
         known: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
-        """The buffer with the bytes of datagrams that are not in it as they are, which take their
-        places in the columns.
+        """Return the buffer with the datagrams appended that were read one by one.
+
+        Their rows are inserted into `columns` in the order of the records.
         """
-        data = b"".join(datagram.data for datagram in self._plain.values())
+        data = b"".join(datagram.data for datagram in self._singles.values())
         at = len(buffer)
         rows = []
-        for datagram in self._plain.values():
+        for datagram in self._singles.values():
             rows.append(
                 (at, len(datagram.data), datagram.at, names.setdefault(datagram.source, len(names)))
             )
             at += len(datagram.data)
         order = np.argsort(
-            np.concatenate([known, np.array(list(self._plain), np.intp)]), kind="stable"
+            np.concatenate([known, np.array(list(self._singles), np.intp)]), kind="stable"
         )
         columns[:] = [
             np.concatenate(parts)[order]
@@ -448,46 +467,48 @@ class _Records:
         ]
         return np.concatenate([buffer, np.frombuffer(data, np.uint8)])
 
-    def _read_plainly(self, index: int) -> None:
+    def _read_single(self, index: int) -> None:
         self._source.begin_record()
         packet = self._form.read()
         datagram = self._reader.to_datagram(packet)
         if datagram is None or isinstance(packet, Passed):
             return
-        self._plain[index] = datagram
-        if self._learnt == MOST_KNOWN or not self._are_whole:
+        self._singles[index] = datagram
+        if self._kinds_added == MOST_KNOWN or not self._are_whole:
             return
-        places = self._reader.headers(packet)
+        headers = self._reader.headers(packet)
         record = self._storage[self._starts[index] : self._starts[index + 1]].tobytes()
-        if places:
-            found = alike(record, places, datagram.source, self._form)
+        if headers:
+            found = make_record_kind(record, headers, datagram.source, self._form)
         else:
             found = None
         if found is not None:
-            self._learnt += 1
+            self._kinds_added += 1
             self._known = [*self._known, found]
             self._match(len(self._known) - 1, since=index)
             if self._kinds[index] >= 0:
-                del self._plain[index]
-                self._counted += 1
+                del self._singles[index]
+                self._matched_singles += 1
 
     def _match(self, kind: int, since: int = 0) -> bool:
-        """Whether all records are now known; those before `since` were read: what was malformed
-        there may be right by now.
+        """Assign a kind to all records that match it; return whether all records now have a kind.
+
+        Records before `since` were already read and are left out: one that was malformed then may
+        match by now.
         """
-        alike = self._known[kind]
+        template = self._known[kind]
         number = len(self._kinds)
         if kind == since == 0 and self._are_whole:
-            found, at = alike.find(self._storage, self._starts[:number], self._lengths)
+            found, at = template.find(self._storage, self._starts[:number], self._lengths)
             if found is None:
-                self._only = alike
+                self._only = template
                 self._at = at
                 self._kinds = np.broadcast_to(np.intp(0), number)
                 return True
             left = np.flatnonzero(found)
         else:
             left = since + np.flatnonzero(self._kinds[since:] < 0)
-            found, at = alike.find(self._storage, self._starts[left], self._lengths[left])
+            found, at = template.find(self._storage, self._starts[left], self._lengths[left])
             left = left if found is None else left[found]
         self._kinds[left] = kind
         self._at[left] = at

@@ -38,7 +38,7 @@ from lidarspec.captures.records import (
     packet_record,
     records,
     resume,
-    sought,
+    seek_time,
 )
 from lidarspec.captures.source import SMALLEST, Source, Truncated
 from lidarspec.errors import SourceError, UsageError
@@ -192,7 +192,7 @@ class CaptureReader(Closing):
         Returns:
             Whether seeking was possible.
         """
-        return self._form is not None and sought(self._source, self._form, at)
+        return self._form is not None and seek_time(self._source, self._form, at)
 
     def close(self) -> None:
         """Close the file if it was given as a path."""

@@ -1,10 +1,15 @@
-"""The records of pcap and pcapng files: all that is known of the two formats, for one record and
-for many alike.
+"""Read and write the records of pcap and pcapng files.
 
-Hostile input: bytes come in bounded steps (`source`), and each turn of the walkers either advances
-or ends the reading. Damaged input: a doubtful length is believed unless other records begin within
-what it claims, and behind a record that cannot be read `resume` goes to the next place where
-records follow each other.
+`PcapRecords` and `PcapngBlocks` read one record at a time. They also describe a record as a
+`Pattern`, from which `bulk` recognizes similar records without reading each. `seek_time` searches a
+file by capture time.
+
+Hostile input: `source` reads in bounded steps, and each iteration of a loop either advances or ends
+the reading.
+
+Damaged input: an implausible length is accepted unless other records begin within the range that it
+covers. After a record that cannot be read, `resume` continues at the next offset at which one
+record follows another.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
 Capture File Format" (draft-ietf-opsawg-pcapng).
@@ -26,17 +31,18 @@ from numpy.typing import NDArray
 from lidarspec.captures.source import Source, Truncated
 from lidarspec.errors import UsageError
 
-LARGEST_PACKET = 1 << 18  # what libpcap and Wireshark allow on the link types read here
+LARGEST_PACKET = 1 << 18  # the limit of libpcap and Wireshark for the supported link types
 NANOSECOND_MAGIC = b"\x4d\x3c\xb2\xa1"
 
-_PCAP = {  # magic: byte order, nanoseconds in a unit of time
+_PCAP = {  # magic: byte order, nanoseconds per unit of the fraction field
     b"\xd4\xc3\xb2\xa1": ("<", 1000),
     b"\xa1\xb2\xc3\xd4": (">", 1000),
     NANOSECOND_MAGIC: ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
-#: the head of a file that is written, little-endian, and that of a record in it.
+#: Header of a pcap file that is written, little-endian.
 _HEAD = struct.Struct("<4sHHiIII")
+#: Header of a record in it.
 _RECORD = struct.Struct("<IIII")
 _SECTION = b"\x0a\x0d\x0d\x0a"  # the same in both byte orders
 _SECTION_KIND = int.from_bytes(_SECTION)
@@ -46,28 +52,32 @@ _OBSOLETE_PACKET = 2
 _SIMPLE_PACKET = 3
 ENHANCED_PACKET = 6
 _PACKETS = {_OBSOLETE_PACKET, _SIMPLE_PACKET, ENHANCED_PACKET}
-_LAST_KIND = 10  # that the draft gives a number, but for the section's
+_LAST_KIND = 10  # the largest block type of the draft, apart from the section header
+#: Options of an interface block.
 _TIME_RESOLUTION = 9
-_TIME_OFFSET = 14  # options of an interface
+_TIME_OFFSET = 14
 
-LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are passed over unread
-#: places that are looked at together for the next record, and bytes behind each that may be needed:
-#: a packet, its options, a head.
+LARGEST_BLOCK = 1 << 20  # a packet with its options; longer blocks are skipped
+#: Number of offsets that one step of the search for the next record covers.
 _STEP = 1 << 16
+#: Number of bytes after each of these offsets that the search needs: a packet, its options and the
+#: next header.
 _REACH = LARGEST_PACKET + (1 << 12)
-#: bytes before a time that is sought which are read all the same.
+#: `seek_time` stops at most this many bytes before the packet.
 NEAR = 1 << 21
-#: seconds between two packets in a row, and between two of a file, at most, where a record may
-#: begin.
+#: Largest plausible difference of the times of two adjacent packets, in seconds.
 _DAY = 86_400
+#: Largest plausible difference of the times of any two packets of a file, in seconds.
 _YEAR = 31_536_000
 _MOST_INTERFACES = 1024
 _SECOND = 1_000_000_000
-_FURTHEST = 4_000_000_000  # seconds; times further on are read one by one, so that none overflows
+#: Latest time that `Times.ns` converts, in seconds. Records with later times are read one by one,
+#: so that no int64 overflows.
+_FURTHEST = 4_000_000_000
 
 
 class Damaged(Exception):
-    """A record that leaves no way to find the next one, or to understand it."""
+    """A record is invalid, and the start of the next one is unknown."""
 
 
 class CapturedPacket(NamedTuple):
@@ -75,9 +85,9 @@ class CapturedPacket(NamedTuple):
 
     Attributes:
         link: link-layer type.
-        at: capture time in ns since 1970, which fits an int64; 0 where the record has none.
-        data: the bytes that were kept.
-        original: how many bytes there were before the snap length cut them.
+        at: capture time in ns since 1970, which fits an int64; 0 if the record has none.
+        data: the bytes in the file.
+        original: the length of the packet before the snap length cut it.
     """
 
     link: int
@@ -87,27 +97,27 @@ class CapturedPacket(NamedTuple):
 
 
 class Passed(Enum):
-    """A record that gives no packet."""
+    """The reason why a record yields no packet."""
 
     NO_PACKET = 0
     MALFORMED = 1
 
 
 def is_capture(head: bytes) -> bool:
-    """Whether the first four bytes of a file are those of a pcap or pcapng capture."""
+    """Return whether a file that begins with these bytes is a pcap or pcapng capture."""
     return head[:4] in _PCAP or head[:4] == _SECTION
 
 
 @dataclass(frozen=True)
 class Times:
-    """How a record's time is read from its two words.
+    """The encoding of a capture time in two words of a record.
 
     Attributes:
-        word: their type, with its byte order.
-        high, low: which words of the record they are.
-        ticks: of `low` in a second where `high` counts seconds, else of both together.
-        is_split: whether `high` counts seconds.
-        offset: ns.
+        word: NumPy type of the words, with the byte order.
+        high, low: indices of the two words in the record.
+        ticks: units per second, of `low` if `is_split`, else of the 64-bit number of both words.
+        is_split: whether `high` counts seconds and `low` the fraction.
+        offset: added to each time, ns.
     """
 
     word: str
@@ -118,12 +128,17 @@ class Times:
     offset: int = 0
 
     def fits(self) -> bool:
-        """Whether all times up to `_FURTHEST` can be had in 64 bits without overflow."""
+        """Return whether 64 bits suffice for all times up to `_FURTHEST`."""
         return self.ticks <= 9 * _SECOND and abs(self.offset) < 1 << 62
 
     def ns(self, heads: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.bool_] | None]:
-        """Times of n records, (n,) ns since 1970, and which of them are right, (n,); None where all
-        are.
+        """Return the times of n records, and which of them are valid.
+
+        Args:
+            heads: the first bytes of each record, (n, size).
+
+        Returns:
+            (n,) ns since 1970, and an (n,) mask of valid times; None if all are valid.
         """
         words = heads.view(self.word)
         high = words[:, self.high].astype(np.int64)
@@ -138,15 +153,15 @@ class Times:
 
 
 class Pattern(NamedTuple):
-    """What the records of a stream of packets have in common, as far as the file's format says.
+    """The layout of a packet record, as defined by the file format.
 
     Attributes:
-        head: bytes of a record before the packet.
-        free: places of bytes among them that differ from record to record: the time's.
-        uncut: those of the length that the packet had before it was cut.
-        times: how the time is read from them.
-        trailer: type of the word at the end that repeats the length, with its byte order; None
-            where there is none.
+        head: number of bytes before the packet.
+        free: offsets of the header bytes that differ between records: the time.
+        uncut: offsets of the original length of the packet.
+        times: the encoding of the time.
+        trailer: NumPy type of the word at the end that repeats the length, with the byte order;
+            None if there is none.
     """
 
     head: int
@@ -160,7 +175,7 @@ class PcapRecords:
     """The records of a pcap file.
 
     Attributes:
-        sections: 0, since it is one whole.
+        sections: always 0; only pcapng files have sections.
         order: the byte order of the file, as in `struct`.
         link: its link-layer type.
     """
@@ -171,47 +186,47 @@ class PcapRecords:
         self._source = source
         self.order, self._unit = _PCAP[source.take(4)]
         *_, self._snap_length, link = struct.unpack(self.order + "HHiIII", source.take(20))
-        self.link = link & 0xFFFF  # the upper half tells the length of the frame check sequence
+        self.link = link & 0xFFFF  # the upper half is the length of the frame check sequence
         self._head = struct.Struct(self.order + "IIII")
         self._lengths = struct.Struct(self.order + "II")
         self._began: int | None = None
 
     def over(self, source: Source) -> PcapRecords:
-        """The same form of other bytes of the file."""
+        """Return a reader of the same format for another position in the file."""
         other = copy.copy(self)
         other._source = source
         return other
 
     def length(self, data: memoryview | bytes, at: int) -> int:
-        """The length of the record that begins there, of which 16 bytes are there; 0 where it is
-        doubtful, or cannot be.
+        """Return the length of the record at an offset; 0 if it is implausible or invalid.
+
+        Args:
+            data: at least 16 bytes from the offset on.
         """
         captured, original = self._lengths.unpack_from(data, at + 8)
         return self._head.size + captured if self._is_sure(captured, original) else 0
 
     def claim(self, length: int) -> tuple[int, str, int]:
-        """Where in a whole packet's record of a length that stands, as what type, and the number
-        that stands there: the length, twice.
-        """
+        """Return the offset, type and value of both length fields of an uncut record."""
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
 
     def pattern(self, record: bytes) -> Pattern:
-        """What records like this one have in common."""
+        """Return the layout of a record."""
         times = Times(f"{self.order}u4", 0, 1, _SECOND // self._unit, True)
         return Pattern(self._head.size, tuple(range(8)), tuple(range(12, 16)), times, None)
 
     def read(self) -> CapturedPacket:
-        """The packet of the record that begins here.
+        """Read the next record and return its packet.
 
         Raises:
-            Truncated, Damaged: nothing can be read from `source.record` on.
+            Truncated, Damaged: if the record at `source.record` cannot be read.
         """
         head = self._source.peek(self._head.size)
         if len(head) < self._head.size:
             raise Truncated
         seconds, fraction, captured, original = self._head.unpack(head)
-        if captured > LARGEST_PACKET or not any(head):  # a hole in a file is full of zeros
+        if captured > LARGEST_PACKET or not any(head):  # a hole in a file reads as zeros
             raise Damaged
         if not self._is_sure(captured, original) and self._is_false(captured, original):
             raise Damaged
@@ -225,8 +240,12 @@ class PcapRecords:
         )
 
     def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """The first place below `stop` where a record begins that another one, or the end of the
-        input, follows.
+        """Return the first offset below `stop` at which a record may begin; None if there is none.
+
+        The record has to be followed by another one, or by the end of the input.
+
+        Args:
+            is_end: whether the input ends with `data`.
         """
         count = len(data) - self._head.size + 1
         if count <= 0:
@@ -262,8 +281,10 @@ class PcapRecords:
         return 0 < captured <= LARGEST_PACKET and captured in (original, self._snap_length)
 
     def _is_false(self, captured: int, original: int) -> bool:
-        """Whether a record is longer or shorter than it says: none begins where it ends, and others
-        do within it or its whole packet.
+        """Return whether the length of a record is wrong.
+
+        It is wrong if neither a record nor the end of the input follows, and another record begins
+        before the end of the original packet.
         """
         size = self._head.size + captured
         within = max(captured, min(original, LARGEST_PACKET) + 1)
@@ -275,11 +296,11 @@ class PcapRecords:
 
 
 class Interface(NamedTuple):
-    """Where packets of a pcapng file were captured."""
+    """A network interface of a pcapng file."""
 
     link: int
     snap_length: int  # 0: no limit
-    ticks: int  # in a second
+    ticks: int  # per second
     offset: int  # ns
 
 
@@ -287,7 +308,7 @@ class PcapngBlocks:
     """The blocks of a pcapng file.
 
     Attributes:
-        sections: how many have begun.
+        sections: number of sections that have begun.
         order: the byte order of the section, as in `struct`.
     """
 
@@ -296,17 +317,20 @@ class PcapngBlocks:
         self.sections = 0
         self.order = "<"
         self._interfaces: list[Interface] = []
-        self._knows_all = True  # interfaces of the section so far
+        self._knows_all = True  # no interface of the section was lost to damage
 
     def over(self, source: Source) -> PcapngBlocks:
-        """The same form, with the interfaces that are known, of other bytes of the file."""
+        """Return a reader with the same interfaces for another position in the file."""
         other = copy.copy(self)
         other._source, other._interfaces = source, list(self._interfaces)
         return other
 
     def length(self, data: memoryview | bytes, at: int) -> int:
-        """The length of the block that begins there; 0 where it can only be read by itself, since
-        it says something that cannot be, begins a section, or is longer than is ever held."""
+        """Return the length of the block at an offset; 0 if `read` has to handle the block.
+
+        This applies to the start of a section, an invalid length and a block longer than
+        `LARGEST_BLOCK`.
+        """
         kind, length = struct.unpack_from(self.order + "II", data, at)
         return (
             0 if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _can_be(length) else length
@@ -317,7 +341,7 @@ class PcapngBlocks:
         return 4, f"{self.order}u4", length
 
     def pattern(self, record: bytes) -> Pattern | None:
-        """What blocks like this one have in common; None for kinds that are read one by one."""
+        """Return the layout of a block; None if such blocks are read one by one."""
         kind, _, number = struct.unpack_from(self.order + "III", record)
         if kind != ENHANCED_PACKET:
             return None
@@ -327,10 +351,10 @@ class PcapngBlocks:
         return Pattern(28, tuple(range(12, 20)), tuple(range(24, 28)), times, word)
 
     def read(self) -> CapturedPacket | Passed:
-        """The packet of the block that begins here.
+        """Read the next block and return its packet.
 
         Raises:
-            Truncated, Damaged: nothing can be read from `source.record` on.
+            Truncated, Damaged: if the block at `source.record` cannot be read.
         """
         head = bytes(self._source.peek(12))
         if len(head) < 12:
@@ -360,10 +384,10 @@ class PcapngBlocks:
         return Passed.NO_PACKET
 
     def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
-        """The first place below `stop` where a whole block begins, or a section; the latter alone
-        where an interface was lost.
+        """Return the first offset below `stop` at which a block may begin; None if there is none.
 
-        Packets name interfaces by number: with one lost, all that follow would be misread.
+        If an interface block was lost, only the start of a section counts. Packets refer to
+        interfaces by number, so that a lost one would assign all later packets wrongly.
         """
         sections = (found.start() for found in re.finditer(re.escape(_SECTION), data[: stop + 3]))
         section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
@@ -383,8 +407,11 @@ class PcapngBlocks:
         return min([*right[:1], *([section] if section is not None else [])], default=None)
 
     def _is_false(self, kind: int, length: int) -> bool:
-        """Whether a block is of another length than it says: its end does not repeat it, or is not
-        there while others begin within it.
+        """Return whether the length of a block is wrong.
+
+        It is wrong if it is impossible for the type of the block, or if the end of the block does
+        not repeat it. If the end cannot be checked, it is wrong if another block begins within the
+        block.
         """
         if not _can_be(length) or (length > LARGEST_BLOCK and kind in _PACKETS | {_INTERFACE}):
             return True
@@ -395,15 +422,15 @@ class PcapngBlocks:
         return self.first_place(data[4:], size, is_end=True) is not None
 
 
-#: the records of either format.
+#: The reader of either format.
 Form = PcapRecords | PcapngBlocks
 
 
 def records(source: Source) -> Form:
-    """The records of a capture whose magic `is_capture` knows.
+    """Return the reader for a file that `is_capture` accepts.
 
     Raises:
-        Truncated: the head of the file is cut.
+        Truncated: if the file header is incomplete.
     """
     if source.peek(4) == _SECTION:
         return PcapngBlocks(source)
@@ -411,8 +438,10 @@ def records(source: Source) -> Form:
 
 
 def resume(source: Source, form: Form) -> bool:
-    """Goes to the next place where records begin, behind one that is damaged; False where there is
-    none, at the end.
+    """Advance to the next record after a damaged one.
+
+    Returns:
+        False at the end of the input, if no record was found.
     """
     source.skip(len(source.peek(1)))
     while data := source.peek(_STEP + _REACH):
@@ -423,26 +452,28 @@ def resume(source: Source, form: Form) -> bool:
     return False
 
 
-def sought(source: Source, form: Form, at: int) -> bool:
-    """Goes on close before the first packet that was captured at a time, ns since 1970, or later:
-    `NEAR` bytes away at most.
+def seek_time(source: Source, form: Form, at: int) -> bool:
+    """Skip to at most `NEAR` bytes before the first packet captured at a time or later.
 
-    Packets are taken to stand in the order of their times. Further sections of a pcapng file are
-    taken to have the interfaces of this one: where a section begins, or times are years away, since
-    they are counted otherwise there, nothing is passed over.
+    The search assumes that packets are in the order of their times, and that all sections of a
+    pcapng file have the interfaces of the current one. It does not skip the start of a section, nor
+    times that are years away: another section may encode times differently.
+
+    Args:
+        at: ns since 1970.
 
     Returns:
-        False where that is behind here, and for a pipe or a packed file: it then goes on where it
-        was.
+        False if nothing was skipped: the packet is not ahead, or the file is a pipe or compressed.
+        The position is then unchanged.
     """
     here = low = source.place
     high = source.size
     if high is None:
         return False
-    first = _captured(source.open_at(here), form, high)
+    first = _find_timed_packet(source.open_at(here), form, high)
     while first is not None and high - low > NEAR:
         middle = (low + high) // 2
-        found = _captured(source.open_at(middle), form, high)
+        found = _find_timed_packet(source.open_at(middle), form, high)
         if found is None or found[0] >= at or abs(found[0] - first[0]) > _YEAR * _SECOND:
             high = middle
         else:
@@ -451,9 +482,10 @@ def sought(source: Source, form: Form, at: int) -> bool:
     return low > here
 
 
-def _captured(source: Source, form: Form, stop: int) -> tuple[int, int] | None:
-    """Time and place of the first packet behind here, of those whose time is known; None where
-    there is none up to a place.
+def _find_timed_packet(source: Source, form: Form, stop: int) -> tuple[int, int] | None:
+    """Return the time and offset of the next packet with a time; None if none begins before `stop`.
+
+    The search ends at the start of another section.
     """
     form, section = form.over(source), form.sections
     while resume(source, form) and source.begin_record() and source.record < stop:
@@ -471,7 +503,7 @@ def _captured(source: Source, form: Form, stop: int) -> tuple[int, int] | None:
 
 
 def _can_be(length: int) -> bool:
-    """Whether a block can have a length: that of its head and tail at least, in words."""
+    """Return whether a block can have this length: a multiple of 4, with header and trailer."""
     return length >= 12 and length % 4 == 0
 
 
@@ -526,20 +558,23 @@ def _block_packet(
 
 
 def capture_head(link: int) -> bytes:
-    """What a pcap file begins with: little-endian, with nanoseconds.
+    """Return the header of a pcap file: little-endian, with nanoseconds.
 
     Args:
-        link: the link type: `ip.ETHERNET` for datagrams; USER0 for bare packets, when no protocol
-            is around the bytes.
+        link: the link type: `ip.ETHERNET` for datagrams, USER0 for bytes without a protocol header.
     """
     return _HEAD.pack(NANOSECOND_MAGIC, 2, 4, 0, 0, LARGEST_PACKET, link)
 
 
 def packet_record(data: bytes, at: int) -> bytes:
-    """The record of one packet as it is, of the file's link type, with its time in ns since 1970.
+    """Return the pcap record of one packet.
+
+    Args:
+        data: the packet, with the headers that the file's link type requires.
+        at: capture time, ns since 1970.
 
     Raises:
-        UsageError: for a packet or time that no record can hold.
+        UsageError: if a record cannot hold the packet or the time.
     """
     seconds, nanoseconds = divmod(at, _SECOND)
     if not 0 <= seconds < 1 << 32:
@@ -554,8 +589,12 @@ def _refuse_size(data: bytes) -> None:
 
 
 def record_size(data: bytes | bytearray, at: int) -> int:
-    """The length of the record that begins there in a piece of a written file, or of the file's
-    head, which the first piece begins with.
+    """Return the length of the record at an offset of a written file.
+
+    At offset 0 this may be the file header instead.
+
+    Args:
+        data: a piece of the file; the first piece begins with the file header.
     """
     if at == 0 and is_capture(bytes(data[:4])):
         return _HEAD.size
@@ -563,12 +602,12 @@ def record_size(data: bytes | bytearray, at: int) -> int:
 
 
 class Writing(NamedTuple):
-    """How captures of a format are written.
+    """Functions that write captures of one format.
 
     Attributes:
-        head: what a file begins with, for a link type.
-        record: of a packet, with its time in ns since 1970.
-        size: of the record that begins at a place of a piece of the file, or of its head.
+        head: returns the file header for a link type.
+        record: returns the record of a packet and its time in ns since 1970.
+        size: returns the length of the record or file header at an offset of a piece of the file.
     """
 
     head: Callable[[int], bytes]
@@ -577,7 +616,7 @@ class Writing(NamedTuple):
 
 
 def _pcapng_head(link: int) -> bytes:
-    """A section, and an interface whose times are in nanoseconds; little-endian."""
+    """Return a section and an interface with times in nanoseconds; little-endian."""
     section = _block(_SECTION_KIND, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
     return section + _block(
         _INTERFACE,
@@ -598,7 +637,7 @@ def _block(kind: int, body: bytes) -> bytes:
     return struct.pack("<I", kind) + size + body + size
 
 
-#: by the suffix of the file.
+#: Functions that write captures, by file suffix.
 WRITINGS = {
     ".pcap": Writing(capture_head, packet_record, record_size),
     ".pcapng": Writing(

@@ -1,9 +1,9 @@
-"""Files and standard input as transports: recordings, captures, logs (see `bags`), raw bytes,
-hexadecimal text.
+"""Transports for files and standard input.
 
-A file ends, and is read as fast as it is asked for. Recordings and captures give what was received
-at the times of then, and count what they leave out; bytes alone have no times. `open_file` tells
-them apart by what they hold.
+`open_file` detects the format of a file by its content: a recording, a capture, a log (see `bags`),
+hexadecimal text or raw bytes. A file is read as fast as the caller requests chunks. Recordings and
+captures yield the original arrival times, and count the data that they skip. Raw bytes have no
+times.
 """
 
 from __future__ import annotations
@@ -31,27 +31,29 @@ from lidarspec.transports.bags import BagTransport, log_of
 from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal
 from lidarspec.transports.protocol import Chunk, Transport
 
-#: events behind which a frame begun earlier does not go on.
+#: Events that interrupt the stream: an incomplete frame does not continue after them.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
-#: bytes read at once.
+#: Number of bytes that are read at once.
 BLOCK = 1 << 18
-#: suffixes of text: of hexadecimal digits, and of what may be that or not.
+#: Suffixes of hexadecimal text.
 HEX_SUFFIXES = {".hex", ".txt"}
+#: Suffixes of text that is hexadecimal only if its content is.
 TEXT_SUFFIXES = {".log", ".csv", ".asc"}
 
 
 class RecordingTransport(Transport):
-    """What was received, as it arrived; commands that were sent and events are passed over, and
-    leave their gap.
+    """Reads the received data of a recording.
+
+    Sent commands and events are skipped. An event in `INTERRUPTIONS` sets `Chunk.gap`.
 
     Args:
         path: the file.
-        file: it, where it is open already.
-        sender: only datagrams from this address, or "ADDRESS:PORT".
-        salvage: go on behind damaged places.
+        file: the open file; by default `path` is opened.
+        sender: yield only datagrams from this "ADDRESS" or "ADDRESS:PORT".
+        salvage: continue after damaged parts.
 
     Attributes:
-        header: what the recording says of itself.
+        header: the header of the recording.
     """
 
     def __init__(
@@ -71,16 +73,16 @@ class RecordingTransport(Transport):
         else:
             self._origin = parse_origin(sender)
         self.warnings: list[str] = []
-        self._no_events = 0
-        self._was_set = False
+        self._invalid_events = 0
+        self._has_clock_warning = False
         self._has_skipped = False
 
     def known_sensor(self) -> Sensor:
-        """The installed sensor that the recording names, with the options of then.
+        """Return the sensor that the recording names, configured with the recorded options.
 
         Raises:
-            UsageError: where it names none, or an option that has to be given again.
-            UnknownSensor: where that one is not installed.
+            UsageError: if the recording names no sensor, or an option has to be given again.
+            UnknownSensor: if the sensor is not installed.
         """
         try:
             return self.header.known_sensor(Path(self._recording.path).parent)
@@ -90,7 +92,7 @@ class RecordingTransport(Transport):
             raise UsageError(f"{self._recording.path}: {error}") from None
 
     def chunks(self) -> Iterator[Chunk]:
-        """What was received, in order, with the arrival times of then."""
+        """Yield the received data in order, with the recorded arrival times."""
         interrupted = False
         damaged = 0
         for record in self._recording:
@@ -99,7 +101,7 @@ class RecordingTransport(Transport):
             self._has_skipped = False
             if record.direction == "event":
                 interrupted = self._interrupts(record) or interrupted
-            elif record.direction == "in" and self._wanted(record):
+            elif record.direction == "in" and self._accepts(record):
                 yield Chunk(
                     record.data,
                     record.at,
@@ -109,16 +111,16 @@ class RecordingTransport(Transport):
                     record.quiet,
                 )
                 interrupted = False
-        if _is_whole(self, self._file) and self._recording.damaged:
-            self.warnings.append(_damage(self._recording))
+        if _check_end(self, self._file) and self._recording.damaged:
+            self.warnings.append(_describe_damage(self._recording))
             if self._recording.is_cut:
                 self.unread = 0
             else:
                 self.unread = self._recording.leftover
-        if self._no_events:
+        if self._invalid_events:
             self.warnings.append(
-                f"{self._recording.path}: {self._no_events} events were passed over, which have no"
-                " name"
+                f"{self._recording.path}: {self._invalid_events} events were passed over,"
+                " which have no name"
             )
 
     def skip(self, at: int) -> bool:
@@ -131,15 +133,17 @@ class RecordingTransport(Transport):
     def close(self) -> None:
         self._recording.close()
 
-    def _wanted(self, record: Record) -> bool:
+    def _accepts(self, record: Record) -> bool:
+        """Return whether the sender is the requested one; count other senders."""
         if self._origin is None or record.sender in self._origin:
             return True
         self.foreign += 1
         return False
 
     def _interrupts(self, record: Record) -> bool:
-        """Whether an event says that the line was interrupted; counts disconnects, and takes down
-        that the clock was set.
+        """Return whether an event interrupts the stream.
+
+        Also counts disconnects and invalid events, and warns if the clock was set.
         """
         try:
             event = json.loads(record.data)
@@ -147,10 +151,10 @@ class RecordingTransport(Transport):
             self.disconnects += name == "disconnect"
             is_interruption = name in INTERRUPTIONS
         except (ValueError, RecursionError, TypeError, KeyError):
-            self._no_events += 1
+            self._invalid_events += 1
             return False
-        if name == "clock" and not self._was_set:
-            self._was_set = True
+        if name == "clock" and not self._has_clock_warning:
+            self._has_clock_warning = True
             text = (
                 "the clock of the computer was set while it recorded; the arrival times go on"
                 " evenly, as it was at first"
@@ -159,28 +163,29 @@ class RecordingTransport(Transport):
         return is_interruption
 
 
-def _damage(recording: Recording) -> str:
-    """Where a recording is damaged, and how much of it was not read."""
+def _describe_damage(recording: Recording) -> str:
+    """Return a warning with the damaged offset and the number of unread bytes."""
     lost = f"{recording.leftover} bytes were not read"
     if recording.salvage:
-        return _passed_over(str(recording.path), recording.damaged, recording.leftover)
+        return _describe_skipped(str(recording.path), recording.damaged, recording.leftover)
     if recording.is_cut:
         return f"{recording.path} is cut off in its last record: {lost}, everything before them was"
     mending = f"lidarspec record {quote(str(recording.path))} --salvage -o mended.lsr"
     return f"{recording.path} is damaged at byte {recording.offset}: {lost}; next: {mending}"
 
 
-def _passed_over(path: str, places: int, size: int) -> str:
-    """How much of a file was not read between what was."""
+def _describe_skipped(path: str, places: int, size: int) -> str:
+    """Return a warning with the number of damaged parts and of unread bytes."""
     return (
         f"{path} is damaged in {places} place{'s' * (places > 1)}: {size} bytes were not read,"
         " everything else was"
     )
 
 
-def _is_whole(transport: FileTransport | RecordingTransport, file: BinaryIO) -> bool:
-    """Whether a file that was unpacked ended as it should; its transport takes down where it did
-    not.
+def _check_end(transport: FileTransport | RecordingTransport, file: BinaryIO) -> bool:
+    """Return whether a compressed file was decompressed to its end.
+
+    If not, add a warning and the number of unread bytes to the transport.
     """
     fault = damage(file)
     if fault is not None:
@@ -190,7 +195,7 @@ def _is_whole(transport: FileTransport | RecordingTransport, file: BinaryIO) -> 
 
 
 class FileTransport(Transport):
-    """The bytes of a file as they are, or standard input for "-".
+    """Reads the raw bytes of a file or of standard input.
 
     Attributes:
         file: the open file.
@@ -203,8 +208,9 @@ class FileTransport(Transport):
 
     @property
     def can_go_on(self) -> bool:
-        """Whether another one can begin where this one stands: of bytes as they are, and batches of
-        a capture.
+        """Whether another transport can continue at the current position of the file.
+
+        This requires a seekable file with raw bytes or a capture.
         """
         return (
             type(self) in (FileTransport, CaptureTransport, StreamCaptureTransport)
@@ -215,7 +221,7 @@ class FileTransport(Transport):
         with system_errors(self._path):
             while block := self.file.read(BLOCK):
                 yield Chunk(block)
-        _is_whole(self, self.file)
+        _check_end(self, self.file)
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"{self._path} is a file: nothing can be sent to it")
@@ -225,11 +231,11 @@ class FileTransport(Transport):
             self.file.close()
 
     def _warn(self, stats: CaptureStats) -> None:
-        """Take down what a capture does not hold whole."""
+        """Add a warning for each kind of data that was not read from a capture."""
         self.unread = stats.lost
         if stats.damaged:
-            self.warnings.append(_passed_over(self._path, stats.damaged, stats.lost))
-        if _is_whole(self, self.file) and stats.truncated_tail:
+            self.warnings.append(_describe_skipped(self._path, stats.damaged, stats.lost))
+        if _check_end(self, self.file) and stats.truncated_tail:
             self.warnings.append(
                 f"{self._path} is cut off in its last record; everything before it was read"
             )
@@ -268,20 +274,18 @@ def _list_counts(counts: Counter[str]) -> str:
 
 
 class HexTransport(FileTransport):
-    """Bytes written as hexadecimal text, at the times that it tells; lines without digits are
-    passed over.
-    """
+    """Reads hexadecimal text, with the times in it; lines without digits are skipped."""
 
     def chunks(self) -> Iterator[Chunk]:
         yield from hex_chunks(self._path, self.file.readline)
-        _is_whole(self, self.file)
+        _check_end(self, self.file)
 
 
 class CaptureTransport(FileTransport):
-    """The UDP datagrams of a pcap or pcapng file.
+    """Reads the UDP datagrams of a pcap or pcapng file.
 
     Attributes:
-        reader: what `chunks` or `batches` come from, once one of them has begun.
+        reader: the reader of the file; None until `chunks` or `batches` is called.
     """
 
     datagrams = True
@@ -308,10 +312,10 @@ class CaptureTransport(FileTransport):
         self._warn(reader.stats)
 
     def batches(self) -> Iterator[Batch]:
-        """The datagrams of the capture, many at a time, as arrays.
+        """Yield the datagrams of the capture in batches of arrays.
 
         Raises:
-            SourceError: where the file cannot be read.
+            SourceError: if the file cannot be read.
         """
         reader = self.reader = self.reader or self.in_batches(self.file)
         for batch in reader.batches():
@@ -330,14 +334,14 @@ class CaptureTransport(FileTransport):
         return self._has_skipped
 
     def _gap(self) -> bool:
-        """Whether something was passed over, once."""
+        """Return whether data was skipped since the last call."""
         gap = self._has_skipped
         self._has_skipped = False
         return gap
 
 
 class StreamCaptureTransport(CaptureTransport):
-    """The bytes of a capture of a byte stream, packet by packet."""
+    """Reads a capture of a byte stream, one chunk per packet."""
 
     datagrams = False
     in_batches = StreamBatches
@@ -351,17 +355,16 @@ class StreamCaptureTransport(CaptureTransport):
 def open_file(
     path: str, *, sender: str | None = None, member: str = ""
 ) -> FileTransport | RecordingTransport | BagTransport:
-    """The transport for a file, by what it holds; "-" is standard input, which is told by its
-    beginning too; a folder is a bag's.
+    """Open a file with the transport for its content.
 
     Args:
-        sender: only what comes from this address, or topic.
-        member: which file of a zip archive; "" for the one capture or recording in it.
+        path: a file, "-" for standard input, or the folder of a bag.
+        sender: yield only data from this address or topic.
+        member: name of a file in a zip archive; "" for the only capture or recording in it.
 
     Raises:
-        SourceError: where it cannot be opened, or is a file of another kind.
-        UsageError: where a library is missing that reads it, and for an archive of several
-            captures.
+        SourceError: if the file cannot be opened, or its format is not supported.
+        UsageError: if a required library is missing, or an archive contains several captures.
     """
     if (log := log_of(path)) is not None:
         return BagTransport(path, log, sender=sender)
@@ -386,23 +389,23 @@ def open_file(
             )
         if log is not None:
             return BagTransport(path, log, sender=sender)
-        undo.pop_all()  # the transport closes it
-    found = _by_content(path, name, file, start, sender)
-    found.stored = plain
-    return found
+        undo.pop_all()  # the transport closes the file
+    opened_transport = _open_by_content(path, name, file, start, sender)
+    opened_transport.stored = plain
+    return opened_transport
 
 
-def _by_content(
+def _open_by_content(
     path: str, name: str, file: BinaryIO, start: bytes, sender: str | None
 ) -> FileTransport | RecordingTransport:
-    """The transport for what a file begins with."""
+    """Return the transport for a file that begins with the bytes `start`."""
     if start.startswith(MAGIC):
         return RecordingTransport(path, file, sender=sender)
     if is_stream_capture(start):
         return StreamCaptureTransport(name, file)
     if is_capture(start):
         return CaptureTransport(name, file, sender=sender)
-    suffixes = set(Path(path.lower()).suffixes[-2:])  # that of a compressed file is behind it
+    suffixes = set(Path(path.lower()).suffixes[-2:])  # compression adds a second suffix
     is_text = suffixes & HEX_SUFFIXES or (
         suffixes & TEXT_SUFFIXES and is_hexadecimal(start, whole=len(start) < HEAD)
     )

@@ -1,16 +1,18 @@
-"""UDP: datagrams from a sensor, as many as there are at each wake-up, with what the kernel knows of
-each.
+"""Receive the UDP datagrams of a sensor, with arrival times and drop counts from the kernel.
 
-A sensor sends to this computer's address or to everybody, so that the sockets have to be bound to
-all interfaces ("udp://"), unless one is named ("udp://127.0.0.1:2368"). Nothing is sent, and nobody
-is answered, before a command is.
+Sensors send to the address of this computer or to the broadcast address. Sockets are therefore
+bound to all interfaces ("udp://"), unless the SOURCE names one ("udp://127.0.0.1:2368"). Nothing is
+sent until `write` is called.
 
-Linux says with each datagram when it arrived, however late we fetch it, and how many the socket has
-dropped before it; so a short pause after each reading, in which some gather, costs no accuracy. The
-receive buffer is what a stalled program lives on; what the kernel really gives is read back. Many
-datagrams are fetched in one system call, recvmmsg, which Python does not have (`Slots`): each call
-of Python gives the interpreter away and has to win it back, which takes milliseconds beside a
-thread that computes, and with a call for each datagram a fast sensor is lost.
+Linux stores with each datagram its arrival time and the number of datagrams that the socket dropped
+before it. A short pause after each read, in which datagrams accumulate, therefore costs no
+accuracy. The receive buffer bridges the time in which the program does not read. The kernel may
+grant a smaller buffer than requested, so its size is read back.
+
+`Slots` fetches many datagrams in one system call, recvmmsg, through ctypes, since Python has no
+function for it. Each socket call in Python releases the interpreter lock. Taking it back needs
+milliseconds if another thread computes, and one call per datagram is then too slow for a fast
+sensor.
 """
 
 from __future__ import annotations
@@ -43,28 +45,34 @@ from lidarspec.transports.base import (
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender
 
-#: datagrams in one call, and the room for each: memory that is not written to costs nothing.
-MANY = 256
-LARGEST = 1 << 16
-NAME = 32
-CONTROL = 128
-_HEADER = struct.Struct("@Nii")
-_TWO = struct.Struct("@Niiqq")
-_ALIGN = struct.calcsize("@N")
-#: bytes of receive buffer that are asked for.
+#: Number of datagrams that one system call fetches, at most.
+SLOT_COUNT = 256
+#: Buffer sizes per datagram, in bytes. Pages that are never written to need no memory.
+PAYLOAD_SLOT_BYTES = 1 << 16
+ADDRESS_SLOT_BYTES = 32
+CONTROL_SLOT_BYTES = 128
+#: Header of a control message: size, level, type.
+_CONTROL_HEADER = struct.Struct("@Nii")
+#: A control message with two 64-bit numbers.
+_CONTROL_WITH_TWO_NUMBERS = struct.Struct("@Niiqq")
+_CONTROL_ALIGNMENT = struct.calcsize("@N")
+#: Requested size of the receive buffer, in bytes.
 BUFFER = 8 << 20
-#: datagrams of one socket that are fetched before the others have their turn.
-TOGETHER = 1024
-#: seconds between two readings, where the kernel keeps the times: a wake-up for each datagram would
-#: cost more than all the rest.
-PAUSE = 0.002
-#: ns that a datagram may have waited in the kernel, at most; more is a clock that was set.
-LATEST = 60_000_000_000
-#: socket options that Python has no names for (Linux, asm-generic/socket.h).
+#: Number of datagrams that are fetched from one socket before the other sockets are read.
+MAX_DATAGRAMS_PER_READ = 1024
+#: Pause between two reads if the kernel records arrival times. One wake-up per datagram would cost
+#: more than all other work.
+READ_PAUSE_S = 0.002
+#: Longest time that a datagram may have waited in the kernel. Longer times mean that the clock was
+#: set.
+MAX_KERNEL_DELAY_NS = 60_000_000_000
+#: Socket options without a name in Python (Linux, asm-generic/socket.h).
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
+#: Value of SO_TIMESTAMPNS: seconds and nanoseconds.
 TIME = struct.Struct("qq")
+#: Options of a UDP SOURCE.
 OPTIONS = ("port", "group", "src")
 
 
@@ -88,23 +96,20 @@ class _Datagram(ctypes.Structure):
     _fields_ = (("message", _Message), ("size", ctypes.c_uint))
 
 
-#: where the size of the first datagram, and of what is told with it, stand in the headers, and how
-#: far on the next ones do, in words.
-_SIZE, _SIZE_STEP = (
-    part // ctypes.sizeof(ctypes.c_uint)
-    for part in (_Datagram.size.offset, ctypes.sizeof(_Datagram))
-)
-_TOLD, _TOLD_STEP = (
-    part // ctypes.sizeof(ctypes.c_size_t)
-    for part in (_Message.control_size.offset, ctypes.sizeof(_Datagram))
-)
+#: Index of the first datagram's size in the array of headers, and the step to the next datagram, in
+#: units of c_uint.
+_SIZE_INDEX = _Datagram.size.offset // ctypes.sizeof(ctypes.c_uint)
+_SIZE_STEP = ctypes.sizeof(_Datagram) // ctypes.sizeof(ctypes.c_uint)
+#: The same for the size of its control messages, in units of c_size_t.
+_CONTROL_SIZE_INDEX = _Message.control_size.offset // ctypes.sizeof(ctypes.c_size_t)
+_CONTROL_SIZE_STEP = ctypes.sizeof(_Datagram) // ctypes.sizeof(ctypes.c_size_t)
 
 
 class Slots:
-    """Room for many datagrams, used again and again.
+    """Buffers for many datagrams, which each call of `fill` reuses.
 
     Raises:
-        OSError: where the system has no recvmmsg.
+        OSError: if the system has no recvmmsg.
     """
 
     def __init__(self) -> None:
@@ -119,44 +124,44 @@ class Slots:
             ctypes.c_int,
             ctypes.c_void_p,
         )
-        self._payload, self._names, self._control = (
-            ctypes.create_string_buffer(MANY * size) for size in (LARGEST, NAME, CONTROL)
-        )
-        self._data, self._senders, self._said = (
-            memoryview(part).cast("B") for part in (self._payload, self._names, self._control)
-        )
-        self._vectors = (_Vector * MANY)()
-        self._headers = ctypes.create_string_buffer(MANY * ctypes.sizeof(_Datagram))
-        self._datagrams = (_Datagram * MANY).from_buffer(self._headers)
-        # An access to a field by its name costs more than a datagram should.
-        self._sizes, self._told = (
-            memoryview(self._headers).cast("B").cast("I"),
-            memoryview(self._headers).cast("B").cast("P"),
-        )
-        for index in range(MANY):
+        self._payload = ctypes.create_string_buffer(SLOT_COUNT * PAYLOAD_SLOT_BYTES)
+        self._names = ctypes.create_string_buffer(SLOT_COUNT * ADDRESS_SLOT_BYTES)
+        self._control = ctypes.create_string_buffer(SLOT_COUNT * CONTROL_SLOT_BYTES)
+        self._payload_bytes = memoryview(self._payload).cast("B")
+        self._name_bytes = memoryview(self._names).cast("B")
+        self._control_bytes = memoryview(self._control).cast("B")
+        self._vectors = (_Vector * SLOT_COUNT)()
+        self._headers = ctypes.create_string_buffer(SLOT_COUNT * ctypes.sizeof(_Datagram))
+        self._datagrams = (_Datagram * SLOT_COUNT).from_buffer(self._headers)
+        # Access to ctypes fields by name is too slow to do for each datagram.
+        self._sizes = memoryview(self._headers).cast("B").cast("I")
+        self._control_sizes = memoryview(self._headers).cast("B").cast("P")
+        for index in range(SLOT_COUNT):
             self._vectors[index] = _Vector(
-                ctypes.addressof(self._payload) + index * LARGEST, LARGEST
+                ctypes.addressof(self._payload) + index * PAYLOAD_SLOT_BYTES, PAYLOAD_SLOT_BYTES
             )
             message = self._datagrams[index].message
-            message.name = ctypes.addressof(self._names) + index * NAME
-            message.name_size = NAME
+            message.name = ctypes.addressof(self._names) + index * ADDRESS_SLOT_BYTES
+            message.name_size = ADDRESS_SLOT_BYTES
             message.vectors = ctypes.pointer(self._vectors[index])
             message.vectors_number = 1
-            message.control = ctypes.addressof(self._control) + index * CONTROL
-            message.control_size = CONTROL
+            message.control = ctypes.addressof(self._control) + index * CONTROL_SLOT_BYTES
+            message.control_size = CONTROL_SLOT_BYTES
         self._fresh = self._headers.raw
         self._known: dict[bytes, tuple[str, int]] = {}
 
     def fill(self, descriptor: int) -> int:
-        """The number of datagrams fetched from a socket, at most `MANY`; 0 where none waits.
+        """Fetch the datagrams that wait in a socket, and return their number.
+
+        Returns:
+            At most `SLOT_COUNT`; 0 if none waits.
 
         Raises:
-            OSError: what the system says.
+            OSError: if the system call fails.
         """
-        ctypes.memmove(
-            self._headers, self._fresh, len(self._fresh)
-        )  # the kernel wrote over the sizes
-        number: int = self._call(descriptor, self._datagrams, MANY, socket.MSG_DONTWAIT, None)
+        # The previous call has overwritten the sizes.
+        ctypes.memmove(self._headers, self._fresh, len(self._fresh))
+        number: int = self._call(descriptor, self._datagrams, SLOT_COUNT, socket.MSG_DONTWAIT, None)
         if number < 0:
             code = ctypes.get_errno()
             if code in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR):
@@ -165,45 +170,55 @@ class Slots:
         return number
 
     def datagram(self, index: int) -> tuple[bytes, tuple[str, int]]:
-        """A datagram that was fetched, and its sender."""
-        start = index * LARGEST
-        data = self._data[start : start + self._sizes[_SIZE + index * _SIZE_STEP]].tobytes()
-        name = self._senders[index * NAME : index * NAME + NAME].tobytes()
+        """Return a fetched datagram and its sender."""
+        start = index * PAYLOAD_SLOT_BYTES
+        size = self._sizes[_SIZE_INDEX + index * _SIZE_STEP]
+        data = self._payload_bytes[start : start + size].tobytes()
+        name = self._name_bytes[
+            index * ADDRESS_SLOT_BYTES : index * ADDRESS_SLOT_BYTES + ADDRESS_SLOT_BYTES
+        ].tobytes()
         sender = self._known.get(name)
         if sender is None:
-            if len(self._known) >= MANY:
+            if len(self._known) >= SLOT_COUNT:
                 self._known.clear()
-            sender = self._known[name] = _address(name)
+            sender = self._known[name] = _parse_address(name)
         return data, sender
 
     def numbers(self, index: int) -> tuple[int, int, int] | None:
-        """What the socket layer said with a datagram, if it is one value of two numbers: its type,
-        and these; else None.
+        """Return type and values of the control message of a datagram.
+
+        None unless the datagram has exactly one control message, with two 64-bit numbers. This is a
+        fast path of `control_messages` for datagrams with an arrival time and nothing else.
         """
-        if self._told[_TOLD + index * _TOLD_STEP] != _TWO.size:
+        control_size = self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
+        if control_size != _CONTROL_WITH_TWO_NUMBERS.size:
             return None
-        size, level, kind, first, second = _TWO.unpack_from(self._said, index * CONTROL)
-        if size == _TWO.size and level == socket.SOL_SOCKET:
+        size, level, kind, first, second = _CONTROL_WITH_TWO_NUMBERS.unpack_from(
+            self._control_bytes, index * CONTROL_SLOT_BYTES
+        )
+        if size == _CONTROL_WITH_TWO_NUMBERS.size and level == socket.SOL_SOCKET:
             return (kind, first, second)
         return None
 
-    def said(self, index: int) -> list[tuple[int, memoryview]]:
-        """What the socket layer said with a datagram: type and value."""
-        start = index * CONTROL
-        found = []
-        end = start + self._told[_TOLD + index * _TOLD_STEP]
-        while start + _HEADER.size <= end:
-            size, level, kind = _HEADER.unpack_from(self._said, start)
-            if size < _HEADER.size:
+    def control_messages(self, index: int) -> list[tuple[int, memoryview]]:
+        """Return type and value of each control message of the socket layer for a datagram."""
+        start = index * CONTROL_SLOT_BYTES
+        messages = []
+        end = start + self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
+        while start + _CONTROL_HEADER.size <= end:
+            size, level, kind = _CONTROL_HEADER.unpack_from(self._control_bytes, start)
+            if size < _CONTROL_HEADER.size:
                 break
             if level == socket.SOL_SOCKET:
-                found.append((kind, self._said[start + _HEADER.size : start + size]))
-            start += -(-size // _ALIGN) * _ALIGN
-        return found
+                messages.append(
+                    (kind, self._control_bytes[start + _CONTROL_HEADER.size : start + size])
+                )
+            start += -(-size // _CONTROL_ALIGNMENT) * _CONTROL_ALIGNMENT
+        return messages
 
 
-def _address(name: bytes) -> tuple[str, int]:
-    """Host and port of a socket address as the kernel writes it."""
+def _parse_address(name: bytes) -> tuple[str, int]:
+    """Return host and port of a socket address in the layout of the kernel."""
     family = int.from_bytes(name[:2], sys.byteorder)
     port = int.from_bytes(name[2:4], "big")
     if family == socket.AF_INET6:
@@ -214,25 +229,26 @@ def _address(name: bytes) -> tuple[str, int]:
 
 
 class UdpTransport(LiveTransport):
-    """Datagrams that arrive on some ports.
+    """Receives the datagrams that arrive on one or more ports.
 
     Args:
         label: the SOURCE, for messages.
-        ports: where to listen; 0 takes any that is free.
+        ports: the ports to listen on; 0 for any free port.
         host: address of the interface, "" for all.
         group: multicast group to join.
-        sender: only datagrams from this host, or "HOST:PORT"; others are counted as foreign.
-        datagrams: whether each is a whole frame, not a piece of a stream.
-        sensor: for the next command in messages.
-        remote: where to send to; by default the sender that is asked for with its port, or
-            accepted.
-        broadcast: whether that may be everybody.
+        sender: accept only datagrams from this "HOST" or "HOST:PORT", and count others as
+            `foreign`.
+        datagrams: whether each datagram is a whole frame instead of a piece of a stream.
+        sensor: used for suggested commands in messages.
+        remote: the address that `write` sends to; by default `sender` if it has a port, else the
+            sender that was accepted.
+        broadcast: whether `remote` may be a broadcast address.
 
     Attributes:
-        ports: those that are open.
+        ports: the open ports.
 
     Raises:
-        SourceError: where a port cannot be opened, or the group not joined.
+        SourceError: if a port cannot be opened, or the group cannot be joined.
     """
 
     def __init__(
@@ -261,13 +277,13 @@ class UdpTransport(LiveTransport):
             self._remote = (self._origin.host, self._origin.port)
         self._selector = selectors.DefaultSelector()
         self._sockets: list[_Socket] = []
-        self._rested = 0.0
+        self._next_read = 0.0
         slots: Slots | None = None
         with contextlib.suppress(OSError):
             slots = Slots() if sys.platform == "linux" else None
         try:
             for port in ports:
-                self._sockets.append(_Socket(self._bound(host, port, group), slots))
+                self._sockets.append(_Socket(self._open_socket(host, port, group), slots))
                 self._selector.register(
                     self._sockets[-1].socket, selectors.EVENT_READ, self._sockets[-1]
                 )
@@ -281,7 +297,7 @@ class UdpTransport(LiveTransport):
         self.warnings = shortfall(BUFFER, smallest)
 
     def read(self, timeout: float) -> list[Chunk]:
-        sleep_until(self._rested)
+        sleep_until(self._next_read)
         found: list[Chunk] = []
         if self.closed:
             ready = []
@@ -290,8 +306,8 @@ class UdpTransport(LiveTransport):
         for one in ready:
             self._fetch(one, found)
         self.kernel_drops = sum(each.drops for each in self._sockets)
-        gathers = 0 < len(found) < MANY and all(one.is_timed for one in ready)
-        self._rested = time.monotonic() + PAUSE if gathers else 0.0
+        gathers = 0 < len(found) < SLOT_COUNT and all(one.is_timed for one in ready)
+        self._next_read = time.monotonic() + READ_PAUSE_S if gathers else 0.0
         return found
 
     def write(self, data: bytes) -> None:
@@ -309,9 +325,7 @@ class UdpTransport(LiveTransport):
 
     @property
     def addressed(self) -> bool:
-        """Whether what is written has somewhere to go: to the address that was given, or a sender
-        that was accepted.
-        """
+        """Whether `write` has a destination: the configured address or the accepted sender."""
         return self._remote is not None
 
     def accept(self, sender: Sender) -> None:
@@ -319,7 +333,7 @@ class UdpTransport(LiveTransport):
             self._remote = sender
 
     def reopen(self) -> None:
-        """Sockets stay open, whatever becomes of the sensor."""
+        """Do nothing: a socket stays open when the sensor disappears."""
 
     def peer(self) -> str | None:
         if self._origin:
@@ -335,7 +349,7 @@ class UdpTransport(LiveTransport):
             one.socket.close()
 
     def _fetch(self, one: _Socket, found: list[Chunk]) -> None:
-        """Everything that waits in a socket, up to a limit that is fair to the others."""
+        """Append the datagrams that wait in a socket, up to a limit, to `found`."""
         start = len(found)
         try:
             own = self._origin
@@ -346,13 +360,13 @@ class UdpTransport(LiveTransport):
                     continue
                 found.append(Chunk(data, at, sender, one.address))
         except ConnectionRefusedError:
-            return  # somebody's answer to what was sent, not to be read as the end
+            return  # an ICMP reply to a sent datagram; the socket still receives
         except OSError as error:
             if not self.closed:
                 raise SourceError(f"{self.label}: {system_reason(error)}") from None
         _order_times(found, start)
 
-    def _bound(self, host: str, port: int, group: str | None) -> socket.socket:
+    def _open_socket(self, host: str, port: int, group: str | None) -> socket.socket:
         if ":" in host or ":" in (group or ""):
             family = socket.AF_INET6
         else:
@@ -366,11 +380,11 @@ class UdpTransport(LiveTransport):
                 _join(found, group, host)
         except OSError as error:
             found.close()
-            raise self._refused(error, host, port, group) from None
+            raise self._open_error(error, host, port, group) from None
         found.setblocking(False)
         return found
 
-    def _refused(self, error: OSError, host: str, port: int, group: str | None) -> SourceError:
+    def _open_error(self, error: OSError, host: str, port: int, group: str | None) -> SourceError:
         doctor = f"lidarspec doctor {quote(self.label)}{sensor_option(self._sensor)}"
         if error.errno == errno.EADDRINUSE:
             return source_error(
@@ -395,16 +409,16 @@ class UdpTransport(LiveTransport):
 
 
 class _Socket:
-    """One socket, and what the kernel has said about it.
+    """One socket and its kernel statistics.
 
     Args:
-        slots: where the kernel writes many datagrams at once; None fetches them one by one.
+        slots: buffers to fetch many datagrams at once; None to fetch them one by one.
 
     Attributes:
-        address: of its end here.
-        buffer: bytes of payload and overhead that the kernel holds for it.
-        is_timed: whether the kernel says when each datagram arrived.
-        drops: datagrams that the kernel threw away since nobody fetched them in time.
+        address: the local address and port.
+        buffer: size of the receive buffer, in bytes of payload and overhead.
+        is_timed: whether the kernel records the arrival time of each datagram.
+        drops: number of datagrams that the kernel dropped because the buffer was full.
     """
 
     def __init__(self, found: socket.socket, slots: Slots | None) -> None:
@@ -412,7 +426,7 @@ class _Socket:
         self._slots = slots
         self.drops = 0
         self.address: tuple[str, int] = found.getsockname()[:2]
-        self.buffer = _enlarged(found)
+        self.buffer = _enlarge_buffer(found)
         self.is_timed = False
         for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL) if slots is not None else ():
             with contextlib.suppress(OSError):
@@ -420,45 +434,47 @@ class _Socket:
                 self.is_timed |= option == SO_TIMESTAMPNS
 
     def datagrams(self, now: int, wall: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
-        """What waits, with sender and arrival time; counts what the kernel dropped.
+        """Yield the waiting datagrams with sender and arrival time, and update `drops`.
 
         Args:
-            now: the time of the clock that arrival times are given in, ns since 1970.
-            wall: the time of the wall clock at the same moment, which the kernel's times are of.
+            now: the current time of the transport's clock, ns since 1970. Arrival times are
+                converted to this clock.
+            wall: the wall-clock time at the same moment, ns. The kernel uses the wall clock.
 
         Raises:
-            OSError: what the system says.
+            OSError: if the system call fails.
         """
         if self._slots is None:
-            yield from self._one_by_one(now)
+            yield from self._fetch_singly(now)
             return
-        for _ in range(TOGETHER // MANY):
+        for _ in range(MAX_DATAGRAMS_PER_READ // SLOT_COUNT):
             number = self._slots.fill(self.socket.fileno())
             for index in range(number):
                 data, sender = self._slots.datagram(index)
-                told = self._slots.numbers(index)
-                if told is not None and told[0] == SO_TIMESTAMPNS:
-                    yield data, sender, _carried(told[1], told[2], now, wall)
+                message = self._slots.numbers(index)
+                if message is not None and message[0] == SO_TIMESTAMPNS:
+                    yield data, sender, _convert_time(message[1], message[2], now, wall)
                 else:
-                    yield data, sender, self._told(self._slots.said(index), now, wall)
-            if number < MANY:
+                    messages = self._slots.control_messages(index)
+                    yield data, sender, self._read_control(messages, now, wall)
+            if number < SLOT_COUNT:
                 return
 
-    def _one_by_one(self, now: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
-        for _ in range(TOGETHER):
+    def _fetch_singly(self, now: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
+        for _ in range(MAX_DATAGRAMS_PER_READ):
             try:
-                data, sender = self.socket.recvfrom(LARGEST)
+                data, sender = self.socket.recvfrom(PAYLOAD_SLOT_BYTES)
             except BlockingIOError:
                 return
             yield data, sender[:2], now
 
-    def _told(self, said: Iterable[tuple[int, memoryview]], now: int, wall: int) -> int:
-        """When the datagram arrived; counts what was dropped before it."""
+    def _read_control(self, messages: Iterable[tuple[int, memoryview]], now: int, wall: int) -> int:
+        """Return the arrival time in the control messages of a datagram, and update `drops`."""
         at = now
-        for kind, data in said:
+        for kind, data in messages:
             if kind == SO_TIMESTAMPNS and len(data) == 16:
                 seconds, nanoseconds = TIME.unpack(data)
-                at = _carried(seconds, nanoseconds, now, wall)
+                at = _convert_time(seconds, nanoseconds, now, wall)
             elif kind == SO_RXQ_OVFL and len(data) == 4:
                 drops = int.from_bytes(data, sys.byteorder)
                 self.drops += (drops - self.drops) & 0xFFFFFFFF
@@ -466,10 +482,10 @@ class _Socket:
 
 
 def _order_times(chunks: list[Chunk], start: int) -> None:
-    """Give no datagram, from `start` on, a later time than those that were queued behind it.
+    """Lower the times of the chunks from `start` on, so that they never decrease.
 
-    For some milliseconds after a socket was opened Linux stamps datagrams when they are fetched
-    instead of when they arrive.
+    For some milliseconds after a socket is opened, Linux records the time at which a datagram is
+    fetched instead of its arrival time. Such a time can be later than that of the next datagrams.
     """
     times = [chunk.at or 0 for chunk in chunks[start:]]
     if times == sorted(times):
@@ -480,23 +496,30 @@ def _order_times(chunks: list[Chunk], start: int) -> None:
         chunks[start + index] = replace(chunks[start + index], at=earliest)
 
 
-def _carried(seconds: int, nanoseconds: int, now: int, wall: int) -> int:
-    """A time of the wall clock, which reads `wall` now, as one of a clock that reads `now`; of the
-    last minute, whatever it says.
+def _convert_time(seconds: int, nanoseconds: int, now: int, wall: int) -> int:
+    """Convert a wall-clock time to the transport's clock.
+
+    The result is limited to the last `MAX_KERNEL_DELAY_NS` before `now`.
+
+    Args:
+        now: the current time of the transport's clock, ns.
+        wall: the current wall-clock time, ns.
     """
-    return now - min(max(wall - seconds * 1_000_000_000 - nanoseconds, 0), LATEST)
+    return now - min(max(wall - seconds * 1_000_000_000 - nanoseconds, 0), MAX_KERNEL_DELAY_NS)
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
-    """The open sockets of a UDP SOURCE: "udp://", "udp://:2368",
+    """Open the sockets of a UDP SOURCE.
+
+    Examples are "udp://", "udp://:2368" and
     "udp://?port=6699,7788&group=239.255.0.1&src=192.168.1.200".
 
     Args:
-        sensor: whose ports are taken where the source names none.
+        sensor: its ports are used if the SOURCE names none.
 
     Raises:
-        UsageError: where nobody says the ports, or for an option that UDP does not take.
-        SourceError: where one cannot be opened.
+        UsageError: if neither SOURCE nor sensor names a port, or for an option unknown to UDP.
+        SourceError: if a socket cannot be opened.
     """
     address.check(OPTIONS)
     host, port = address.host_and_port()
@@ -530,9 +553,7 @@ def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
 
 
 def shortfall(asked: int, granted: int) -> list[str]:
-    """A warning where the kernel gave less receive buffer than was asked for, with the command that
-    mends it; else nothing.
-    """
+    """Return a warning with a fix if the kernel granted a smaller buffer than requested."""
     if granted >= asked:
         return []
     text = (
@@ -542,20 +563,19 @@ def shortfall(asked: int, granted: int) -> list[str]:
     return [f"{text}; next: sudo sysctl -w net.core.rmem_max={asked}"]
 
 
-def _enlarged(found: socket.socket) -> int:
-    """Ask for a larger receive buffer; the bytes that there are in the end. Linux says twice what
-    it gives.
-    """
+def _enlarge_buffer(found: socket.socket) -> int:
+    """Request a larger receive buffer, and return the size that the kernel granted."""
     for option in (
         (socket.SO_RCVBUF, SO_RCVBUFFORCE) if sys.platform == "linux" else (socket.SO_RCVBUF,)
     ):
-        if _granted(found) < BUFFER:
+        if _buffer_size(found) < BUFFER:
             with contextlib.suppress(OSError):
                 found.setsockopt(socket.SOL_SOCKET, option, BUFFER)
-    return _granted(found)
+    return _buffer_size(found)
 
 
-def _granted(found: socket.socket) -> int:
+def _buffer_size(found: socket.socket) -> int:
+    # Linux reports twice the size that was set.
     return found.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // (
         2 if sys.platform == "linux" else 1
     )
