@@ -1,14 +1,15 @@
-"""Which installed sensor sent these bytes: each is tried, and what passes checksum and plausibility
-is counted.
+"""Identify the installed sensor that sent some bytes.
 
-Sensors with the same frames are told apart by what they declare of their `relatives`: by packets
-that only one of them sends, by how fast their clocks run, and by the model that their frames name,
-in a text or by the author's remark on the value of a field ("0x22 NAME"). Where nothing of that was
-seen, each may be it, and so may relatives that are not installed.
+`scores` decodes the bytes with each installed sensor, and rates a sensor by the share of the bytes
+in frames with a valid checksum and plausible values. `verdict` selects the best sensor.
 
-Bytes that were given to be looked at, frame by frame, and are exactly one frame of a sensor are
-that sensor's (`fitting`). Where no sensor fits, the one whose frame they begin like is said to be
-nearest.
+`distinguish` compares related models with the same frames, by the differences that their
+`relatives` declare: packets that only one of them sends, the pace of the clock in the packets, and
+the model that a frame names, in a text or by a documented value ("0x22 NAME"). If none of these
+differences is visible, all related models remain possible, also those that are not installed.
+
+For a single frame, `fitting` returns the sensors with a frame type that matches it exactly, and
+`nearest` the error of the sensor that parsed most of it.
 """
 
 from __future__ import annotations
@@ -50,85 +51,83 @@ from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import live_address, resolved, transport
 from lidarspec.transports.protocol import no_bytes
 
-#: share by which the pace of a clock may be off, frames of a type that are looked into for names,
-#: and packets simulated.
-OFF = 0.03
-READ = 3
-PACKETS = 64
+#: Relative tolerance of the pace of a clock.
+PACE_TOLERANCE = 0.03
+#: Number of frames of a type that are searched for the name of the model.
+MAX_NAMED_FRAMES = 3
+#: Number of packets that are simulated to find the pace of a sensor's clock.
+SIMULATED_PACKETS = 64
+#: A number and its meaning in the documentation of a field.
 _VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
-#: bytes that an error shows.
+#: Number of bytes that an error shows.
 SHOWN = 16
-#: share of the bytes that has to be in a sensor's frames for it to fit, how close to the best
-#: another is as good, and what is beyond doubt.
+#: Smallest share of the bytes that has to be in a sensor's frames for the sensor to fit.
 FITS = 0.2
+#: A sensor is as good as the best one if its share is at most this much smaller.
 AS_GOOD = 0.01
+#: Share of the bytes that identifies a sensor without doubt.
 CLEAR = 0.9
-#: data frames one after another that are no chance even where no checksum is right.
-RHYTHM = 3
+#: Number of data frames that are no coincidence even if all checksums are invalid.
+MIN_UNCHECKED_FRAMES = 3
 
 
-class Told(NamedTuple):
-    """What frames say of the sensors that send such.
+class Distinction(NamedTuple):
+    """The result of a comparison of related models.
 
     Attributes:
-        alike: those of the candidates that they may be of, by id, each with why; where it is one
-            alone, what differs was seen.
-        others: relatives of theirs that are not installed, and whose frames these may be; are,
-            where `alike` is empty.
+        alike: the candidates that may have sent the frames: id -> reason, "" if there is none.
+        others: related models, not installed, that may have sent the frames: id -> difference. If
+            `alike` is empty, one of them did.
     """
 
     alike: dict[str, str]
     others: dict[str, str]
 
 
-def told_apart(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found]]) -> Told:
-    """What tells sensors with the same data frames apart: single packets that only one sends, then
-    the pace of the clock, then names.
+def distinguish(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found]]) -> Distinction:
+    """Decide which of several sensors with the same data frames sent some frames.
+
+    Packets that only one model sends decide first, then the pace of the clock, then model names.
 
     Args:
-        candidates: sensors whose data frames these are alike.
-        found: frames as each of them reads the bytes, by id, in the order of their arrival.
+        candidates: sensors that decode the same data frames.
+        found: sensor id -> the frames that this sensor decoded, in the order of their arrival.
     """
     ids = {sensor.id for sensor in candidates}
-    shown = {sensor.id: _shown(sensor, found[sensor.id]) for sensor in candidates}
-    left = [sensor for sensor in candidates if not shown[sensor.id]]
+    excluding = {sensor.id: _excluding_relatives(sensor, found[sensor.id]) for sensor in candidates}
+    left = [sensor for sensor in candidates if not excluding[sensor.id]]
+    reasons = {name: why for relatives in excluding.values() for name, why in relatives.items()}
     if not left:
-        return Told(
-            {},
-            {name: why for seen in shown.values() for name, why in seen.items() if name not in ids},
-        )
-    timed = _spoken_for(left, _by_clock, found)
+        return Distinction({}, {name: why for name, why in reasons.items() if name not in ids})
+    timed = _select(left, _match_clock, found)
     named_among = [sensor for sensor in left if sensor.id in timed] or left
     if len(timed) == 1:
-        spoken_for = timed
+        selected = timed
     else:
-        spoken_for = _spoken_for(named_among, _by_name, found) or timed
-    if spoken_for:
-        return Told(spoken_for, {})
-    reasons = {name: why for seen in shown.values() for name, why in seen.items()}
-    told = {
+        selected = _select(named_among, _match_name, found) or timed
+    if selected:
+        return Distinction(selected, {})
+    differences = {
         name: text
         for sensor in left
         for name, text in sensor.relatives.items()
         if isinstance(text, str) and name not in ids
     }
     installed = registry()
-    return Told(
+    return Distinction(
         {sensor.id: reasons.get(sensor.id, "") for sensor in left},
-        {name: text for name, text in told.items() if installed.find(name) is None},
+        {name: text for name, text in differences.items() if installed.find(name) is None},
     )
 
 
 def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
-    """That these frames are those of relatives and not the sensor's, with what says so, or name
-    another model; "" where nothing does.
-    """
-    relatives = map(registry().find, sensor.relatives)  # loads their plugins alone
+    """Return the evidence that another model than the sensor sent some frames; "" if none."""
+    relatives = map(registry().find, sensor.relatives)  # loads only their plugins
     alike = [sensor, *(relative for relative in relatives if relative is not None)]
-    told = told_apart(alike, {one.id: found for one in alike})
-    if sensor.id not in told.alike:
+    result = distinguish(alike, {one.id: found for one in alike})
+    if sensor.id not in result.alike:
         return "the frames are those of " + " or ".join(
-            f"{name} ({why})" for name, why in (told.alike or told.others).items()
+            f"{name} ({why})" for name, why in (result.alike or result.others).items()
         )
     names = _models(sensor, found)
     fits = any(
@@ -141,8 +140,8 @@ def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
     return f"{sensor.info['model']} says {names[0]}"
 
 
-def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
-    """The relatives that most of the data frames can only be of, by id, each with what tells it."""
+def _excluding_relatives(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
+    """Return the relatives that alone send most of these packets: id -> difference."""
     single = {
         name: relative
         for name, relative in sensor.relatives.items()
@@ -165,13 +164,18 @@ def _shown(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
     }
 
 
-def _spoken_for(
+def _select(
     left: Sequence[Sensor],
     why: Callable[[Sensor, Sequence[Found]], str],
     found: Mapping[str, Sequence[Found]],
 ) -> dict[str, str]:
-    """Those that the frames speak for in one way, by id, each with why; none where nothing does, or
-    for all of several.
+    """Select the sensors that match by one criterion: id -> reason.
+
+    Args:
+        why: returns the reason why a sensor matches, "" if it does not.
+
+    Returns:
+        An empty dict if no sensor matches, or if all of several match.
     """
     if len(left) == 1 and not left[0].relatives:
         return {}
@@ -181,8 +185,8 @@ def _spoken_for(
     return {}
 
 
-def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
-    """Why the clock in the frames is this sensor's, "" where it is not."""
+def _match_clock(sensor: Sensor, found: Sequence[Found]) -> str:
+    """Return a reason if the clock in the frames has the pace of this sensor, else ""."""
     data = [item for item in found if item.frame == sensor.data_frame]
     if sensor.clock is None or len(data) < 3:
         return ""
@@ -201,10 +205,13 @@ def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
         expected = _declared_pace(sensor.clock.pace, packets)
     if expected is None:
         return ""
-    if sensor.datagrams:  # lost, doubled and swapped ones leave most steps as they were
+    if sensor.datagrams:
+        # Lost, repeated and reordered datagrams leave the median of the steps unchanged.
         step = float(np.median(np.diff(np.sort(packets.time_ns))))
         grain = 0.0
-    else:  # a clock may be coarse, and what is lost is seen
+    else:
+        # The clock may be coarse, which requires a mean. In a stream, gaps in the offsets show
+        # where frames were lost, and these steps are left out.
         follows = np.array(
             [
                 after.offset == item.offset + len(item.data)
@@ -216,21 +223,22 @@ def _by_clock(sensor: Sensor, found: Sequence[Found]) -> str:
         if len(steps) < 2:
             return ""
         step = float(steps.mean())
-        grain = min(float(np.ptp(steps)), expected) / (
-            2 * len(steps) ** 0.5
-        )  # as uneven as its steps
-    if abs(step - expected) > OFF * expected + grain:
+        # The error of the mean, from the spread of the steps.
+        grain = min(float(np.ptp(steps)), expected) / (2 * len(steps) ** 0.5)
+    if abs(step - expected) > PACE_TOLERANCE * expected + grain:
         return ""
     return f"its clock advances by {step / 1e6:.3g} ms a packet"
 
 
 @functools.lru_cache(maxsize=256)
 def _pace(sensor_id: str, sensor: Sensor) -> float | None:
-    """Nanoseconds by which the sensor's clock advances a packet in a simulation, None where it has
-    none.
+    """Return the simulated step of the sensor's clock per packet, ns; None if it does not advance.
+
+    Args:
+        sensor_id: not read; it is part of the key of the cache.
     """
     try:
-        steps = np.diff(sensor.decode(simulate(sensor, PACKETS)).time_ns)
+        steps = np.diff(sensor.decode(simulate(sensor, SIMULATED_PACKETS)).time_ns)
     except LidarSpecError:
         return None
     steps = steps[steps >= 0]
@@ -240,12 +248,12 @@ def _pace(sensor_id: str, sensor: Sensor) -> float | None:
 
 
 def _declared_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
-    """Nanoseconds by which the clock advances a packet, as most of the packets say."""
+    """Return the median of the declared clock steps per packet, ns."""
     return float(np.median(np.asarray(pace(Fields(packets.batch())), np.float64))) * 1e9
 
 
-def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
-    """Why the frames name this sensor as their model, "" where they do not."""
+def _match_name(sensor: Sensor, found: Sequence[Found]) -> str:
+    """Return a reason if the frames name the model of this sensor, else ""."""
     return next(
         (
             f"{sensor.info['model']} says {text}"
@@ -257,49 +265,51 @@ def _by_name(sensor: Sensor, found: Sequence[Found]) -> str:
 
 
 def _models(sensor: Sensor, found: Sequence[Found]) -> list[str]:
-    """The models that the first frames name, as far as they name any; a relative may send another
-    frame under the same name.
-    """
-    frame, _, field = sensor.info.get("model", "").partition(".")
+    """Return the models that the first frames with a model field name."""
+    frame, _, path = sensor.info.get("model", "").partition(".")
+    named_frames = (item for item in found if item.frame == frame)
     names = []
-    for item in itertools.islice((item for item in found if item.frame == frame), READ):
+    for item in itertools.islice(named_frames, MAX_NAMED_FRAMES):
         try:
-            names.append(_text(*_field(sensor, item, field)))
+            names.append(_text(*_field(sensor, item, path)))
         except WireError:
-            continue
+            continue  # a related model may use the same frame name for another frame
     return [name for name in names if name]
 
 
 def said(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
-    """What the last of these frames say of the device itself, as the sensor's `info` declares: role
-    -> text, a number with its unit.
+    """Return the values of the sensor's `info` fields in the last frame of each type.
+
+    Returns:
+        Role -> text, such as "serial" -> "A1234"; numbers have a unit.
     """
     last = {item.frame: item for item in found}
-    told = dict[str, str]()
+    texts = dict[str, str]()
     for role, path in sensor.info.items():
-        frame, _, field = path.partition(".")
+        frame, _, field_path = path.partition(".")
         if frame in last:
-            value, info = _field(sensor, last[frame], field)
+            value, info = _field(sensor, last[frame], field_path)
             if isinstance(value, list):
-                told[role] = ".".join(map(str, value))  # a version
+                texts[role] = ".".join(map(str, value))  # a version
             elif isinstance(value, bytes):
-                text = value.rstrip(b"\0 ")
-                if text.isascii() and text.decode("ascii").isprintable():
-                    told[role] = text.decode("ascii")
+                content = value.rstrip(b"\0 ")
+                if content.isascii() and content.decode("ascii").isprintable():
+                    texts[role] = content.decode("ascii")
                 else:
-                    told[role] = value.hex()
+                    texts[role] = value.hex()
             else:
-                told[role] = _text(value, info) or (
+                texts[role] = _text(value, info) or (
                     f"{info.physical(value):g} {info.unit}".rstrip()
                     if isinstance(value, int | float)
                     else f"{value}"
                 )
-    return {role: text for role, text in told.items() if text}
+    return {role: text for role, text in texts.items() if text}
 
 
 def _field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
-    """The raw value of a field of a frame, or of the first of its parts that has it ("" where none
-    has), and what is known of the field.
+    """Return the raw value and the description of a field.
+
+    For a field of repeated parts the value is that of the first part with the field, or "".
     """
     fields = schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
@@ -316,7 +326,7 @@ def _at(parsed: Any, path: str) -> Any:
 
 
 def _text(value: Any, info: FieldInfo) -> str:
-    """What a field says: its text, or the meaning of its number."""
+    """Return the text of a field, or the documented meaning of its number."""
     if isinstance(value, bytes):
         return value.split(b"\0")[0].decode("ascii", "replace")
     meanings = {int(number, 0): text.strip() for number, text in _VALUE.findall(info.docs)} | dict(
@@ -331,8 +341,14 @@ def _plain(text: str) -> str:
 
 @dataclass(frozen=True)
 class Score:
-    """How well a sensor fits: the share of the bytes in its frames, the number of its data frames,
-    and what else speaks for it.
+    """The rating of a sensor for some bytes.
+
+    Attributes:
+        sensor: the sensor.
+        share: the share of the bytes that are in its frames.
+        data_frames: the number of its data frames.
+        found: all of its frames.
+        why: other evidence for this sensor.
     """
 
     sensor: Sensor
@@ -344,16 +360,15 @@ class Score:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whose bytes were heard.
+    """The sensors that may have sent some bytes.
 
     Attributes:
         heard: the bytes.
-        scores: every sensor that fits, the best first.
-        alike: those that it may be.
-        others: relatives of theirs, by id, each with what tells it apart, that are not installed:
-            it may be one of them too; where `alike` is empty it is one.
-        fault: what is wrong with frames that are a sensor's but for their checksums; "" where there
-            are none.
+        scores: all sensors that fit, best first.
+        alike: the sensors that remain possible.
+        others: related models, not installed, that are also possible: id -> difference. If `alike`
+            is empty, one of them sent the bytes.
+        fault: a description of frames that fit a sensor except for their checksums, or "".
     """
 
     heard: Heard
@@ -364,41 +379,50 @@ class Verdict:
 
     @property
     def sensor(self) -> Sensor | None:
-        """The sensor, None where none fits or several do."""
+        """The sensor; None if no sensor or more than one is possible."""
         if len(self.alike) == 1 and not self.others:
             return self.alike[0].sensor
         return None
 
     @property
     def is_clear(self) -> bool:
-        """Whether no other baud rate has to be tried."""
+        """Whether the result is certain, so that no other baud rate has to be tried."""
         return (
             bool(self.scores) and self.scores[0].share >= CLEAR and self.scores[0].data_frames > 1
         )
 
 
 def scores(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
-    """Every installed sensor of which a data frame was found, the best first."""
-    known = _readable()
-    found = _each(known, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
+    """Return the scores of all installed sensors with at least one data frame, best first."""
+    known = _sensors_with_frames()
+    found = _score_each(known, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
     if not any(score.share >= FITS for score in found):
-        found += _each(known, lambda sensor: _from_the_middle(sensor, chunks, datagrams=datagrams))
+        found += _score_each(
+            known, lambda sensor: _score_mid_stream(sensor, chunks, datagrams=datagrams)
+        )
     return sorted(found, key=lambda score: (-score.share, score.sensor.id))
 
 
-def _readable() -> list[Sensor]:
-    """The installed sensors that have frames before they are configured."""
+def _sensors_with_frames() -> list[Sensor]:
+    """Return the installed sensors that have incoming frames without any configuration."""
     return [sensor for sensor in sensors().values() if sensor.incoming]
 
 
 def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
-    """What to say of bytes that are the frames of a sensor but for their checksums, which are never
-    right; "" of all others.
+    """Describe bytes that are frames of a sensor except for their checksums, all of them invalid.
+
+    Returns:
+        "" for all other bytes.
     """
-    as_stored = _each(
-        _readable(), lambda sensor: _score(sensor, chunks, datagrams=datagrams, sums=_stored)
+    unchecked = _score_each(
+        _sensors_with_frames(),
+        lambda sensor: _score(sensor, chunks, datagrams=datagrams, sums=_stored_checksums),
     )
-    found = [score for score in as_stored if score.share >= CLEAR and score.data_frames >= RHYTHM]
+    found = [
+        score
+        for score in unchecked
+        if score.share >= CLEAR and score.data_frames >= MIN_UNCHECKED_FRAMES
+    ]
     if not found or _score(found[0].sensor, chunks, datagrams=datagrams) is not None:
         return ""
     kinds = [item.frame for item in found[0].found]
@@ -423,13 +447,13 @@ def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     )
 
 
-def _stored(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
-    """The checksums that stand in the frames, whatever they are, in place of those that should."""
+def _stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
+    """Return the checksums in the frames instead of computed ones, so that all are valid."""
     return seal.stored(rows)
 
 
-def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> list[Score]:
-    """The score of each sensor; those with the very same frames share one."""
+def _score_each(known: Sequence[Sensor], rate: Callable[[Sensor], Score | None]) -> list[Score]:
+    """Return the score of each sensor; sensors with identical frames are decoded only once."""
     shared: dict[object, Score | None] = {}
     for sensor in known:
         frames = (
@@ -440,7 +464,7 @@ def _each(known: Sequence[Sensor], scored: Callable[[Sensor], Score | None]) -> 
             ),
         )
         if frames not in shared:
-            shared[frames] = scored(sensor)
+            shared[frames] = rate(sensor)
         if (score := shared[frames]) is not None:
             shared[sensor.id] = replace(
                 score,
@@ -455,7 +479,7 @@ def _score(
     if sensor.recognise is not None and datagrams and (options := sensor.recognise(tuple(chunks))):
         sensor = sensor.configure(**options)
     decoder = Decoder(sensor, stream=not datagrams, sums=sums)
-    # All at once: chunk by chunk takes ten times as long.
+    # Decode all chunks in one call: one call per chunk takes ten times as long.
     if datagrams:
         items = decoder.datagrams(chunks).found()
     else:
@@ -469,9 +493,11 @@ def _score(
     return None
 
 
-def _from_the_middle(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    """The best score of a sensor whose data frames come after others, configured as if one of those
-    had been seen before.
+def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
+    """Score a sensor as if the frame that precedes its data frames had been seen already.
+
+    This applies to data frames that are only valid after another frame, such as a reply. Returns
+    the best score of all such data frames.
     """
     answers = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
     scored = [
@@ -485,22 +511,20 @@ def _from_the_middle(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool
 
 
 def verdict(heard: Heard) -> Verdict:
-    """Whose bytes were heard: by the frames, then by clocks and names in them, then by the baud
-    rate.
-    """
+    """Identify the sensor by its frames, then by their clocks and names, then by the baud rate."""
     fitting = [
         score for score in scores(heard.chunks, datagrams=heard.datagrams) if score.share >= FITS
     ]
     best = [score for score in fitting if score.share >= fitting[0].share - AS_GOOD]
     if not best:
         return Verdict(heard, fault=never_right(heard.chunks, datagrams=heard.datagrams))
-    told = told_apart(
+    result = distinguish(
         [score.sensor for score in best], {score.sensor.id: score.found for score in best}
     )
     alike = [
-        replace(score, why=told.alike[score.sensor.id])
+        replace(score, why=result.alike[score.sensor.id])
         for score in best
-        if score.sensor.id in told.alike
+        if score.sensor.id in result.alike
     ]
     if len(alike) > 1 and heard.baud is not None:
         why = f"it runs at {heard.baud} baud"
@@ -516,27 +540,28 @@ def verdict(heard: Heard) -> Verdict:
         )
         for score in alike
     ]
-    # Of many with the same frames, it is likelier one of the vendor that makes most of them.
+    # List the vendor first that makes most of these sensors: it is the most likely one.
     vendors = [score.sensor.vendor for score in alike]
     alike.sort(key=lambda score: (-vendors.count(score.sensor.vendor), score.sensor.id))
     ruled_out = [
         score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}
     ]
-    return Verdict(heard, (*alike, *ruled_out), tuple(alike), told.others)
+    return Verdict(heard, (*alike, *ruled_out), tuple(alike), result.others)
 
 
 def verdicts(
     source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore
 ) -> list[Verdict]:
-    """Whose bytes come from a source, one verdict for each sender; of a serial port, at the baud
-    rate that fits best.
+    """Identify the sensors that send to a source: one verdict for each sender.
+
+    For a serial port, return the verdict of the baud rate that fits best.
 
     Args:
-        seconds: to listen for, at each baud rate.
-        tell: called with what is being listened to, before each time.
+        seconds: time to listen at each baud rate.
+        tell: called with a description of the source before each time of listening.
 
     Raises:
-        SourceError: where it cannot be opened.
+        SourceError: if the source cannot be opened.
     """
     tried: list[Verdict] = []
     for heard in hear(source, seconds=seconds, tell=tell):
@@ -549,29 +574,28 @@ def verdicts(
 
 
 def best(tried: Sequence[Verdict]) -> Verdict:
-    """The verdict whose first sensor has the most of the bytes in its frames; of those without a
-    sensor, the one on most bytes.
-    """
+    """Return the verdict with the highest score; without any scores, the one on most bytes."""
     return max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
 
 
 def detected(source: str | Path) -> Sensor:
-    """The one installed sensor whose frames come from a source; a recording says it itself, where
-    it was made with one.
+    """Return the installed sensor that sends to a source.
+
+    A source that declares its sensor, such as a recording, is not searched for frames.
 
     Raises:
-        CommandError: where nothing comes from a live source.
-        WireError: where none fits.
-        UsageError: where several fit equally well: they are listed.
-        SourceError: where it cannot be opened.
+        CommandError: if a live source sends nothing.
+        WireError: if no sensor fits.
+        UsageError: if several sensors fit equally well.
+        SourceError: if the source cannot be opened.
     """
-    told = declared(source)
-    if told is not None:
-        return told
+    declared_sensor = declared(source)
+    if declared_sensor is not None:
+        return declared_sensor
     found = verdicts(resolved(source))
     fitting = [one for one in found if one.scores]
     if not fitting:
-        raise _nothing(str(source), found)
+        raise _no_sensor_error(str(source), found)
     if not any(one.alike for one in fitting):
         raise suggest(
             WireError(f"{source}: {others_named(fitting[0])}"),
@@ -592,7 +616,7 @@ def detected(source: str | Path) -> Sensor:
 
 
 def chosen(sensor: Sensor) -> str:
-    """What to type for a sensor and what it is configured with."""
+    """Return the command-line options that select a sensor and its configuration."""
     return " ".join(
         [
             f"-s {sensor.id}",
@@ -602,7 +626,7 @@ def chosen(sensor: Sensor) -> str:
 
 
 def names(found: Verdict) -> list[str]:
-    """The ids of all that it may be, with a remark on those that are not installed."""
+    """Return the ids of all possible sensors, and mark those that are not installed."""
     return [
         *(score.sensor.id for score in found.alike),
         *(f"{name} (not installed)" for name in found.others),
@@ -610,7 +634,7 @@ def names(found: Verdict) -> list[str]:
 
 
 def others_named(found: Verdict) -> str:
-    """What to say of frames that are of a sensor that is recognised, and not installed."""
+    """Return a message for frames of models that are known but not installed."""
     return (
         " or ".join(f"these are frames of {name} ({why})" for name, why in found.others.items())
         + ", which no installed plugin reads"
@@ -618,12 +642,13 @@ def others_named(found: Verdict) -> str:
 
 
 def declared(source: str | Path) -> Sensor | None:
-    """The sensor that a source names itself: a device of `lidarspec.toml`, a recording, a simulated
-    sensor; None for any other.
+    """Return the sensor that a source declares; None if it declares none.
+
+    Sources that declare a sensor are devices of `lidarspec.toml`, recordings and simulated sensors.
 
     Raises:
         UsageError: for standard input.
-        SourceError: for a file that cannot be opened.
+        SourceError: if the file cannot be opened.
     """
     device = named(source)
     if device is not None:
@@ -647,17 +672,15 @@ def declared(source: str | Path) -> Sensor | None:
 
 
 def simulated_sensor(source: str | Path) -> Sensor | None:
-    """Return the sensor that a source simulates, as in "sim:ID"; None for any other source. Nothing
-    is opened.
-    """
+    """Return the sensor of a source "sim:ID", without opening it; None for any other source."""
     address = live_address(source)
     if address is None or address.scheme != "sim" or not address.place:
         return None
     return named_sensor(address.place)
 
 
-def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
-    """What to say where no sensor fits."""
+def _no_sensor_error(source: str, found: Sequence[Verdict]) -> Exception:
+    """Return the error for a source for which no sensor fits."""
     heard = max((one.heard for one in found), key=lambda one: one.size, default=Heard(source))
     if fault := next((one.fault for one in found if one.fault), ""):
         return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {quote(str(source))}")
@@ -676,13 +699,14 @@ def _nothing(source: str, found: Sequence[Verdict]) -> Exception:
     return suggest(CommandError(why), f"lidarspec doctor {quote(source)}")
 
 
-#: constant bits that make bytes look like a frame.
-ALIKE = 8
+#: Smallest number of constant bits that have to be equal for bytes to resemble a frame type.
+MIN_CONSTANT_BITS = 8
 
 
 def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
-    """The installed sensors whose bytes these are, the best first; those with a type of exactly
-    this frame before all others.
+    """Return the installed sensors that fit some bytes, best first.
+
+    If all bytes together are exactly one frame of some sensors, only these are returned.
     """
     known = list(sensors().values())
     data = b"".join(chunks)
@@ -696,8 +720,9 @@ def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
 
 
 def nearest(data: bytes) -> WireError | None:
-    """What the installed sensor that came farthest with some bytes says of them, with its id; None
-    where none came far.
+    """Return the error of the installed sensor that parsed most of an invalid frame.
+
+    None if the bytes do not begin like a frame of any sensor.
     """
     faults = []
     for sensor in sensors().values():
@@ -713,7 +738,7 @@ def nearest(data: bytes) -> WireError | None:
 
 
 def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
-    """Whether the bytes are exactly one valid and plausible frame of a type."""
+    """Return whether the bytes are exactly one valid and plausible frame of a type."""
     frame = sensor.frames[name]
     if not 0 < len(data) <= frame.max_length:
         return False
@@ -728,18 +753,19 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
 
 
 def _begins_alike(fault: WireError) -> bool:
-    """Whether the bytes have the constants that the frame type begins with, and those are enough
-    not to be chance.
+    """Return whether the invalid bytes have the constant bits at the start of the frame type.
+
+    At least `MIN_CONSTANT_BITS` are required, since fewer may be equal by coincidence.
     """
     if not fault.frame:
         return False
     prefix = codec(sensors()[fault.sensor].frames[fault.frame]).prefix
-    there = [
+    constants = [
         (fault.data[spot], mask, value)
         for spot, (mask, value) in prefix.items()
         if spot < len(fault.data)
     ]
     return (
-        all(byte & mask == value for byte, mask, value in there)
-        and sum(mask.bit_count() for _, mask, _ in there) >= ALIKE
+        all(byte & mask == value for byte, mask, value in constants)
+        and sum(mask.bit_count() for _, mask, _ in constants) >= MIN_CONSTANT_BITS
     )

@@ -1,14 +1,14 @@
-"""The search for a CRC of 8, 16 or 32 bits: every polynomial at once, by division instead of by
-trial.
+"""Search for a CRC of 8, 16 or 32 bits by polynomial division instead of trial.
 
-Polynomials over GF(2) are integers here, bit k the coefficient of x**k. A CRC is the remainder of a
-message by its polynomial. So the polynomial divides the message with its checksum behind it, and of
-two frames of one length it divides the XOR of both, whatever register the CRC begins with and
-whatever is XORed onto it: the greatest common divisor of such pairs is it. Start value and final
-XOR then follow: where frames differ in length they are the solution of linear equations; where all
-have one length, many pairs say the same, and the most usual of them is taken. Where no two frames
-have one length, or there are few, the usual pairs are assumed first, so that every frame counts by
-itself.
+Polynomials over GF(2) are integers: bit k is the coefficient of x**k. A CRC is the remainder of a
+message modulo its polynomial, so the polynomial divides the message followed by its CRC. For two
+frames of one length it divides their XOR, whatever the start value and the final XOR of the CRC
+are. The polynomial is therefore a divisor of the greatest common divisor of such XORs.
+
+Start value and final XOR follow from the polynomial. If the frames have several lengths, the values
+are the solution of linear equations. If all frames have one length, many pairs of values are
+equivalent, and the most usual pair is returned. If too few frames share a length, the usual pairs
+are assumed first, so that each frame alone is a multiple of the polynomial.
 """
 
 from __future__ import annotations
@@ -25,29 +25,30 @@ import numpy as np
 from lidarspec.drafting.samples import Match, Place, Samples, Span, anywhere, doubt, enough, spans
 from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflected
 
-#: how much larger than sought a common divisor may be, where its divisors are tried one by one.
-SPARE = 11
-#: the widest first: the polynomial of a narrow one can be a divisor of that of a wide one.
+#: Largest degree of the cofactors that are tried to find a divisor, one by one.
+MAX_COFACTOR_DEGREE = 11
+#: Widths of CRCs in bits. The widest comes first, since the polynomial of a narrow CRC may divide
+#: that of a wide one.
 WIDTHS = (32, 16, 8)
-#: frames longer than this are divided for a checksum at their end alone; elsewhere the catalogue is
-#: tried.
-DIVIDED = 256
-#: bytes of which a CRC is computed in the time in which one byte is divided.
+#: In longer frames than this, division is used only for a CRC at the end. At other places only the
+#: CRCs of the catalogue are tried.
+MAX_DIVIDED_BYTES = 256
+#: Cost of the division of one byte, in bytes of CRC computation.
 DIVISION_WORK = 32
-#: work of a quick search, in bytes of which a CRC is computed: about a second.
+#: Limit of a quick search, in bytes of CRC computation: about a second.
 QUICK_WORK = 1 << 23
-#: frames of one length that a polynomial is sought with; at the usual place other picks are tried
-#: where one fails, in case of damage.
-TAKEN = 4
+#: Number of frames of one length that are used to find a polynomial.
+FRAMES_PER_PICK = 4
+#: Number of selections of frames that are tried at the usual place, in case of damaged frames.
 PICKS = 6
-#: most polynomials that are held against all frames for one place and span.
-WEIGHED = 64
-#: (size of what is covered, message with the checksum behind it) of each frame.
+#: Largest number of polynomials that are tested with all frames for one place and span.
+MAX_POLYNOMIALS = 64
+#: For each frame: number of covered bytes, and the polynomial of the message and its checksum.
 Codewords = list[tuple[int, int]]
 
 
 def remainder(a: int, b: int) -> int:
-    """a modulo b; b is not 0."""
+    """Return a modulo b; b must not be 0."""
     size = b.bit_length()
     while (shift := a.bit_length() - size) >= 0:
         a ^= b << shift
@@ -55,7 +56,7 @@ def remainder(a: int, b: int) -> int:
 
 
 def quotient(a: int, b: int) -> int:
-    """a divided by b, without the remainder; b is not 0."""
+    """Return a divided by b, without the remainder; b must not be 0."""
     size = b.bit_length()
     found = 0
     while (shift := a.bit_length() - size) >= 0:
@@ -65,8 +66,10 @@ def quotient(a: int, b: int) -> int:
 
 
 def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
-    """The largest polynomial that divides all of them; 0 for none but zeros, and early where its
-    degree falls below `floor`.
+    """Return the greatest common divisor of polynomials; 0 if all are 0.
+
+    Args:
+        floor: stop early if the degree of the divisor falls below this.
     """
     found = 0
     for polynomial in polynomials:
@@ -79,8 +82,10 @@ def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
 
 
 def divisors(polynomial: int, degree: int) -> list[int]:
-    """The divisors of this degree whose constant term is 1, as those of CRCs have; [] where there
-    are too many to try.
+    """Return the divisors of a degree with constant term 1, as CRC polynomials have.
+
+    Returns:
+        An empty list also if there are too many polynomials to try.
     """
     if polynomial == 0:
         return []
@@ -88,7 +93,7 @@ def divisors(polynomial: int, degree: int) -> list[int]:
     spare = polynomial.bit_length() - 1 - degree
     if spare < 0:
         return []
-    if spare <= SPARE:
+    if spare <= MAX_COFACTOR_DEGREE:
         found = (
             quotient(polynomial, small)
             for small in range((1 << spare) | 1, 2 << spare, 2)
@@ -98,12 +103,12 @@ def divisors(polynomial: int, degree: int) -> list[int]:
             return sorted(found)
         return [polynomial]
     if degree <= 16:
-        return _tried(polynomial, degree)
+        return _try_all(polynomial, degree)
     return []
 
 
-def _tried(polynomial: int, degree: int) -> list[int]:
-    """The divisors of a small degree: every polynomial of it at once."""
+def _try_all(polynomial: int, degree: int) -> list[int]:
+    """Return the divisors of a small degree, by division by all polynomials at once."""
     candidates = np.arange((1 << degree) | 1, 2 << degree, 2, dtype=np.uint32)
     rest = np.zeros(len(candidates), np.uint32)
     top = np.uint32(degree)
@@ -114,12 +119,15 @@ def _tried(polynomial: int, degree: int) -> list[int]:
 
 
 def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[int]] | None:
-    """A solution of linear equations over GF(2), and what can be added to it; None where there is
-    none.
+    """Solve linear equations over GF(2).
 
     Args:
-        equations: (mask, bit) each: the XOR of the unknown's bits under the mask is the bit.
-        width: bits of the unknown.
+        equations: pairs (mask, bit): the XOR of the bits of the unknown under the mask equals bit.
+        width: number of bits of the unknown.
+
+    Returns:
+        One solution and a basis of the null space; the XOR of the solution with any of the basis
+        vectors is another solution. None if there is no solution.
     """
     rows: dict[int, int] = {}
     for mask, bit in equations:
@@ -143,7 +151,13 @@ def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[i
 
 @dataclass(frozen=True)
 class _Reading:
-    """How frames are read as polynomials: bytes and register with the lowest bit first, or not."""
+    """A conversion of frames to polynomials.
+
+    Attributes:
+        width: of the CRC, in bits.
+        order: byte order of the stored CRC.
+        refin, refout: whether bytes and register begin with the lowest bit.
+    """
 
     width: int
     order: ByteOrder
@@ -158,12 +172,12 @@ class _Reading:
             return reflected(value, self.width)
         return value
 
-    def started(self, init: int, size: int) -> int:
-        """What a start value adds to the message of `size` bytes."""
+    def init_term(self, init: int, size: int) -> int:
+        """Return the polynomial that a start value adds to a message of `size` bytes."""
         return init << 8 * size
 
     def known(self) -> list[Crc]:
-        """The CRCs of the catalogue that are read like this."""
+        """Return the CRCs of the catalogue with this width and bit order."""
         return [
             crc
             for crc in CRCS.values()
@@ -182,21 +196,28 @@ def crc_matches(
     quick: bool = False,
     stands: Callable[[Place], bool] = anywhere,
 ) -> Iterator[Match]:
-    """Every CRC that fits, up to the first place with a sure one.
+    """Yield the CRCs that fit, up to the first place with a sure match.
 
     Args:
-        mixed: look for those whose bytes and register are not mirrored alike, in place of those
-            where they are.
-        quick: end after a fixed amount of work; the usual places come first.
-        stands: whether a CRC may stand at a place.
+        mixed: search only for CRCs with different `refin` and `refout`; by default, only for CRCs
+            with equal ones.
+        quick: stop after a fixed amount of work; the usual places come first.
+        stands: returns whether a CRC may be at a place.
     """
     if mixed:
         mirrors = [(False, True), (True, False)]
     else:
         mirrors = [(False, False), (True, True)]
-    picks = [samples.alike(TAKEN, pick) for pick in range(PICKS if len(samples) > 2 * TAKEN else 1)]
+    picks = [
+        samples.alike(FRAMES_PER_PICK, pick)
+        for pick in range(PICKS if len(samples) > 2 * FRAMES_PER_PICK else 1)
+    ]
     by_width = [
-        [place for place in filter(stands, samples.places(width // 8)) if _random(samples, place)]
+        [
+            place
+            for place in filter(stands, samples.places(width // 8))
+            if _varies_like_crc(samples, place)
+        ]
         for width in WIDTHS
     ]
     tried = 0
@@ -211,7 +232,7 @@ def crc_matches(
         for span, reading in product(spans(place, samples), readings):
             tried += 1
             at_end = place.offset == -place.size
-            by_catalogue = samples.shortest > DIVIDED and (quick or not at_end)
+            by_catalogue = samples.shortest > MAX_DIVIDED_BYTES and (quick or not at_end)
             chosen = picks if at_end and span == Span() else picks[:1]
             work_left -= sum(_work(some, reading, by_catalogue=by_catalogue) for some in chosen)
             if work_left < 0:
@@ -230,14 +251,14 @@ def crc_matches(
 
 
 def _work(few: Samples, reading: _Reading, *, by_catalogue: bool) -> int:
-    """Return how much work one place, span and reading are, in bytes of which a CRC is computed."""
+    """Return the cost of one place, span and reading, in bytes of CRC computation."""
     if by_catalogue:
         return few.shortest * len(reading.known())
     return DIVISION_WORK * sum(map(len, few.frames))
 
 
-def _random(samples: Samples, place: Place) -> bool:
-    """Whether every byte of a place varies as those of a CRC do."""
+def _varies_like_crc(samples: Samples, place: Place) -> bool:
+    """Return whether each byte of a place has as many values as the bytes of a CRC."""
     if len(samples) < 2:
         return True
     wanted = max(min(len(samples) // 2, 24), 2)
@@ -249,10 +270,10 @@ def _random(samples: Samples, place: Place) -> bool:
 
 def _codewords(samples: Samples, place: Place, span: Span, reading: _Reading) -> Codewords:
     rows = [row.tobytes() for group in samples.covered(place, span) for row in group]
-    there = samples.fields(place, reading.order).tolist()
+    stored = samples.fields(place, reading.order).tolist()
     return [
         (len(row), reading.message(row) ^ reading.register(value))
-        for row, value in zip(rows, there, strict=True)
+        for row, value in zip(rows, stored, strict=True)
     ]
 
 
@@ -266,17 +287,23 @@ def _fitting(
     *,
     by_catalogue: bool,
 ) -> Iterator[Match]:
-    """The CRCs of one place, span and reading; of the catalogue alone, or any."""
-    there = samples.fields(place, reading.order)
+    """Yield the CRCs that fit for one place, span and reading.
+
+    Args:
+        few: the samples that are used to find candidates; all samples are used to test these.
+        tried: number of combinations that were tried so far.
+        by_catalogue: try only the CRCs of the catalogue.
+    """
+    stored = samples.fields(place, reading.order)
     if by_catalogue:
-        candidates = _catalogued(few, place, span, reading)
+        candidates = _iter_catalogue(few, place, span, reading)
     else:
         candidates = _candidates(_codewords(few, place, span, reading), reading)
     for crc, fitted, remarks in candidates:
         right = samples.right(crc, place, span, reading.order)
         known = crc.poly in KNOWN[crc.width]
         doubtful = doubt(
-            crc.width, there, fitted + (not known), tried * (len(CRCS) if known else 1)
+            crc.width, stored, fitted + (not known), tried * (len(CRCS) if known else 1)
         )
         if enough(right, len(samples)) and doubtful > 0:
             open_ = bool(remarks)
@@ -296,8 +323,11 @@ def _fitting(
 
 
 def _candidates(words: Codewords, reading: _Reading) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """CRCs to be tried, with how many values of the frames went into their parameters, and what
-    remains open.
+    """Yield candidate CRCs.
+
+    Yields:
+        The CRC, the number of values of the frames that determined its parameters, and remarks
+        about parameters that remain ambiguous.
     """
     ones = (1 << reading.width) - 1
     lengths = {size for size, _ in words}
@@ -308,7 +338,7 @@ def _candidates(words: Codewords, reading: _Reading) -> Iterator[tuple[Crc, int,
         return
     for init, xorout in product((0, ones), repeat=2):
         absolute = [
-            word ^ reading.started(init, size) ^ xorout
+            word ^ reading.init_term(init, size) ^ xorout
             for size, word in words
             if 8 * size >= reading.width
         ]
@@ -320,36 +350,42 @@ def _candidates(words: Codewords, reading: _Reading) -> Iterator[tuple[Crc, int,
         yield from ((crc, 0, ()) for crc in reading.known())
 
 
-def _catalogued(
+def _iter_catalogue(
     few: Samples, place: Place, span: Span, reading: _Reading
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """The CRCs of the catalogue that are right for one frame."""
-    rows = few.covered(place, span)[0][0].tobytes()
-    there = int(few.fields(place, reading.order)[0])
-    yield from ((crc, 0, ()) for crc in reading.known() if crc(rows) == there)
+    """Yield the CRCs of the catalogue that are valid for the first frame."""
+    covered = few.covered(place, span)[0][0].tobytes()
+    stored = int(few.fields(place, reading.order)[0])
+    yield from ((crc, 0, ()) for crc in reading.known() if crc(covered) == stored)
 
 
 def _differences(words: Codewords) -> list[int]:
-    """The XOR of frames of one length."""
+    """Return the XOR of each frame and the first one of the same length, if they differ."""
     first: dict[int, int] = {}
     return [word ^ first[size] for size, word in words if first.setdefault(size, word) != word]
 
 
 def _polynomials(multiples: Sequence[int], width: int) -> list[int]:
+    """Return the possible CRC polynomials that divide all multiples, known ones first."""
+    xor_polynomial = (1 << width) | 1  # its CRC is a plain XOR, which is searched elsewhere
     found = [
         poly
         for poly in divisors(common_divisor(multiples, floor=width), width)
-        if poly != (1 << width) | 1
-    ]  # that one is an XOR
+        if poly != xor_polynomial
+    ]
     known = [poly for poly in found if poly & ((1 << width) - 1) in KNOWN[width]]
-    return (known + [poly for poly in found if poly not in known])[:WEIGHED]
+    return (known + [poly for poly in found if poly not in known])[:MAX_POLYNOMIALS]
 
 
 def _registers(
     words: Codewords, poly: int, reading: _Reading, *, open_: bool
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Start value and final XOR for a polynomial."""
-    first = dict(reversed(words))  # one frame of each length
+    """Yield a CRC with start value and final XOR for a polynomial.
+
+    Args:
+        open_: whether all frames have one length, so that the two values are ambiguous.
+    """
+    first = dict(reversed(words))  # the first frame of each length
     left = {size: remainder(word, poly) for size, word in first.items()}
     ones = (1 << reading.width) - 1
     usual = [
@@ -360,7 +396,7 @@ def _registers(
     consistent = []
     for init in dict.fromkeys((*usual, 0, ones)):
         finals = {
-            rest ^ remainder(reading.started(init, size), poly) for size, rest in left.items()
+            rest ^ remainder(reading.init_term(init, size), poly) for size, rest in left.items()
         }
         if len(finals) == 1:
             consistent.append(reading.crc(poly, init, finals.pop()))
@@ -383,19 +419,23 @@ def _registers(
     elif consistent:
         yield consistent[0], 2, ()
     elif len(left) > 1:
-        yield from _solved(left, poly, reading)
+        yield from _solve_registers(left, poly, reading)
 
 
-def _solved(
+def _solve_registers(
     left: dict[int, int], poly: int, reading: _Reading
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Start value and final XOR from frames of several lengths, by linear equations."""
+    """Yield a CRC with start value and final XOR from linear equations.
+
+    Args:
+        left: frame length -> remainder of a frame of this length.
+    """
     (size, rest), *others = left.items()
     equations = []
     bits = range(reading.width)
     for other, other_rest in others:
         columns = [
-            remainder(reading.started(1 << bit, size) ^ reading.started(1 << bit, other), poly)
+            remainder(reading.init_term(1 << bit, size) ^ reading.init_term(1 << bit, other), poly)
             for bit in bits
         ]
         wanted = rest ^ other_rest
@@ -410,7 +450,7 @@ def _solved(
             chosen for count in range(1 + len(free[:4])) for chosen in combinations(free[:4], count)
         )
         inits = [functools.reduce(operator.xor, chosen, first) for chosen in some]
-        pairs = [(init, rest ^ remainder(reading.started(init, size), poly)) for init in inits]
+        pairs = [(init, rest ^ remainder(reading.init_term(init, size), poly)) for init in inits]
         init, xorout = min(
             pairs, key=lambda pair: (pair[1] not in (0, (1 << reading.width) - 1), pair[0])
         )
@@ -419,7 +459,7 @@ def _solved(
 
 
 def pasted(crc: Crc) -> str:
-    """A CRC as a plugin writes it."""
+    """Return the Python expression for a CRC in a plugin."""
     digits = crc.width // 4
     parts = [f"width={crc.width}", f"poly=0x{crc.poly:0{digits}X}"]
     parts += (

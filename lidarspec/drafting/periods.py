@@ -1,14 +1,13 @@
-"""What unknown bytes are made of: where frames may begin, how long they are, which checksum seals
-them, and which fields change steadily.
+"""Find frames and steadily changing fields in unknown bytes.
 
-Frames of one length show as a distance at which many bytes are equal; their sync bytes are then the
-longest run of bytes that never change. Frames of several lengths show as a pair of bytes that comes
-again and again, at distances that a length field in front of each frame explains.
+`structure` finds the frames. Frames of one length cause a distance at which many bytes are equal.
+Their sync bytes are then the longest run of constant bytes. Frames of several lengths cause a
+frequent pair of bytes, at distances that a length field after the pair explains.
 
-Counters, angles that wrap at a full circle and clocks show by how they change: such a field rises
-from frame to frame by about the same step each time; the wrong byte order, or a field read one byte
-off, jumps. What it falls back from tells its scale: an angle in hundredths of a degree never
-reaches 36 000.
+`candidates` finds counters, angles that wrap at a full circle, and clocks. Such a field rises from
+frame to frame by about the same step. With the wrong byte order or offset it jumps instead. The
+value at which an angle wraps gives its unit: an angle in hundredths of a degree never reaches
+36 000.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from lidarspec.spec.checksums import ByteOrder
 
 Kind = Literal["counter", "angle", "rising"]
 
-#: full circles on the wire -> what one unit of them is, in degrees, and in words.
+#: Full circle in raw units -> one unit in degrees, and in words.
 CIRCLES = {
     360: (1.0, "whole degrees"),
     3_600: (0.1, "tenths of a degree"),
@@ -39,58 +38,66 @@ CIRCLES = {
     360_000: (0.001, "thousandths of a degree"),
     3_600_000: (0.0001, "1/10 000 of a degree"),
 }
-#: frames below which only the ends of a frame are looked at, and how far these go.
+#: With fewer frames than this, only the first and last bytes of a frame are searched for fields.
 FEW = 8
+#: Number of first bytes that are searched then.
 FRONT = 16
+#: Number of offsets at the end that are searched then.
 BACK = 8
-#: share of the steps that has to be regular, by which share of a step they may differ, and units
-#: that they always may.
-MOST = 0.9
-EVEN = 0.05
-GRAIN = 4
-#: how much less even steps have to be without the lowest byte.
-ROUGH = 1.5
-#: part of all values that a step may be, and share of frames in which something may stay as it is
-#: (two returns of one firing).
-WIDE = 4
-STILL = 0.75
-#: bytes that are looked at, and the shortest and longest period.
-LOOKED_AT = 1 << 15
+#: Smallest share of regular steps.
+MIN_REGULAR_SHARE = 0.9
+#: Relative difference of two steps that counts as regular.
+STEP_TOLERANCE = 0.05
+#: Absolute difference of two steps that always counts as regular, in raw units.
+STEP_SLACK_UNITS = 4
+#: The steps have to be less even by this factor without the lowest byte of a field.
+MIN_COARSENING = 1.5
+#: Largest ratio of a step to the usual step, and smallest ratio of the value range to a usual step.
+MAX_STEP_RATIO = 4
+#: Largest share of frames in which the value may stay the same, as in two returns of one firing.
+MAX_UNCHANGED_SHARE = 0.75
+#: Number of bytes of a stream that are searched.
+MAX_SEARCHED_BYTES = 1 << 15
+#: Shortest and longest frame length that is searched, in bytes.
 SHORTEST = 4
 LONGEST = 4096
-#: distances that are tried as a length, and the share of frames in which a byte that never changes
-#: is the same.
-LAGS = 48
+#: Number of distances that are tried as frame length.
+MAX_DISTANCES = 48
+#: Smallest share of frames in which a constant byte has its usual value; the others may be damaged.
 STEADY = 0.9
-#: share of the bytes that has to be in frames, shares that are about the same, and many frames.
-HALF = 0.5
-CLOSE = 0.03
+#: Smallest share of the bytes that has to be in frames.
+MIN_SHARE = 0.5
+#: Shares that differ by less than this count as equal.
+SHARE_TOLERANCE = 0.03
+#: Number of frames that decides between one length and several: fewer may be coincidence.
 MANY = 12
-#: part of the best weight that a shorter period needs.
-ALIKE = 0.75
-#: pairs of bytes that are tried as sync bytes, and frames that a structure needs.
-PAIRS = 32
-FRAMES = 3
+#: Smallest ratio of a shorter period's weight to the best weight, for the shorter one to be used.
+MIN_RELATIVE_WEIGHT = 0.75
+#: Number of byte pairs that are tried as sync bytes.
+MAX_SYNC_PAIRS = 32
+#: Smallest number of frames of a structure.
+MIN_FRAMES = 3
 #: A structure is refused if random bytes show one like it with a higher probability.
 CHANCE = 1e-3
-#: bytes behind the sync that may hold a length, and the largest size of one unit of it.
+#: The length field has to begin before this offset.
 HEADER = 8
-UNIT = 16
+#: Largest size of the elements that a length field counts, in bytes.
+MAX_UNIT_BYTES = 16
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A field that changes as counters, angles or clocks do.
+    """A field that changes like a counter, an angle or a clock.
 
     Attributes:
-        offset, size, order: where it stands in a frame or block, and how it is read.
-        kind: "counter" rises by one each time; "angle" wraps at a full circle; "rising" is anything
-            else that rises.
-        circle: what it wraps at, 0 where it was not seen to wrap.
+        offset, size, order: position in the frame or block, in bytes, and byte order.
+        kind: "counter" rises by one each time; "angle" wraps at a full circle; "rising" is any
+            other field that rises.
+        circle: the value at which the field wraps; 0 if no wrap was seen.
         steps: the smallest, usual and largest step.
-        right, total: steps that are regular, and all.
-        wraps: how often it fell back.
-        first: what a counter falls back to.
+        right, total: the number of regular steps, and of all steps.
+        wraps: the number of wraps.
+        first: the value of a counter after a wrap.
     """
 
     offset: int
@@ -106,16 +113,16 @@ class Candidate:
 
     @property
     def end(self) -> int:
-        """The first byte behind it."""
+        """The offset after the field."""
         return self.offset + self.size
 
     @property
     def name(self) -> str:
-        """What it is called until somebody knows better."""
+        """The provisional name of the field in a draft."""
         return f"{self.kind}_{self.offset}"
 
     def why(self, what: str = "frame") -> str:
-        """The evidence in words; `what` it rises with."""
+        """Describe the evidence; `what` is "frame" or "block"."""
         low, usual, high = self.steps
         if low == high:
             by = f"{usual}"
@@ -132,16 +139,15 @@ class Candidate:
 
 
 def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:
-    """The fields that rise, without overlaps, in the order of the frame.
+    """Return the rising fields of consecutive frames, without overlaps, by offset.
 
     Args:
-        rows: frames that follow each other, or as much of their beginnings as they have in common,
-            shape (n, size).
+        rows: the frames, or the first bytes of each, (n, size).
     """
     if len(rows) < 3:
         return []
     found = sorted(
-        _all(rows),
+        _iter_rising_fields(rows),
         key=lambda one: (one.kind == "rising", -one.size, -one.right / one.total, one.offset),
     )
     chosen: list[Candidate] = []
@@ -152,12 +158,12 @@ def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:
 
 
 def follows(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
-    """The share of frames in which `last` lies between this frame's `first` and the next one's."""
+    """Return the share of frames in which `last` is between this `first` and the next `first`."""
     modulus = circle or 1 << 40
     return float((((last - first)[:-1] % modulus) <= (np.diff(first) % modulus)).mean())
 
 
-def _all(rows: NDArray[np.uint8]) -> Iterator[Candidate]:
+def _iter_rising_fields(rows: NDArray[np.uint8]) -> Iterator[Candidate]:
     varied = (rows != rows[0]).any(axis=0)
     for offset in _offsets(rows, 1):
         if varied[offset] and len(rows) >= FEW:
@@ -185,14 +191,14 @@ def _offsets(rows: NDArray[np.uint8], size: int) -> Iterable[int]:
 def _counter(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
 ) -> Iterator[Candidate]:
-    """What rises by one each time, and falls back to where it began."""
+    """Yield a counter: it rises by one each time, and wraps to its smallest value."""
     there = values(rows, offset, size, order)
     steps = np.diff(there)
     first = int(there.min())
     last = int(there.max())
     back = (there[:-1] == last) & (there[1:] == first) & (last > first + 1)
     right = int((steps == 1).sum() + back.sum())
-    if right >= MOST * len(steps) and (steps == 1).sum() >= 2:
+    if right >= MIN_REGULAR_SHARE * len(steps) and (steps == 1).sum() >= 2:
         wraps = int(back.sum())
         yield Candidate(
             offset,
@@ -211,16 +217,20 @@ def _counter(
 def _rising(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
 ) -> Iterator[Candidate]:
-    """What rises by about the same step each time."""
+    """Yield a field that rises by about the same step each time."""
     there = values(rows, offset, size, order)
     steps = np.diff(there)
     moved = steps[steps != 0]
-    if len(moved) < 2 or len(moved) < (1 - STILL) * len(steps) or not (moved > 0).any():
+    if (
+        len(moved) < 2
+        or len(moved) < (1 - MAX_UNCHANGED_SHARE) * len(steps)
+        or not (moved > 0).any()
+    ):
         return
     usual = int(np.median(moved[moved > 0]))
     falls = moved < 0
     wraps = int(falls.sum())
-    if wraps > (1 - MOST) * len(moved):
+    if wraps > (1 - MIN_REGULAR_SHARE) * len(moved):
         return
     if wraps:
         circle = _circle(int(there.max()), int(np.median(usual - moved[falls])), usual)
@@ -231,11 +241,11 @@ def _rising(
     else:
         forward = moved
     uneven = np.abs(np.diff(forward))
-    within = (forward > 0) & (forward <= WIDE * usual)
+    within = (forward > 0) & (forward <= MAX_STEP_RATIO * usual)
     if (
-        within.mean() < MOST
-        or np.median(uneven) > max(GRAIN, EVEN * usual)
-        or usual * WIDE > (circle or 1 << 8 * size)
+        within.mean() < MIN_REGULAR_SHARE
+        or np.median(uneven) > max(STEP_SLACK_UNITS, STEP_TOLERANCE * usual)
+        or usual * MAX_STEP_RATIO > (circle or 1 << 8 * size)
     ):
         return
     if len(rows) >= FEW and not _low_byte_counts(there):
@@ -248,20 +258,24 @@ def _rising(
 
 
 def _low_byte_counts(there: NDArray[np.int64]) -> bool:
-    """Whether the steps become less even without the lowest byte: else it belongs to something
-    else.
-    """
+    """Return whether the lowest byte belongs to the field: without it, steps are less even."""
     steps = np.diff(there)
     coarse = 256 * np.diff(there >> 8)
     fine, rough = (np.abs(np.diff(each[steps != 0])) for each in (steps, coarse))
     forward = steps[steps != 0] > 0
     both = forward[1:] & forward[:-1]
-    return bool(both.any()) and bool(rough[both].mean() > ROUGH * fine[both].mean())
+    return bool(both.any()) and bool(rough[both].mean() > MIN_COARSENING * fine[both].mean())
 
 
 def _circle(highest: int, fallen: int, usual: int) -> int:
-    """What a field wraps at: a full circle that it comes near to and never reaches, else about as
-    much as it was seen to fall.
+    """Return the value at which a field wraps.
+
+    This is a full circle if the highest value and the fall are close to one, else the fall itself.
+
+    Args:
+        highest: the highest value.
+        fallen: the usual decrease at a wrap, plus one step.
+        usual: the usual step.
     """
     near = [
         circle
@@ -273,8 +287,9 @@ def _circle(highest: int, fallen: int, usual: int) -> int:
 
 @dataclass(frozen=True)
 class Length:
-    """What a header says of the length of its frame: `rest` + `unit` times the number of `size`
-    bytes at `place`.
+    """A length field in the header of a frame.
+
+    The frame length is `rest` + `unit` times the number of `size` bytes at `place`.
     """
 
     place: int
@@ -285,11 +300,11 @@ class Length:
 
     @property
     def end(self) -> int:
-        """The first byte behind the number."""
+        """The offset after the number."""
         return self.place + self.size
 
     def of(self, frame: bytes) -> int:
-        """The length that a frame says it has."""
+        """Return the frame length from the length field of a frame."""
         return self.rest + self.unit * int.from_bytes(frame[self.place : self.end], self.order)
 
     def __str__(self) -> str:
@@ -302,13 +317,13 @@ class Length:
 
 @dataclass(frozen=True)
 class Structure:
-    """Frames that unknown bytes seem to consist of.
+    """The likely frames in unknown bytes.
 
     Attributes:
-        sync: bytes that each begins with.
-        period: their length; None where it varies.
-        length: how they say it, where it varies.
-        share: share of the bytes that are in them.
+        sync: the first bytes of each frame.
+        period: the length of the frames; None if it varies.
+        length: the length field, if the length varies.
+        share: the share of the bytes that are in frames.
         frames: the frames.
     """
 
@@ -320,45 +335,46 @@ class Structure:
 
     @cached_property
     def checksums(self) -> tuple[Match, ...]:
-        """The checksums that fit, the likeliest first, as far as a second of search finds them."""
+        """The checksums that fit, likeliest first, found in about a second of search."""
         return tuple(search(self.frames, quick=True))
 
 
 def structure(chunks: Sequence[bytes], *, datagrams: bool) -> Structure | None:
-    """The likely structure of unknown bytes, None where there is none to be seen.
+    """Return the likely structure of unknown bytes; None if none is found.
 
     Args:
         chunks: datagrams, or pieces of a stream.
+        datagrams: whether the chunks are datagrams.
     """
     if datagrams:
         return _of_datagrams(chunks)
-    return _of_stream(np.frombuffer(b"".join(chunks)[:LOOKED_AT], np.uint8))
+    return _of_stream(np.frombuffer(b"".join(chunks)[:MAX_SEARCHED_BYTES], np.uint8))
 
 
 def usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The commonest value of each column, (n,)."""
+    """Return the most frequent value of each column, (n,)."""
     return np.array([np.bincount(column, minlength=256).argmax() for column in rows.T], np.uint8)
 
 
 def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Where each run of True begins, and the first place behind it."""
+    """Return start and stop of each run of True."""
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def cut(data: bytes, period: int, start: int = 0) -> list[bytes]:
-    """Whole frames of one length."""
+    """Split data into frames of one length; an incomplete last one is left out."""
     return [data[first : first + period] for first in range(start, len(data) - period + 1, period)]
 
 
 def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
-    """The datagrams of the commonest length, with the bytes that they begin with."""
-    if len(chunks) < FRAMES:
+    """Return the structure of the datagrams with the length that most bytes are in."""
+    if len(chunks) < MIN_FRAMES:
         return None
     lengths, counts = np.unique([len(chunk) for chunk in chunks], return_counts=True)
     length = int(lengths[(lengths * counts).argmax()])
     frames = [chunk for chunk in chunks if len(chunk) == length]
-    if len(frames) < FRAMES or length == 0:
+    if len(frames) < MIN_FRAMES or length == 0:
         return None
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), length)
     steady = (rows == rows[0]).all(axis=0)
@@ -369,51 +385,53 @@ def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
 
 
 def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
-    """The reading that explains more of the bytes; one length for all frames is the simpler one."""
+    """Return the structure that explains more bytes, and prefer one length for all frames."""
     periodic = _periodic(data)
     varying = _by_length(data)
     if periodic is None or varying is None:
         return periodic or varying
     few = len(periodic.frames) < MANY <= len(varying.frames)
-    if varying.share > periodic.share + CLOSE or few:
+    if varying.share > periodic.share + SHARE_TOLERANCE or few:
         return varying
     return periodic
 
 
 def _periodic(data: NDArray[np.uint8]) -> Structure | None:
-    """Frames of one length: of the distances at which most bytes are equal, the one at which the
-    most stay the same all along.
+    """Return frames of one length.
+
+    Of the distances at which most bytes are equal, select the one with the largest share of
+    constant bytes, or a shorter one that is almost as good.
     """
-    lags = np.arange(SHORTEST, min(LONGEST, len(data) // FRAMES) + 1)
+    lags = np.arange(SHORTEST, min(LONGEST, len(data) // MIN_FRAMES) + 1)
     equal = np.array([float((data[lag:] == data[:-lag]).mean()) for lag in lags])
-    likely = lags[np.argsort(equal)[::-1][:LAGS]].tolist()
+    likely = lags[np.argsort(equal)[::-1][:MAX_DISTANCES]].tolist()
     framed = [
         (weight, found)
         for lag in likely
-        for weight, found in _framed(data, lag)
-        if found.share > HALF
+        for weight, found in _iter_frames_of_length(data, lag)
+        if found.share > MIN_SHARE
     ]
     best = max((weight for weight, _ in framed), default=0.0)
     shortest = min(
-        (found for weight, found in framed if weight > ALIKE * best),
+        (found for weight, found in framed if weight > MIN_RELATIVE_WEIGHT * best),
         key=lambda found: found.period or 0,
         default=None,
     )
     if shortest is None:
         return None
-    return _divided(data, shortest)
+    return _split_groups(data, shortest)
 
 
-def _divided(data: NDArray[np.uint8], whole: Structure) -> Structure:
-    """The frames of which a whole number repeats together, as turns of an index or in a simulation
-    do; else the same.
+def _split_groups(data: NDArray[np.uint8], whole: Structure) -> Structure:
+    """Split frames that are groups of shorter frames; return other frames unchanged.
 
-    They are frames of their own where more than one byte begins them, or one and a counter.
+    A group repeats if, for example, an index runs from 0 to 5, or the data is simulated. A part
+    counts as a frame if its sync bytes have different values, or if it has a counter.
     """
     period = whole.period or 0
     for part in (part for part in range(SHORTEST, period // 2 + 1) if period % part == 0):
-        for _, found in _framed(data, part):
-            if found.share > whole.share - CLOSE and (
+        for _, found in _iter_frames_of_length(data, part):
+            if found.share > whole.share - SHARE_TOLERANCE and (
                 len(set(found.sync)) > 1 or _is_counted(found)
             ):
                 return found
@@ -425,14 +443,18 @@ def _is_counted(found: Structure) -> bool:
     return any(one.kind == "counter" for one in candidates(rows))
 
 
-def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Structure]]:
-    """Frames of this length, which begin with the longest run of bytes that are always the same,
-    and the share of such bytes.
+def _iter_frames_of_length(
+    data: NDArray[np.uint8], period: int
+) -> Iterator[tuple[float, Structure]]:
+    """Yield frames of this length and their weight; nothing if there are none.
+
+    The frames begin with the longest run of constant bytes. The weight is the share of constant
+    bytes, multiplied by the share of bytes in frames.
     """
     count = len(data) // period
     rows = data[: count * period].reshape(count, period)
     usual = usual_bytes(rows)
-    if count >= 2 * FRAMES:
+    if count >= 2 * MIN_FRAMES:
         steady = (rows == usual).mean(axis=0) >= STEADY
     else:
         steady = (rows == usual).all(axis=0)
@@ -442,7 +464,7 @@ def _framed(data: NDArray[np.uint8], period: int) -> Iterator[tuple[float, Struc
     start, length = _longest_run(steady, usual)
     sync = bytes(np.roll(usual, -start)[:length])
     frames = [frame for frame in cut(data.tobytes(), period, start) if frame.startswith(sync)]
-    if len(frames) >= FRAMES:
+    if len(frames) >= MIN_FRAMES:
         share = len(frames) * period / len(data)
         yield (
             share * steady_count / period,
@@ -468,16 +490,18 @@ def _is_chance(data: NDArray[np.uint8], steady: int, count: int, period: int) ->
     if expected == 0:  # below the smallest float, after many repetitions
         return False
     log_of_one = steady - expected - steady * math.log(steady / expected)
-    periods = min(LONGEST, len(data) // FRAMES)
+    periods = min(LONGEST, len(data) // MIN_FRAMES)
     return math.log(periods) + log_of_one > math.log(CHANCE)
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
-    """Start and length of the longest run of steady bytes, around the end too, without zeros in
-    front: they tell little.
+    """Return start and length of the longest run of constant bytes, counted by nonzero bytes.
+
+    A run may continue from the end of the period to its start. Zeros at the start of a run are left
+    out, since they are frequent in any data.
     """
-    turn = int(np.argmin(steady))
-    best = (-1, 0, 0)  # the circle is cut where no run is
+    turn = int(np.argmin(steady))  # rotate to a byte that is not constant, so that no run is split
+    best = (-1, 0, 0)
     for start, end in runs(np.roll(steady, -turn)):
         run = np.roll(usual, -turn)[start:end]
         zeros = int(np.argmax(run != 0)) if run.any() else 0
@@ -489,40 +513,42 @@ def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[i
 
 
 def _by_length(data: NDArray[np.uint8]) -> Structure | None:
-    """Frames of several lengths, whose header says how long they are."""
+    """Return frames of several lengths, with a length field in the header."""
     pairs = data[:-1].astype(np.int64) << 8 | data[1:]
     counts = np.bincount(pairs, minlength=1 << 16)
     best: tuple[float, int, Structure] | None = None
-    for pair in np.argsort(counts)[::-1][:PAIRS].tolist():
+    for pair in np.argsort(counts)[::-1][:MAX_SYNC_PAIRS].tolist():
         starts = np.flatnonzero(pairs == pair)
-        if pair in (0, 0xFFFF) or len(starts) < 2 * FRAMES:
+        if pair in (0, 0xFFFF) or len(starts) < 2 * MIN_FRAMES:
             continue
-        found = _explained(data, starts, bytes([pair >> 8, pair & 0xFF]))
+        found = _find_length_field(data, starts, bytes([pair >> 8, pair & 0xFF]))
         if found is None:
             continue
-        begins = int(
-            starts[0]
-            # of pairs in a header that do as well, the one in front:
-            # captures often begin with a frame
-        )
+        # Several pairs of a header explain the lengths equally well. Use the one that occurs first,
+        # since captures often begin with a frame.
+        begins = int(starts[0])
         if (
             best is None
-            or found.share > best[0] + CLOSE
-            or (found.share > best[0] - CLOSE and begins < best[1])
+            or found.share > best[0] + SHARE_TOLERANCE
+            or (found.share > best[0] - SHARE_TOLERANCE and begins < best[1])
         ):
             best = (found.share, begins, found)
-    if best is not None and best[0] > HALF:
+    if best is not None and best[0] > MIN_SHARE:
         return best[2]
     return None
 
 
-def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -> Structure | None:
-    """Frames from one sync to the next, where a byte or a word behind it tells most of their
-    lengths.
+def _find_length_field(
+    data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes
+) -> Structure | None:
+    """Return the frames between sync bytes if a byte or word after these gives most lengths.
+
+    Args:
+        starts: offsets of the sync bytes.
     """
     starts = starts[starts + HEADER + 2 < len(data)]
     steps = np.diff(starts)
-    if len(steps) < FRAMES:
+    if len(steps) < MIN_FRAMES:
         return None
     best: tuple[float, Length | None, NDArray[np.bool_]] = (0.0, None, np.zeros(0, np.bool_))
     kinds: tuple[tuple[int, ByteOrder], ...] = ((1, "little"), (2, "little"), (2, "big"))
@@ -532,25 +558,25 @@ def _explained(data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes) -
         for (size, order), numbers in zip(
             kinds, (low, low | high << 8, high | low << 8), strict=True
         ):
-            for unit in range(1, UNIT + 1):
+            for unit in range(1, MAX_UNIT_BYTES + 1):
                 rest = steps - unit * numbers
-                usual, number = _commonest(rest)
-                told = rest == usual
-                distinct = len(np.unique(steps[told]))
-                share = float(steps[told].sum() / len(data))
-                if distinct > 1 and number >= FRAMES and usual >= 0 and share > best[0]:
-                    best = (share, Length(place, size, order, unit, usual), told)
-    share, length, told = best
+                usual, number = _most_frequent(rest)
+                fits = rest == usual
+                distinct = len(np.unique(steps[fits]))
+                share = float(steps[fits].sum() / len(data))
+                if distinct > 1 and number >= MIN_FRAMES and usual >= 0 and share > best[0]:
+                    best = (share, Length(place, size, order, unit, usual), fits)
+    share, length, fits = best
     if length is None:
         return None
     whole = data.tobytes()
     frames = [
         whole[start : start + step]
-        for start, step in zip(starts[:-1][told].tolist(), steps[told].tolist(), strict=True)
+        for start, step in zip(starts[:-1][fits].tolist(), steps[fits].tolist(), strict=True)
     ]
     return Structure(sync, None, length, share, tuple(frames))
 
 
-def _commonest(numbers: NDArray[np.int64]) -> tuple[int, int]:
+def _most_frequent(numbers: NDArray[np.int64]) -> tuple[int, int]:
     found, counts = np.unique(numbers, return_counts=True)
     return int(found[counts.argmax()]), int(counts.max())
