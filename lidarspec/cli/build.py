@@ -19,7 +19,7 @@ from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageError, suggest
 from lidarspec.explaining.assignments import arguments, values
-from lidarspec.explaining.explanation import explain, replied
+from lidarspec.explaining.explanation import describe_reply, explain
 from lidarspec.explaining.pieces import explained, pieces
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import sensor as named_sensor
@@ -126,7 +126,7 @@ def send(
     if as_json:
         emit_json(_told(sensor, reply), output)
     else:
-        said, rows = replied(sensor, reply)
+        said, rows = describe_reply(sensor, reply)
         if rows:
             shown = f"\n{table(['field', 'value', 'meaning'], rows, output)}"
         else:

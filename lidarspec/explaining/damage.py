@@ -169,13 +169,13 @@ def _rows(
     return rows
 
 
-def told(
+def describe_damage(
     frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, Value]]
 ) -> Iterator[str]:
-    """Which single change would explain the damage, with what its field would have said.
+    """Yield a sentence for each single change that would explain the damage.
 
     Args:
-        values: every value in some bytes by its path, as far as they go.
+        values: returns the values of a frame by path.
     """
     found = changes(frame, data)
     if len(found) > TOLD:

@@ -1,8 +1,8 @@
-"""A frame, byte by byte: the name and value of each, what is wrong with it, and the differences
-from another frame.
+"""Explain one frame byte by byte: fields and values, the first fault, differences to another frame.
 
-`FrameRows` reads the fields of the frame by its layout, as far as its bytes go. A damaged frame is
-shown with the change that would explain the damage, a valid one with its points.
+`FrameRows` reads the fields of the frame by its layout, up to the end of the bytes. For a damaged
+frame, the explanation has the single change that would explain the damage. For a valid data frame,
+it has the points.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from lidarspec.device.session import Reply
 from lidarspec.display import drawn
 from lidarspec.errors import LidarSpecError, WireError
-from lidarspec.explaining.damage import told
+from lidarspec.explaining.damage import describe_damage
 from lidarspec.explaining.frame_rows import FrameRows
 from lidarspec.explaining.listing import Line, Listing, text
 from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
@@ -30,26 +30,24 @@ from lidarspec.points.plain import evaluate_plainly
 from lidarspec.scans.ends import first_points
 from lidarspec.spec import Sensor
 
-#: most points of a frame without arrays that are told.
-TOLD = 4
-#: most decimals that steps are told apart by, and those that may be added to show one in full.
-DIGITS = 12
-SPARE = 2
-
-Keys = tuple[str | int, ...]
+#: points to list in the notes of a frame without arrays.
+MAX_LISTED_POINTS = 4
 
 
 @dataclass(frozen=True, repr=False)
 class Explanation:
-    """A frame explained: rows that name every byte exactly once, in order. Its text is the listing
-    that the command line prints.
+    """The explanation of one frame.
+
+    The rows cover every byte exactly once, in order. `str()` returns the listing that the command
+    line prints.
 
     Attributes:
-        sensor, frame: ids.
+        sensor: the id of the sensor.
+        frame: the frame type; "" for bytes that are not in a frame.
         data: the bytes.
         rows: one for each field, bit block or array element.
-        fault: what is wrong with the frame as a whole; None if it is valid.
-        notes: what concerns the whole frame.
+        fault: the first fault of the frame; None if it is valid.
+        notes: remarks on the whole frame.
     """
 
     sensor: str
@@ -72,32 +70,35 @@ class Explanation:
 
     @property
     def fields(self) -> dict[str, Value]:
-        """Every value by its path with array indices, "points[1].intensity", in the order of the
-        wire.
-        """
+        """All values in wire order, by path with array indices, e.g. "points[1].intensity"."""
         return {value.path: value for row in self.rows for value in row.values}
 
     @property
     def verdict(self) -> str:
-        """What is wrong with the frame, in one sentence; "valid" where nothing is."""
+        """The first fault of the frame in one sentence; "valid" if there is none."""
         if self.fault is None:
             return "valid"
         return self.fault.reason
 
     @property
     def is_filler(self) -> bool:
-        """Whether it is no frame, and nothing but bytes that the sensor sends between frames."""
+        """Whether it is not a frame, only filler bytes that the sensor sends between frames."""
         return not self.frame and all(row.right for row in self.rows)
 
     def path_of(self, number: int, part: int = 0) -> str | None:
-        """The path of the row that gives a point, by its number in the frame, or in a part of it;
-        None where no row does.
+        """Return the path of the row that contains a point, None if no row does.
+
+        Args:
+            number: of the point in its part.
+            part: number of the part of the frame; 0 if the points are not in parts.
         """
         return next((row.path for row in self.rows if (part, number) in row.numbers), None)
 
     def lines(self, *, every: bool = False) -> list[Line]:
-        """The listing in pieces; `every` draws the bits of all elements of an array, and not of the
-        first alone.
+        """Return the lines of the listing, as text with roles.
+
+        Args:
+            every: True draws the bits of all elements of an array; by default of the first only.
         """
         return [
             *Listing(self.rows, every=every).lines(),
@@ -105,12 +106,12 @@ class Explanation:
         ]
 
     def differences(self, other: Explanation) -> list[Difference]:
-        """The fields that another frame does not have alike, in the order of the wire."""
+        """Return the fields that differ in another frame, in wire order."""
         before = self.fields
         after = other.fields
         pairs = ((path, before.get(path), after.get(path)) for path in {**before, **after})
         compared = [
-            Difference(path, old, new, self._bytes(old), other._bytes(new))
+            Difference(path, old, new, self._bytes_of(old), other._bytes_of(new))
             for path, old, new in pairs
         ]
         return [
@@ -120,7 +121,7 @@ class Explanation:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """The explanation for JSON."""
+        """Return the explanation as a dict for JSON."""
         if self.fault is None:
             fault = None
         else:
@@ -138,22 +139,23 @@ class Explanation:
         }
         return {**head, "rows": [row.to_dict() for row in self.rows]}
 
-    def _bytes(self, value: Value | None) -> bytes:
+    def _bytes_of(self, value: Value | None) -> bytes:
         if value is None:
             return b""
         return self.data[value.start : value.start + len(value.masks)]
 
 
 def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanation:
-    """What every byte of one frame is; of a damaged or truncated one as far as it goes, with what
-    is wrong.
+    """Explain every byte of one frame.
+
+    A damaged or truncated frame is explained as far as possible, with its first fault.
 
     Args:
-        frame: the frame type; by default the one that fits, or comes nearest.
+        frame: the frame type; by default the one that fits, or the closest.
 
     Raises:
-        WireError: where the bytes do not even begin like a frame of this sensor.
-        UnknownFrame: for a frame type that it does not have.
+        WireError: if the bytes do not even begin like a frame of this sensor.
+        UnknownFrame: if the sensor has no such frame type.
     """
     data = bytes(data)
     fault = None
@@ -167,22 +169,23 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
     listed_rows = FrameRows(sensor.frames[name], data, fault)
     rows = (*listed_rows.rows(), *listed_rows.rest(fault))
     if fault is not None and not fits(sensor, data[: listed_rows.after], name):
-        guessed = told(sensor.frames[name], data, lambda sent: values(sent, sensor, name))
-        return Explanation(sensor.id, name, data, rows, fault, tuple(guessed))
-    rows, notes = _with_points(sensor, name, data[: listed_rows.after], rows)
+        guesses = describe_damage(
+            sensor.frames[name], data, lambda candidate: values(candidate, sensor, name)
+        )
+        return Explanation(sensor.id, name, data, rows, fault, tuple(guesses))
+    rows, notes = _add_points(sensor, name, data[: listed_rows.after], rows)
     return Explanation(sensor.id, name, data, rows, fault, notes)
 
 
 def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, Value]:
-    """Every value of one frame of this type, by its path with array indices, in the order of the
-    wire.
-    """
+    """Return all values of one frame of this type in wire order, by path with array indices."""
     return FrameRows(sensor.frames[frame], data).values()
 
 
-def replied(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, str, str]]]:
-    """What became of a command, in a sentence, and of the reply each field with its value and its
-    meaning.
+def describe_reply(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, str, str]]]:
+    """Return the result of a command in one sentence, and the fields of the reply.
+
+    Each field is (path, value, meaning).
     """
     if not reply.confirmed or reply.frame is None:
         return "sent; no answer is documented, so whether it took is not known", []
@@ -195,13 +198,13 @@ def replied(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, str, str
 
 
 def reply_text(sensor: Sensor, reply: Reply) -> str:
-    """What became of a command, and of the reply each field with its value, a line each."""
-    said, rows = replied(sensor, reply)
-    return "\n".join([said, *(f"{path}: {value}" for path, value, _ in rows)])
+    """Return the result of a command, and a line for each field of the reply."""
+    result, rows = describe_reply(sensor, reply)
+    return "\n".join([result, *(f"{path}: {value}" for path, value, _ in rows)])
 
 
 def fits(sensor: Sensor, data: bytes, name: str) -> bool:
-    """Whether bytes are one valid frame of a type."""
+    """Return whether the bytes are one valid frame of a type."""
     try:
         identify(sensor, data, frame=name)
     except WireError:
@@ -209,10 +212,10 @@ def fits(sensor: Sensor, data: bytes, name: str) -> bool:
     return True
 
 
-def _with_points(
+def _add_points(
     sensor: Sensor, name: str, data: bytes, rows: tuple[Row, ...]
 ) -> tuple[tuple[Row, ...], tuple[str, ...]]:
-    """The rows with their points, and what is to be said of the frame."""
+    """Return the rows with their points, and notes on the frame."""
     frame = sensor.frames[name]
     survey = codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
     notes = ["not plausible: a decoder passes over this frame"] * bool(
@@ -234,43 +237,45 @@ def _with_points(
     )
     points = [Point.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
     chain = packets.table.schema.chain
-    parts = _parts(sensor, name, data)
+    parts = _find_parts_with_points(sensor, name, data)
     if not chain and not parts:
-        return rows, (*notes, *(f"point {point}" for point in points[:TOLD]))
+        return rows, (*notes, *(f"point {point}" for point in points[:MAX_LISTED_POINTS]))
     arrays = {axis for info in packets.table.schema.fields.values() for axis in info.axes}
     along = tuple(axis for axis in evaluated.axes if axis in arrays)
     if len(along) == len(chain):
-        chain = along  # which of several arrays side by side points go with, they say
+        chain = along  # with several parallel arrays, the axes of the points decide
     inside = evaluated.counts.astype(np.bool_)
     numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
     first = first_points(evaluated)
-    given = list[Row]()
+    rows_with_points = list[Row]()
     for row in rows:
-        spot = next(
-            (spot for spot, part in enumerate(parts) if f"{row.path}.".startswith(f"{part}.")),
+        part_number = next(
+            (index for index, part in enumerate(parts) if f"{row.path}.".startswith(f"{part}.")),
             None if parts else 0,
         )
-        if not parts or spot is None:
-            path = row.path
-        else:
-            path = row.path[len(parts[spot]) + 1 :]
-        if spot is None:
-            own = []
-        else:
-            own = _numbers(path, chain, evaluated.axes, numbers[spot])
-        within = tuple((spot or 0, number - int(first[spot or 0])) for number in own)
-        given.append(replace(row, points=tuple(points[number] for number in own), numbers=within))
-    return tuple(given), tuple(notes)
+        if part_number is None:  # a row outside all parts
+            rows_with_points.append(row)
+            continue
+        path = row.path[len(parts[part_number]) + 1 :] if parts else row.path
+        own = _find_point_numbers(path, chain, evaluated.axes, numbers[part_number])
+        within = tuple((part_number, number - int(first[part_number])) for number in own)
+        rows_with_points.append(
+            replace(row, points=tuple(points[number] for number in own), numbers=within)
+        )
+    return tuple(rows_with_points), tuple(notes)
 
 
-def _parts(sensor: Sensor, name: str, data: bytes) -> list[str]:
-    """Return the parts of a frame that have its points, as "segments[0]"; none if it has none."""
+def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]:
+    """Return the paths of the parts that contain the points, e.g. "segments[0]".
+
+    Returns an empty list if the points are not in parts.
+    """
     frame = sensor.frames[name]
     path = sensor.parts_with("points", name)
-    place = schema(frame.tree).within(path) if path else None
-    if place is None:
+    location = schema(frame.tree).within(path) if path else None
+    if location is None:
         return []
-    axis, kind_name, _ = place
+    axis, kind_name, _ = location
     struct = frame_coder(frame).decode(data).struct
     examined = examine(frame.tree, struct, frame.room)
     node = schema(frame.tree).parts[axis]
@@ -278,11 +283,18 @@ def _parts(sensor: Sensor, name: str, data: bytes) -> list[str]:
     return [part.prefix for part in examined.parts_of(axis) if part.root is kind.root]
 
 
-def _numbers(
+def _find_point_numbers(
     path: str, chain: tuple[str, ...], axes: tuple[str | None, ...], numbers: Any
 ) -> list[int]:
-    """The numbers of the points that an element of the innermost array gives; none for any other
-    row.
+    """Return the numbers of the points in a row.
+
+    Only the rows of the innermost array with points have any.
+
+    Args:
+        path: the path of the row.
+        chain: the axes of the nested arrays with the points, outermost first.
+        axes: the axes of `numbers`, None for an axis that is not an array of the frame.
+        numbers: the number of each point, -1 if there is none.
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if not chain:

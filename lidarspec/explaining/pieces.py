@@ -1,9 +1,9 @@
-"""An input in pieces: its frames, what lies between them, and of this what was a frame before it
-was damaged.
+"""Split an input into pieces: valid frames, damaged frames, and the bytes between them.
 
-The decoder alone says what is a frame, and pieces come as soon as it does. Bytes that it passed
-over are cut where a frame seems to begin: after as many bytes as the frame has, one more or fewer,
-or where the next one begins before that.
+The decoder finds the valid frames, and `pieces` yields them as soon as it does. `explained`
+searches the bytes between them for damaged frames. A damaged frame begins at constants that look
+like the start of a frame. It ends after the size of the frame, or one byte before or after that if
+another frame begins there, or at the start of the next frame.
 """
 
 from __future__ import annotations
@@ -25,18 +25,23 @@ from lidarspec.spec import Sensor
 from lidarspec.spec.sensor import with_frames
 from lidarspec.transports.protocol import Chunk
 
-#: constant bytes that look like the beginning of a frame in the midst of others.
-SYNC = 2
-#: bytes without a frame that are waited for, before they are given out.
-HELD = 1 << 16
-#: stands for the frame type of a whole input that is short enough to be one damaged frame.
+#: constant bytes that a frame type must begin with to be searched for between other bytes.
+MIN_SYNC_BYTES = 2
+#: bytes without a frame that are collected before they are yielded as a piece.
+MAX_HELD_BYTES = 1 << 16
+#: placeholder for the frame type of a whole input that may be one damaged frame.
 NEAREST = "?"
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A frame in the input, or with `frame` "" bytes that are in none: of a stream, or one whole
-    datagram.
+    """A frame of the input, or bytes that are in no frame.
+
+    Attributes:
+        offset: of the first byte in the input.
+        data: the bytes.
+        frame: the frame type, "" for bytes in no frame, or `NEAREST`.
+        datagram: True for bytes of a datagram that are in no frame.
     """
 
     offset: int
@@ -46,39 +51,40 @@ class Piece:
 
     @property
     def is_valid(self) -> bool:
-        """Whether it is a frame, and not what may have been one."""
+        """Whether it is a valid frame."""
         return self.frame not in ("", NEAREST)
 
     @property
     def end(self) -> int:
-        """The offset of what follows it."""
+        """The offset after its last byte."""
         return self.offset + len(self.data)
 
     def part(self, start: int, end: int, frame: str = "") -> Piece:
-        """A stretch of it, as a piece of the input."""
+        """Return the bytes from `start` to `end` as a piece of the input."""
         return Piece(self.offset + start, self.data[start:end], frame)
 
 
 def pieces(
     sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: str | None = None
 ) -> Iterator[Piece]:
-    """The frames of the input and the bytes between them, in order, as they are found; a datagram
-    that is no frame is a piece of its own.
+    """Yield the frames of the input and the bytes between them, in order, as they are found.
 
-    An input that is no longer than a frame and holds none is one piece, of the type `NEAREST`.
+    A datagram that is not a frame is a piece of its own. An input that is not longer than a frame
+    and contains none is one piece of the type `NEAREST`.
 
     Args:
-        frame: look for frames of this type, also where another one has the same bytes or has to
-            come before; other types are pieces too.
+        datagrams: True if each chunk is a datagram, False for a stream.
+        frame: prefer this frame type if several types match the same bytes, and find it without
+            the frame that it must follow. Frames of other types are yielded too.
 
     Raises:
-        UnknownFrame: for a type that the sensor does not have.
+        UnknownFrame: if the sensor has no such frame type.
     """
     if frame is not None and frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
     chunks = iter(chunks)
     head = list[Chunk]()
-    longest = _longest(sensor)
+    longest = _find_max_length(sensor)
     while (
         sum(len(chunk.data) for chunk in head) <= longest
         and (chunk := next(chunks, None)) is not None
@@ -86,8 +92,8 @@ def pieces(
         head.append(chunk)
     whole = b"".join(chunk.data for chunk in head)
     if len(whole) > longest:
-        yield from _cut(
-            sensor if frame is None else _preferring(sensor, frame),
+        yield from _split_input(
+            sensor if frame is None else _prefer_frame(sensor, frame),
             itertools.chain(head, chunks),
             datagrams=datagrams,
         )
@@ -96,13 +102,15 @@ def pieces(
         yield Piece(0, whole, identify(sensor, whole, frame=frame))
     except LidarSpecError:
         found = list(
-            _cut(sensor if frame is None else _preferring(sensor, frame), head, datagrams=datagrams)
+            _split_input(
+                sensor if frame is None else _prefer_frame(sensor, frame), head, datagrams=datagrams
+            )
         )
         yield from found if any(piece.frame for piece in found) else [Piece(0, whole, NEAREST)]
 
 
-def _preferring(sensor: Sensor, frame: str) -> Sensor:
-    """The sensor with one type as an incoming one that comes before all others, and after none."""
+def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
+    """Return the sensor with one frame type as the first and incoming one, not after another."""
     first = replace(sensor.frames[frame], direction="in", after=None)
     return with_frames(
         sensor,
@@ -110,7 +118,7 @@ def _preferring(sensor: Sensor, frame: str) -> Sensor:
     )
 
 
-def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterator[Piece]:
+def _split_input(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterator[Piece]:
     decoder = sensor.decoder(stream=not datagrams)
     held = bytearray()
     start = 0
@@ -122,7 +130,7 @@ def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterato
         if chunk is not None:
             held += chunk.data
             found += decoder.feed(chunk.data)
-        if decoder.joins:  # a message stands in no one place of the input
+        if decoder.joins:  # a joined message has no contiguous bytes in the input
             yield from (Piece(item.offset, item.data, item.frame) for item in found)
             continue
         end = start
@@ -132,7 +140,7 @@ def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterato
             yield Piece(item.offset, item.data, item.frame)
             end = item.offset + len(item.data)
         left = len(held) - (end - start) - decoder.stats.pending
-        if left and (datagrams or chunk is None or left > HELD):
+        if left and (datagrams or chunk is None or left > MAX_HELD_BYTES):
             yield Piece(end, bytes(held[end - start : end - start + left]), "", datagrams)
             end += left
         del held[: end - start]
@@ -142,29 +150,30 @@ def _cut(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterato
 def explained(
     sensor: Sensor, piece: Piece, frame: str | None = None
 ) -> Iterator[tuple[Piece, Explanation]]:
-    """A piece, and what is in it; one without a frame is cut into what were frames before they were
-    damaged, and the rest.
+    """Yield a piece with its explanation.
+
+    A piece without a frame is split into damaged frames and the bytes between them.
 
     Args:
-        frame: what `NEAREST` stands for; the type that comes nearest where left out.
+        frame: the frame type for `NEAREST`; by default the closest.
 
     Raises:
-        WireError: where bytes that are `NEAREST` do not even begin like a frame.
+        WireError: if the piece is `NEAREST` and does not even begin like a frame.
     """
     if piece.frame:
         yield piece, explain(piece.data, sensor, piece.frame if piece.is_valid else frame)
         return
     end = 0
-    for part in _damaged(sensor, piece):
+    for part in _iter_damaged(sensor, piece):
         if part.offset > piece.offset + end:
-            yield _skipped(sensor, piece.part(end, part.offset - piece.offset))
+            yield _explain_skipped(sensor, piece.part(end, part.offset - piece.offset))
         yield part, explain(part.data, sensor, part.frame)
         end = part.end - piece.offset
     if end < len(piece.data):
-        yield _skipped(sensor, piece.part(end, len(piece.data)))
+        yield _explain_skipped(sensor, piece.part(end, len(piece.data)))
 
 
-def _skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
+def _explain_skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
     is_filler = not piece.data.translate(None, bytes(sensor.fillers))
     remark = "filler" if is_filler else "in no frame"
     return piece, Explanation(
@@ -172,59 +181,67 @@ def _skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
     )
 
 
-def _damaged(sensor: Sensor, piece: Piece) -> Iterator[Piece]:
-    """The frames that some bytes were before they were damaged, in order."""
+def _iter_damaged(sensor: Sensor, piece: Piece) -> Iterator[Piece]:
+    """Yield the damaged frames in the bytes of a piece, in order."""
     data = piece.data
     end = 0
     starts = [start for start in likely_starts(sensor, data) if not piece.datagram or start == 0]
     for start in [*starts, len(data)]:
-        if start > end and (name := _headless(sensor, data[end:start])):
+        if start > end and (name := _find_headless_type(sensor, data[end:start])):
             yield piece.part(end, start, name)
             end = start
-        if end <= start < len(data) and (name := _nearest(sensor, data[start:])):
+        if end <= start < len(data) and (name := _find_nearest_type(sensor, data[start:])):
             if piece.datagram:
                 end = len(data)
             else:
-                end = _end(sensor, data, start, name, [*starts, len(data)])
+                end = _find_end(sensor, data, start, name, [*starts, len(data)])
             yield piece.part(start, end, name)
 
 
 def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
-    """Where bytes begin like an incoming frame: with two constant bytes or more, and any other; in
-    ascending order.
+    """Return the offsets at which a frame may begin, in ascending order.
+
+    There, the bytes match the first constants of an incoming frame type, and at least one more
+    byte follows. Types that begin with fewer than `MIN_SYNC_BYTES` constants are not searched for.
     """
     starts: set[int] = set()
     for frame in sensor.incoming.values():
         prefix = codec(frame).prefix
         size = next(
-            (spot for spot in range(len(prefix) + 1) if prefix.get(spot, (0, 0))[0] != 0xFF), 0
+            (index for index in range(len(prefix) + 1) if prefix.get(index, (0, 0))[0] != 0xFF), 0
         )
-        if size >= SYNC:
-            magic = bytes(prefix[spot][1] for spot in range(size))
+        if size >= MIN_SYNC_BYTES:
+            magic = bytes(prefix[index][1] for index in range(size))
             starts |= {
                 found.start() for found in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)
             }
     return sorted(starts)
 
 
-def _nearest(sensor: Sensor, data: bytes) -> str:
-    """The type of frame that bytes begin like; "" for none."""
+def _find_nearest_type(sensor: Sensor, data: bytes) -> str:
+    """Return the frame type that the bytes begin like, "" if there is none."""
     try:
-        return identify(sensor, data[: _longest(sensor)])
+        return identify(sensor, data[: _find_max_length(sensor)])
     except WireError as fault:
         return fault.frame
 
 
-def _headless(sensor: Sensor, data: bytes) -> str:
-    """The type that bytes were a frame of which do not begin like one; "" where no single change
-    makes them one.
+def _find_headless_type(sensor: Sensor, data: bytes) -> str:
+    """Return the type of a damaged frame that does not begin like a frame.
+
+    Returns "" if no single change makes the bytes a valid frame.
     """
     return next((name for name, frame in sensor.incoming.items() if changes(frame, data)), "")
 
 
-def _end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
-    """Where a damaged frame ends: by its length or next to that, where something else begins, or
-    else where the first thing does.
+def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
+    """Return the offset at which a damaged frame ends.
+
+    This is the start of another frame at the expected end, or one byte before or after it.
+    Otherwise it is the expected end or the next start, whichever comes first.
+
+    Args:
+        ends: the offsets at which another frame may begin, and the end of the data.
     """
     following = [end for end in ends if end > start]
     size = frame_coder(sensor.frames[name]).find_size(data[start:])
@@ -241,5 +258,5 @@ def _end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) ->
     return next((end for end in (whole, whole - 1, whole + 1) if end in following), cut_off)
 
 
-def _longest(sensor: Sensor) -> int:
+def _find_max_length(sensor: Sensor) -> int:
     return max((frame.max_length for frame in sensor.frames.values()), default=0)

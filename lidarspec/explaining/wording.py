@@ -1,4 +1,4 @@
-"""The words for a frame's parts: numbers, bits, points and places as people read them."""
+"""Format the parts of an explained frame as text: values, bits, points, rows and differences."""
 
 from __future__ import annotations
 
@@ -14,15 +14,18 @@ from lidarspec.spec.sensor import Sensor
 if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
 
-#: bytes in a line of a hexdump, and lines before the marked one.
-DUMPED = 16
-BEFORE = 2
+#: bytes in a line of a hexdump.
+HEXDUMP_LINE_BYTES = 16
+#: lines of a hexdump before the marked line.
+HEXDUMP_LINES_BEFORE = 2
 DEGREES_PER_TURN = 360
 
 
 class Span(NamedTuple):
-    """A piece of a line and its role: "" or "offset", "hex", "name", "bits", "docs", "good", "bad",
-    "point", "note", "title".
+    """A piece of a line with its role, which decides its colour.
+
+    The roles are "", "offset", "hex", "name", "bits", "docs", "good", "bad", "point", "note" and
+    "title".
     """
 
     text: str
@@ -30,8 +33,9 @@ class Span(NamedTuple):
 
 
 class Point(NamedTuple):
-    """One point of a cloud in metres and degrees; x y z nan and range inf or nan where there is no
-    return.
+    """One point of a cloud, in metres and degrees.
+
+    Without a return, x, y and z are nan and the range is inf or nan.
     """
 
     x: float
@@ -43,7 +47,7 @@ class Point(NamedTuple):
 
     @classmethod
     def of(cls, cloud: PointCloud, index: int) -> Point:
-        """Point number `index` of a cloud."""
+        """Return point number `index` of a cloud."""
         x, y, z, distance = (
             float(column[index]) for column in (cloud.x, cloud.y, cloud.z, cloud.range)
         )
@@ -77,14 +81,15 @@ class Value:
     """One field of a row.
 
     Attributes:
-        path: with array indices: "points[1].intensity".
-        raw: the number or bytes of the wire.
-        physical: the number in `unit`; None for what is no number.
-        digits: decimals that show every step of it; None for a float, which has no steps.
-        label: the name of the raw value, where it has one.
-        bits: which bits of the row's bytes it is; "" for whole bytes.
-        docs: the author's text.
-        start, masks: where in the frame its bytes begin, and which bits of each are its own.
+        path: with array indices, e.g. "points[1].intensity".
+        raw: the raw value, a number or bytes.
+        physical: the number in `unit`; None if the value is not a number.
+        digits: the decimals that show every step of the value; None for a float field.
+        label: the name of the raw value, "" without one.
+        bits: the bits that it has in the bytes of the row, as text; "" for whole bytes.
+        docs: the documentation of the field.
+        start: the offset of its first byte in the frame.
+        masks: a mask for each of its bytes, with its own bits set.
     """
 
     path: str
@@ -104,12 +109,12 @@ class Value:
         return self.path.rpartition(".")[2]
 
     def holds(self, offset: int, bit: int) -> bool:
-        """Whether a bit of the frame is one of its own."""
-        place = offset - self.start
-        return 0 <= place < len(self.masks) and bool(self.masks[place] >> bit & 1)
+        """Return whether it contains a bit of the frame."""
+        index = offset - self.start
+        return 0 <= index < len(self.masks) and bool(self.masks[index] >> bit & 1)
 
     def covers(self, offset: int) -> bool:
-        """Whether it has bits in a byte of the frame."""
+        """Return whether it has bits in a byte of the frame."""
         return any(self.holds(offset, bit) for bit in range(8))
 
     def __str__(self) -> str:
@@ -131,8 +136,10 @@ class Value:
         return f"{text} {self.unit}".strip() + turns
 
     def to_dict(self) -> dict[str, Any]:
-        """The value for JSON: bytes and masks as hexadecimal text, no entry for what is not there,
-        null for nan and infinity.
+        """Return the value as a dict for JSON.
+
+        Bytes and masks are hexadecimal text, nan and infinity are None. Empty attributes are left
+        out.
         """
         if isinstance(self.raw, bytes | bytearray):
             raw = self.raw.hex(" ")
@@ -157,13 +164,15 @@ class Row:
     """Some bytes of a frame: one field, one bit block, or one element of an array of structs.
 
     Attributes:
-        offset, data: where they stand, and they.
-        path: the field or element; "" for bytes that belong to none.
-        values: the fields in them.
-        remarks: what else is to be said: constants, the verdict of a checksum, what is missing.
-        right: False where the bytes are not what the spec asks for.
-        points: the points that this element gives.
-        numbers: of each of them which part of the frame it is of, and which point of that, from 0.
+        offset: of the first byte in the frame.
+        data: the bytes.
+        path: the field or element; "" for bytes in no field.
+        values: the fields in these bytes.
+        remarks: remarks on constants, checksums and missing bytes.
+        right: False if the bytes do not match the spec.
+        points: the points in this element.
+        numbers: for each point (number of the part of the frame, number of the point in the part),
+            from 0.
     """
 
     offset: int
@@ -177,15 +186,18 @@ class Row:
 
     @property
     def meaning(self) -> str:
-        """Values in their units, the author's text, remarks and points, in one line."""
+        """Values in their units, remarks, documentation and points, in one line."""
         return "".join(text for text, _ in self.spans())
 
     def spans(self, *, drawn: bool = False) -> list[Span]:
-        """The meaning in pieces with their roles; with `drawn`, without the values, which stand bit
-        by bit below the row.
+        """Return the meaning in pieces with their roles.
+
+        Args:
+            drawn: True leaves out the values, because the listing draws them bit by bit below the
+                row.
         """
         alone = len(self.values) == 1 and not self.values[0].bits
-        values = [] if drawn else self._values(alone=alone)
+        values = [] if drawn else self._format_values(alone=alone)
         verdict = "good" if self.right else "bad"
         docs = self.values[0].docs if alone and self.first else ""
         points = list(dict.fromkeys(str(point) for point in self.points))
@@ -205,14 +217,16 @@ class Row:
 
     @property
     def first(self) -> bool:
-        """Whether it stands in the first element of every array around it; the others are the same
-        again.
+        """Whether it is in the first element of every array around it.
+
+        Texts that are the same in all elements are only shown there.
         """
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
-    def _values(self, *, alone: bool) -> list[str]:
-        """Each value in words: with its name, unless the unit says enough, and with its bits; those
-        of further elements are left out.
+    def _format_values(self, *, alone: bool) -> list[str]:
+        """Return each value as text, with its name unless its unit is unique in the row.
+
+        The first element of an array also shows the bits of each value.
         """
         if alone and self.remarks:
             return []
@@ -229,14 +243,14 @@ class Row:
                 where = f" ({value.bits})"
             else:
                 where = ""
-            says_enough = alone or units.count(value.unit) == 1
+            needs_no_name = alone or units.count(value.unit) == 1
             words.append(
-                f"{text}{where}" if says_enough else f"{name} {text or value.raw.hex(' ')}{where}"
+                f"{text}{where}" if needs_no_name else f"{name} {text or value.raw.hex(' ')}{where}"
             )
         return words
 
     def to_dict(self) -> dict[str, Any]:
-        """The row for JSON."""
+        """Return the row as a dict for JSON."""
         facts = {
             "offset": self.offset,
             "hex": self.data.hex(" "),
@@ -254,12 +268,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Difference:
-    """A field that two frames do not have alike.
+    """A field that differs between two frames.
 
     Attributes:
         path: with array indices.
-        before, after: its value in each; None where the frame has no such field.
-        first, second: its bytes in each.
+        before: its value in the first frame; None if that frame lacks the field.
+        after: its value in the second frame; None if that frame lacks the field.
+        first: its bytes in the first frame.
+        second: its bytes in the second frame.
     """
 
     path: str
@@ -270,7 +286,7 @@ class Difference:
 
     @property
     def missing(self) -> str:
-        """Which frame alone has the field, "first" or "second"; "" for both."""
+        """The only frame that has the field, "first" or "second"; "" if both have it."""
         if self.before is None:
             return "second"
         if self.after is None:
@@ -279,9 +295,7 @@ class Difference:
 
     @property
     def masks(self) -> bytes:
-        """The bits that differ, of bytes that both frames have; bits of other fields in the same
-        bytes are not among them.
-        """
+        """The bits of the field that differ, for the bytes that both frames have."""
         own = self.before.masks if self.before else b""
         return bytes(
             (a ^ b) & mask for a, b, mask in zip(self.first, self.second, own, strict=False)
@@ -289,7 +303,7 @@ class Difference:
 
     @property
     def change(self) -> str:
-        """By how much a physical value went up or down; "" for what is no number."""
+        """The signed change of the physical value as text; "" if it is not a number."""
         if (
             not self.before
             or not self.after
@@ -302,7 +316,7 @@ class Difference:
         return f"{'' if step.startswith('-') else '+'}{step} {self.before.unit}".strip()
 
     def to_dict(self) -> dict[str, Any]:
-        """The difference for JSON."""
+        """Return the difference as a dict for JSON."""
         values = {
             name: None if value is None else value.to_dict()
             for name, value in (("before", self.before), ("after", self.after))
@@ -320,8 +334,9 @@ class Difference:
 
 
 def bit_picture(data: bytes, masks: bytes) -> str:
-    """The bits of one value in some bytes, the highest of each byte first: ".. 000001.. 00011000";
-    dots are bits of other values.
+    """Return the bits of one value as text, e.g. ".. 000001.. 00011000".
+
+    The highest bit of each byte is first. Dots are bits of other values.
     """
     parts = []
     for byte, mask in zip(data, masks, strict=True):
@@ -331,14 +346,17 @@ def bit_picture(data: bytes, masks: bytes) -> str:
 
 
 def number(value: Any) -> Any:
-    """A value as JSON takes it: null for nan and infinity."""
+    """Return a value for JSON: None for nan and infinity."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 
 
 def fixed(value: float, digits: int | None) -> str:
-    """A number with so many decimals, or with seven figures, and no minus before a zero."""
+    """Format a number with `digits` decimals, without a minus sign if the result is zero.
+
+    Without `digits`, it has seven significant digits.
+    """
     if digits is None:
         text = f"{value:.7g}"
     else:
@@ -349,21 +367,24 @@ def fixed(value: float, digits: int | None) -> str:
 
 
 def limits(low: float, high: float, between: str = "..") -> str:
-    """A range of numbers, with every digit of whole ones: "0..4294967295"."""
+    """Format a range of numbers, with all digits of integers, e.g. "0..4294967295"."""
     return between.join(
         f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high)
     )
 
 
 def asked(kind: Taken, between: str = "..") -> str:
-    """What an argument of a command takes: a range of numbers, or the name of another kind."""
+    """Format the type of a command argument: its range if it is a number, else its name."""
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)
     return kind.words(None)
 
 
 def ascii_text(data: bytes | bytearray) -> str:
-    """Printable ASCII, which zeros may follow, in quotes; nothing for other bytes."""
+    """Return printable ASCII in quotes, without trailing zero bytes; "" for other bytes.
+
+    Texts of up to three characters also return "".
+    """
     text = bytes(data).rstrip(b"\0").decode("ascii", "replace")
     if len(text) > 3 and text.isascii() and text.isprintable():
         return repr(text)
@@ -371,27 +392,31 @@ def ascii_text(data: bytes | bytearray) -> str:
 
 
 def hexdump(error: WireError) -> str:
-    """The bytes around the place of an error, sixteen to a line, with the place and its field
-    marked; "" without bytes.
+    """Return a hexdump of the bytes around an error, "" if the error has no bytes.
+
+    A line below them marks the invalid bytes and names their field.
     """
-    size = _marked(error)
-    first = min(error.offset, len(error.data)) // DUMPED * DUMPED
+    size = _count_marked_bytes(error)
+    first = min(error.offset, len(error.data)) // HEXDUMP_LINE_BYTES * HEXDUMP_LINE_BYTES
     if error.offset == len(error.data) and first == len(error.data) and first:
-        first -= DUMPED
-    lines = ["  ..."] * (first > BEFORE * DUMPED)
-    for start in range(max(first - BEFORE * DUMPED, 0), first + 1, DUMPED):
+        first -= HEXDUMP_LINE_BYTES
+    lines = ["  ..."] * (first > HEXDUMP_LINES_BEFORE * HEXDUMP_LINE_BYTES)
+    for start in range(
+        max(first - HEXDUMP_LINES_BEFORE * HEXDUMP_LINE_BYTES, 0), first + 1, HEXDUMP_LINE_BYTES
+    ):
         left, right = (error.data[start + half : start + half + 8].hex(" ") for half in (0, 8))
         lines.append(f"  {start:04x}  {left:<23}  {right}".rstrip())
-    place = error.offset - first
-    columns = [8 + 3 * index + (index >= 8) for index in (place, min(place + size, DUMPED) - 1)]
+    start = error.offset - first
+    end = min(start + size, HEXDUMP_LINE_BYTES)
+    columns = [8 + 3 * index + (index >= 8) for index in (start, end - 1)]
     marks = "^" * (max(columns[1], columns[0]) + 2 - columns[0])
     if error.data:
         return "\n".join([*lines, f"{' ' * columns[0]}{marks} {error.path}".rstrip()])
     return ""
 
 
-def _marked(error: WireError) -> int:
-    """How many bytes to mark."""
+def _count_marked_bytes(error: WireError) -> int:
+    """Return the number of bytes to mark in a hexdump."""
     left = max(len(error.data) - error.offset, 1)
     if isinstance(error.got, str):
         digits = error.got.removeprefix("0x").replace(" ", "")
