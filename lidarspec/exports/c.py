@@ -1,12 +1,15 @@
-"""A C99 header for a sensor: accessors, lengths, checksums and scaling, as functions of bytes;
-nothing in it depends on struct packing.
+"""Generate a C99 header for a sensor.
 
-`header` puts together what all headers have (``c_bytes.h``, beside this module), a function for
-each checksum algorithm that the sensor uses, and for each frame type the accessors of
-`lidarspec.exports.c_fields` and the functions of the whole frame: how long it is by its header,
-whether a whole, sound frame stands there, and each checksum as it is and as it has to be. A
-checksum's function takes the byte ranges that it covers, so that one serves every frame;
-`frame_length` looks at no byte before it has asked whether the byte is there.
+The header has functions of bytes: accessors, lengths, checksums and scaling. It does not depend on
+struct packing. `header` joins:
+
+* the helpers of all headers (``c_bytes.h``, beside this module),
+* a function for each checksum algorithm of the sensor; it takes the covered byte ranges as an
+  argument, so that all frame types share it,
+* for each frame type, the accessors of `lidarspec.exports.c_fields`, and functions of the whole
+  frame: its length by its header, whether it is valid, and its stored and computed checksums.
+
+`frame_length` checks that a byte exists before it reads the byte.
 """
 
 from __future__ import annotations
@@ -66,8 +69,12 @@ static inline uint64_t {name}(const uint8_t *p, const int64_t (*spans)[2], size_
 
 @dataclass(frozen=True)
 class _Body:
-    """What makes one algorithm: before the bytes, for each byte, and what comes of it; `i` counts
-    the bytes covered so far.
+    """The C code of one checksum algorithm. In it, `i` is the number of bytes covered so far.
+
+    Attributes:
+        begin: statements before the first byte.
+        step: statements for each byte.
+        result: the expression of the checksum.
     """
 
     begin: str
@@ -76,16 +83,16 @@ class _Body:
 
 
 def checksum(algorithm: Checksum, name: str) -> str:
-    """The function that computes a checksum.
+    """Return the C function that computes a checksum.
 
     Raises:
-        Refused: for an algorithm that is a plugin's own Python code.
+        Refused: if C cannot compute the algorithm, e.g. if a plugin implements it in Python.
     """
     if isinstance(algorithm, ZeroPadded):
         inner = algorithm.algorithm
     else:
         inner = algorithm
-    body = _body(inner)
+    body = _make_body(inner)
     pad = ""
     is_counting = isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
     if isinstance(algorithm, ZeroPadded):
@@ -109,10 +116,10 @@ def checksum(algorithm: Checksum, name: str) -> str:
     )
 
 
-def _body(algorithm: Checksum) -> _Body:
+def _make_body(algorithm: Checksum) -> _Body:
     match algorithm:
         case Crc():
-            return _crc(algorithm)
+            return _make_crc_body(algorithm)
         case Xor():
             return _Body("uint64_t total = 0;", "total ^= byte;", "total")
         case Sum():
@@ -122,7 +129,7 @@ def _body(algorithm: Checksum) -> _Body:
                 f"total & UINT64_C(0x{(1 << algorithm.width) - 1:x})",
             )
         case WordXor():
-            return _word_xor(algorithm)
+            return _make_word_xor_body(algorithm)
         case Fold15():
             begin = (
                 "uint64_t total = 0;\nint64_t size = 0, first;\n"
@@ -138,7 +145,7 @@ def _body(algorithm: Checksum) -> _Body:
     raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which C does not run")
 
 
-def _word_xor(algorithm: WordXor) -> _Body:
+def _make_word_xor_body(algorithm: WordXor) -> _Body:
     halves = [half for size in algorithm.groups for half in range(size)]
     begin = (
         f"static const uint8_t halves[{len(halves)}] = {{{', '.join(map(str, halves))}}};\n"
@@ -154,21 +161,22 @@ def _word_xor(algorithm: WordXor) -> _Body:
     )
 
 
-def _crc(crc: Crc) -> _Body:
-    """By the engine's own table, with the register as it has it: its low byte is the one that meets
-    the next byte of data.
+def _make_crc_body(crc: Crc) -> _Body:
+    """Return a CRC that uses the byte table of `lidarspec.spec.checksums`.
+
+    As there, the low byte of the register is combined with the next byte of data.
     """
     size = next(size for size in (8, 16, 32, 64) if crc.width <= size)
-    entries = [_literal(register, size) for register in byte_table(crc.width, crc.poly, crc.refin)]
+    entries = [
+        _format_literal(register, size) for register in byte_table(crc.width, crc.poly, crc.refin)
+    ]
     per_line = max(96 // (len(entries[0]) + 2), 1)
     table = ",\n    ".join(
         ", ".join(entries[first : first + per_line]) for first in range(0, 256, per_line)
     )
     start = reflected(crc.init, crc.width)
     begin = f"static const uint{size}_t table[256] = {{\n    {table}}};\n"
-    begin += (
-        f"uint{size}_t total = {_literal(start if crc.refin else mirrored_bytes(start), size)};"
-    )
+    begin += f"uint{size}_t total = {_format_literal(start if crc.refin else mirrored_bytes(start), size)};"
     step = f"total = (uint{size}_t)(table[(total ^ byte) & 0xff] ^ total >> 8);"
     if crc.refin:
         result = "(uint64_t)total"
@@ -177,11 +185,11 @@ def _crc(crc: Crc) -> _Body:
     if crc.refin != crc.refout:
         result = f"lidarspec_mirrored({result}, {crc.width})"
     return _Body(
-        begin, step, f"({result}) ^ {_literal(crc.xorout, size)}" if crc.xorout else result
+        begin, step, f"({result}) ^ {_format_literal(crc.xorout, size)}" if crc.xorout else result
     )
 
 
-def _literal(value: int, size: int) -> str:
+def _format_literal(value: int, size: int) -> str:
     digits = f"0x{value:0{size // 4}x}"
     if size == 64:
         return f"UINT64_C({digits})"
@@ -203,13 +211,13 @@ static inline uint64_t {name}_computed({parameters})
     const int64_t spans[][2] = {{{spans}}};
     return {algorithm}(p, spans, sizeof spans / sizeof spans[0]);
 }}
-static inline uint64_t {name}_stored({parameters})
+static inline uint64_t {name}_format_stored_checksum({parameters})
 {{
     return {stored};
 }}
 static inline int {name}_ok({parameters})
 {{
-    const uint64_t stored = {name}_stored({arguments});
+    const uint64_t stored = {name}_format_stored_checksum({arguments});
     return {absent}stored == {name}_computed({arguments});
 }}
 """
@@ -224,46 +232,50 @@ static inline int {name}(const uint8_t *p, size_t n)
 """
 
 
-def _frame(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]:
-    """The functions of a frame type that are about the whole of it; `algorithms` are the names of
-    the checksums' functions.
+def _iter_frame_functions(layout: CLayout, algorithms: Mapping[Checksum, str]) -> Iterator[str]:
+    """Yield the functions of a frame type that read a whole frame.
+
+    Args:
+        algorithms: the name of the C function of each checksum algorithm.
     """
     length = layout.name("", "frame_length")
     longest = layout.message.frame.max_length
-    checks = _lines(_needs(layout))
+    checks = _join_statements(_iter_length_checks(layout))
     unused = "" if checks else "    (void)p;\n    (void)n;\n"
     yield _LENGTH.format(
         name=length, unused=unused, checks=checks, size=layout.size, longest=longest
     )
     seals = dict[str, tuple[Entry, Sealed]]()
     for entry in layout.entries:
-        if isinstance(
-            entry.node, Sealed
-        ):  # of several around one struct, the inner ones are called after their fields
+        # If several checksums are around one struct, the outer one is named after the struct and
+        # the inner ones after their fields.
+        if isinstance(entry.node, Sealed):
             if layout.name(entry.path, "checksum_ok") not in seals:
                 path = entry.path
             else:
                 path = entry.node.fields[0]
             seals[layout.name(path, "checksum_ok")] = entry, entry.node
     for name, (entry, seal) in seals.items():
-        yield _checksum(layout, entry, seal, name, algorithms[seal.algorithm])
-    sealed = [
-        _unless(entry, f"!{name}({arguments(entry.depth)})") for name, (entry, _) in seals.items()
+        yield _format_checksum(layout, entry, seal, name, algorithms[seal.algorithm])
+    checksum_checks = [
+        _format_check(entry, f"!{name}({arguments(entry.depth)})")
+        for name, (entry, _) in seals.items()
     ]
     yield _IS_FRAME.format(
         name=layout.name("", "is_frame"),
         length=length,
-        checks=_lines([*_constants(layout), *sealed]),
+        checks=_join_statements([*_iter_value_checks(layout), *checksum_checks]),
     )
 
 
-def _lines(statements: Iterable[str]) -> str:
+def _join_statements(statements: Iterable[str]) -> str:
     return "".join(f"    {statement}\n" for statement in dict.fromkeys(statements))
 
 
-def _needs(layout: CLayout) -> Iterator[str]:
-    """Checks that what the length depends on is there, and makes sense, in the order in which it is
-    met.
+def _iter_length_checks(layout: CLayout) -> Iterator[str]:
+    """Yield checks that the fields that determine the length exist and have possible values.
+
+    The checks are in wire order.
     """
     longest = layout.message.frame.max_length
     for entry in layout.entries:
@@ -289,7 +301,7 @@ def _needs(layout: CLayout) -> Iterator[str]:
                 )
 
 
-def _checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, algorithm: str) -> str:
+def _format_checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, algorithm: str) -> str:
     held = [access for path in seal.fields for access in accesses(layout, path)]
     for path in seal.fields:
         if [access.depth for access in held if access.info.path == path] != [entry.depth]:
@@ -298,18 +310,22 @@ def _checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, algorithm:
         name=name.removesuffix("_ok"),
         parameters=parameters(entry.depth),
         arguments=arguments(entry.depth),
-        spans=", ".join(f"{{{start}, {end}}}" for start, end in _spans(layout, entry, seal, held)),
+        spans=", ".join(
+            f"{{{start}, {end}}}" for start, end in _iter_covered_spans(layout, entry, seal, held)
+        ),
         algorithm=algorithm,
-        stored=_stored(held, seal.algorithm.order),
+        stored=_format_stored_checksum(held, seal.algorithm.order),
         absent="".join(f"stored == UINT64_C({value}) || " for value in seal.absent),
     )
 
 
-def _spans(
+def _iter_covered_spans(
     layout: CLayout, entry: Entry, seal: Sealed, held: list[Entry]
 ) -> Iterator[tuple[Extent, Extent]]:
-    """The byte ranges that a checksum covers: from its first to its last part, or all that holds no
-    bit of it.
+    """Yield the byte ranges that a checksum covers.
+
+    This is the range that the seal declares, or the whole struct without the fields that hold the
+    checksum.
     """
     if seal.over is not None:
         first, last = (layout.whole(path) for path in seal.over)
@@ -327,8 +343,8 @@ def _spans(
         yield start, entry.start + entry.size
 
 
-def _stored(held: list[Entry], order: str) -> str:
-    """The value that several fields hold, low bits first."""
+def _format_stored_checksum(held: list[Entry], order: str) -> str:
+    """Return the C expression of a checksum stored in several fields, low bits first."""
     terms = []
     shift = 0
     for access in held:
@@ -346,32 +362,36 @@ def _stored(held: list[Entry], order: str) -> str:
     return " | ".join(terms)
 
 
-def _constants(layout: CLayout) -> Iterator[str]:
+def _iter_value_checks(layout: CLayout) -> Iterator[str]:
     for entry in layout.entries:
         node = entry.node
         if isinstance(node, Blob) and node.const is not None:
-            yield _unless(
+            yield _format_check(
                 entry, f"memcmp(p + {entry.start}, {quoted(node.const)}, {len(node.const)}) != 0"
             )
         elif isinstance(node, Check):
-            yield _unless(entry, f"!{layout.formula(node.condition)}")
+            yield _format_check(entry, f"!{layout.formula(node.condition)}")
         elif isinstance(node, Never):
-            yield _unless(entry, "1")
+            yield _format_check(entry, "1")
         elif isinstance(node, Number | Block):
             for access in entry.fields:
                 if access.info.const is not None:
-                    yield _unless(entry, f"({access.expression}) != {_number(access.info.const)}")
+                    yield _format_check(
+                        entry, f"({access.expression}) != {_format_number(access.info.const)}"
+                    )
                 elif access.info.allowed is not None:
-                    yield _unless(entry, f"!({_among(access.expression, access.info.allowed)})")
+                    yield _format_check(
+                        entry, f"!({_format_allowed(access.expression, access.info.allowed)})"
+                    )
                 elif access.info.held and access.info.rebuilt is not None:
-                    yield _unless(
+                    yield _format_check(
                         entry,
                         f"(int64_t)({access.expression}) != {layout.formula(access.info.rebuilt)}",
                     )
 
 
-def _among(expression: str, allowed: tuple[int, ...]) -> str:
-    """Whether a number is one of some."""
+def _format_allowed(expression: str, allowed: tuple[int, ...]) -> str:
+    """Return a C condition that an expression has one of the allowed values."""
     ranges = (
         f"(lidarspec_int({expression}) >= {first} && lidarspec_int({expression}) <= {last})"
         for first, last in runs_of(allowed)
@@ -379,8 +399,8 @@ def _among(expression: str, allowed: tuple[int, ...]) -> str:
     return " || ".join(ranges) or "0"
 
 
-def _number(value: Any) -> str:
-    """A constant as C, unsigned where it is not negative."""
+def _format_number(value: Any) -> str:
+    """Return a constant as a C literal, unsigned if it is not negative."""
     if isinstance(value, float) or value < 0:
         return repr(value)
     if value > 0x7FFFFFFF:
@@ -388,9 +408,13 @@ def _number(value: Any) -> str:
     return f"{value}u"
 
 
-def _unless(entry: Entry, wrong: str) -> str:
-    """A statement that ends with 0 where something is wrong, for every element of the arrays that
-    it is in.
+def _format_check(entry: Entry, wrong: str) -> str:
+    """Return a C statement that returns 0 if a condition is true.
+
+    For an entry in arrays, the statement loops over all elements.
+
+    Args:
+        wrong: the C condition.
     """
     where = " && ".join(filter(None, (entry.where, wrong)))
     names = [(c_fields.index(level), count) for level, count in enumerate(entry.loops)]
@@ -407,7 +431,7 @@ _HEAD = """\
  * For every frame type F:
  *   {prefix}_F_frame_length(p, n)  bytes of the frame that begins at p, of which n are there; 0 where the header does not tell
  *   {prefix}_F_is_frame(p, n)      whether a whole, sound frame begins at p
- *   {prefix}_F_checksum_ok(p)      whether its checksum is right; ..._computed(p), ..._stored(p)
+ *   {prefix}_F_checksum_ok(p)      whether its checksum is right; ..._computed(p), ..._format_stored_checksum(p)
  *   {prefix}_F_FIELD(p, i, ...)    the raw number of a field, with an index for each array that it is in
  *   {prefix}_F_FIELD_present(p)    whether a field that not every header has is there; without, it reads as 0
  *   {prefix}_F_ARRAY_count(p)      elements of an array
@@ -426,31 +450,41 @@ _TAIL = """\
 #endif
 #endif
 """
-#: functions of a whole frame, whose names no field may take.
-_OWN = ("frame_length", "is_frame", "checksum_computed", "checksum_stored", "checksum_ok")
+#: endings of the names of whole-frame functions, which are reserved.
+_RESERVED_ENDINGS = (
+    "frame_length",
+    "is_frame",
+    "checksum_computed",
+    "checksum_stored",
+    "checksum_ok",
+)
 
 
 def header(sensor: Sensor) -> str:
-    """A C99 header that reads the frames of a sensor.
+    """Return a C99 header that reads the frames of a sensor.
 
     Raises:
-        Refused: where only Python code can decide what a frame is made of, or its layout cannot be
-            computed in C.
+        Refused: if the content of a frame depends on Python code, or if C cannot compute its
+            layout.
     """
     prefix = identifier(beginning(sensor))
     title, source = (
         text.replace("*/", "* /").replace("/*", "/ *")
         for text in (f"{sensor.vendor} {sensor.model}", sensor.source)
     )
-    found = messages(sensor)
+    all_messages = messages(sensor)
     algorithms = dict.fromkeys(
-        seal.algorithm for message in found for seal in message.seals.values()
+        seal.algorithm for message in all_messages for seal in message.seals.values()
     )
     names = {
         algorithm: f"{prefix}_checksum_{number}" for number, algorithm in enumerate(algorithms, 1)
     }
-    given: dict[str, tuple[str, str, str]] = {}
-    frames = [text for message in found for text in _message(message, prefix, given, names)]
+    taken: dict[str, tuple[str, str, str]] = {}
+    frames = [
+        text
+        for message in all_messages
+        for text in _iter_definitions(message, prefix, taken, names)
+    ]
     head = _HEAD.format(
         title=title, version=__version__, source=source, prefix=prefix, guard=f"{prefix.upper()}_H"
     )
@@ -466,16 +500,21 @@ def header(sensor: Sensor) -> str:
     )
 
 
-def _message(
+def _iter_definitions(
     message: Message,
     prefix: str,
-    given: dict[str, tuple[str, str, str]],
+    taken: dict[str, tuple[str, str, str]],
     algorithms: Mapping[Checksum, str],
 ) -> Iterator[str]:
-    """All of a frame type; `given` are the names that are taken, and what has them."""
-    name = functools.partial(_name, given, prefix, message.name)
-    for own in _OWN:
-        name("", own)
+    """Yield all definitions of a frame type.
+
+    Args:
+        taken: C name -> (frame type, path, ending) that has it; new names are added.
+        algorithms: the name of the C function of each checksum algorithm.
+    """
+    name = functools.partial(_make_name, taken, prefix, message.name)
+    for ending in _RESERVED_ENDINGS:
+        name("", ending)
     layout = CLayout(message, name)
     yield comment(
         f"---- {message.name}: {'from' if message.frame.direction == 'in' else 'to'}"
@@ -487,14 +526,14 @@ def _message(
     )
     yield from (text for text in c_fields.fields(layout) if text)
     yield ""
-    yield from _frame(layout, algorithms)
+    yield from _iter_frame_functions(layout, algorithms)
 
 
-def _name(
-    given: dict[str, tuple[str, str, str]], prefix: str, frame: str, path: str, ending: str
+def _make_name(
+    taken: dict[str, tuple[str, str, str]], prefix: str, frame: str, path: str, ending: str
 ) -> str:
-    """The C name of what stands at a path of a frame, with an ending; each is given once."""
+    """Return a unique C name for a path of a frame type, with an ending."""
     name = "_".join(identifier(part) for part in (prefix, frame, path, ending) if part)
-    while given.setdefault(name, (frame, path, ending)) != (frame, path, ending):
+    while taken.setdefault(name, (frame, path, ending)) != (frame, path, ending):
         name += "_"
     return name

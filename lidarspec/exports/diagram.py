@@ -1,11 +1,11 @@
-"""Packet diagrams as manuals have them: rows of four bytes, every field a box, repeated parts drawn
-once with their number.
+"""Draw packet diagrams as SVG, in the style of vendor manuals.
 
-A diagram is made in two steps. `_Cells` says what is shown of a frame tree: boxes in the order of
-the wire (`Cell`), and groups that repeat or that some headers leave out (`Group`). `_Sheet` draws
-these from top to bottom as SVG: a box across the end of a row goes on in the next, a group has rows
-of its own with a bracket beside them, and a field too long to draw, or of no fixed length, is a
-torn row.
+A row has four bytes, and each field is a box. A repeated part is drawn once, with its count.
+
+A diagram is made in two steps. `_Cells` converts a frame tree to boxes in wire order (`Cell`), and
+to groups that are repeated or optional (`Group`). `_Sheet` draws them from top to bottom. A box
+that crosses the end of a row continues in the next row. A group starts a new row and has a bracket
+beside it. A field that is too long, or that has no fixed length, is drawn as a cut row.
 """
 
 from __future__ import annotations
@@ -29,32 +29,39 @@ from lidarspec.frames.wire_table import (
 )
 from lidarspec.spec import Sensor, tree
 
-#: how the names of fields begin that are there for nothing yet, in manuals.
-SPARE = ("reserved", "unused", "spare", "zeros", "padding")
+#: prefixes of the names of fields without a meaning, as manuals call them.
+SPARE_PREFIXES = ("reserved", "unused", "spare", "zeros", "padding")
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A box: `bits` wide, or with `bits` 0 of a size that only a header tells.
+    """A box of a diagram.
 
     Attributes:
-        name: what is written in it; `detail`: below that; `said`: all there is to say of it.
-        role: "const", "sum", "spare", "group" or "".
-        offset: where it starts.
+        name: its title.
+        bits: its width; 0 if its size depends on the header.
+        detail: the text below the title.
+        tooltip: the full description.
+        role: "const", "sum", "spare" or ""; it decides the colour.
+        offset: of its first byte.
     """
 
     name: str
     bits: int
     detail: str
-    said: str
+    tooltip: str
     role: str
     offset: Extent
 
 
 @dataclass(frozen=True)
 class Group:
-    """Boxes that stand together: repeated, or with `optional` there under a condition, as the label
-    says.
+    """Boxes that are repeated together, or optional together.
+
+    Attributes:
+        label: the count or the condition.
+        items: the boxes and groups in it.
+        optional: True if some frames do not have it.
     """
 
     label: str
@@ -66,8 +73,9 @@ Item = Cell | Group
 
 
 def byte_order(message: Message) -> str:
-    """The byte order of all numbers of a frame type, "" where they differ or there are none of
-    several bytes.
+    """Return the byte order of all numbers of a frame type.
+
+    Returns "" if they differ, or if all numbers have a single byte.
     """
     orders = {
         node.order
@@ -81,31 +89,35 @@ def byte_order(message: Message) -> str:
 
 @dataclass
 class _Cells:
-    """Makes the items of a frame type.
+    """Converts the tree of a frame type to items.
 
     Attributes:
         seals: path of a field that holds a checksum -> its seal.
-        mixed: whether its numbers have several byte orders, so that each says its own.
+        mixed: True shows the byte order of each number, because they differ.
     """
 
     seals: Mapping[str, tree.Sealed]
     mixed: bool
 
     def visit(self, node: tree.Node, start: Extent, depth: int) -> tuple[Item, ...]:
-        """The items of a part that begins at `start`."""
+        """Return the items of a node that begins at `start`.
+
+        Args:
+            depth: the number of arrays around the node.
+        """
         match node:
             case tree.Sealed():
                 return self.visit(node.body, start, depth)
             case tree.Struct():
-                return tuple(self._struct(node, start, depth))
+                return tuple(self._iter_struct_items(node, start, depth))
             case tree.Number():
-                return (self._number(node, start),)
+                return (self._make_number_cell(node, start),)
             case tree.Blob() if node.size != 0:
-                return (self._blob(node, start),)
+                return (self._make_blob_cell(node, start),)
             case tree.Block():
-                return tuple(self._block(node, start))
+                return tuple(self._make_block_cells(node, start))
             case tree.Repeat():
-                return (self._repeat(node, start, depth),)
+                return (self._make_repeat_group(node, start, depth),)
             case tree.Parts():
                 kinds = [
                     (kind.name, self.visit(kind.element, Extent(0, ("i",)), depth + 1))
@@ -123,7 +135,7 @@ class _Cells:
                 return tuple(Group(label, items, optional=True) for label, items in parts if items)
         return ()
 
-    def _struct(self, node: tree.Struct, start: Extent, depth: int) -> Iterator[Item]:
+    def _iter_struct_items(self, node: tree.Struct, start: Extent, depth: int) -> Iterator[Item]:
         for member in node.members:
             named = isinstance(member, tree.Struct | tree.Sealed) or (
                 isinstance(member, tree.Block) and member.parts[0].names
@@ -136,7 +148,7 @@ class _Cells:
                 )
             start = start + extent(member, member.name)
 
-    def _number(self, node: tree.Number, start: Extent) -> Cell:
+    def _make_number_cell(self, node: tree.Number, start: Extent) -> Cell:
         width = 8 * node.size
         is_long = node.size > 1
         short = {"uint": "u", "int": "s", "float": "float "}[
@@ -148,7 +160,7 @@ class _Cells:
                 detail = f"{node.info.const:#0{2 * node.size + 2}x}"
             else:
                 detail = str(node.info.const)
-        return self._cell(
+        return self._make_cell(
             node.info,
             node.name,
             width,
@@ -157,17 +169,18 @@ class _Cells:
             start,
         )
 
-    def _blob(self, node: tree.Blob, start: Extent) -> Cell:
+    def _make_blob_cell(self, node: tree.Blob, start: Extent) -> Cell:
         size = extent(node)
         if node.const is not None and len(node.const) <= 8:
             detail = node.const.hex(" ")
         else:
             detail = f"{size} byte{'s' * (str(size) != '1')}"
-        return self._cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
+        return self._make_cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
 
-    def _block(self, node: tree.Block, start: Extent) -> list[Cell]:
-        """A box for each run of bits of one value, in the order of the wire, the highest bit of
-        each byte first.
+    def _make_block_cells(self, node: tree.Block, start: Extent) -> list[Cell]:
+        """Return a box for each contiguous run of bits of one value, in wire order.
+
+        The highest bit of each byte is first.
         """
         segments = [
             (run.byte, run.low + run.mask.bit_count() - 1, run, part)
@@ -183,11 +196,14 @@ class _Cells:
             else:
                 runs.append((part, low, high, byte))
         return [
-            self._run(node, part, low, high, start + Extent(byte)) for part, low, high, byte in runs
+            self._make_run_cell(node, part, low, high, start + Extent(byte))
+            for part, low, high, byte in runs
         ]
 
-    def _run(self, node: tree.Block, part: tree.Part, low: int, high: int, start: Extent) -> Cell:
-        """The box of some bits of a value, with their numbers where it has others, too."""
+    def _make_run_cell(
+        self, node: tree.Block, part: tree.Part, low: int, high: int, start: Extent
+    ) -> Cell:
+        """Return the box of a run of bits, with the bit numbers if it is not the whole value."""
         width = high - low + 1
         name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)
         if high > low:
@@ -198,9 +214,9 @@ class _Cells:
             detail = unit_text(part.info)
         else:
             detail = numbers
-        return self._cell(part.info, name, width, detail, bit_text(part.bits), start)
+        return self._make_cell(part.info, name, width, detail, bit_text(part.bits), start)
 
-    def _cell(
+    def _make_cell(
         self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent
     ) -> Cell:
         seal = self.seals.get(info.path)
@@ -208,20 +224,21 @@ class _Cells:
             role = "sum"
         elif info.const is not None:
             role = "const"
-        elif name.startswith(SPARE):
+        elif name.startswith(SPARE_PREFIXES):
             role = "spare"
         else:
             role = ""
-        said = (
+        description = (
             info.path,
             kind,
             unit_text(info),
             meaning(info),
             seal.algorithm.describe() if seal else "",
         )
-        return Cell(name or "(constant)", bits, detail, "; ".join(filter(None, said)), role, start)
+        tooltip = "; ".join(filter(None, description))
+        return Cell(name or "(constant)", bits, detail, tooltip, role, start)
 
-    def _repeat(self, node: tree.Repeat, start: Extent, depth: int) -> Group:
+    def _make_repeat_group(self, node: tree.Repeat, start: Extent, depth: int) -> Group:
         step = extent(node.element, node.name).times(INDICES[depth % len(INDICES)])
         count = node.count if isinstance(node.count, int) else phrase(node.count)
         return Group(
@@ -229,32 +246,45 @@ class _Cells:
         )
 
 
-#: bits in a row, pixels of a bit and of a row, of the offsets at the left, of a level of brackets,
-#: and around everything.
-BITS = 32
-BIT = 22
-ROW = 46
-LEFT = 104
-LEVEL = 136
-EDGE = 16
-#: bits that are drawn in full; a longer field is a torn row.
-LONGEST = 128
-#: letters of an offset in one line.
-FORMULA = 13
+#: bits in a row.
+ROW_BITS = 32
+#: width of a bit, in pixels.
+BIT_WIDTH = 22
+#: height of a row, in pixels.
+ROW_HEIGHT = 46
+#: width of the column of offsets at the left, in pixels.
+LEFT_MARGIN = 104
+#: width of a level of brackets at the right, in pixels.
+BRACKET_WIDTH = 136
+#: margin around the drawing, in pixels.
+MARGIN = 16
+#: bits of the longest field that is drawn in full; a longer one is drawn as a cut row.
+MAX_DRAWN_BITS = 128
+#: letters of the longest offset that is written in one line.
+MAX_OFFSET_LETTERS = 13
+#: fill colour by role.
 FILLS = {"": "#ffffff", "const": "#e4e8ee", "sum": "#fde7b8", "spare": "#f4f4f2"}
-INK, FAINT, LINE = "#1c2430", "#64707f", "#4a5565"
-#: width of a letter in its size, and the sizes of names and of what stands below them.
-LETTER = 0.61
-NAMED = 13
-DETAILED = 10.5
-SMALLEST = 8
+#: colour of names.
+INK = "#1c2430"
+#: colour of details and offsets.
+FAINT = "#64707f"
+#: colour of lines.
+LINE = "#4a5565"
+#: width of a letter as a share of the font size.
+LETTER_ASPECT = 0.61
+#: font size of names, in pixels.
+NAME_SIZE = 13
+#: font size of details, in pixels.
+DETAIL_SIZE = 10.5
+#: smallest font size of names, in pixels.
+MIN_NAME_SIZE = 8
 
 
 def svg(sensor: Sensor) -> str:
-    """The frame types of a sensor, one below the other, as an SVG document.
+    """Return an SVG document with the diagrams of all frame types of a sensor.
 
     Raises:
-        Refused: where a frame holds a part that only Python code can decide.
+        Refused: if the content of a frame depends on Python code.
     """
     sheet = _Sheet()
     for message in messages(sensor, on_wire=False):
@@ -269,30 +299,35 @@ def svg(sensor: Sensor) -> str:
     return sheet.document(f"{sensor.id}: packet diagrams")
 
 
-#: left edge, upper edge and bits of what a field has of a row.
+#: the piece of a box in one row: left edge, upper edge, bits.
 Piece = tuple[float, float, int]
 
 
 @dataclass
 class _Sheet:
-    """A drawing while it grows downwards: `top` is the upper edge of the current row, `used` how
-    many of its bits are taken.
+    """A drawing, which grows downwards.
+
+    Attributes:
+        parts: the SVG elements.
+        top: the upper edge of the current row, in pixels.
+        used: the bits of the current row that are already drawn.
+        deepest: the number of levels of brackets.
     """
 
     parts: list[str] = field(default_factory=list)
-    top: float = EDGE
+    top: float = MARGIN
     used: int = 0
     deepest: int = 0
 
     def title(self, text: str, detail: str) -> None:
-        """The name of a frame type above its rows, then bytes and bits above the first of them."""
-        self.parts.append(_text(EDGE, self.top + 14, text, 15, weight="bold"))
-        self.parts.append(_text(EDGE, self.top + 31, detail, 11.5, fill=FAINT))
+        """Draw the name of a frame type, and the byte and bit numbers above its first row."""
+        self.parts.append(_format_text(MARGIN, self.top + 14, text, 15, weight="bold"))
+        self.parts.append(_format_text(MARGIN, self.top + 31, detail, 11.5, fill=FAINT))
         self.top += 48
-        for byte in range(BITS // 8):
+        for byte in range(ROW_BITS // 8):
             self.parts.append(
-                _text(
-                    LEFT + (8 * byte + 4) * BIT,
+                _format_text(
+                    LEFT_MARGIN + (8 * byte + 4) * BIT_WIDTH,
                     self.top,
                     f"byte {byte}",
                     10.5,
@@ -300,10 +335,10 @@ class _Sheet:
                     anchor="middle",
                 )
             )
-        for bit in range(BITS):
+        for bit in range(ROW_BITS):
             self.parts.append(
-                _text(
-                    LEFT + (bit + 0.5) * BIT,
+                _format_text(
+                    LEFT_MARGIN + (bit + 0.5) * BIT_WIDTH,
                     self.top + 13,
                     str(7 - bit % 8),
                     8.5,
@@ -314,24 +349,24 @@ class _Sheet:
         self.top += 18
 
     def items(self, items: Sequence[Item], depth: int) -> None:
-        """Boxes and groups one after another."""
+        """Draw boxes and groups one after another."""
         for item in items:
             if isinstance(item, Group):
-                self._group(item, depth)
-            elif item.bits == 0 or item.bits > LONGEST:
-                self._torn(item)
+                self._draw_group(item, depth)
+            elif item.bits == 0 or item.bits > MAX_DRAWN_BITS:
+                self._draw_cut_row(item)
             else:
-                self._box(item)
+                self._draw_box(item)
 
     def close(self) -> None:
-        """End the last row and leave room before what comes next."""
-        self._row_ends()
+        """End the last row and leave space before the next frame type."""
+        self._end_row()
         self.top += 26
 
     def document(self, title: str) -> str:
-        """All of it."""
-        width = LEFT + BITS * BIT + EDGE + LEVEL * self.deepest
-        height = self.top - 26 + EDGE
+        """Return the whole SVG document."""
+        width = LEFT_MARGIN + ROW_BITS * BIT_WIDTH + MARGIN + BRACKET_WIDTH * self.deepest
+        height = self.top - 26 + MARGIN
         head = (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}"'
             f' width="{width:g}" height="{height:g}" font-family="Helvetica, Arial, sans-serif">'
@@ -347,175 +382,202 @@ class _Sheet:
             ]
         )
 
-    def _row_ends(self) -> None:
+    def _end_row(self) -> None:
         if self.used:
-            self.top = self.top + ROW
+            self.top = self.top + ROW_HEIGHT
             self.used = 0
 
-    def _group(self, group: Group, depth: int) -> None:
-        """A part with a bracket at its right; it has rows of its own."""
-        self._row_ends()
+    def _draw_group(self, group: Group, depth: int) -> None:
+        """Draw a group in rows of its own, with a bracket at the right."""
+        self._end_row()
         self.deepest = max(self.deepest, depth + 1 + _depth(group))
         top = self.top
         self.items(group.items, depth)
-        self._row_ends()
-        x = LEFT + BITS * BIT + 8 + LEVEL * _depth(group)
+        self._end_row()
+        x = LEFT_MARGIN + ROW_BITS * BIT_WIDTH + 8 + BRACKET_WIDTH * _depth(group)
         path = f"M{x} {top + 2:g}h6v{self.top - top - 4:g}h-6"
         dashes = ' stroke-dasharray="4 3"' if group.optional else ""
         self.parts.append(
             f'<path d="{path}" fill="none" stroke="{LINE}" stroke-width="1.4"{dashes}/>'
         )
-        self.parts += _lines(x + 12, (top + self.top) / 2, group.label)
+        self.parts += _draw_bracket_label(x + 12, (top + self.top) / 2, group.label)
 
-    def _box(self, cell: Cell) -> None:
-        """A field in as many pieces as it takes rows; the name stands in the widest."""
+    def _draw_box(self, cell: Cell) -> None:
+        """Draw a field as a piece in each row that it covers, with its name in the widest."""
         pieces: list[Piece] = []
         left = cell.bits
         lead = self.used % 8
         while left:
             if self.used == 0:
-                self._offset(cell, (lead + cell.bits - left) // 8)
-            taken = min(left, BITS - self.used)
-            pieces.append((LEFT + self.used * BIT, self.top, taken))
+                self._draw_offset(cell, (lead + cell.bits - left) // 8)
+            taken = min(left, ROW_BITS - self.used)
+            pieces.append((LEFT_MARGIN + self.used * BIT_WIDTH, self.top, taken))
             self.used = self.used + taken
             left = left - taken
-            if self.used == BITS:
-                self._row_ends()
+            if self.used == ROW_BITS:
+                self._end_row()
         widest = max(range(len(pieces)), key=lambda index: pieces[index][2])
-        self.parts += _outlined(pieces, cell)
+        self.parts += _draw_outline(pieces, cell)
         for index, (x, y, bits) in enumerate(pieces):
             if index == widest:
-                self.parts += _label(x, y, bits * BIT, cell)
-            elif len(pieces) == 2 and not _below(*pieces):
-                self.parts += _label(
-                    x, y, bits * BIT, replace(cell, name=f"({cell.name})", detail=""), fill=FAINT
+                self.parts += _draw_label(x, y, bits * BIT_WIDTH, cell)
+            elif len(pieces) == 2 and not _touches(*pieces):
+                self.parts += _draw_label(
+                    x,
+                    y,
+                    bits * BIT_WIDTH,
+                    replace(cell, name=f"({cell.name})", detail=""),
+                    fill=FAINT,
                 )
 
-    def _torn(self, cell: Cell) -> None:
-        """A field too long to draw, or of no known length: a row with a wavy cut."""
-        self._row_ends()
-        self._offset(cell, 0)
-        width = BITS * BIT
-        self.parts += _outlined([(LEFT, self.top, BITS)], cell)
+    def _draw_cut_row(self, cell: Cell) -> None:
+        """Draw a field that is too long, or has no fixed length, as a row with jagged cuts."""
+        self._end_row()
+        self._draw_offset(cell, 0)
+        width = ROW_BITS * BIT_WIDTH
+        self.parts += _draw_outline([(LEFT_MARGIN, self.top, ROW_BITS)], cell)
         for share in (0.12, 0.88):
-            x = LEFT + share * width
-            path = f"M{x - 4:g} {self.top:g}l8 {ROW / 3:g}l-8 {ROW / 3:g}l8 {ROW / 3:g}"
+            x = LEFT_MARGIN + share * width
+            step = ROW_HEIGHT / 3
+            path = f"M{x - 4:g} {self.top:g}l8 {step:g}l-8 {step:g}l8 {step:g}"
             self.parts.append(f'<path d="{path}" fill="none" stroke="{FAINT}"/>')
-        self.parts += _label(LEFT, self.top, width, cell)
-        self.top = self.top + ROW
+        self.parts += _draw_label(LEFT_MARGIN, self.top, width, cell)
+        self.top = self.top + ROW_HEIGHT
         self.used = 0
 
-    def _offset(self, cell: Cell, more: int) -> None:
-        """The offset of a row, so many bytes after the field's, left of it; a long formula in two
-        lines.
+    def _draw_offset(self, cell: Cell, more: int) -> None:
+        """Draw the offset of the current row at its left, a long formula in two lines.
+
+        Args:
+            more: the bytes of the field in the rows before.
         """
         text = str(cell.offset + Extent(more))
         middle = text.find(" + ", len(text) // 2 - 4)
-        if len(text) <= FORMULA or middle < 0:
+        if len(text) <= MAX_OFFSET_LETTERS or middle < 0:
             lines = [text]
         else:
             lines = [text[: middle + 2], text[middle + 3 :]]
         for index, line in enumerate(lines):
-            y = self.top + ROW / 2 + 4 + 13 * (index - (len(lines) - 1) / 2)
-            size = min(11, (LEFT - 12) / (LETTER * len(line)))
-            self.parts.append(_text(LEFT - 8, y, line, size, fill=FAINT, anchor="end"))
+            y = self.top + ROW_HEIGHT / 2 + 4 + 13 * (index - (len(lines) - 1) / 2)
+            size = min(11, (LEFT_MARGIN - 12) / (LETTER_ASPECT * len(line)))
+            self.parts.append(
+                _format_text(LEFT_MARGIN - 8, y, line, size, fill=FAINT, anchor="end")
+            )
 
 
 def _depth(group: Group) -> int:
-    """How many groups are nested in one."""
+    """Return the depth of the groups nested in a group."""
     return max((1 + _depth(item) for item in group.items if isinstance(item, Group)), default=0)
 
 
-def _outlined(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
-    """The box of a field: its pieces filled, and lines around them but not between two of them."""
+def _draw_outline(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
+    """Yield the filled pieces of a box, and the outline around them without the lines between."""
     rects = "".join(
-        f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT}" height="{ROW}"/>' for x, y, bits in pieces
+        f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT_WIDTH}" height="{ROW_HEIGHT}"/>'
+        for x, y, bits in pieces
     )
-    yield f'<g fill="{FILLS[cell.role]}"><title>{escape(cell.said)}</title>{rects}</g>'
+    yield f'<g fill="{FILLS[cell.role]}"><title>{escape(cell.tooltip)}</title>{rects}</g>'
     path = ""
     for index, piece in enumerate(pieces):
         x, y, bits = piece
-        end = x + bits * BIT
-        path += f"M{x:g} {y:g}v{ROW}M{end:g} {y:g}v{ROW}"
+        end = x + bits * BIT_WIDTH
+        path += f"M{x:g} {y:g}v{ROW_HEIGHT}M{end:g} {y:g}v{ROW_HEIGHT}"
         before = pieces[index - 1] if index else None
         if index + 1 < len(pieces):
             after = pieces[index + 1]
         else:
             after = None
         path += (
-            f"M{max(x, _end(before)):g} {y:g}H{end:g}"
-            if before is None or _end(before) < end
+            f"M{max(x, _right_edge(before)):g} {y:g}H{end:g}"
+            if before is None or _right_edge(before) < end
             else ""
         )
-        path += f"M{x:g} {y + ROW:g}H{end:g}" if after is None or not _below(piece, after) else ""
+        path += (
+            f"M{x:g} {y + ROW_HEIGHT:g}H{end:g}"
+            if after is None or not _touches(piece, after)
+            else ""
+        )
         path += f"M{x:g} {y:g}H{before[0]:g}" if before and before[0] > x else ""
         path += (
-            f"M{_end(after):g} {y + ROW:g}H{end:g}"
-            if after and _below(piece, after) and _end(after) < end
+            f"M{_right_edge(after):g} {y + ROW_HEIGHT:g}H{end:g}"
+            if after and _touches(piece, after) and _right_edge(after) < end
             else ""
         )
     yield f'<path d="{path}" fill="none" stroke="{LINE}"/>'
 
 
-def _end(piece: Piece | None) -> float:
+def _right_edge(piece: Piece | None) -> float:
     if piece is None:
         return 0
-    return piece[0] + piece[2] * BIT
+    return piece[0] + piece[2] * BIT_WIDTH
 
 
-def _below(one: Piece, other: Piece) -> bool:
-    """Whether two pieces of a field touch, one above the other."""
-    return abs(one[1] - other[1]) == ROW and max(one[0], other[0]) < min(_end(one), _end(other))
+def _touches(one: Piece, other: Piece) -> bool:
+    """Return whether two pieces touch, one above the other."""
+    return abs(one[1] - other[1]) == ROW_HEIGHT and max(one[0], other[0]) < min(
+        _right_edge(one), _right_edge(other)
+    )
 
 
-def _label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Iterator[str]:
-    """The name of a field and what it is, as large as there is room; a name that fits nowhere is
-    written upright.
+def _draw_label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Iterator[str]:
+    """Yield the name and the detail of a box, as large as there is room.
+
+    A name that does not fit in the smallest size is written vertically.
     """
     room = width - 5
-    if LETTER * SMALLEST * len(cell.name) > room:
+    if LETTER_ASPECT * MIN_NAME_SIZE * len(cell.name) > room:
         cell = replace(cell, name=cell.name.rpartition(".")[2])
-    size = min(NAMED, room / (LETTER * len(cell.name)))
+    size = min(NAME_SIZE, room / (LETTER_ASPECT * len(cell.name)))
     middle = x + width / 2
-    if size < SMALLEST and len(cell.name) > 1:
-        tall = min(NAMED - 2, (ROW - 4) / (LETTER * len(cell.name)))
-        if tall >= SMALLEST - 1:
+    if size < MIN_NAME_SIZE and len(cell.name) > 1:
+        tall = min(NAME_SIZE - 2, (ROW_HEIGHT - 4) / (LETTER_ASPECT * len(cell.name)))
+        if tall >= MIN_NAME_SIZE - 1:
             text = cell.name
         else:
-            text = cell.name[: int((ROW - 4) / (LETTER * (SMALLEST - 1)))]
-        tall = max(tall, SMALLEST - 1)
-        turned = f' transform="rotate(-90 {middle:g} {y + ROW / 2:g})"'
-        yield _text(
-            middle, y + ROW / 2 + tall * 0.35, text, tall, fill=fill, anchor="middle", more=turned
+            text = cell.name[: int((ROW_HEIGHT - 4) / (LETTER_ASPECT * (MIN_NAME_SIZE - 1)))]
+        tall = max(tall, MIN_NAME_SIZE - 1)
+        turned = f' transform="rotate(-90 {middle:g} {y + ROW_HEIGHT / 2:g})"'
+        yield _format_text(
+            middle,
+            y + ROW_HEIGHT / 2 + tall * 0.35,
+            text,
+            tall,
+            fill=fill,
+            anchor="middle",
+            more=turned,
         )
         return
-    has_room = cell.detail and LETTER * DETAILED * len(cell.detail) <= room
-    yield _text(
+    has_room = cell.detail and LETTER_ASPECT * DETAIL_SIZE * len(cell.detail) <= room
+    yield _format_text(
         middle,
-        y + ROW / 2 + (-1 if has_room else size * 0.35),
+        y + ROW_HEIGHT / 2 + (-1 if has_room else size * 0.35),
         cell.name,
         size,
         fill=fill,
         anchor="middle",
     )
     if has_room:
-        yield _text(middle, y + ROW / 2 + 13, cell.detail, DETAILED, fill=FAINT, anchor="middle")
+        yield _format_text(
+            middle, y + ROW_HEIGHT / 2 + 13, cell.detail, DETAIL_SIZE, fill=FAINT, anchor="middle"
+        )
 
 
-def _lines(x: float, y: float, label: str) -> Iterator[str]:
-    """The label of a bracket, in lines that fit its level."""
+def _draw_bracket_label(x: float, y: float, label: str) -> Iterator[str]:
+    """Yield the label of a bracket, in lines that fit beside the bracket."""
     lines = [""]
-    room = (LEVEL - 30) / (LETTER * 12)
+    room = (BRACKET_WIDTH - 30) / (LETTER_ASPECT * 12)
     for word in label.split(" "):
         if lines[-1] and len(lines[-1]) + 1 + len(word) > room:
             lines.append("")
         lines[-1] = f"{lines[-1]} {word}".strip()
     for index, line in enumerate(lines):
-        size = min(12, (LEVEL - 30) / (LETTER * len(line)))
-        yield _text(x, y + 4 + 15 * (index - (len(lines) - 1) / 2), line, size, weight="bold")
+        size = min(12, (BRACKET_WIDTH - 30) / (LETTER_ASPECT * len(line)))
+        yield _format_text(
+            x, y + 4 + 15 * (index - (len(lines) - 1) / 2), line, size, weight="bold"
+        )
 
 
-def _text(
+def _format_text(
     x: float,
     y: float,
     text: str,

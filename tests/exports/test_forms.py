@@ -20,7 +20,7 @@ from construct import Bytes, Const, Struct
 import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, narrowed
-from lidarspec.exports.diagram import BIT, BITS, LEFT
+from lidarspec.exports.diagram import BIT_WIDTH, LEFT_MARGIN, ROW_BITS
 from lidarspec.frames.schema import schema
 from lidarspec.spec import Command, Frame
 from tests.broken import sound
@@ -129,10 +129,10 @@ def assert_diagram_is_complete(sensor: Sensor) -> None:
     ]
     for box in boxes:
         assert (
-            LEFT
+            LEFT_MARGIN
             <= float(box.get("x", "0"))
             <= float(box.get("x", "0")) + float(box.get("width", "0"))
-            <= LEFT + BITS * BIT
+            <= LEFT_MARGIN + ROW_BITS * BIT_WIDTH
         )
 
 
@@ -142,8 +142,8 @@ def test_boxes_do_not_overlap_and_fill_their_bits() -> None:
     for box in root.iter("{http://www.w3.org/2000/svg}rect"):
         if "x" in box.attrib:
             columns = {
-                (float(box.attrib["y"]), float(box.attrib["x"]) + bit * BIT)
-                for bit in range(int(float(box.attrib["width"]) / BIT))
+                (float(box.attrib["y"]), float(box.attrib["x"]) + bit * BIT_WIDTH)
+                for bit in range(int(float(box.attrib["width"]) / BIT_WIDTH))
             }
             assert not seen & columns
             seen |= columns
