@@ -1,37 +1,36 @@
-"""A frame type as a tree of nodes: what stands on the wire, in order, with formulas where fields of
-the header decide.
+"""The frame tree: a frame type as a tree of nodes in wire order.
 
-`lidarspec.spec.syntax` makes it from an author's struct, once for each frame; schema, layouts,
-examples, wire tables, explain and exports walk it (`children`, `nodes`) and know nothing of
-construct. Everything here is immutable. A node says what it is (`FieldInfo` for what carries a
-value) and how it is stored; where it begins is the sum of what stands before it.
+`lidarspec.spec.syntax` makes the tree from an author's struct, once for each frame type. Schemas,
+layouts, examples, wire tables, explanations and exports walk it (`children`, `nodes`) and do not
+use construct. Nodes are immutable. A node has its meaning (`FieldInfo` if it has a value) and its
+storage. Its offset is the sum of the sizes of the nodes before it.
 
-    Struct          members in a row
+    Struct          a sequence of members
     Sealed          a Struct with a checksum
     Number          an integer or float of whole bytes
-    Blob            plain bytes; a constant without name is one with name ""
-    Block           so many bytes whose bits make up one or more integers (`Part`)
-    Repeat          one element so many times
-    Parts           frames within the frame, one after another, each of a size of its own
-    When            a part that a condition decides on
-    Select          a part that a key decides on
-    Empty           nothing
-    Check           nothing, under a condition that the frame has to meet
-    Never           what no frame has
-    Opaque          what construct alone can read
+    Blob            plain bytes; the name of an unnamed constant is ""
+    Block           bytes that contain one or more integers as bits (`Part`)
+    Repeat          an array: one element, repeated
+    Parts           frames within the frame, one after another, each with its own size
+    When            a node or another one, by a condition
+    Select          one of several nodes, by a key
+    Empty           no bytes
+    Check           no bytes; a condition that the frame must meet
+    Never           an alternative that is always an error
+    Opaque          a part that only construct can read
 
 Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and
-operations on both (`Op`). An expression that cannot be written down like this is `Untraced`, and
-construct reads its frames.
+operations on both (`Op`). An expression that cannot be converted to a formula is `Untraced`. Then
+construct reads the frames.
 
-Parts stand in the tree twice: as they are described, with paths from the top of the frame
-(`Kind.element`), and as frames in themselves, with paths from their own start (`Kind.root`), which
-layouts and tables are made of.
+Parts are in the tree twice. `Kind.element` has paths from the top of the frame, as the author
+described it. `Kind.root` is a frame of its own with paths from the start of the part; layouts and
+tables are made from it.
 
-A field that says how long a part is (`FieldInfo.held`) follows from what the nodes of that part add
-up to (`size`), and what pads a part is so many bytes: both are formulas like all others. An axis
-has its name in `Repeat.axis` and `FieldInfo.axes`; one element of an array is an index in `Ref`. A
-wire form, which recodes the bytes before they have places, is a value of the `Frame`, beside its
+A field that declares the size of a part (`FieldInfo.held`) has a formula made from the sizes of the
+nodes of the part (`size`). The size of padding is a formula too. An array is identified by its axis
+(`Repeat.axis`, `FieldInfo.axes`). One element of an array is an index in the path of a `Ref`.
+A wire form, which recodes the bytes before they are parsed, belongs to the `Frame`, not to its
 tree.
 """
 
@@ -51,12 +50,12 @@ from lidarspec.errors import SpecError
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.checksums import Checksum
 
-#: the name that is shown for a constant without one.
+#: the name that is displayed for an unnamed constant.
 UNNAMED = "(constant)"
 
 
 def exact(number: float | int) -> Fraction:
-    """The decimal number that was written, not the binary one nearest to it: 0.001 is 1/1000."""
+    """Return a float as the decimal number that it prints as: 0.001 is 1/1000."""
     if isinstance(number, float):
         return Fraction(repr(float(number)))
     return Fraction(number)
@@ -69,21 +68,22 @@ class FieldInfo:
     Attributes:
         path: dotted, without indices: "points.distance".
         axes: paths of the arrays it is in, outermost first; a bytes field adds its own path.
-        dtype: type of the raw value in native byte order; None where construct alone knows it.
+        dtype: dtype of the raw value in native byte order; None if only construct knows it.
         kind: "int", "float", "bytes" or "other".
-        scale, offset, unit: ``physical = raw * scale + offset``.
-        bits: width in bits; 0 where not fixed.
-        const: the value it must have, None where free.
+        scale, offset, unit: ``physical = raw * scale + offset``, in this unit.
+        docs: the author's documentation.
+        bits: width in bits; 0 if it is not fixed.
+        const: the value that it must have; None for any.
         allowed: the raw values that it may have (construct's OneOf, NoneOf and Mapping), in their
             order; None for any.
-        rebuilt: what its value in a frame that is made follows from, None where it is given
-            (construct's Rebuild).
-        default: the value that a frame gets if none is given: raw, or a formula; of bytes, a
-            pattern of one byte that fills the field.
-        held: whether a frame that comes is held to that (`SizeOf`).
-        labels: meanings of raw values (construct's Enum).
-        optional: whether some headers leave it out.
-        measured: whether the author says what it measures, with a unit or as a pure number.
+        rebuilt: the formula of its value when a frame is built (construct's Rebuild); None if the
+            caller supplies the value.
+        default: the value in a built frame if the caller supplies none: a raw value or a formula.
+            For bytes, a pattern of one byte that fills the field.
+        held: True if a parsed frame must have the value of `rebuilt` (`SizeOf`).
+        labels: names of raw values (construct's Enum).
+        optional: True if some headers leave the field out.
+        measured: True if the author declared a unit, or that it is a pure number.
     """
 
     path: str
@@ -111,18 +111,18 @@ class FieldInfo:
 
     @property
     def scaled(self) -> bool:
-        """Whether the physical value is another number than the raw one."""
+        """Whether physical values differ from raw values."""
         return self.scale != 1 or self.offset != 0
 
     def physical(self, raw: Any) -> Any:
-        """Raw values in the field's unit.
+        """Convert raw values to the field's unit.
 
         Args:
             raw: a number, or an array of any shape.
 
         Returns:
-            The same kind of thing; raw values themselves where no scale is declared. A Fraction is
-            scaled exactly.
+            A number, or an array of the same shape; `raw` itself if no scale is declared. A
+            Fraction is scaled exactly.
         """
         if not self.scaled:
             return raw
@@ -131,14 +131,15 @@ class FieldInfo:
         return raw * self.scale + self.offset
 
     def raw(self, physical: Any) -> Any:
-        """The raw values nearest to physical ones, halfway to the even one; of a float field those
-        that are equal.
+        """Convert physical values to raw values.
+
+        Values of an integer field are rounded to the nearest raw value, ties to the even one.
 
         Args:
             physical: a number in the field's unit, or an array of any shape.
 
         Returns:
-            An int, or int64 of the same shape; floats for a float field. They may be beyond the
+            An int, or int64 of the same shape; floats for a float field. They may exceed the
             field's limits.
         """
         if isinstance(physical, Fraction):
@@ -173,7 +174,11 @@ class FieldInfo:
 
 
 def runs_of(values: Sequence[int]) -> list[tuple[int, int]]:
-    """The first and last of each run of values that follow one another; they ascend."""
+    """Return the first and last value of each run of consecutive values.
+
+    Args:
+        values: integers in ascending order.
+    """
     ends = [
         index
         for index, value in enumerate(values)
@@ -195,20 +200,20 @@ def format_hex(value: object) -> str:
 
 
 def listed(values: Sequence[int]) -> str:
-    """Some raw values in words: "1, 3, 5 to 7"."""
-    between = {0: "{0}", 1: "{0}, {1}"}
+    """Return raw values as text, e.g. "1, 3, 5 to 7"."""
+    formats = {0: "{0}", 1: "{0}, {1}"}
     return ", ".join(
-        between.get(last - first, "{0} to {1}").format(first, last)
+        formats.get(last - first, "{0} to {1}").format(first, last)
         for first, last in runs_of(values)
     )
 
 
 @dataclass(frozen=True)
 class Ref:
-    """The raw value of a field that stands before the formula.
+    """A reference to the raw value of a field before the formula.
 
     Attributes:
-        path: from the top of the frame, dotted, without indices; within an array it is the field of
+        path: from the top of the frame, dotted. Without indices, a field in an array is the one of
             the same element.
         info: the field.
     """
@@ -219,8 +224,9 @@ class Ref:
 
 @dataclass(frozen=True)
 class Op:
-    """An operation on integers as Python does it: ``//`` and ``%`` round down, comparisons give 1
-    or 0.
+    """An operation on integers, with Python's semantics.
+
+    ``//`` and ``%`` round down. Comparisons return 1 or 0.
 
     Attributes:
         symbol: + - * // % & | ^ << >> == != < <= > >= with two arguments; - and not with one.
@@ -232,13 +238,13 @@ class Op:
 
 @dataclass(frozen=True, eq=False)
 class Untraced:
-    """A formula that cannot be written down, such as a Python function that decides on values.
+    """An expression that cannot be converted to a formula, e.g. a Python function with branches.
 
-    construct reads the frames of a struct with such a formula, one at a time.
+    construct reads the frames of a struct with such an expression, one at a time.
 
     Attributes:
-        reason: why it cannot be written down, with the path of the part that it belongs to.
-        text: the formula as the author wrote it, with fields by their whole paths; "?" for a
+        reason: why it cannot be converted, with the path of its part.
+        text: the expression as the author wrote it, with whole paths of fields; "?" for a
             function.
     """
 
@@ -273,29 +279,31 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 
 
 def calculated(symbol: str, *args: Formula) -> Formula:
-    """An operation, done at once where it is a sum or product of numbers."""
+    """Return an operation as a formula.
+
+    A sum, difference or product of numbers is computed at once.
+    """
     if all(isinstance(arg, int) for arg in args) and symbol in ("+", "-", "*"):
         return int(_OPERATIONS[symbol](*args))
     return Op(symbol, args)
 
 
 def evaluated(formula: Formula, read: Read) -> Any:
-    """The value of a formula.
+    """Return the value of a formula.
 
     Args:
-        read: what gives the values of fields; a field that the header leaves out counts as None, as
-            in construct.
+        read: returns the values of fields; None for a field that the header leaves out, as in
+            construct.
 
     Raises:
-        Exception: whatever the operation raises on these values.
+        Exception: any exception of an operation on these values.
     """
     match formula:
         case Ref():
             return read(formula.path)
         case Op("*", (condition, _)) if _is_condition(condition) and not evaluated(condition, read):
-            return (
-                0  # the size of an alternative that is not there, whose fields nobody can ask for
-            )
+            # The size of an alternative that is not present: its fields cannot be read.
+            return 0
         case Op():
             return _OPERATIONS[formula.symbol](*(evaluated(arg, read) for arg in formula.args))
         case Untraced():
@@ -304,8 +312,11 @@ def evaluated(formula: Formula, read: Read) -> Any:
 
 
 def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
-    """Return the values of a formula by arrays of its fields of a type that holds all it
-    comes to; truths stay truths.
+    """Evaluate a formula on arrays. Conditions return boolean arrays.
+
+    Args:
+        columns: path of a field -> array of its values.
+        dtype: a dtype that holds all intermediate values.
     """
     match formula:
         case Ref():
@@ -314,7 +325,7 @@ def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
             return arrays(operand, columns, dtype) == 0
         case Op(symbol, args):
             values = [arrays(arg, columns, dtype) for arg in args]
-            if symbol not in _OF_TRUTHS:
+            if symbol not in _BOOLEAN_OPERATIONS:
                 values = [
                     np.asarray(value, dtype) if isinstance(value, np.ndarray) else value
                     for value in values
@@ -323,11 +334,11 @@ def arrays(formula: Formula, columns: Mapping[str, Any], dtype: Any) -> Any:
     return formula
 
 
-#: operations that give 1 or 0.
+#: operations that return 1 or 0.
 COMPARISONS = frozenset({"==", "!=", "<", "<=", ">", ">="})
 
-#: operations that take truths for 1 and 0 in arrays too.
-_OF_TRUTHS = COMPARISONS | {"&", "|", "^"}
+#: operations that accept boolean arrays without a conversion to integers.
+_BOOLEAN_OPERATIONS = COMPARISONS | {"&", "|", "^"}
 
 
 def _is_condition(formula: Formula) -> bool:
@@ -338,12 +349,15 @@ def _is_condition(formula: Formula) -> bool:
 
 
 def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
-    """A formula, that is traced in it, as an expression of another language.
+    """Return a formula as an expression of another language.
 
     Args:
-        named: what gives the text of a field.
-        operations: symbol -> text with "{}" for each argument, where the language says it in
-            another way than Python.
+        named: returns the text of a field.
+        operations: symbol -> text with "{}" for each argument, for the operations that the
+            language writes differently from Python.
+
+    Raises:
+        ValueError: if a part of the formula is `Untraced`.
     """
     match formula:
         case Ref():
@@ -363,8 +377,11 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
 
 
 def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
-    """A field by its place in some of its arrays, as a field of its own; None where it is not in
-    these.
+    """Return the field of one array element, None if the field is not in these arrays.
+
+    Args:
+        path: the path of the new field.
+        indices: axis -> index; these axes are removed.
     """
     if not indices.keys() <= set(info.axes):
         return None
@@ -380,7 +397,7 @@ def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldI
 
 
 def parts(formula: Formula) -> Iterator[Formula]:
-    """A formula and all that it is made of."""
+    """Yield a formula and all its operands, recursively."""
     yield formula
     if isinstance(formula, Op):
         for arg in formula.args:
@@ -388,16 +405,20 @@ def parts(formula: Formula) -> Iterator[Formula]:
 
 
 def refs(formula: Formula) -> tuple[Ref, ...]:
-    """The fields that a formula depends on, in the order in which it names them, each once."""
+    """Return the fields that a formula depends on, each once, in the order of the formula."""
     return tuple(dict.fromkeys(part for part in parts(formula) if isinstance(part, Ref)))
 
 
-#: bits of a value that a formula in 64-bit integers may reach.
+#: maximum width of the values of a formula that is evaluated in 64-bit integers.
 MOST_BITS = 62
 
 
 def width(formula: Formula) -> int:
-    """How many bits, besides a sign, a formula that is traced takes at most."""
+    """Return the maximum width of the values of a formula in bits, without the sign.
+
+    Raises:
+        ValueError: if a part of the formula is `Untraced`.
+    """
     if isinstance(formula, Ref):
         return formula.info.bits
     if isinstance(formula, int):
@@ -428,7 +449,11 @@ def width(formula: Formula) -> int:
 
 
 def moved(formula: Formula, axis: str) -> Formula:
-    """A formula of a part as one of the frame around it, in which the part is at a path."""
+    """Return a formula of a part with paths from the top of the outer frame.
+
+    Args:
+        axis: the path of the part.
+    """
     match formula:
         case Ref(path):
             return replace(formula, path=path[2:] if path.startswith("_.") else f"{axis}.{path}")
@@ -455,11 +480,11 @@ class Number:
 
     @property
     def name(self) -> str:
-        """The field's own name."""
+        """The name of the field."""
         return self.info.name
 
     def encoded(self, value: float) -> bytes:
-        """The bytes that a raw value is on the wire."""
+        """Return the bytes of a raw value on the wire."""
         if self.kind == "float":
             order = "<" if self.order == "little" else ">"
             code = {2: "e", 4: "f", 8: "d"}[self.size]
@@ -487,8 +512,8 @@ class Part:
     Attributes:
         info: the field.
         bits: which bits of the block make it up: `bits.segments`, `bits.width`, `bits.signed`.
-        names: from the block down to it: (), ("distance",).
-        indices: which element it is, for each array inside the block.
+        names: the names that lead from the block to it, e.g. () or ("distance",).
+        indices: its index in each array inside the block.
     """
 
     info: FieldInfo
@@ -499,8 +524,14 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """So many bytes whose bits make up its parts; a block of one part without names is a plain
-    field of odd width or order.
+    """Bytes that contain one or more integers as bits.
+
+    A block of one part without names is a field with an unusual width or byte order.
+
+    Attributes:
+        info: the block as a field.
+        size: in bytes.
+        parts: the integers.
     """
 
     name: str
@@ -511,8 +542,11 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Struct:
-    """Members in a row; `path` is "" for the frame itself, `docs` is the author's text on all of
-    them.
+    """A sequence of members.
+
+    Attributes:
+        path: "" for the frame itself.
+        docs: the author's documentation of the struct.
     """
 
     name: str
@@ -522,7 +556,7 @@ class Struct:
 
     @property
     def struct(self) -> Struct:
-        """Itself, as `Sealed.struct`."""
+        """The struct itself; the counterpart of `Sealed.struct`."""
         return self
 
 
@@ -531,12 +565,12 @@ class Sealed:
     """A struct with a checksum.
 
     Attributes:
-        body: the struct, which may be sealed by other fields too.
-        fields: paths of what holds the checksum, low bits first.
-        over: paths of the first and last member that it covers; None: all bytes of the body that
-            hold no bit of `fields`.
-        declared: the algorithm, None where a hook has to supply it.
-        absent: values that mean "not filled", and pass.
+        body: the struct, which may have other checksums too.
+        fields: paths of the fields that hold the checksum, low bits first.
+        over: paths of the first and last member that it covers; None for all bytes of the body
+            without the bytes of `fields`.
+        declared: the algorithm; None if a hook has to supply it.
+        absent: values that mean "not filled" and are accepted.
     """
 
     body: Struct | Sealed
@@ -550,7 +584,7 @@ class Sealed:
         """The algorithm of the checksum.
 
         Raises:
-            SpecError: where there is none.
+            SpecError: if there is none.
         """
         if self.declared is None:
             raise SpecError(
@@ -561,7 +595,7 @@ class Sealed:
 
     @property
     def struct(self) -> Struct:
-        """The struct itself, below all its seals."""
+        """The struct without its checksums."""
         return self.body.struct
 
     @property
@@ -572,8 +606,10 @@ class Sealed:
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """One element `count` times; `axis` is the name of the array, its path, with brackets where it
-    is directly in an array.
+    """An array of `count` elements.
+
+    Attributes:
+        axis: identifies the array: its path, with "[]" appended for each array directly around it.
     """
 
     name: str
@@ -585,14 +621,14 @@ class Repeat:
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """What a part can be.
+    """A kind of parts.
 
     Attributes:
-        name: by which it is asked for; "" where all parts are of one kind.
-        element: it as it stands in the frame.
-        root: it as a frame in itself; a field of the frame around it is "_." and its path there.
-        following: of fields of `root`: the bytes of the part behind it, 0 behind the last; None
-            where parts are no chain.
+        name: of the kind; "" if all parts are of one kind.
+        element: the part with paths from the top of the frame.
+        root: the part as a frame of its own. A field of the outer frame is "_." and its path there.
+        following: the size of the next part in bytes, as a formula of fields of `root`; 0 after the
+            last part. None if parts do not declare the size of the next one.
     """
 
     name: str
@@ -603,14 +639,16 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """Frames within the frame: `count` of them, a chain whose first is `size` bytes long, or as
-    many as fill `within` bytes.
+    """Frames within the frame, one after another.
 
     Attributes:
-        axis: its path, the name of the array that parts are elements of.
-        kinds: those that a part is compared with, in this order.
-        outer: fields of the frame that formulas of the parts ask for.
-        total: the bytes of all parts, as formulas behind them ask for it.
+        axis: the path of the array of parts.
+        kinds: the kinds of parts, in the order in which they are tried.
+        count: the number of parts, or None.
+        size: the bytes of the first part, or None. Then each part declares the size of the next.
+        within: the bytes of all parts, or None.
+        outer: fields of the outer frame that formulas of the parts use.
+        total: the bytes of all parts, as a field for the formulas after them.
     """
 
     name: str
@@ -623,9 +661,7 @@ class Parts:
     total: FieldInfo
 
     def following(self, kind: Kind) -> Formula | None:
-        """The bytes of the part behind one of a kind, by the paths that its fields have in the
-        frame.
-        """
+        """Return the size of the part after one of this kind, with paths from the frame."""
         if kind.following is None:
             return None
         return moved(kind.following, self.axis)
@@ -633,7 +669,7 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class When:
-    """`then` where the condition is not 0, else `otherwise`."""
+    """The node `then` if the condition is not 0, else the node `otherwise`."""
 
     name: str
     condition: Formula
@@ -643,7 +679,7 @@ class When:
 
 @dataclass(frozen=True, eq=False)
 class Select:
-    """A part for each value of the key, and one for all other values.
+    """A node for each value of the key, and a default node for all other values.
 
     The values are integers, unless the key is `Untraced`.
     """
@@ -656,14 +692,18 @@ class Select:
 
 @dataclass(frozen=True, eq=False)
 class Empty:
-    """Nothing."""
+    """A node without bytes."""
 
     name: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """A condition that frames have to meet: not 0; `axes` of the arrays that it is in."""
+    """A condition that valid frames meet: it is not 0.
+
+    Attributes:
+        axes: the axes of the arrays that it is in.
+    """
 
     name: str
     path: str
@@ -673,24 +713,23 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Never:
-    """What no frame has: an alternative that is an error."""
+    """An alternative that is an error, so that no valid frame has it."""
 
     name: str
 
 
 @dataclass(frozen=True, eq=False)
 class Opaque:
-    """What construct alone can read.
+    """A part that only construct can read.
 
     Attributes:
-        info: the field, where it is one.
-        kind: the name of construct's class, or of the author's.
-        reason: why no node stands for it.
-        inside: the parts of a bit block, or of a struct, that cannot be read as one; they have no
-            places.
-        size: in bytes, None where only the bytes themselves tell.
-        form: how a field stands on the wire: "text up to" its terminator, else its kind.
-        in_bits: whether it is a bit block.
+        info: the part as a field.
+        kind: the name of its construct class, which may be the author's own.
+        reason: why it cannot be converted to another node.
+        inside: the nodes in it, if it is a bit block or a struct. They have no offsets.
+        size: in bytes; None if it depends on the bytes themselves.
+        form: how a field is stored: "text up to" its terminator, else its kind.
+        in_bits: True for a bit block.
     """
 
     name: str
@@ -721,7 +760,7 @@ Node = (
 
 
 def children(node: Node) -> tuple[Node, ...]:
-    """The nodes directly below one."""
+    """Return the nodes directly below a node."""
     match node:
         case Struct():
             return node.members
@@ -742,14 +781,14 @@ def children(node: Node) -> tuple[Node, ...]:
 
 
 def nodes(node: Node) -> Iterator[Node]:
-    """A node and all below it, in the order of the wire."""
+    """Yield a node and all nodes below it, in wire order."""
     yield node
     for child in children(node):
         yield from nodes(child)
 
 
 def formulas(node: Node) -> tuple[Formula, ...]:
-    """The formulas of a node, those of its parts left out."""
+    """Return the formulas of a node itself, without those of the nodes below it."""
     match node:
         case Blob():
             return (node.size,)
@@ -766,7 +805,10 @@ def formulas(node: Node) -> tuple[Formula, ...]:
 
 
 def size(node: Node) -> Formula | None:
-    """The bytes of a node as a formula of header fields; None where construct alone can tell."""
+    """Return the size of a node in bytes as a formula of header fields.
+
+    Returns None if only construct can determine it.
+    """
     match node:
         case Number() | Block() | Blob() | Opaque():
             return node.size
@@ -775,7 +817,7 @@ def size(node: Node) -> Formula | None:
         case Parts():
             return Ref(node.total.path, node.total)
         case When():
-            return _chosen(
+            return _sum_alternatives(
                 [
                     (calculated("!=", node.condition, 0), size(node.then)),
                     (calculated("==", node.condition, 0), size(node.otherwise)),
@@ -789,8 +831,8 @@ def size(node: Node) -> Formula | None:
             ]
             others = [calculated("!=", node.key, value) for value, _ in node.cases]
             if isinstance(node.default, Never):
-                return _chosen(cases)
-            return _chosen(
+                return _sum_alternatives(cases)
+            return _sum_alternatives(
                 [
                     *cases,
                     (
@@ -803,7 +845,7 @@ def size(node: Node) -> Formula | None:
 
 
 def total(sizes: Iterable[Formula | None]) -> Formula | None:
-    """The sum of sizes, None where one is not known."""
+    """Return the sum of sizes, None if one of them is None."""
     found: Formula | None = 0
     for each in sizes:
         found = joined("+", found, each)
@@ -811,9 +853,7 @@ def total(sizes: Iterable[Formula | None]) -> Formula | None:
 
 
 def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula | None:
-    """A sum, difference or product, as short as it can be written; None where one of both is not
-    known.
-    """
+    """Return a sum, difference or product in its simplest form, None if an operand is None."""
     if one is None or other is None:
         return None
     neutral = 1 if symbol == "*" else 0
@@ -832,8 +872,12 @@ def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula |
     return calculated(symbol, one, other)
 
 
-def _chosen(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
-    """The size of alternatives, each with the condition under which it is there."""
+def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
+    """Return the size of alternatives.
+
+    Args:
+        cases: (condition, size) of each alternative.
+    """
     first = cases[0][1] if cases else 0
     if all(each == first for _, each in cases):
         return first
@@ -841,8 +885,9 @@ def _chosen(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
 
 
 def infos(node: Node) -> tuple[FieldInfo, ...]:
-    """The fields that a node is: one, or those of the parts of a block; none for a struct, an array
-    or a choice.
+    """Return the fields of a node itself, without the nodes below it.
+
+    A block has the fields of its parts. Structs, arrays and choices have none.
     """
     match node:
         case Number() | Blob() | Opaque():
@@ -853,11 +898,15 @@ def infos(node: Node) -> tuple[FieldInfo, ...]:
 
 
 class Scope:
-    """What an expression of a struct sees of the fields before it, as symbols, so that what it does
-    with them can be written down.
+    """The context of an expression while it is traced.
+
+    It replaces the context of construct: each field before the expression is a `Symbol`, which
+    records the operations on it.
 
     Args:
-        asked: to which the fields are added that an expression asks for.
+        parent: the context of the outer struct, "_" in expressions.
+        path: the path of the struct.
+        asked: a list; each field that an expression reads is appended to it.
     """
 
     def __init__(self, parent: Scope | None, path: str, asked: list[Ref]) -> None:
@@ -865,18 +914,18 @@ class Scope:
         self.path = path
         self.asked = asked
         self.names: dict[str, Ref | Scope] = {}
-        #: names of parts that branches have in different forms.
-        self.several: set[str] = set()
+        #: names that different branches define differently.
+        self.ambiguous: set[str] = set()
 
     def add(self, name: str, part: Ref | Scope) -> None:
-        """Make a field or struct known from here on."""
+        """Add a field or struct that later expressions may read."""
         known = self.names.get(name)
         if known is not None and not (
             isinstance(known, Ref)
             and isinstance(part, Ref)
             and known.info.labels == part.info.labels
         ):
-            self.several.add(name)
+            self.ambiguous.add(name)
         self.names[name] = part
 
     def __getitem__(self, name: str) -> Any:
@@ -892,7 +941,7 @@ class Scope:
         if isinstance(part, Scope):
             return part
         self.asked.append(part)
-        if name in self.several:
+        if name in self.ambiguous:
             raise Untraceable(f"an expression asks for {name!r}, which has several forms")
         return Symbol(part)
 
@@ -904,7 +953,10 @@ class Scope:
 
 
 class Outside(Scope):
-    """What a part sees of the frame around it: the same symbols, with "_." before their paths."""
+    """The context of the outer frame for expressions in a part.
+
+    It has the symbols of that frame, with "_." before their paths.
+    """
 
     def __init__(self, scope: Scope, asked: list[Ref]) -> None:
         super().__init__(None, f"_.{scope.path}".rstrip("."), asked)
@@ -921,11 +973,11 @@ class Outside(Scope):
 
 
 class Untraceable(Exception):
-    """Why an expression cannot be written down as data."""
+    """Raised if an expression cannot be converted to a formula."""
 
 
 class Symbol:
-    """A value that is not known yet; what is done with it is kept."""
+    """A placeholder for a value that records the operations on it as a formula."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -958,7 +1010,8 @@ class Symbol:
         raise Untraceable("an expression takes an element of an array, or a byte")
 
 
-def _traced_operation(symbol: str, left: Any, right: Any) -> Symbol:
+def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
+    """Return the result of an operation on symbols and numbers as a symbol."""
     pair: list[Any] = [part.formula if isinstance(part, Symbol) else part for part in (left, right)]
     for one, other in ((0, 1), (1, 0)):
         known = pair[other]
@@ -966,9 +1019,9 @@ def _traced_operation(symbol: str, left: Any, right: Any) -> Symbol:
             continue
         if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
             raise Untraceable("an expression takes the name of a value for a number")
-        if pair[one] in known.info.labels:  # construct has the name in place of such a number
+        if pair[one] in known.info.labels:  # construct replaces this number by its name
             return Symbol(int(symbol == "!="))
-        pair[one] = _labelled(known, pair[one]) if isinstance(pair[one], str) else pair[one]
+        pair[one] = _find_label_value(known, pair[one]) if isinstance(pair[one], str) else pair[one]
     wrong = next((part for part in pair if not isinstance(part, int | Ref | Op)), None)
     if wrong is not None:
         raise Untraceable(f"an expression with {wrong!r}")
@@ -977,7 +1030,7 @@ def _traced_operation(symbol: str, left: Any, right: Any) -> Symbol:
     )
 
 
-def _no_integer(sign: str) -> Any:
+def _raise_no_integer(sign: str) -> Any:
     raise Untraceable(f"an expression with {sign!r}, which need not give an integer")
 
 
@@ -1000,21 +1053,25 @@ for _name, _symbol in _SYMBOLS.items():
     setattr(
         Symbol,
         f"__{_name}__",
-        lambda self, other, symbol=_symbol: _traced_operation(symbol, self, other),
+        lambda self, other, symbol=_symbol: _trace_operation(symbol, self, other),
     )
     if _symbol not in COMPARISONS:
         setattr(
             Symbol,
             f"__r{_name}__",
-            lambda self, other, symbol=_symbol: _traced_operation(symbol, other, self),
+            lambda self, other, symbol=_symbol: _trace_operation(symbol, other, self),
         )
 for _name, _symbol in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
     for _full in (f"__{_name}__", f"__r{_name}__"):
-        setattr(Symbol, _full, lambda self, other, sign=_symbol: _no_integer(sign))
+        setattr(Symbol, _full, lambda self, other, sign=_symbol: _raise_no_integer(sign))
 
 
-def _labelled(ref: Ref, label: str) -> int:
-    """The raw value that a name of construct's Enum stands for."""
+def _find_label_value(ref: Ref, label: str) -> int:
+    """Return the raw value of a label.
+
+    Raises:
+        Untraceable: if the field has no such label.
+    """
     for value, name in ref.info.labels.items():
         if name == str(label):
             return value
