@@ -1,13 +1,16 @@
-"""The distribution of a new sensor: drafted from a capture of unknown frames, or with an invented
-sensor that has everything.
+"""Create the Python distribution of a new sensor.
 
-What the frames can be told to consist of, as far as their bytes say it, is a `Draft`. The structure
-of a stream is looked for in its beginning and then held against all of it. Constant bytes in front
-are the sync; what rises steadily is no checksum, which rules out most of the places where an XOR
-fits as well. `drafted` is the text of a first spec out of that: each field with the evidence for
-it, and honest names for what nobody knows yet. The files come from the templates inside the
-package, where a line that ends in ``#if serial`` or ``#if udp`` is for sensors with that link
-alone.
+`captured` drafts the sensor from a capture of unknown frames. `invented` writes an example sensor
+with all features.
+
+`draft` analyses unknown frames and returns a `Draft`. It searches the beginning of a stream for a
+structure, and then applies this structure to all bytes. Constant bytes at the start are the sync
+bytes. Fields that rise steadily are excluded as checksums: an XOR often fits there by coincidence.
+`drafted` writes a first spec from the `Draft`. Each field has a comment with its evidence, and
+fields without evidence are named ``unknown_N``.
+
+The files are made from templates in the package. A template line that ends in ``#if serial`` or
+``#if udp`` is used only for sensors with that link.
 """
 
 from __future__ import annotations
@@ -45,43 +48,62 @@ from lidarspec.drafting.samples import Match, Place, values
 from lidarspec.errors import UsageError, WireError, system_errors
 from lidarspec.spec.checksums import ByteOrder
 
-#: frames that a checksum is looked for with, longest sync, and the same where there are few frames:
-#: more may be chance.
-SOUGHT, SYNC, SHORT_SYNC, MANY = 256, 4, 2, 12
-#: fewest blocks, and the share of a frame that they fill.
-BLOCKS, FILLED = 3, 0.5
-#: bytes behind which no count is looked for, and longest and shortest element of what is counted.
-HEADER, LARGEST, SMALLEST = 8, 16, 2
-#: widest checksum, in bytes.
-LONGEST_SEAL = 4
+#: Number of frames that are searched for a checksum.
+MAX_CHECKSUM_FRAMES = 256
+#: Longest sync, in bytes.
+MAX_SYNC_BYTES = 4
+#: Longest sync with few frames: more constant bytes may be coincidence.
+MAX_SHORT_SYNC_BYTES = 2
+#: Number of frames from which `MAX_SYNC_BYTES` applies.
+MANY = 12
+#: Smallest number of blocks in a frame.
+MIN_BLOCKS = 3
+#: Smallest share of a frame that its blocks fill.
+MIN_BLOCKS_SHARE = 0.5
+#: A count has to be before this offset.
+HEADER = 8
+#: Largest and smallest size of a counted element, in bytes.
+MAX_ELEMENT_BYTES = 16
+MIN_ELEMENT_BYTES = 2
+#: Widest checksum, in bytes.
+MAX_CHECKSUM_BYTES = 4
 Link = Literal["serial", "udp"]
-#: what the modules of the templates call something else.
-TAKEN = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
-#: frames of a capture that are kept as vectors.
+#: Names that the modules of the templates use otherwise.
+RESERVED_NAMES = {"ACK", "COMMAND", "DATA", "RATE", "SAMPLES", "TURNS"}
+#: Number of frames of a capture that are written as vectors.
 VECTORS = 3
 _ID = re.compile(r"([a-z0-9]+)-([a-z0-9]+(?:-[a-z0-9]+)*)")
-#: characters of a line of what is written, at most.
+#: Longest line of the written files, in characters.
 LINE = 100
 _CONDITION = re.compile(r"^(.*?) *#if (\w+)\n", re.MULTILINE)
-#: bytes of a constant that are told, and how many have to be constant together to be a field.
-TOLD, RUN = 8, 2
-#: unknown bytes in a row in which no constant ones are looked for: there the scene decides what
-#: changes.
-LONG = 64
-#: doubt below which a checksum may be chance, as one in so many powers of two.
+#: Number of bytes of a constant that a comment shows.
+MAX_SHOWN_BYTES = 8
+#: Smallest number of adjacent constant bytes that become a field.
+MIN_CONSTANT_RUN = 2
+#: Longest range of unknown bytes that is searched for constant bytes. In longer ranges, which are
+#: mostly measurements, bytes may be constant because the scene does not change.
+MAX_CONSTANT_SEARCH_BYTES = 64
+#: A checksum with a lower `Match.doubt` may be coincidence.
 WEAK = 12
-#: frames after which most bits of their checksums have changed.
-DIFFERENT = 16
-#: other candidates that are told of.
-OFFERED = 3
-#: bits of constants and checksum that let noise through: two frames in a row are asked for then.
+#: Number of frames after which most bits of a checksum have changed.
+MIN_FRAMES_FOR_CHANGE = 16
+#: Number of alternatives that a comment lists.
+MAX_ALTERNATIVES = 3
+#: With at most this many bits of constants and checksum, noise may pass as a frame. The draft then
+#: requires two consecutive frames.
 FEW_BITS = 24
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Parts of a frame that begin alike: `count` of `size` bytes from `start` on, each beginning
-    with `flag`.
+    """Repeated blocks of a frame.
+
+    Attributes:
+        start: offset of the first block.
+        size: size of a block, in bytes.
+        count: number of blocks.
+        flag: constant first bytes of each block; may be empty.
+        candidates: rising fields in the blocks.
     """
 
     start: int
@@ -92,27 +114,27 @@ class Blocks:
 
     @property
     def end(self) -> int:
-        """The first byte behind them."""
+        """The offset after the last block."""
         return self.start + self.count * self.size
 
 
 @dataclass(frozen=True)
 class Draft:
-    """What is known of the frames in some bytes.
+    """The known properties of the frames in some bytes.
 
     Attributes:
         datagrams: whether each frame is a datagram.
-        sync: bytes that every frame begins with.
-        size: their length; None where it varies.
-        length: how they say it then.
-        frames: (offset, bytes) of those that fit it all, in order.
-        bytes_in: the number of bytes that were looked at.
-        candidates: fields that rise, outside the blocks.
-        blocks: parts of the frame that begin alike.
-        seal: the checksum, None where none was found.
-        others: what else fits as the checksum.
-        front: bytes that nearly all frames have at least, where a length counts bytes: as many are
-            looked into.
+        sync: the first bytes of every frame.
+        size: the length of the frames; None if it varies.
+        length: the length field, if the length varies.
+        frames: (offset, bytes) of the frames with all known properties, in order.
+        bytes_in: the number of input bytes.
+        candidates: rising fields outside the blocks.
+        blocks: repeated blocks of a frame; None if there are none.
+        seal: the checksum; None if none was found.
+        others: other checksums that fit.
+        front: number of first bytes that nearly all frames have, if the length field counts bytes.
+            These are searched for fields.
     """
 
     datagrams: bool
@@ -134,34 +156,35 @@ class Draft:
 
     @property
     def tail(self) -> int:
-        """Bytes of a checksum that stands at the end of frames of several lengths."""
+        """The size of a checksum at the end of frames of varying length, else 0."""
         if self.size is None and self.seal is not None and self.seal.place.offset < 0:
             return -self.seal.place.offset
         return 0
 
     @property
     def head(self) -> int:
-        """Bytes in front that every frame has: all of them where there is one length."""
+        """The number of first bytes that every frame has: the size if it does not vary."""
         if self.size is not None or self.length is None:
             return self.size or 0
         return max(self.length.rest - self.tail, self.length.end, self.front)
 
     @property
     def rows(self) -> NDArray[np.uint8]:
-        """The heads of all frames, shape (n, head)."""
+        """The first bytes of all frames, shape (n, head)."""
         return np.frombuffer(
             b"".join(frame[: self.head] for _, frame in self.frames), np.uint8
         ).reshape(-1, self.head)
 
 
 def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
-    """What can be told of the frames in unknown bytes.
+    """Analyse the frames in unknown bytes.
 
     Args:
         chunks: datagrams, or pieces of a stream.
+        datagrams: whether the chunks are datagrams.
 
     Raises:
-        WireError: where no frames of one kind can be seen.
+        WireError: if no frames of one kind are found.
     """
     found = structure(chunks, datagrams=datagrams)
     if found is None:
@@ -176,21 +199,23 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
         start = max(parts[0].find(found.sync), 0)
     first = Draft(datagrams, b"", found.period, found.length, (), size)
     first = (
-        _begun(first, parts, start)
-        or _begun(first, parts, max(parts[0].find(found.sync), 0))
+        _find_sync(first, parts, start)
+        or _find_sync(first, parts, max(parts[0].find(found.sync), 0))
         or replace(first, sync=found.sync)
     )
-    known = _counted(replace(first, frames=tuple(_walk(first, parts))), parts[-1])
-    known = _fronted(known, parts)
+    known = _find_count(replace(first, frames=tuple(_walk(first, parts))), parts[-1])
+    known = _find_front(known, parts)
     known = replace(known, candidates=tuple(candidates(known.rows)))
     seals = _seals(known)
     known = replace(known, seal=seals[0] if seals else None, others=tuple(seals[1:]))
-    return _detailed(replace(known, frames=tuple(_walk(known, parts))))
+    return _add_details(replace(known, frames=tuple(_walk(known, parts))))
 
 
-def _begun(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
-    """The sync bytes of frames that are cut at equal distances, or have their length in them; None
-    where they begin differently.
+def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
+    """Return the draft with the sync bytes of frames of one length; None if there are none.
+
+    Args:
+        start: offset of the first frame in a stream.
     """
     if first.datagrams:
         frames = [part for part in parts if len(part) == first.size]
@@ -202,27 +227,28 @@ def _begun(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
     else:
         return None
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
-    usual = usual_bytes(rows[:, :SYNC])
+    usual = usual_bytes(rows[:, :MAX_SYNC_BYTES])
     steady = (rows[:, : len(usual)] == usual).mean(axis=0) >= (STEADY if len(rows) >= FEW else 1)
     if not steady.all():
         length = int(np.argmin(steady))
     else:
         length = len(steady)
-    sync = usual[: length if len(rows) >= MANY else min(length, SHORT_SYNC)].tobytes()
+    sync = usual[: length if len(rows) >= MANY else min(length, MAX_SHORT_SYNC_BYTES)].tobytes()
     if any(sync):
         return replace(first, sync=sync)
     return None
 
 
 def _walk(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
-    """The frames that fit, leftmost first, with their places in the whole input; behind one that
-    does not fit, one byte further.
+    """Yield offset and bytes of the frames that fit, in order.
+
+    After a sync that begins no valid frame, the search continues at the next byte.
     """
     base = 0
     for part in parts:
         at = part.find(known.sync)
         while 0 <= at < len(part):
-            size = _fits(known, part, at)
+            size = _frame_size(known, part, at)
             if size:
                 yield base + at, part[at : at + size]
             if known.datagrams:
@@ -231,8 +257,8 @@ def _walk(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
         base += len(part)
 
 
-def _fits(known: Draft, part: bytes, at: int) -> int:
-    """The length of the frame that begins here, 0 where none does."""
+def _frame_size(known: Draft, part: bytes, at: int) -> int:
+    """Return the length of the frame at an offset; 0 if no valid frame begins there."""
     size = known.size
     if size is None and known.length is not None:
         if at + known.length.end <= len(part):
@@ -246,21 +272,23 @@ def _fits(known: Draft, part: bytes, at: int) -> int:
         or size < known.head + known.tail
     ):
         return 0
-    if known.seal is None or _sealed(known.seal, part[at : at + size]):
+    if known.seal is None or _has_valid_checksum(known.seal, part[at : at + size]):
         return size
     return 0
 
 
-def _sealed(seal: Match, frame: bytes) -> bool:
+def _has_valid_checksum(seal: Match, frame: bytes) -> bool:
     start = seal.place.start(len(frame))
-    there = int.from_bytes(frame[start : start + seal.place.size], seal.order)
+    stored = int.from_bytes(frame[start : start + seal.place.size], seal.order)
     covered = b"".join(frame[a:b] for a, b in seal.span.ranges(seal.place, len(frame)))
-    return seal.algorithm(covered) == there
+    return seal.algorithm(covered) == stored
 
 
-def _counted(known: Draft, data: bytes) -> Draft:
-    """Frames of one length, unless what is left of one behind them says another number, where
-    theirs tells their length.
+def _find_count(known: Draft, data: bytes) -> Draft:
+    """Return the draft with a length field if an incomplete last frame has another count.
+
+    If all whole frames have one length, only the incomplete frame after them can show that a
+    constant byte is a count. Otherwise the draft is returned unchanged.
     """
     if known.size is None or known.datagrams or not known.frames:
         return known
@@ -275,37 +303,38 @@ def _counted(known: Draft, data: bytes) -> Draft:
             or rest[place] == last[place]
         ):
             continue
-        told = [
+        lengths = [
             Length(place, 1, "little", unit, known.size - unit * last[place])
-            for unit in range(SMALLEST, LARGEST + 1)
+            for unit in range(MIN_ELEMENT_BYTES, MAX_ELEMENT_BYTES + 1)
         ]
-        fitting = [length for length in told if length.rest > place and length.of(rest) > len(rest)]
+        fitting = [
+            length for length in lengths if length.rest > place and length.of(rest) > len(rest)
+        ]
         if fitting:
             return replace(known, size=None, length=min(fitting, key=lambda length: length.rest))
     return known
 
 
-def _fronted(known: Draft, parts: Sequence[bytes]) -> Draft:
-    """Where the length counts bytes, with a head of the fields in front of what varies: short
-    frames are of another kind then.
+def _find_front(known: Draft, parts: Sequence[bytes]) -> Draft:
+    """Return the draft with `front` if the length field counts bytes.
+
+    Frames that are shorter than `front` are then dropped, since they are probably of another type.
     """
     if known.length is None or known.length.unit > 1 or not known.frames:
         return known
     lengths = sorted(len(frame) for _, frame in known.frames)
     known = replace(
-        known, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - LONGEST_SEAL)
+        known, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - MAX_CHECKSUM_BYTES)
     )
     return replace(known, frames=tuple(_walk(known, parts)))
 
 
 def _seals(known: Draft) -> list[Match]:
-    """The checksums that fit and do not stand where something rises, or where next to nothing
-    changes.
-    """
+    """Return the checksums that fit, except at rising fields and at nearly constant bytes."""
     frames = [frame for _, frame in known.frames]
-    step = max(1, len(frames) // SOUGHT)
+    step = max(1, len(frames) // MAX_CHECKSUM_FRAMES)
     shortest = min(map(len, frames), default=0)
-    some = frames[::step][:SOUGHT]
+    some = frames[::step][:MAX_CHECKSUM_FRAMES]
     free = (
         match
         for match in search(some)
@@ -315,14 +344,16 @@ def _seals(known: Draft) -> list[Match]:
 
 
 def _changes(match: Match, frames: Sequence[bytes]) -> bool:
-    """Whether most bits of a checksum change; of few frames nobody knows."""
+    """Return whether most bits of a checksum change; True if there are too few frames."""
     starts = [match.place.start(len(frame)) for frame in frames]
     stored = [
         int.from_bytes(frame[start : start + match.place.size])
         for frame, start in zip(frames, starts, strict=True)
     ]
     changing = np.bitwise_or.reduce([value ^ stored[0] for value in stored])
-    return len(frames) < DIFFERENT or 2 * int(changing).bit_count() > 8 * match.place.size
+    return (
+        len(frames) < MIN_FRAMES_FOR_CHANGE or 2 * int(changing).bit_count() > 8 * match.place.size
+    )
 
 
 def _overlaps(place: Place, one: Candidate, length: int) -> bool:
@@ -331,8 +362,9 @@ def _overlaps(place: Place, one: Candidate, length: int) -> bool:
 
 
 def _can_stand(known: Draft, match: Match) -> bool:
-    """Whether a struct can have it: not inside of what varies in number, in one range, and not
-    split over nibbles.
+    """Return whether a struct can declare the checksum.
+
+    It must not be in the part of varying length or split into nibbles, and has to cover one range.
     """
     if any("nibbles" in remark for remark in match.remarks):
         return False
@@ -347,16 +379,14 @@ def _can_stand(known: Draft, match: Match) -> bool:
     return whole or at_end or span.part == "behind"
 
 
-def _detailed(known: Draft) -> Draft:
-    """With the fields that rise and the blocks that begin alike; what belongs to the checksum is
-    neither.
-    """
+def _add_details(known: Draft) -> Draft:
+    """Return the draft with rising fields and blocks, except for fields at the checksum."""
     if not known.frames:
         return known
     rows = known.rows
     found = known.candidates
     if known.size is not None:
-        blocks = _blocks(rows) or _rows_of(found, rows.shape[1])
+        blocks = _find_flagged_blocks(rows) or _find_blocks_of_fields(found, rows.shape[1])
     else:
         blocks = None
     if blocks is not None:
@@ -377,10 +407,8 @@ def _detailed(known: Draft) -> Draft:
     )
 
 
-def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
-    """The parts of a frame that begin with the same two constant bytes at equal distances, if they
-    fill much of it.
-    """
+def _find_flagged_blocks(rows: NDArray[np.uint8]) -> Blocks | None:
+    """Return blocks that begin with the same two constant bytes and fill much of the frame."""
     first, steady = rows[0], (rows == rows[0]).mean(axis=0) >= STEADY
     pairs: dict[tuple[int, int], list[int]] = {}
     for spot in np.flatnonzero(steady[:-1] & steady[1:]).tolist():
@@ -390,22 +418,20 @@ def _blocks(rows: NDArray[np.uint8]) -> Blocks | None:
         steps = np.diff(spots)
         if (
             pair in ((0, 0), (255, 255))
-            or len(spots) < BLOCKS
+            or len(spots) < MIN_BLOCKS
             or (steps != steps[0]).any()
             or steps[0] <= 2
         ):
             continue
         size = int(steps[0])
         count = min(len(spots), (rows.shape[1] - spots[0]) // size)
-        if count >= BLOCKS and count * size >= FILLED * rows.shape[1]:
+        if count >= MIN_BLOCKS and count * size >= MIN_BLOCKS_SHARE * rows.shape[1]:
             found.append(Blocks(spots[0], size, count, bytes(pair)))
     return max(found, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
-def _rows_of(found: Sequence[Candidate], length: int) -> Blocks | None:
-    """The parts of a frame that begin with a field of the same kind at equal distances, the longest
-    row of them.
-    """
+def _find_blocks_of_fields(found: Sequence[Candidate], length: int) -> Blocks | None:
+    """Return the largest blocks that each begin with a rising field of the same kind."""
     rows = []
     for one in found:
         like = [(one.size, one.order, one.kind, one.circle)]
@@ -420,15 +446,21 @@ def _rows_of(found: Sequence[Candidate], length: int) -> Blocks | None:
                 number for number in itertools.count(1) if one.offset + number * step not in same
             )
             count -= one.offset + count * step > length
-            if count >= BLOCKS:
+            if count >= MIN_BLOCKS:
                 rows.append(Blocks(one.offset, step, count, b""))
     return max(rows, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
 @dataclass(frozen=True)
 class Field:
-    """A line of a struct: where it begins, how long it is, its name, what follows the name, and the
-    evidence.
+    """A field of the drafted struct.
+
+    Attributes:
+        start: its offset.
+        size: its size in bytes.
+        name: its name.
+        code: the construct expression after the name.
+        why: the evidence, one comment each.
     """
 
     start: int
@@ -438,7 +470,7 @@ class Field:
     why: tuple[str, ...] = ()
 
     def lines(self, indent: str) -> Iterator[str]:
-        """Its text."""
+        """Yield the lines of code of the field."""
         for line in self.why:
             yield from textwrap.wrap(
                 line, LINE, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   "
@@ -448,11 +480,11 @@ class Field:
 
 
 def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
-    """What a template of a module needs: imports, the struct, functions and arguments, as text.
+    """Return the values for the template of a module: imports, struct, functions and arguments.
 
     Args:
-        origin: what the draft was made from, in words.
-        link: the data link as it stands in the module.
+        origin: a description of the capture.
+        link: the code of the data link.
     """
     fields = list(_fields(draft))
     seal = _seal_text(draft, fields)
@@ -476,9 +508,8 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     counting = (
         one for one in draft.candidates if one.kind == "counter" and one.offset < draft.head
     )
-    counters = sorted(
-        counting, key=lambda one: (-one.right / one.total, -one.size)
-    )  # the one that never jumps
+    # The most regular counter comes first.
+    counters = sorted(counting, key=lambda one: (-one.right / one.total, -one.size))
     text = {
         "frames_told": (
             f"{len(draft.frames)} frame{'s' * (len(draft.frames) != 1)},"
@@ -507,8 +538,9 @@ def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
 
 
 def _fields(draft: Draft) -> Iterator[Field]:
-    """The fields of a frame in their order."""
-    rows, known = draft.rows, _known(draft)
+    """Yield the fields of a frame in their order."""
+    rows = draft.rows
+    known = _known_fields(draft)
     cuts = sorted(
         {
             0,
@@ -527,8 +559,8 @@ def _fields(draft: Draft) -> Iterator[Field]:
         yield from _varying(draft)
 
 
-def _known(draft: Draft) -> list[Field]:
-    """The fields that something is known of, without overlaps."""
+def _known_fields(draft: Draft) -> list[Field]:
+    """Return the fields with evidence, without overlaps, by offset."""
     found = list(_header(draft))
     if (length := draft.length) is not None:
         sizes = sorted({len(frame) for _, frame in draft.frames})
@@ -562,8 +594,9 @@ def _known(draft: Draft) -> list[Field]:
 
 
 def _header(draft: Draft) -> Iterator[Field]:
-    """The sync bytes, in pieces where the checksum's span begins among them; those of blocks that
-    begin with them are theirs.
+    """Yield the sync bytes as fields, split at the borders of the checksum's span.
+
+    Sync bytes that belong to the first block are left out.
     """
     if draft.blocks is None:
         end = len(draft.sync)
@@ -585,28 +618,38 @@ def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> 
     bytes.
     """
     edges = {start, end, *(cut for cut in cuts if start < cut < end)}
-    if len(rows) >= FEW and end - start <= LONG:
+    if len(rows) >= FEW and end - start <= MAX_CONSTANT_SEARCH_BYTES:
         edges |= _constant_edges(rows, start, end)
     for a, b in itertools.pairwise(sorted(edges)):
         yield Field(a, b - a, f"unknown_{a}", f"Bytes({b - a})", _constant(rows[:, a:b]))
 
 
 def _constant_edges(rows: NDArray[np.uint8], start: int, end: int) -> set[int]:
-    """Where runs of bytes that never change begin and end."""
+    """Return the start and end offsets of runs of constant bytes."""
     steady = (rows[:, start:end] == rows[0, start:end]).all(axis=0)
-    return {start + edge for run in runs(steady) if run[1] - run[0] >= RUN for edge in run}
+    return {
+        start + edge for run in runs(steady) if run[1] - run[0] >= MIN_CONSTANT_RUN for edge in run
+    }
 
 
 def _constant(columns: NDArray[np.uint8]) -> tuple[str, ...]:
+    """Return a comment with the value of constant bytes; nothing for other bytes."""
     if not columns.size or not (columns == columns[0]).all():
         return ()
-    told = columns[0, :TOLD].tobytes().hex(" ") + (" ..." if columns.shape[1] > TOLD else "")
-    alike = bool((columns[0] == columns[0, 0]).all()) and columns.shape[1] > TOLD
-    return (f"always {f'{columns[0, 0]:02x}' if alike else told} in {len(columns)} frames",)
+    is_long = columns.shape[1] > MAX_SHOWN_BYTES
+    if is_long and (columns[0] == columns[0, 0]).all():
+        value = f"{columns[0, 0]:02x}"
+    else:
+        value = columns[0, :MAX_SHOWN_BYTES].tobytes().hex(" ") + (" ..." if is_long else "")
+    return (f"always {value} in {len(columns)} frames",)
 
 
 def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
-    """A counter, an angle, or something else that rises."""
+    """Return the field for a counter, an angle or another rising field.
+
+    Args:
+        what: "frame" or "block": the part that contains the field.
+    """
     code = _integer(one.size, one.order)
     why: tuple[str, ...] = (one.why(what),)
     if one.kind == "angle":
@@ -662,7 +705,7 @@ def _block_field(draft: Draft, blocks: Blocks) -> Field:
 
 
 def _varying(draft: Draft) -> Iterator[Field]:
-    """What varies in number, and the checksum behind it."""
+    """Yield the part of varying length, and the checksum after it."""
     assert draft.length is not None
     rest, name = draft.head + draft.tail - draft.length.rest, _counter_name(draft)
     if draft.length.unit > 1 and rest == 0:
@@ -711,7 +754,7 @@ def _check(draft: Draft, seal: Match, start: int) -> Field:
         *(one for one in seal.remarks if "constant" not in one),
     )
     size = min(len(frame) for _, frame in draft.frames)
-    for other in draft.others[:OFFERED]:
+    for other in draft.others[:MAX_ALTERNATIVES]:
         why = (
             *why,
             (
@@ -723,8 +766,9 @@ def _check(draft: Draft, seal: Match, start: int) -> Field:
 
 
 def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
-    """The arguments of `Checksummed` behind its struct, and a class where the checksum needs one of
-    its own.
+    """Return the arguments of `Checksummed` after its struct, and the class of the checksum.
+
+    The class is "" for an algorithm that lidarspec has. None if there is no checksum.
     """
     if draft.seal is None:
         return None
@@ -752,7 +796,7 @@ def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
 
 
 def _span_cuts(draft: Draft) -> list[int]:
-    """Where the checksum's span begins and ends inside of the head."""
+    """Return the borders of the checksum's span in the head."""
     if draft.seal is None or not draft.frames:
         return []
     shortest = min(len(frame) for _, frame in draft.frames)
@@ -761,7 +805,7 @@ def _span_cuts(draft: Draft) -> list[int]:
 
 
 def _angles(draft: Draft) -> list[str]:
-    """The paths of the angles that wrap, those of blocks first."""
+    """Return the paths of the angles, those of blocks first."""
     if draft.blocks:
         inside = [f"blocks.{one.name}" for one in draft.blocks.candidates if one.kind == "angle"]
     else:
@@ -770,7 +814,7 @@ def _angles(draft: Draft) -> list[str]:
 
 
 def _strength(draft: Draft) -> int:
-    """Bits of the constants and the checksum."""
+    """Return the number of bits of constants and checksum in a frame."""
     if draft.blocks:
         flags = len(draft.blocks.flag) * draft.blocks.count
     else:
@@ -797,9 +841,9 @@ def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator
 
 
 def _or(names: Sequence[str], begin: str = "  #") -> str:
-    """The others that it could be, as the end of a comment."""
+    """Return the alternatives as the end of a comment."""
     if names:
-        return f"{begin or ';'} or {', '.join(names[:OFFERED])}"
+        return f"{begin or ';'} or {', '.join(names[:MAX_ALTERNATIVES])}"
     return ""
 
 
@@ -813,7 +857,7 @@ def _longest(draft: Draft) -> str:
 
 
 def _imports(text: dict[str, str]) -> dict[str, str]:
-    """The names that the text uses, by the library that they are from."""
+    """Return the template values with the imports that the text needs."""
     code = "\n".join(text.values())
     construct = sorted(
         set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"}
@@ -831,7 +875,7 @@ def _imports(text: dict[str, str]) -> dict[str, str]:
 
 
 def _import(module: str, names: list[str]) -> str:
-    """An import of these names, on one line where that holds them."""
+    """Return an import statement, on one line if it fits."""
     line = f"from {module} import {', '.join(names)}"
     if len(line) <= LINE:
         return line
@@ -839,7 +883,7 @@ def _import(module: str, names: list[str]) -> str:
 
 
 def _case(name: str) -> tuple[bool, str, int]:
-    """Classes before functions, and numbers by their size."""
+    """Sort key: names in upper case first, and numbers by value."""
     number = re.search(r"\d+", name)
     return (
         name[0].islower(),
@@ -860,17 +904,16 @@ def _bytes(data: bytes) -> str:
 
 @dataclass(frozen=True)
 class Names:
-    """What is called after a sensor.
+    """The names in the distribution of a sensor.
 
     Args:
-        id: of the sensor.
-        distribution: what is installed; by default one for this sensor alone, "lidarspec-" and its
-            id.
-        vendor, model: as people write them; by default after the id.
+        id: the id of the sensor.
+        distribution: the name of the distribution; by default "lidarspec-" and the id.
+        vendor, model: display names; by default derived from the id.
 
     Raises:
-        UsageError: for what is no id, no name of a distribution, or cannot stand in a text of
-            Python.
+        UsageError: for an invalid id or distribution name, and for a vendor or model that a Python
+            string cannot contain without escapes.
     """
 
     id: str
@@ -902,19 +945,19 @@ class Names:
 
     @property
     def constant(self) -> str:
-        """The sensor's name in its module."""
+        """The name of the variable for the sensor in its module."""
         name = self.id.partition("-")[2].upper().replace("-", "_")
-        if name.isidentifier() and name not in TAKEN:
+        if name.isidentifier() and name not in RESERVED_NAMES:
             return name
         return f"SENSOR_{name}"
 
     @property
     def module(self) -> str:
-        """What is imported."""
+        """The import name of the distribution."""
         return self.distribution.replace("-", "_")
 
     def values(self) -> dict[str, str]:
-        """Everything for the templates."""
+        """Return the values for the templates."""
         return {
             name: getattr(self, name)
             for name in ("id", "constant", "distribution", "module", "vendor", "model")
@@ -922,7 +965,7 @@ class Names:
 
 
 def invented(names: Names, link: Link) -> dict[str, str]:
-    """The files of a distribution with an invented sensor that has everything, by path."""
+    """Return the files of a distribution with an example sensor: path -> text."""
     values = {**names.values(), "speed_remark": ", with code 3; else 0" if link == "serial" else ""}
     return _files(
         names,
@@ -936,11 +979,11 @@ def invented(names: Names, link: Link) -> dict[str, str]:
 def captured(
     names: Names, link: Link, draft: Draft, *, origin: str, port: int | None
 ) -> dict[str, str]:
-    """The files of a distribution with the sensor that a capture was drafted to, by path.
+    """Return the files of a distribution with a sensor drafted from a capture: path -> text.
 
     Args:
-        origin: the capture in words.
-        port: the UDP port that the datagrams were sent to, where that is known.
+        origin: a description of the capture.
+        port: the UDP port that the datagrams were sent to; None if unknown.
     """
     serial = "Serial(115_200)},  # the baud rate: a capture does not tell it"
     if port:
@@ -977,8 +1020,11 @@ def _files(
     vectors: str,
     templates: tuple[str, str, str],
 ) -> dict[str, str]:
-    """The files of a distribution by path; the templates are those of its README, its module and
-    its tests.
+    """Return the files of a distribution: path -> text.
+
+    Args:
+        vectors: the text of the file of vectors.
+        templates: the names of the templates of README, module and tests.
     """
     readme, module, tests = (filled(template, values, link) for template in templates)
     return {
@@ -993,27 +1039,26 @@ def _files(
 
 
 def filled(template: str, values: Mapping[str, str], link: Link) -> str:
-    """The text of a template."""
+    """Return the text of a template with values inserted."""
     text = (files("lidarspec") / "templates" / f"{template}.in").read_text(encoding="utf-8")
     chosen = _CONDITION.sub(lambda line: f"{line[1]}\n" if line[2] == link else "", text)
     return Template(chosen).substitute(values)
 
 
-#: where a distribution lists its sensors.
+#: The section of pyproject.toml that lists the sensors.
 _LISTED = '[project.entry-points."lidarspec.sensors"]\n'
 
 
 def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, str]:
-    """The files, by path, that make a sensor one more of a distribution that is there: a module and
-    tests of its own, and what is changed.
+    """Return the new and changed files that add a sensor to an existing distribution.
 
     Args:
-        folder: of the distribution.
-        texts: the files of a distribution with this sensor alone.
+        folder: the folder of the distribution.
+        texts: the files of a distribution with only this sensor.
 
     Raises:
-        UsageError: where it is another distribution, or has such a sensor already.
-        SourceError: where its files cannot be read.
+        UsageError: if the folder has another distribution, or already has such a sensor.
+        SourceError: if its files cannot be read.
     """
     listed = f"{names.module}/vectors.json"
     with system_errors(folder):
@@ -1054,10 +1099,10 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
 
 
 def write(folder: Path, texts: Mapping[str, str]) -> None:
-    """Put files into a folder.
+    """Write files into a folder.
 
     Raises:
-        SourceError: where one cannot be written.
+        SourceError: if a file cannot be written.
     """
     with system_errors(folder):
         for name, text in texts.items():
