@@ -10,7 +10,8 @@ In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules i
 * `provenance`: the frame that a point of a scan came from.
 * `stream`: `ScanStream`, which makes scans of batches of packets as they arrive.
 * `cutter`: `Cutter`, which decides where a scan ends and whether it is complete.
-* `ends`: the ends of scans by the sensor's rule; `rotation`: at which rows an angle passes another.
+* `ends`: the ends of scans by the sensor's rule.
+* `rotation`: the rows at which a turning angle passes a given angle.
 * `limits`: the longest and the largest scan.
 * `completeness`: the packets of a scan, and those missing in it.
 * `masking`: the masked sector of a rotating sensor, in which scans are cut.

@@ -3,7 +3,7 @@
     from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled,
     Sensor, Serial, Simulation, hookimpl, spread
 
-A plugin imports from here and from `lidarspec` alone. The facts of a manual become a `Sensor`,
+A plugin imports from here and from `lidarspec` alone. In: the facts of a manual. Out: a `Sensor`,
 which is checked when it is made; every other package is a set of functions of a `Sensor`. Nothing
 in this package reads bytes of a stream. Modules in reading order:
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import partial
 from numbers import Integral, Real
 from os import PathLike
-from pathlib import Path
 from reprlib import repr as shown
 from types import NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, Optional, Union, get_args, get_origin, get_type_hints
@@ -79,7 +78,7 @@ _ANNOTATION_NAMES = {
     "Learned": Learned,
     "Literal": Literal,
     "Optional": Optional,
-    "Path": Path,
+    "Path": PathLike,  # importing pathlib takes longer than finding a sensor
     "Union": Union,
 }
 
@@ -102,7 +101,7 @@ def _is_instance(kind: type, value: object) -> bool:
 
 #: type in an annotation -> test of a value. A value of any other type is left to the plugin.
 _TESTS: dict[object, Callable[[object], bool]] = {
-    Path: _is_path,
+    PathLike: _is_path,
     Learned: partial(_is_instance, Learned),
     bool: partial(_is_instance, bool),
     float: _is_number,
@@ -112,7 +111,7 @@ _TESTS: dict[object, Callable[[object], bool]] = {
 }
 #: type in an annotation -> its name in messages.
 _WORDS: dict[object, str] = {
-    Path: "a path",
+    PathLike: "a path",
     Learned: "data reported by the sensor",
     bool: "true or false",
     float: "a number",
@@ -148,6 +147,8 @@ class OptionType:
         for member in members:
             if get_origin(member) is Literal:
                 choices.extend(get_args(member))
+            elif isinstance(member, type) and issubclass(member, PathLike):
+                types.append(PathLike)
             else:
                 types.append(member)
         return cls(tuple(types), tuple(choices))
@@ -155,7 +156,7 @@ class OptionType:
     @property
     def is_file(self) -> bool:
         """Whether a value can be the path of a file."""
-        return Path in self.types
+        return PathLike in self.types
 
     def accepts(self, value: object) -> bool:
         """Return whether a value is one of the choices, or of one of the types."""

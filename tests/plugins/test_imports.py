@@ -35,6 +35,7 @@ ALLOWED = {
         "spec.fields",
         "spec.links",
         "spec.results",
+        "spec.options",
         "spec.sensor",
         "spec.timing",
         "spec.tree",
