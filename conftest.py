@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import pytest
 
 from lidarspec.framing import examples
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from tests.missing import describe_missing
 
 #: plugins whose tests need an environment of their own: `make test-ros2`.

@@ -24,6 +24,8 @@ what comes in and what goes out:
     view        scans drawn                    formats     scans as files
     plugins     what is installed, its hooks   testing     the test kit for authors
     cli         the command line, on top
+
+`Sensor` is in `sensor_operations`: a description from `spec` whose methods call these engines.
 """
 
 from __future__ import annotations
@@ -57,12 +59,12 @@ if TYPE_CHECKING:
     from lidarspec.scans.laserscan import LaserScan as LaserScan
     from lidarspec.scans.scan import Scan as Scan
     from lidarspec.scans.selection import Selection as Selection
+    from lidarspec.sensor_operations import Sensor as Sensor
     from lidarspec.simulation.simulator import simulate as simulate
-    from lidarspec.spec.sensor import Sensor as Sensor
 
 _NAMES = {
     "plugins": ("sensor", "sensors"),
-    "spec.sensor": ("Sensor",),
+    "sensor_operations": ("Sensor",),
     "device.device": ("open", "Device"),
     "device.async_device": ("open_async", "AsyncDevice"),
     "device.session": ("Session", "Reply"),

@@ -57,7 +57,7 @@ from lidarspec.libraries import import_library
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.stores import (
     digest,
     file_of,

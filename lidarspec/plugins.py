@@ -44,11 +44,11 @@ from lidarspec.errors import (
     suggest,
 )
 from lidarspec.known_sensors import KnownLink, KnownSensor, describe_entry_points, unknown_sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.results import Points
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.syntax import prepare, seals
 from lidarspec.trust import document, own_settings
 

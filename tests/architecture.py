@@ -17,7 +17,7 @@ from pathlib import Path
 
 #: the stations on the way of a byte, bottom to top; a module that is named stands on its own floor,
 #: else on that of its package. Imports go down or stay, wherever in a module they stand and for
-#: types alike; `FACADE` is the one exception.
+#: types alike.
 FLOORS = (
     "_version display errors libraries trust stores entry_points known_sensors",
     "transports.protocol",  # what a source is, as values that plugins give too
@@ -28,6 +28,7 @@ FLOORS = (
     "points",  # functions of a batch of packets: `Packets.points` hands over to them
     "packets",
     "scans",
+    "sensor_operations",  # `Sensor`: a description, and the engines as its methods
     "simulation",
     "plugins unfinished",
     "spec.__init__ captures recording",  # the names of authors
@@ -42,9 +43,6 @@ FLOORS = (
     "__main__ __init__",
 )
 FLOOR_OF = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
-#: the class `Sensor`: engines take it, and its methods import the engines when they are called. The
-#: imports in its functions and for its types are not part of the order.
-FACADE = "lidarspec.spec.sensor"
 IO_FLOOR = FLOOR_OF["plugins"]
 #: packages with a face above their modules.
 PACKAGES = {name.removesuffix(".__init__") for name in FLOOR_OF if name.endswith(".__init__")}
@@ -151,12 +149,6 @@ class Module:
         return found
 
     @cached_property
-    def imports_on_loading(self) -> list[tuple[int, str]]:
-        """Those of `imports` at the left margin: loading the module runs them."""
-        lines = self.code.split("\n")
-        return [(line, name) for line, name in self.imports if not lines[line - 1].startswith(" ")]
-
-    @cached_property
     def typing_lines(self) -> set[int]:
         """The lines of `if TYPE_CHECKING` blocks."""
         lines = set[int]()
@@ -219,7 +211,7 @@ def floor(name: str) -> int | None:
 
 def climbing(modules: Mapping[str, Module]) -> list[str]:
     """Modules without a floor, imports that go up, and the first circle; imports for types count as
-    all others. Of `FACADE` the imports count that run when it is loaded.
+    all others.
     """
     complaints = [
         f"{name} stands on no floor: add it to FLOORS" for name in modules if floor(name) is None
@@ -227,8 +219,7 @@ def climbing(modules: Mapping[str, Module]) -> list[str]:
     graph: dict[str, set[str]] = {name: set() for name in modules}
     for module in modules.values():
         here = floor(module.name)
-        imports = module.imports_on_loading if module.name == FACADE else module.imports
-        for line, imported in imports:
+        for line, imported in module.imports:
             target = resolve(imported, modules)
             if target is None or target == module.name:
                 continue

@@ -17,6 +17,7 @@ import lidarspec
 from tests.architecture import (
     FACES,
     PAGE_MAY_IMPORT,
+    Module,
     climbing,
     construct_asked,
     core_modules,
@@ -40,6 +41,15 @@ PLUGINS = sorted(
 def test_imports_go_down_without_circles() -> None:
     assert "lidarspec.spec" in CORE
     assert not climbing(CORE)
+
+
+def test_a_function_that_imports_what_stands_above_makes_a_circle() -> None:
+    name = "lidarspec.spec.sensor"
+    upward = "\n\ndef parse():\n    from lidarspec.frames.parse import parse\n"
+    planted = {**CORE, name: Module(name, CORE[name].text + upward, is_package=False)}
+    complaints = climbing(planted)
+    assert any(line.startswith(f"{name}:") for line in complaints)
+    assert any(line.startswith("circle: ") for line in complaints)
 
 
 def test_io_and_libraries_are_imported_where_they_belong() -> None:

@@ -23,7 +23,7 @@ from lidarspec.explaining.explanation import describe_reply, explain
 from lidarspec.explaining.pieces import explained, pieces
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.hexadecimal import unhexed
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk

@@ -27,7 +27,7 @@ from lidarspec.device.settings import devices, named
 from lidarspec.errors import LidarSpecError
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import registry, sensor as named_sensor
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.ports import serial_ports
 

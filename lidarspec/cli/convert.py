@@ -38,7 +38,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Times, iter_received
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.stores import found
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, no_bytes

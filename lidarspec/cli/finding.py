@@ -38,8 +38,8 @@ from lidarspec.drafting.samples import Match
 from lidarspec.errors import SourceError, UsageError, WireError, suggest
 from lidarspec.known_sensors import KnownSensor, find_known_sensor, install_command, no_sensors
 from lidarspec.plugins import sensor as named_sensor, sensors
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, resolved

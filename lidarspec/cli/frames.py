@@ -23,7 +23,7 @@ from lidarspec.explaining.pieces import Piece, explained, pieces
 from lidarspec.explaining.wording import Span, number
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import selection as scans
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 
 words_argument = click.argument("words", metavar="HEX|FILE|-", nargs=-1, required=True)
 

@@ -40,7 +40,7 @@ from lidarspec.frames.parse import identify
 from lidarspec.plugins import sensors
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Times, iter_received
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, unhexed
 from lidarspec.transports.protocol import Chunk, no_bytes
 

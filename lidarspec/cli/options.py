@@ -15,8 +15,8 @@ import click
 
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.fields import duration, factor, share, split_unit
-from lidarspec.spec.sensor import Sensor
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

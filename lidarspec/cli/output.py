@@ -51,7 +51,7 @@ def output_option(function: Function) -> Function:
     def refuse_and_call(*args: Any, output: str | None, **others: Any) -> Any:
         if output is not None:
             from lidarspec.cli.inputs import refuse_overwriting
-            from lidarspec.spec.sensor import Sensor
+            from lidarspec.sensor_operations import Sensor
 
             words = [
                 word

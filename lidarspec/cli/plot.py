@@ -21,7 +21,7 @@ from lidarspec.formats.writing import replacing
 from lidarspec.points.look import fit, look
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.view import figures
 from lidarspec.view.feed import Feed
 from lidarspec.view.svg import svg

@@ -30,7 +30,7 @@ from lidarspec.errors import UnknownFrame, UsageError
 from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Slice
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.view.feed import LOOK_S, Feed
 from lidarspec.view.meter import Reading, format_figure
 

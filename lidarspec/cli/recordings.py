@@ -31,7 +31,7 @@ from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
 from lidarspec.scans.selection import Selection
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.destinations import replay_outlet
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.open_url import is_live, live_address, transport

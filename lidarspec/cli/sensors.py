@@ -22,8 +22,8 @@ from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
 
 if TYPE_CHECKING:
     from lidarspec.plugins import Plugin
+    from lidarspec.sensor_operations import Sensor
     from lidarspec.spec.description import Frame
-    from lidarspec.spec.sensor import Sensor
 
 #: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
 PACKETS = 32

@@ -26,11 +26,11 @@ from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.look import look
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scan import Scan
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import BLOCKED, Faults
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link
 from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, Outlet, has_terminals

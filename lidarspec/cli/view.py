@@ -23,7 +23,7 @@ from lidarspec.errors import UsageError
 from lidarspec.points.look import look
 from lidarspec.recording.switch import RecordingSwitch
 from lidarspec.scans.selection import Selection
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Origin
 from lidarspec.view.canvas import Cells

@@ -14,8 +14,8 @@ from shlex import quote
 from lidarspec.detect.identification import CLEAR, Verdict, said, verdict, verdicts
 from lidarspec.detect.listen import LISTEN, bauds, heard_as, started_first, udp_ports
 from lidarspec.errors import LidarSpecError, UsageError, printable, suggestion
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports import ports
 from lidarspec.transports.addresses import Address, with_option
 from lidarspec.transports.base import data_link

@@ -41,10 +41,10 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import VALID, Found
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import registry, sensor as named_sensor, sensors
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec.description import Relative
 from lidarspec.spec.links import Serial
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport

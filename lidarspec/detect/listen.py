@@ -18,8 +18,8 @@ from lidarspec.device.session import Pending, Session
 from lidarspec.errors import LidarSpecError, SourceError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live, live_address, transport

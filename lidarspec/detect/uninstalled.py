@@ -16,7 +16,7 @@ from lidarspec.errors import WireError, suggest
 from lidarspec.framing.frame_engine import codec
 from lidarspec.known_sensors import KnownSensor, Signature, install_command, known_sensors
 from lidarspec.plugins import registry
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 
 #: bytes at the beginning of a frame that a signature covers.
 MAX_SYNC_BYTES = 16

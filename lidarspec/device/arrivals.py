@@ -26,7 +26,7 @@ from lidarspec.errors import CommandError, SourceError
 from lidarspec.frames.schema import schema
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.stores import is_stored
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport

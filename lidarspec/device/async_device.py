@@ -25,7 +25,7 @@ from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 
 T = TypeVar("T")
 #: A thread waits for so long before it returns to the event loop,

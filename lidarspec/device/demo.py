@@ -23,10 +23,10 @@ from lidarspec.device.session import Reply
 from lidarspec.errors import SourceError
 from lidarspec.framing.results import Counters
 from lidarspec.scans.scan import Scan
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec.links import Serial
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.base import data_link
 from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals

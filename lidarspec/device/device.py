@@ -33,7 +33,7 @@ from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Sieve
 from lidarspec.scans.stream import ScanStream
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Closing, LiveTransport, Transport
 

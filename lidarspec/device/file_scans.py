@@ -35,7 +35,7 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets, StateOf
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import ScanStream
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.files import CaptureTransport, FileTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Closing, LiveTransport

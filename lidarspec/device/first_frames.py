@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, told_seconds
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 
 #: bytes of a file without any frame that could tell the turn of the clock; then no such frame is
 #: expected.

@@ -14,7 +14,7 @@ from lidarspec.device.capture_thread import Capture
 from lidarspec.device.senders import SenderFilter
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import LiveTransport, Sender, endpoint
 

@@ -35,9 +35,9 @@ from lidarspec.errors import (
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.appending import Log
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Address
 from lidarspec.spec.links import Http, Link, Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import find_own_address
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import control_link, has_control

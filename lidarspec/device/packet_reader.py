@@ -18,7 +18,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import ScanStream, handed_out
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 
 #: Batches that are kept until the type of the data frames is known.
 _MAX_UNDECIDED_BATCHES = 256

@@ -18,7 +18,7 @@ import numpy as np
 from lidarspec.errors import UsageError, suggest
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import Chunk, Sender, endpoint
 

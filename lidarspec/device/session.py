@@ -27,10 +27,10 @@ from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageErro
 from lidarspec.frames.field_paths import steps
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Found
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Address, Filled
 from lidarspec.spec.description import Command
 from lidarspec.spec.options import Learned
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo
 
 #: fields that a reply's repr shows.

@@ -28,7 +28,7 @@ from typing import Any
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggest
 from lidarspec.plugins import names_file, sensor as named_sensor
 from lidarspec.points.mount import Mount
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.stores import is_stored
 from lidarspec.trust import FILE, beside, document, foreign, is_trusted, own_settings
 

@@ -25,7 +25,7 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.appending import Appender
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import MadeFor, recorder
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import is_live, transport

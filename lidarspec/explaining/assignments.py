@@ -18,9 +18,9 @@ from lidarspec.frames.commands import argument_slot
 from lidarspec.frames.encode import given_value
 from lidarspec.frames.field_paths import Steps, is_index, put, steps
 from lidarspec.frames.schema import Schema
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Octets, Range
 from lidarspec.spec.fields import factor, split_unit
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.tree import FieldInfo, evaluated
 from lidarspec.transports.hexadecimal import unhexed
 

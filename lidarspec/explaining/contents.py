@@ -20,7 +20,7 @@ from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, suggest
 from lidarspec.recording.format import Header
 from lidarspec.scans.selection import format_date
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.bags import BagTransport
 from lidarspec.transports.files import (
     CaptureTransport,

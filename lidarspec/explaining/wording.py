@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lidarspec.errors import WireError
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Range, Taken
-from lidarspec.spec.sensor import Sensor
 
 if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud

@@ -23,7 +23,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import with_frames
 
 if TYPE_CHECKING:
-    from lidarspec.spec.sensor import Sensor
+    from lidarspec.sensor_operations import Sensor
 
 #: kind -> "module:function"; each takes a Sensor and returns the text of the export.
 EXPORTS: dict[str, str] = {

@@ -22,13 +22,18 @@ from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import build_plain
 from lidarspec.frames.schema import Schema, schema
 from lidarspec.frames.wire_coder import SPELLING, frame_coder
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import WireNaN
 from lidarspec.spec.tree import FieldInfo
 
 
 def build(
-    sensor: Sensor, frame: str, value: Any, values: Mapping[str, Any], *, units: bool = False
+    sensor: SensorDescription,
+    frame: str,
+    value: Any,
+    values: Mapping[str, Any],
+    *,
+    units: bool = False,
 ) -> bytes:
     """The bytes of one frame; constants, counts and the checksum are filled in.
 

@@ -21,11 +21,11 @@ from lidarspec.frames.build import build
 from lidarspec.frames.field_paths import put, steps
 from lidarspec.frames.schema import schema
 from lidarspec.spec.arguments import Address, Count, Filled, Range, Taken
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.tree import FieldInfo
 
 
-def build_command(sensor: Sensor, name: str, arguments: Mapping[str, Any]) -> bytes:
+def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, Any]) -> bytes:
     """The bytes of a command, none for one that only moves lines.
 
     Args:
@@ -77,7 +77,7 @@ class Slot:
     is_array: bool = False
 
 
-def argument_slot(sensor: Sensor, name: str, argument: str) -> Slot:
+def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Slot:
     """Where an argument of a command goes.
 
     Raises:
@@ -104,7 +104,7 @@ def argument_slot(sensor: Sensor, name: str, argument: str) -> Slot:
     return slot
 
 
-def _slot(sensor: Sensor, name: str, path: str, place: str) -> Slot:
+def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> Slot:
     frame = sensor.commands[name].frame or ""
     names = steps(path)
     table = schema(sensor.frames[frame].tree) if frame else None
@@ -190,7 +190,7 @@ def _placed(slot: Slot, data: bytes) -> Any:
     return int.from_bytes(data, "big")
 
 
-def _found_out(sensor: Sensor, name: str, path: str, value: Filled, given: Any) -> Any:
+def _found_out(sensor: SensorDescription, name: str, path: str, value: Filled, given: Any) -> Any:
     """Return a value that is known only when a command is sent.
 
     If it is not given, the first number is used, or an address of zeros.

@@ -28,7 +28,7 @@ from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import Examined, examine
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.description import Frame
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import WireNaN, seen, unnamed
 from lidarspec.spec.tree import (
     Blob,
@@ -46,7 +46,7 @@ from lidarspec.spec.tree import (
 
 
 def parse(
-    sensor: Sensor,
+    sensor: SensorDescription,
     data: bytes,
     *,
     frame: str | None = None,
@@ -74,7 +74,7 @@ def parse(
     return values
 
 
-def identify(sensor: Sensor, data: bytes, *, frame: str | None = None) -> str:
+def identify(sensor: SensorDescription, data: bytes, *, frame: str | None = None) -> str:
     """Return the frame type of one frame.
 
     Args:
@@ -98,7 +98,9 @@ def _as_bytes(data: bytes) -> bytes:
     return bytes(data)
 
 
-def _find_sound(sensor: Sensor, data: bytes, frame: str | None) -> tuple[str, Any] | None:
+def _find_sound(
+    sensor: SensorDescription, data: bytes, frame: str | None
+) -> tuple[str, Any] | None:
     """Return type and values of a frame if it is valid, else None."""
     names = sensor.frames if frame is None or frame not in sensor.frames else (frame,)
     for name in names:
@@ -133,7 +135,7 @@ def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
 
 
 def _parse_unsound(
-    sensor: Sensor, data: bytes, frame: str | None, *, verify: bool
+    sensor: SensorDescription, data: bytes, frame: str | None, *, verify: bool
 ) -> tuple[str, Any]:
     """Return type and values of an invalid frame.
 
@@ -160,7 +162,7 @@ def _parse_unsound(
     raise _find_likeliest(sensor, data, faults)
 
 
-def _find_fault(sensor: Sensor, name: str, data: bytes) -> WireError:
+def _find_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
     """Return the first fault of an invalid frame as an error."""
     frame = sensor.frames[name]
     if isinstance(frame_layouts(frame), NotCompilable):
@@ -183,7 +185,11 @@ def _find_fault(sensor: Sensor, name: str, data: bytes) -> WireError:
 
 
 def _find_field_fault(
-    sensor: Sensor, name: str, data: bytes, examined: Examined, to_wire_offset: Callable[[int], int]
+    sensor: SensorDescription,
+    name: str,
+    data: bytes,
+    examined: Examined,
+    to_wire_offset: Callable[[int], int],
 ) -> WireError:
     """Return the first fault of the fields of a frame as an error.
 
@@ -197,7 +203,7 @@ def _find_field_fault(
 
 
 def _run_search(
-    sensor: Sensor,
+    sensor: SensorDescription,
     name: str,
     find: Callable[[Examined], diagnose.Fault | None],
     examined: Examined,
@@ -214,7 +220,7 @@ def _run_search(
 
 
 def _to_wire_error(
-    sensor: Sensor,
+    sensor: SensorDescription,
     name: str,
     data: bytes,
     fault: diagnose.Fault,
@@ -233,7 +239,7 @@ def _to_wire_error(
     )
 
 
-def _parse_unverified(sensor: Sensor, name: str, data: bytes) -> Any:
+def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
     """Return the values of a frame without verifying it.
 
     Raises:
@@ -544,7 +550,7 @@ def _read_rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContaine
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
 
 
-def layout_of(sensor: Sensor, name: str, data: bytes) -> Layout | Refused | None:
+def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | Refused | None:
     """Return the layout that the header of this frame leads to.
 
     Returns None if the type is not compiled, or if the header is incomplete.
@@ -555,7 +561,7 @@ def layout_of(sensor: Sensor, name: str, data: bytes) -> Layout | Refused | None
     return layouts.layout(data)
 
 
-def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
+def _progress(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
     """Return a sort key for how far a frame type matched before it failed.
 
     It is highest for a whole frame with trailing bytes, or with a wrong checksum only.
@@ -572,7 +578,7 @@ def _progress(sensor: Sensor, fault: WireError) -> tuple[int, int]:
     return (0, fault.offset)
 
 
-def _find_likeliest(sensor: Sensor, data: bytes, faults: list[WireError]) -> WireError:
+def _find_likeliest(sensor: SensorDescription, data: bytes, faults: list[WireError]) -> WireError:
     best = max(faults, key=functools.partial(_progress, sensor))
     if best.offset > 0 or len(sensor.frames) == 1:
         return best

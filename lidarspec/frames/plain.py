@@ -17,7 +17,7 @@ from lidarspec.errors import MissingField, SpecError, UsageError, WireError, str
 from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_fields import WireField
 from lidarspec.spec.description import Frame
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import Mismatch, clean, field_path, leaves
 from lidarspec.spec.tree import FieldInfo
 
@@ -117,7 +117,7 @@ def _is_placed(value: Any, end: int) -> bool:
     return bool(max(stop for _, stop in value["_marks"].values()) <= end)
 
 
-def plain_fault(sensor: Sensor, name: str, data: bytes) -> WireError:
+def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
     """Return what is wrong with bytes that are no frame of this type.
 
     Raises:

@@ -29,7 +29,7 @@ from lidarspec.framing.search import leftmost
 from lidarspec.framing.steady import steady_stream
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Udp
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 
 __all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
 
@@ -82,7 +82,12 @@ class Decoder:
     """
 
     def __init__(
-        self, sensor: Sensor, *, stream: bool, backend: str = "auto", sums: Sums | None = None
+        self,
+        sensor: SensorDescription,
+        *,
+        stream: bool,
+        backend: str = "auto",
+        sums: Sums | None = None,
     ) -> None:
         if not sensor.incoming:
             raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")

@@ -37,7 +37,7 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.plausibility import plausibility
 from lidarspec.framing.results import VALID
 from lidarspec.spec.description import Frame
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import Fault, member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
@@ -58,7 +58,7 @@ Drawn = Mapping[str, Callable[[random.Random], Any]]
 NOTHING: Drawn = {}
 
 
-def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
+def example(sensor: SensorDescription, frame: str, *, seed: int = 0) -> bytes:
     """The bytes of a valid frame with seeded random content.
 
     Raises:
@@ -70,7 +70,7 @@ def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
 
 
 def random_frame(
-    sensor: Sensor, frame: str, source: random.Random, drawn: Drawn = NOTHING
+    sensor: SensorDescription, frame: str, source: random.Random, drawn: Drawn = NOTHING
 ) -> bytes:
     """Return a valid frame with a random header and random content.
 
@@ -184,7 +184,7 @@ def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -
 
 
 def _make_of_values(
-    sensor: Sensor, frame: str, engine: Codec, source: random.Random, drawn: Drawn
+    sensor: SensorDescription, frame: str, engine: Codec, source: random.Random, drawn: Drawn
 ) -> bytes:
     """Return a frame with parts, or without layouts: its values are drawn one by one."""
     for _ in range(LARGEST_BATCH * TRIES):
@@ -236,7 +236,9 @@ def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> 
     return rows
 
 
-def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+def _plausible(
+    sensor: SensorDescription, frame: str, layout: Layout, rows: NDArray[np.uint8]
+) -> list[bytes]:
     if layout.conditions:
         rows = rows[layout.meets(rows)]
     table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
@@ -251,7 +253,9 @@ def _plausible(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint
     return _sent(sensor, frame, layout, rows[good])
 
 
-def _sent(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -> list[bytes]:
+def _sent(
+    sensor: SensorDescription, frame: str, layout: Layout, rows: NDArray[np.uint8]
+) -> list[bytes]:
     """Return the first frame that can be written in the form of its type, or none."""
     encode = frame_coder(sensor.frames[frame]).encode
     frames = (encode(row.tobytes()) for row in rows)
@@ -259,7 +263,7 @@ def _sent(sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]) -
 
 
 def _make_along_sweep(
-    sensor: Sensor, frame: str, engine: Codec, source: random.Random, drawn: Drawn
+    sensor: SensorDescription, frame: str, engine: Codec, source: random.Random, drawn: Drawn
 ) -> bytes:
     """Return a frame with the values that the sensor's `sweep` declares.
 

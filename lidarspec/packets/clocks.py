@@ -17,7 +17,7 @@ from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec.fields import factor
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock
 from lidarspec.spec.tree import exact
 
@@ -100,7 +100,7 @@ class Epoch:
     """
 
     def __init__(
-        self, sensor: Sensor, clock: Clock, reference: ClockReference | None = None
+        self, sensor: SensorDescription, clock: Clock, reference: ClockReference | None = None
     ) -> None:
         assert clock.told is not None
         assert clock.wraps_at is not None
@@ -181,7 +181,7 @@ def told_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
     return np.broadcast_to(seconds.reshape(-1), (len(table),))
 
 
-def clock_ns(sensor: Sensor, batch: Batch) -> Times:
+def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
     """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire.
 
     Where it stands in the parts of a frame, it is that of the first one; in a frame without any
@@ -193,7 +193,7 @@ def clock_ns(sensor: Sensor, batch: Batch) -> Times:
     return held(which, readings, np.zeros(len(batch), np.int64))
 
 
-def clocked(sensor: Sensor, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
+def clocked(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
     """Return the packets that have the clock (None: all), and its readings.
 
     If the clock is in parts, the first part counts.
@@ -266,7 +266,11 @@ def clock_parts(fields: tuple[str, ...], schema: Schema) -> tuple[str, str] | No
 
 
 def part_times(
-    sensor: Sensor, place: tuple[str, str], table: Table, which: NDArray[np.intp], times: Times
+    sensor: SensorDescription,
+    place: tuple[str, str],
+    table: Table,
+    which: NDArray[np.intp],
+    times: Times,
 ) -> Times:
     """The times of parts, (k,), where they have a clock of their own.
 
@@ -296,7 +300,7 @@ def _prefix(place: tuple[str, str]) -> str:
     return ".".join(filter(None, place))
 
 
-def _in_parts(sensor: Sensor, place: tuple[str, str], table: Table) -> Times:
+def _in_parts(sensor: SensorDescription, place: tuple[str, str], table: Table) -> Times:
     """The clock that stands in parts, in each of them."""
     assert sensor.clock is not None
     own = tuple(path.removeprefix(f"{_prefix(place)}.") for path in paths(sensor.clock))

@@ -28,7 +28,7 @@ from lidarspec.packets.clocks import Times
 from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import Paces, read_paces, shortest_pace
 from lidarspec.packets.packets import Index
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock, Sequence
 
 #: places that a packet may be late; if it is further back, the sensor has started again.
@@ -120,7 +120,7 @@ class CounterOrder:
         clock: of the packets; it is used if its pace is declared.
     """
 
-    def __init__(self, sensor: Sensor, stats: Counters, clock: Clock | None) -> None:
+    def __init__(self, sensor: SensorDescription, stats: Counters, clock: Clock | None) -> None:
         assert sensor.sequence is not None
         self._rule: Sequence = sensor.sequence
         self._clock = clock if clock is not None and clock.pace is not None else None

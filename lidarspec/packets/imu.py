@@ -17,7 +17,7 @@ from lidarspec.expressions.columns import Batch, Fields, of_points, unpadded
 from lidarspec.points.conventions import vendor_turn
 from lidarspec.points.plain import flat
 from lidarspec.spec.results import Imu
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 
 #: the columns of a sample after its time, in the order in which files list them, and their units.
 UNITS = {
@@ -78,7 +78,9 @@ def joined(parts: Sequence[ImuSamples]) -> ImuSamples:
     return ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def samples(sensor: Sensor, frame: str, batch: Batch, time_ns: NDArray[np.int64]) -> ImuSamples:
+def samples(
+    sensor: SensorDescription, frame: str, batch: Batch, time_ns: NDArray[np.int64]
+) -> ImuSamples:
     """The samples of packets.
 
     Args:

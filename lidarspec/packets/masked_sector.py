@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.frame_table import Table
 from lidarspec.points.cloud import COLUMNS
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import OnChange, OnWrap
 
 Angles = NDArray[np.float64]
@@ -107,7 +107,7 @@ class AngleReader:
         is_available: whether the rule names an angle in the packets.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SensorDescription) -> None:
         rule = sensor.scan
         self._path = ""
         self._full: float | None = None
@@ -251,7 +251,7 @@ class MaskedGaps:
         masked: packets that the masked sector leaves out; 0 until it is known.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SensorDescription) -> None:
         self._reader = AngleReader(sensor)
         self._angles: Angles | None = None  # of the packets at hand
         self._first_unnoted = 0  # row of the first one that `_finder` has not seen

@@ -19,7 +19,7 @@ from lidarspec.packets.clocks import part_times
 from lidarspec.packets.imu import ImuSamples, samples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.evaluate import evaluate
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 
 #: what is known of each packet besides its fields.
 _COLUMNS = ("offset", "time_ns", "host_ns", "index", "breaks")
@@ -48,7 +48,7 @@ class Packets:
 
     def __init__(
         self,
-        sensor: Sensor,
+        sensor: SensorDescription,
         frame: str,
         table: Table,
         *,

@@ -40,7 +40,7 @@ from lidarspec.packets.counter_order import CounterOrder
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
 from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock
 
 Integers = NDArray[np.int64]
@@ -65,7 +65,7 @@ class PacketStream:
 
     def __init__(
         self,
-        sensor: Sensor,
+        sensor: SensorDescription,
         frame: str,
         stats: Counters,
         *,
@@ -335,7 +335,7 @@ class ImuStream:
 
     def __init__(
         self,
-        sensor: Sensor,
+        sensor: SensorDescription,
         stats: Counters,
         *,
         backend: str = "auto",
@@ -429,7 +429,7 @@ class OwnFrames:
         return len(self.frames) < len(self.piece)
 
 
-def data_frame(sensor: Sensor, found: Sequence[Frames]) -> str | None:
+def data_frame(sensor: SensorDescription, found: Sequence[Frames]) -> str | None:
     """Return the type of data frame that an input is read by if none is asked for.
 
     It is the configured one, or the first that arrived; None if the sensor has several, none is
@@ -446,7 +446,7 @@ def data_frame(sensor: Sensor, found: Sequence[Frames]) -> str | None:
     return None
 
 
-def _clock_of(sensor: Sensor, frame: str, schema: Schema) -> Clock | None:
+def _clock_of(sensor: SensorDescription, frame: str, schema: Schema) -> Clock | None:
     """Return the clock of frames of a type, if any.
 
     Data frames use the clock of the sensor, as do frames of an IMU that have its fields.
@@ -466,11 +466,11 @@ def _clock_of(sensor: Sensor, frame: str, schema: Schema) -> Clock | None:
     return None
 
 
-def _has_counter(sensor: Sensor, frame: str) -> bool:
+def _has_counter(sensor: SensorDescription, frame: str) -> bool:
     return sensor.sequence is not None and _has_field(sensor, frame, sensor.sequence.field)
 
 
-def _has_field(sensor: Sensor, frame: str, path: str) -> bool:
+def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
     """Return whether packets of this type have a field, or should, since no data frame has it."""
     schemas = {name: codec(sensor.frames[name]).schema for name in sensor.data_frames}
     having = [

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidarspec.expressions.columns import Column
 from lidarspec.expressions.graph import Traced
 from lidarspec.spec.results import Extra
-from lidarspec.spec.sensor import DIRECTIONS, Sensor
+from lidarspec.spec.sensor import DIRECTIONS, SensorDescription
 
 Floats = NDArray[np.float32]
 
@@ -269,7 +269,7 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
     return matrix
 
 
-def axes_of(sensor: Sensor) -> tuple[str, str, str]:
+def axes_of(sensor: SensorDescription) -> tuple[str, str, str]:
     """Return the directions of x, y and z of a sensor's points.
 
     They follow REP-103, or the vendor's axes if these are configured.
@@ -281,7 +281,7 @@ def axes_of(sensor: Sensor) -> tuple[str, str, str]:
     return wanted or REP_103
 
 
-def vendor_turn(sensor: Sensor) -> NDArray[np.float64] | None:
+def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
     """Return the (3, 3) matrix from REP-103 to the configured axes.
 
     Returns None if these are the axes of REP-103.

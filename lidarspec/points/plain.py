@@ -25,7 +25,7 @@ from lidarspec.points import conventions
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud, organised
 from lidarspec.points.conventions import Kind
 from lidarspec.spec.results import Cartesian, Points, Polar
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 
 _OPTIONAL = ("intensity", "ring", "return_index", "column")
 
@@ -41,7 +41,7 @@ class PacketBatch(Protocol):
         backend: what makes points of them, "auto", "numpy" or "jit".
     """
 
-    sensor: Sensor
+    sensor: SensorDescription
     frame: str
     table: Table
     time_ns: NDArray[np.int64]

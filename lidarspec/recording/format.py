@@ -46,8 +46,8 @@ from typing import Any, BinaryIO, Literal
 
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.options import Learned
-from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import file_of
 from lidarspec.transports.protocol import Closing
 

@@ -39,8 +39,8 @@ from lidarspec.recording.format import (
     packed,
     size_at,
 )
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", *WRITINGS, ".bin")

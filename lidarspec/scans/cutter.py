@@ -20,7 +20,7 @@ from lidarspec.points.plain import Evaluated
 from lidarspec.scans.completeness import OpenScan, PacketCounts
 from lidarspec.scans.ends import End, EndFinder, first_points
 from lidarspec.scans.limits import ScanLimits
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 
 #: packets that are searched together for the one that exceeds the limits.
@@ -45,7 +45,7 @@ class Cutter:
         sensor: of the stream.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SensorDescription) -> None:
         rule = sensor.scan
         self._ends = EndFinder(sensor)
         self._limits = ScanLimits(sensor)

@@ -27,7 +27,7 @@ from lidarspec.scans.rotation import (
     WrapDetector,
     previous_values,
 )
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every, OnChange, OnFlag, OnJump, OnRewind, OnWrap
 
 Indices = NDArray[np.intp]
@@ -56,7 +56,7 @@ class EndFinder:
         sensor: of the stream.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SensorDescription) -> None:
         self._rule = sensor.scan
         self._reader = AngleReader(sensor)
         self._wraps = WrapDetector()

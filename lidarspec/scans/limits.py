@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarspec.scans.completeness import OpenScan, PacketCounts
 from lidarspec.spec.links import Serial
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every
 
 #: the slowest turn if the sensor does not declare it.
@@ -34,7 +34,7 @@ class ScanLimits:
         has_point_limit: whether the limit of the size is in points, not in bytes.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SensorDescription) -> None:
         turn_s = SLOWEST_TURN_S
         if isinstance(sensor.scan, Every):
             turn_s = sensor.scan.seconds

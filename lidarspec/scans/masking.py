@@ -24,7 +24,7 @@ from lidarspec.packets.masked_sector import (
     SectorFinder,
 )
 from lidarspec.packets.packets import Packets, joined
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 
 #: turns within which a leap has to recur.
 MAX_TURNS = 4
@@ -45,7 +45,7 @@ class Masking:
             if there is none.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SensorDescription) -> None:
         self._reader = AngleReader(sensor)
         self._is_settled = False
         self._longest_ns = int(

@@ -16,7 +16,7 @@ from lidarspec.points.conventions import axes_of
 from lidarspec.points.mount import Mount
 from lidarspec.scans.laserscan import FULL_TURN, LaserScan, find_nearest_returns, fit_times
 from lidarspec.scans.provenance import Provenance
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 
 #: the usual name of the frame that the points are in: x forward, y left, z up (REP-103).
 FRAME_ID = "laser"
@@ -50,7 +50,7 @@ class Scan:
     points: PointCloud
     rate_hz: float
     complete: bool
-    sensor: Sensor
+    sensor: SensorDescription
     whole: bool = False
     imu: ImuSamples | None = None
     host_ns: int = 0

@@ -27,7 +27,7 @@ from lidarspec.scans.ends import first_points
 from lidarspec.scans.masking import Masking, describe
 from lidarspec.scans.provenance import PointRun, Provenance, find_part
 from lidarspec.scans.scan import Scan
-from lidarspec.spec.sensor import Sensor
+from lidarspec.spec.sensor import SensorDescription
 
 
 class ScanStart(NamedTuple):
@@ -52,7 +52,7 @@ class ScanStream:
     """
 
     def __init__(
-        self, sensor: Sensor, mount: Mount | None = None, imu: Waiting | None = None
+        self, sensor: SensorDescription, mount: Mount | None = None, imu: Waiting | None = None
     ) -> None:
         self._sensor = sensor
         self._mount = mount
@@ -259,7 +259,7 @@ def _read_starts(
 
 
 def scans_of(
-    sensor: Sensor, batches: Iterable[Packets], imu: Waiting | None = None
+    sensor: SensorDescription, batches: Iterable[Packets], imu: Waiting | None = None
 ) -> Iterator[Scan]:
     """Yield every scan of the batches of one stream.
 

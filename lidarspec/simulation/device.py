@@ -23,13 +23,14 @@ from lidarspec.errors import SpecError
 from lidarspec.frames.parse import parse
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.faults import Faults, FaultyLink
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Scene, furnished
 from lidarspec.simulation.simulator import Rest, Simulation, simulation
 from lidarspec.spec.description import Answer, Command, Frame
 from lidarspec.spec.links import is_datagram
-from lidarspec.spec.sensor import Sensor, with_frames
+from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000

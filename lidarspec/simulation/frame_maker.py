@@ -23,7 +23,7 @@ from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import Coder, frame_coder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.plain_frames import PlainCodec
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.syntax import member
 from lidarspec.spec.tree import Formula, Kind, Node, refs
 

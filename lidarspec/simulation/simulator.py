@@ -36,12 +36,12 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.points.conventions import coordinates, direction_of
 from lidarspec.points.plain import parts_of
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.frame_maker import FrameMaker, sealed
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Cartesian, Points, Polar
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Every
 from lidarspec.spec.tree import FieldInfo, exact
 

@@ -4,11 +4,12 @@
     Sensor, Serial, Simulation, hookimpl, spread
 
 A plugin imports from here and from `lidarspec` alone. In: the facts of a manual. Out: a `Sensor`,
-which is checked when it is made; every other package is a set of functions of a `Sensor`. Nothing
-in this package reads bytes of a stream. Modules in reading order:
+which is checked when it is made; every other package is a set of functions of its description.
+Nothing in this package reads bytes of a stream. Modules in reading order:
 
 * `description`: `Frame`, `Command`, `Simulation`, `Relative`.
-* `sensor`: `Sensor`, which puts all of these together; its methods call the engines.
+* `sensor`: `SensorDescription`, which puts all of these together; `Sensor`, in
+  `lidarspec.sensor_operations`, is a description with the engines as methods.
 * `options`: the values that options of `configure` take, from their annotations.
 * `arguments`: arguments of commands, and values that are filled in when a command is sent.
 * `fields`: units and seals, as parts of a struct.
@@ -29,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lidarspec.expressions.columns import Column as Column, Fields as Fields
     from lidarspec.plugins import hookimpl as hookimpl
+    from lidarspec.sensor_operations import Sensor as Sensor
     from lidarspec.spec.arguments import Address as Address, Count as Count, Text as Text
     from lidarspec.spec.checksums import (
         Checksum as Checksum,
@@ -69,7 +71,6 @@ if TYPE_CHECKING:
         Points as Points,
         Polar as Polar,
     )
-    from lidarspec.spec.sensor import Sensor as Sensor
     from lidarspec.spec.timing import (
         Clock as Clock,
         Every as Every,
@@ -117,7 +118,7 @@ if TYPE_CHECKING:
     )
 
 _NAMES = {
-    "spec.sensor": ("Sensor",),
+    "sensor_operations": ("Sensor",),
     "spec.options": ("Learned",),
     "spec.description": ("Frame", "Command", "Relative", "Simulation"),
     "spec.arguments": ("Text", "Address", "Count"),

@@ -1,7 +1,7 @@
 """The message types and commands of a sensor, and facts for its simulation, as values.
 
 Everything here is immutable, checks itself when it is made, and has no engine. `spec.sensor` puts
-these values together into a `Sensor`.
+these values together into a `SensorDescription`.
 """
 
 from __future__ import annotations

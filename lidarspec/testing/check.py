@@ -25,7 +25,7 @@ from typing import Any
 from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import SourceError, SpecError, UnknownSensor
 from lidarspec.plugins import Registry, file_and_id, file_module, registry
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.testing.declared import declared
 from lidarspec.testing.findings import Finding, left_over
 from lidarspec.testing.properties import PROPERTIES

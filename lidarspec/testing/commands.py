@@ -14,10 +14,10 @@ from lidarspec.explaining.wording import asked
 from lidarspec.frames.commands import argument_slot, raw_argument
 from lidarspec.frames.parse import identify
 from lidarspec.framing.results import Found
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.spec.arguments import Address, Range, Text
 from lidarspec.spec.links import is_datagram
-from lidarspec.spec.sensor import Sensor
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
 

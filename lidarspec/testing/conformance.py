@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.testing.check import Report, Target, reports, target
 from lidarspec.testing.subject import EXAMPLES
 

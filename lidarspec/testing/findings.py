@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 
 
 class Rule(NamedTuple):

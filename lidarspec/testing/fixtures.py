@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Scene
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.serving import Served
 

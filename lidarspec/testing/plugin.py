@@ -12,7 +12,7 @@ import pytest
 
 if TYPE_CHECKING:
     from lidarspec.plugins import Registry
-    from lidarspec.spec.sensor import Sensor
+    from lidarspec.sensor_operations import Sensor
     from lidarspec.transports.serving import Served
 
 
@@ -31,7 +31,7 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
     It is the sensor of ``@pytest.mark.lidarspec("acme-x1")``, or of the test class.
     """
     from lidarspec.plugins import sensor as named
-    from lidarspec.spec.sensor import Sensor
+    from lidarspec.sensor_operations import Sensor
 
     marker = request.node.get_closest_marker("lidarspec")
     if marker:

@@ -13,7 +13,7 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate_plainly
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import scans_of
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.testing import subject as material
 from lidarspec.testing.clouds import assert_same_places, assert_well_formed
 from lidarspec.testing.findings import Violation, require

@@ -11,8 +11,8 @@ from collections.abc import Collection
 from typing import Any, TypeVar
 
 from lidarspec.errors import SourceError, suggest
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Link
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 

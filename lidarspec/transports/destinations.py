@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from lidarspec.errors import SourceError, UsageError
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Http, Link, Tcp, Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import Address
 from lidarspec.transports.outlets import LOCALHOST, Line, Outlet, PtyLine, TcpLine, UdpLine
 

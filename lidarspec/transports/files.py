@@ -24,7 +24,7 @@ from lidarspec.captures.pcap import CaptureStats, is_stream_capture
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.stores import file_of, is_stored
 from lidarspec.transports.addresses import parse_origin
 from lidarspec.transports.bags import BagTransport, log_of

@@ -12,8 +12,8 @@ from urllib.parse import parse_qs
 from lidarspec.device.settings import named
 from lidarspec.errors import SpecError, UnknownOption, UsageError
 from lidarspec.plugins import registry
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Http, Link, Tcp, Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.stores import is_stored
 from lidarspec.transports.addresses import Address, resolve_host
 from lidarspec.transports.base import source_error

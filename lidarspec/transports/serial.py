@@ -18,8 +18,8 @@ from shlex import quote
 import serial
 
 from lidarspec.errors import SourceError, UsageError
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import Address
 from lidarspec.transports.base import (
     StreamTransport,

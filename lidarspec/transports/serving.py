@@ -14,9 +14,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.outlets import LOCALHOST, Outlet
 from lidarspec.transports.protocol import POLL, Chunk, Closing, Sender
 

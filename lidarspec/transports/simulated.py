@@ -9,11 +9,11 @@ from collections.abc import Mapping
 
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import FAULTS, faults_of
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial, is_datagram
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import Address
 from lidarspec.transports.base import source_error
 from lidarspec.transports.host_clock import HostClock

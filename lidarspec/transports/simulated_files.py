@@ -16,8 +16,8 @@ from typing import Literal
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.frames.commands import build_command
 from lidarspec.recording.recorders import recorder
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.serving import due_chunks
 

@@ -8,8 +8,8 @@ import socket
 from shlex import quote
 
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Tcp
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import Address
 from lidarspec.transports.base import (
     StreamTransport,

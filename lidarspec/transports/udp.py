@@ -32,8 +32,8 @@ from dataclasses import replace
 from shlex import quote
 
 from lidarspec.errors import SourceError, UsageError
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Udp, is_datagram
-from lidarspec.spec.sensor import Sensor
 from lidarspec.transports.addresses import Address, parse_origin, resolve_host, with_option
 from lidarspec.transports.base import (
     disconnected_error,

@@ -24,7 +24,7 @@ from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.look import fit, look
 from lidarspec.scans.scan import Scan
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.view.svg import svg
 

@@ -16,7 +16,7 @@ from lidarspec.errors import SpecError, UsageError, suggest
 from lidarspec.known_sensors import install_command
 from lidarspec.plugins import load_hooks
 from lidarspec.scans.selection import Selection
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 
 DISTRIBUTION = "lidarspec-web"
 

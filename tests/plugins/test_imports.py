@@ -24,6 +24,7 @@ ALLOWED = {
         "errors",
         "known_sensors",
         "plugins",
+        "sensor_operations",
         "spec",
         "spec.arguments",
         "spec.bits",

@@ -24,7 +24,7 @@ from lidarspec.errors import UsageError
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
-    from lidarspec.spec.sensor import Sensor
+    from lidarspec.sensor_operations import Sensor
     from lidarspec_ros2.node import LidarNode
     from lidarspec_ros2.shared_memory import SharedMemory
 

@@ -23,7 +23,7 @@ from lidarspec.recording.appending import Log
 from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.planes import Planes
 from lidarspec.scans.selection import Selection
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.protocol import Transport
 
 

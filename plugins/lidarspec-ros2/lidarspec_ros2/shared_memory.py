@@ -25,8 +25,8 @@ from pathlib import Path
 
 from lidarspec.errors import LidarSpecError
 from lidarspec.formats.messages import records
+from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.simulator import opening, simulate, simulation
-from lidarspec.spec.sensor import Sensor
 from lidarspec.spec.timing import Every
 
 #: The variable that names the file of profiles, of Fast DDS 3 (Kilted and later) and Fast DDS 2.

@@ -29,7 +29,7 @@ from lidarspec.packets.stream import ImuStream
 from lidarspec.points.mount import Mount
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Sieve
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.bags import RAW
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk

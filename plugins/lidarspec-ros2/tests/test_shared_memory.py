@@ -17,7 +17,7 @@ from sensor_msgs.msg import PointCloud2
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.formats.messages import Messages
-from lidarspec.spec.sensor import Sensor
+from lidarspec.sensor_operations import Sensor
 from lidarspec_ros2 import shared_memory
 from lidarspec_ros2.shared_memory import (
     PROFILE_VARIABLE,

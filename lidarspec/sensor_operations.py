@@ -1,0 +1,255 @@
+"""The class `Sensor`: a sensor's description, with the engines as methods.
+
+The engines (`frames`, `framing`, `packets`, `scans`) are functions of a `SensorDescription`. This
+module stands above them and gives them the names of one class. Each method imports its engine on
+the first call, so listing and configuring sensors does not import any engine.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from lidarspec.display import drawn
+from lidarspec.spec.sensor import SensorDescription
+
+if TYPE_CHECKING:
+    from lidarspec.framing.decoder import Decoder
+    from lidarspec.framing.results import Found
+    from lidarspec.packets.imu import Waiting
+    from lidarspec.packets.packets import Packets
+    from lidarspec.scans.scan import Scan
+    from lidarspec.scans.selection import Selection
+
+
+@dataclass(frozen=True, eq=False, repr=False, init=False)
+class Sensor(SensorDescription):
+    """One sensor: the facts of its manual, and the engines as methods.
+
+    Args:
+        id: vendor-model in lower case with hyphens; it never changes.
+        vendor, model: names as the vendor writes them.
+        frames: every message type by name, in both directions. If several types fit at one
+            offset, the first one in this order is taken.
+        points: a function of `Fields` that returns `Polar` or `Cartesian`; None if each data frame
+            has a function of its own.
+        scan: the rule by which a scan ends and the next one begins.
+        links: the links by name. Data comes over "data", commands go over the link that they name.
+        commands: the commands by name.
+        clock: the sensor's clock, if it has one.
+        sequence: the packet counter, if it has one.
+        fillers: bytes that the sensor sends between frames; they are counted separately.
+        state: default values for ``f.state``, by frame and field path, in the unit of the field.
+        simulation: additional facts for a simulated sensor.
+        configure: a function of the sensor and its options, by name, that returns another sensor.
+            The annotations of its parameters say which values an option takes.
+        recognise: needed if data frames do not contain their own layout: a function of datagrams
+            that returns the options of `configure` which decode them, {} if the datagrams are not
+            from such a sensor.
+        on_open, on_close: names of the commands that are sent on opening and on closing.
+        range_limits: the shortest and the longest range that it can measure, metres.
+        vendor_axes: the directions of the vendor's x, y and z axes, for ``frame="vendor"``: three
+            of forward, back, left, right, up and down.
+        beams: points of a scan, if their number is constant.
+        turn: the slowest and the fastest number of scans a second.
+        relatives: ids of related models, installed or not, with the difference: a text if the pace
+            of the clock or the model in `info` shows it, a `Relative` if single packets show it.
+        info: fields with information about the device: "serial", "firmware", "model" or
+            "temperature" -> "frame.path".
+        status: how it was verified: "manual", "vectors", "capture" or "hardware".
+        source: the manual with its revision and sections, and the captures.
+        aliases: other ids of the sensor. An installed plugin declares them as entry points, which
+            are added here; give them if there are no entry points, such as in a script.
+        api: the version of this interface that it was written for.
+        acknowledged: findings of `lidarspec check` about the sensor as a whole that are accepted:
+            "LS401" -> the reason.
+        options: the options that it was configured with; not set by plugins.
+        hooked: applies the hooks of installed plugins to a sensor; not set by plugins.
+
+    Raises:
+        SpecError: for an invalid id or status, or if a part refers to one that does not exist.
+    """
+
+    _repr_html_ = drawn("sensor")
+
+    def parse(
+        self, data: bytes, frame: str | None = None, *, verify: bool = True, units: bool = False
+    ) -> Any:
+        """Return exactly one frame as a construct Container of raw wire integers.
+
+        Args:
+            frame: its type; identified if left out.
+            verify: False accepts wrong constants, a wrong checksum and trailing bytes.
+            units: return physical values, as ``build(units=True)`` takes them: scaled fields in
+                their units, other fields as they are.
+
+        Raises:
+            WireError: if the bytes are not such a frame; it has the sensor, the offset, the field
+                path and the expected and actual value.
+        """
+        from lidarspec.frames.parse import parse
+
+        return parse(self, data, frame=frame, verify=verify, units=units)
+
+    def build(
+        self, frame: str, value: Any = None, /, *, units: bool = False, **values: Any
+    ) -> bytes:
+        """Return the bytes of one frame; constants, counts and checksum are filled in.
+
+        Args:
+            value: a mapping of all fields, such as what `parse` returned; `values` override it.
+            units: take physical values, and round them to the steps of the wire.
+
+        Raises:
+            UsageError: for a missing or unknown field, or a value that its field cannot hold.
+        """
+        from lidarspec.frames.build import build
+
+        return build(self, frame, value, values, units=units)
+
+    def example(self, frame: str, *, seed: int = 0) -> bytes:
+        """Return the bytes of a valid frame with seeded random content.
+
+        Raises:
+            UnknownFrame: for a frame type that the sensor does not have.
+        """
+        from lidarspec.framing.examples import example
+
+        return example(self, frame, seed=seed)
+
+    def command(self, name: str, /, **arguments: Any) -> bytes:
+        """Return the bytes of a command.
+
+        Args:
+            arguments: by name, in the unit of the field.
+
+        Raises:
+            UnknownCommand: for a command that the sensor does not have.
+            OutOfRange: for an argument outside its range.
+        """
+        from lidarspec.frames.commands import build_command
+
+        return build_command(self, name, arguments)
+
+    def decoder(self, *, stream: bool | None = None, backend: str = "auto") -> Decoder:
+        """Return a new incremental decoder without I/O, independent of all others.
+
+        Args:
+            stream: True reads a byte stream, False one datagram with each `feed`; by default the
+                data link decides.
+            backend: "auto", "numpy" or "jit"; the results are the same.
+
+        Raises:
+            UsageError: for an unknown back end, or a sensor that has no frames before it is
+                configured.
+        """
+        from lidarspec.framing.decoder import Decoder, backend as checked_backend
+
+        chosen = checked_backend(backend)
+        sums = None
+        if chosen == "jit":
+            from lidarspec.points.numba_kernels import compiled_sums
+
+            sums = compiled_sums()
+        if stream is None:
+            stream = not self.datagrams
+        return Decoder(self, stream=stream, backend=chosen, sums=sums)
+
+    def split(self, data: Any, *, backend: str = "auto") -> list[Found]:
+        """Return every incoming frame of all types, in stream order.
+
+        Invalid bytes do not raise.
+
+        Args:
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
+                datagrams.
+            backend: "auto", "numpy" or "jit"; the results are the same.
+
+        Raises:
+            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
+                before it is configured.
+        """
+        from lidarspec.framing.decoder import frames_of, is_stream
+
+        decoder = self.decoder(stream=is_stream(data), backend=backend)
+        return [found for frames in frames_of(decoder, data) for found in frames.found()]
+
+    def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
+        """Return the data frames, or those of another type, as columns.
+
+        Invalid bytes do not raise.
+
+        Args:
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
+                datagrams.
+            frame: the name of a frame type; by default the data frame, of several the type that
+                arrives first.
+            backend: "auto", "numpy" or "jit"; the results are the same.
+
+        Raises:
+            UnknownFrame: for a frame type that the sensor does not have.
+            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
+                before it is configured.
+        """
+        packets, _ = self._decode(data, frame, backend)
+        return packets
+
+    def _decode(self, data: Any, frame: str | None, backend: str) -> tuple[Packets, Waiting | None]:
+        """Return the packets of a frame type, and the IMU samples if no type is named."""
+        from lidarspec.framing.decoder import frames_of, is_stream
+        from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
+
+        decoder = self.decoder(stream=is_stream(data), backend=backend)
+        frames = frames_of(decoder, data)
+        name = frame or data_frame(self, frames) or self.data_frame
+        stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
+        packets = stream.add(frames, whole=True)
+        if frame is not None:
+            return packets, None
+        imu = ImuStream(self, decoder.stats, backend=decoder.backend)
+        imu.add(frames, packets, whole=True)
+        return packets, imu.waiting
+
+    def scans(
+        self, data: Any, *, backend: str = "auto", select: Selection | None = None
+    ) -> Iterator[Scan]:
+        """Return an iterator over the scans; the first and last have ``complete=False``.
+
+        Issues a Python warning if the data has no data frame, or if `points` raises for some of
+        the packets.
+
+        Args:
+            data: bytes (a stream), an iterable of datagrams, or an (n, size) uint8 array of
+                datagrams.
+            backend: "auto", "numpy" or "jit"; the results are the same.
+            select: the scans to return, and the part of each.
+
+        Raises:
+            UsageError: for a text or a path, an unknown back end, a sensor that has no frames
+                before it is configured, or if no scan is selected.
+        """
+        from lidarspec.scans.selection import Sieve
+        from lidarspec.scans.stream import scans_of
+
+        packets, imu = self._decode(data, None, backend)
+        if packets.stats.bytes_in and not len(packets):
+            warnings.warn(
+                f"{self.id}: no {packets.frame} frame in the data ({packets.stats}): is it of"
+                " another sensor?",
+                stacklevel=2,
+            )
+        scans = scans_of(self, [packets], imu)
+        if select is None:
+            return self._warn_after(scans, packets)
+        return self._warn_after(Sieve(select, "the data").of(scans), packets)
+
+    def _warn_after(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
+        """Yield the scans, then warn about errors of the plugin and scans without an end."""
+        yield from scans
+        if packets.stats.unended:
+            warnings.warn(f"{self.id}: {packets.stats.unended}", stacklevel=2)
+        failure = packets.stats.failure(self.id)
+        if failure is not None:
+            warnings.warn(str(failure), stacklevel=2)
