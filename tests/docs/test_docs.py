@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import ast
-import doctest
 import importlib
 import inspect
 import operator
 import os
 import re
+from collections import Counter, defaultdict
 from pathlib import Path
 
 import pytest
@@ -38,10 +38,12 @@ def headings(page: str) -> set[str]:
     )
 
 
+#: as a page under docs/.
+README = "../README.md"
 #: pages with something to run.
 FOLLOWED = [
     page
-    for page in PAGES
+    for page in [README, *PAGES]
     if any(block.language in ("sh", "python") for block in pages.blocks(page))
 ]
 
@@ -102,10 +104,29 @@ def test_the_plugin_of_the_tutorial_decodes_the_manuals_frame(tmp_path: Path) ->
     assert cloud.y[0] == pytest.approx(0.224 * 0.58384, abs=1e-4)  # 35.73 deg to the left
 
 
-def test_the_readme_says_what_is_printed() -> None:
-    done = doctest.testfile(str(DOCS.parent / "README.md"), module_relative=False)
-    assert done.attempted
-    assert not done.failed
+def test_the_python_of_the_readme_prints_what_it_says(tmp_path: Path) -> None:
+    code, output = pages.blocks(README)[:2]
+    pages.assert_printed(output, pages.python(code, tmp_path, {}))
+
+
+def test_the_readme_counts_the_models_of_each_vendor_by_status() -> None:
+    text = (DOCS / README).read_text(encoding="utf-8")
+    statuses = defaultdict(Counter)
+    for sensor in map(ls.sensor, ls.sensors()):
+        statuses[sensor.vendor][sensor.status] += 1
+    expected = {
+        vendor: (
+            str(counts.total()),
+            f"{counts['capture']} / {counts['vectors']} / {counts['manual']}",
+        )
+        for vendor, counts in statuses.items()
+    }
+    cells = re.findall(r"\| (\w[^|]*) \| (\d+) \| (\d+ / \d+ / \d+)(?= \|)", text)
+    assert {vendor: (models, verified) for vendor, models, verified in cells} == expected
+    totals = sum(statuses.values(), Counter())
+    total = f"{totals['capture']} / {totals['vectors']} / {totals['manual']}"
+    assert f"In total {totals.total()} models: {total}." in text
+    assert f"{totals.total()} lidars are described" in " ".join(text.split())
 
 
 HOOKS = {
