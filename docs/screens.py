@@ -137,7 +137,7 @@ def main() -> None:
         "sim:velodyne-vlp16", "velodyne-vlp16", columns=110, lines=36, seconds=2.2, called=":2368"
     )
     (HERE / "view-3d.svg").write_text(svg(tall), encoding="utf-8")
-    for name in ("view.md", "find.md"):
+    for name in ("find.md", "troubleshoot.md", "explain.md", "stats.md"):
         page = HERE.parent / name
         page.write_text(printed(page.read_text(encoding="utf-8")), encoding="utf-8")
 
