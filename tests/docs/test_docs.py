@@ -194,7 +194,8 @@ def test_every_verb_has_its_heading() -> None:
 def test_links_between_pages_lead_somewhere(page: str) -> None:
     path = DOCS / page
     for target in re.findall(r"\]\(([^)#:]+\.md)", path.read_text(encoding="utf-8")):
-        assert (path.parent / target).is_file(), target
+        # `make docs` checks the links to generated pages
+        assert GENERATED in target or (path.parent / target).is_file(), target
 
 
 def test_every_page_is_in_the_contents_of_the_site() -> None:
