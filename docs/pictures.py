@@ -25,7 +25,7 @@ from pathlib import Path
 from screens import svg as drawn
 
 import lidarspec as ls
-from lidarspec.exports import narrowed
+from lidarspec.exports import select_frame
 from lidarspec.exports.diagram import svg as diagram
 from lidarspec.points.look import fit, look
 from lidarspec.simulation.simulator import simulate
@@ -78,7 +78,7 @@ def cloud() -> str:
 
 def packet() -> str:
     """The packet diagram of a sensor."""
-    return diagram(narrowed(ls.sensor("ldrobot-stl27l"), "data"))
+    return diagram(select_frame(ls.sensor("ldrobot-stl27l"), "data"))
 
 
 def page(folder: Path, target: Path) -> None:

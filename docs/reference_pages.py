@@ -12,7 +12,7 @@ import shutil
 from pathlib import Path
 
 import lidarspec as ls
-from lidarspec.exports import export, narrowed
+from lidarspec.exports import export, select_frame
 from lidarspec.exports.reference import page
 
 FOLDER = Path(__file__).parent / "reference" / "sensors"
@@ -25,7 +25,7 @@ def make_sensor_files(sensor: ls.Sensor) -> dict[str, str]:
         diagrams = {data_frames[0]: f"{sensor.id}.svg"}
     else:
         diagrams = {name: f"{sensor.id}-{name}.svg" for name in data_frames}
-    files = {file: export(narrowed(sensor, name), "svg") for name, file in diagrams.items()}
+    files = {file: export(select_frame(sensor, name), "svg") for name, file in diagrams.items()}
     files[f"{sensor.id}.md"] = page(sensor, diagrams)
     return files
 

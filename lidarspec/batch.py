@@ -41,7 +41,7 @@ from typing import Any
 import numpy as np
 
 from lidarspec._version import __version__
-from lidarspec.detect.identification import detected
+from lidarspec.detect.identification import detect
 from lidarspec.device.file_scans import FileScans
 from lidarspec.errors import (
     LidarSpecError,
@@ -140,12 +140,12 @@ class Piece:
         }
         return {"asked": self.sensor, **how, "target": self.target}
 
-    def opened(self) -> FileScans:
+    def open_scans(self) -> FileScans:
         """The file, from where the piece begins."""
         if self.sensor:
-            named = _configured(self.sensor, tuple(self.options.items()))
+            named = _configure_sensor(self.sensor, tuple(self.options.items()))
         else:
-            named = detected(self.source)
+            named = detect(self.source)
         return FileScans(self.source, named, self.bookmark)
 
     def record(self, **more: Any) -> Record:
@@ -159,7 +159,7 @@ class Piece:
             **more,
         }
 
-    def failed(self, error: Exception) -> Record:
+    def describe_failure(self, error: Exception) -> Record:
         """What the manifest says where it was not to be made."""
         return self.record(
             error=(
@@ -169,7 +169,7 @@ class Piece:
             )
         )
 
-    def numbered(self, scans: FileScans) -> Iterator[Scan]:
+    def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
         """What is wanted of its scans, with their numbers in the file."""
         sieve = Sieve(self.select, self.source)
         for number, scan in enumerate(itertools.islice(scans, self.count), self.first):
@@ -182,7 +182,7 @@ class Piece:
 
 
 @functools.lru_cache(maxsize=64)
-def _configured(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
+def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
     """One for all files, since what is compiled for it is kept with it."""
     known = named_sensor(name)
     configured: Sensor = known.configure(**dict(options)) if options else known
@@ -191,7 +191,7 @@ def _configured(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
 
 def survey(piece: Piece) -> list[Piece]:
     """The piece, with the number of its scans, and what follows it, if anything does."""
-    with piece.opened() as scans:
+    with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
         return [replace(piece, count=count, is_last=True)]
@@ -201,13 +201,13 @@ def survey(piece: Piece) -> list[Piece]:
     return [replace(piece, count=count, is_last=False), following]
 
 
-def converted(piece: Piece) -> Record:
+def convert_piece(piece: Piece) -> Record:
     """What the manifest says of a piece, once its points are written, or it has failed."""
     counts: Record = {"first_scan": piece.first, "scans": 0, "points": 0}
     try:
         about = {**stamp(piece.source), "digest": digest(piece.source)}
-        with piece.opened() as scans:
-            counted = _counted(piece, piece.numbered(scans), counts)
+        with piece.open_scans() as scans:
+            counted = _count_scans(piece, piece.iter_numbered(scans), counts)
             first = next(counted, None)
             if first is None and piece.is_last and not piece.first:
                 raise WireError(f"no scan: {scans.stats}")
@@ -220,10 +220,10 @@ def converted(piece: Piece) -> Record:
                 warnings=scans.warnings,
             )
     except Exception as error:  # of whatever kind: the others go on
-        return piece.failed(error)
+        return piece.describe_failure(error)
 
 
-def _counted(piece: Piece, scans: Iterator[Scan], counts: Record) -> Iterator[Scan]:
+def _count_scans(piece: Piece, scans: Iterator[Scan], counts: Record) -> Iterator[Scan]:
     for scan in scans:
         counts["scans"] += 1
         counts["points"] += len(scan) if piece.every_point else int(scan.points.valid.sum())
@@ -389,7 +389,7 @@ class Manifest:
             and (now["modified"] == record["modified"] or digest(source) == record["digest"])
         )
 
-    def finished(self, piece: Piece) -> list[Record]:
+    def find_records(self, piece: Piece) -> list[Record]:
         """What was said of all pieces of a file, none where one is missing."""
         records = list[Record]()
         for number in itertools.count():
@@ -548,7 +548,7 @@ def convert(
             )
             raise suggest(error, "the same with --force, or into another folder")
         if not force:
-            known = {piece.source: manifest.finished(piece) for piece in todo}
+            known = {piece.source: manifest.find_records(piece) for piece in todo}
             yield from ((record, True) for records in known.values() for record in records)
             todo = [piece for piece in todo if not known[piece.source]]
         for piece in todo:
@@ -569,7 +569,7 @@ def _run(
     made again.
     """
     ended = queue.SimpleQueue[tuple[Piece, Future[Any]]]()
-    tasks = deque((survey if _is_large(piece) else converted, piece) for piece in todo)
+    tasks = deque((survey if _is_large(piece) else convert_piece, piece) for piece in todo)
     running = 0
     ahead = 1 if isinstance(executor, _Here) else AHEAD
 
@@ -593,13 +593,13 @@ def _run(
             )
             raise suggest(error, "the same again, which goes on where this ended") from None
         except Exception as failure:  # of a survey, or a worker of Dask that died again and again
-            result = piece.failed(failure)
+            result = piece.describe_failure(failure)
         if isinstance(result, dict):
             yield result, False
             continue
         tasks.extendleft((survey, following) for following in result[1:])
         if (record := done(result[0])) is None:
-            tasks.appendleft((converted, result[0]))
+            tasks.appendleft((convert_piece, result[0]))
         else:
             yield record, True
 
@@ -694,8 +694,8 @@ def _cut(piece: Piece) -> list[Piece]:
 
 def _partition(piece: Piece) -> Any:
     """The points of a piece as a pandas dataframe."""
-    with piece.opened() as scans:
-        made = tables(piece.numbered(scans), every_point=piece.every_point)
+    with piece.open_scans() as scans:
+        made = tables(piece.iter_numbered(scans), every_point=piece.every_point)
         table = import_library("pyarrow", "arrow").concat_tables(made)
         if not table.num_rows and piece.is_last and not piece.first:
             raise WireError(f"no scan in {piece.source}: {scans.stats}")

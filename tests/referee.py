@@ -29,7 +29,7 @@ import numpy as np
 import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.errors import LidarSpecError
-from lidarspec.testing.subject import mutated
+from lidarspec.testing.subject import mutate
 from tests.every_sensor import every_sensor
 
 RECORD = Path(__file__).parents[1] / ".referee" / "record.json.xz"
@@ -113,11 +113,11 @@ def _make_inputs(sensor: Sensor) -> dict[str, list[Any]]:
         for seed in range(EXAMPLES)
     ]
     damaged = [
-        (name, mutated(data, chance))
+        (name, mutate(data, chance))
         for name, data in itertools.islice(itertools.cycle(frames), DAMAGED)
     ]
     stream = _make_stream(sensor)
-    broken = [mutated(data, chance) if chance.random() < 0.1 else data for data in stream]
+    broken = [mutate(data, chance) if chance.random() < 0.1 else data for data in stream]
     return {
         "frames": [(name, _encoded(data)) for name, data in frames],
         "damaged": [(name, _encoded(data)) for name, data in damaged],

@@ -12,9 +12,17 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, output_option
 from lidarspec.cli.terminal import note, say
 from lidarspec.detect.heard import beginning
-from lidarspec.drafting.draft import Link, Names, captured, draft, invented, joining, write
+from lidarspec.drafting.draft import (
+    Link,
+    Names,
+    draft,
+    joining,
+    make_draft_files,
+    make_example_files,
+    write,
+)
 from lidarspec.errors import UsageError, WireError, suggest
-from lidarspec.exports import EXPORTS, Refused, export as exported, narrowed
+from lidarspec.exports import EXPORTS, Refused, export as exported, select_frame
 from lidarspec.libraries import import_library
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.testing.check import Report, reports, target
@@ -82,9 +90,9 @@ def new(
             f"lidarspec new {quote(sensor_id)} --distribution NAME",
         )
     if capture is None:
-        texts = invented(names, "udp" if link == "udp" else "serial")
+        texts = make_example_files(names, "udp" if link == "udp" else "serial")
     else:
-        texts = _drafted(names, link, capture)
+        texts = _draft_files(names, link, capture)
     if folder.exists():
         texts = joining(folder, names, texts)
     write(folder, texts)
@@ -100,7 +108,7 @@ def new(
     )
 
 
-def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
+def _draft_files(names: Names, link: str | None, capture: str) -> dict[str, str]:
     """The files with a draft of the capture's frames: of several senders and ports, those that the
     most bytes come from and go to.
     """
@@ -121,7 +129,7 @@ def _drafted(names: Names, link: str | None, capture: str) -> dict[str, str]:
     chosen: Link = (
         "udp" if (link or ("udp" if opened.datagrams else "serial")) == "udp" else "serial"
     )
-    return captured(
+    return make_draft_files(
         names,
         chosen,
         found,
@@ -174,13 +182,16 @@ def check(
         emit_json([report.to_dict() for report in found], output)
     else:
         emit(
-            "\n\n".join(text for report in found for text in _told(report, verbose=verbose)), output
+            "\n\n".join(
+                text for report in found for text in _format_report(report, verbose=verbose)
+            ),
+            output,
         )
     if any(report.findings for report in found):
         ctx.exit(FINDINGS)
 
 
-def _told(report: Report, *, verbose: bool) -> list[str]:
+def _format_report(report: Report, *, verbose: bool) -> list[str]:
     """A report in paragraphs."""
     paragraphs = [str(finding) for finding in report.findings]
     number = len(report.findings)
@@ -217,7 +228,7 @@ def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> 
     SENSOR is an id or a file ./mysensor.py. What the target cannot say is refused, with the reason.
     """
     sensor = named_sensor(sensor_id)
-    chosen = sensor if frame is None else narrowed(sensor, frame)
+    chosen = sensor if frame is None else select_frame(sensor, frame)
     try:
         text = exported(chosen, kind)
     except Refused as refused:

@@ -20,7 +20,7 @@ from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageError, suggest
 from lidarspec.explaining.assignments import arguments, values
 from lidarspec.explaining.explanation import describe_reply, explain
-from lidarspec.explaining.pieces import explained, pieces
+from lidarspec.explaining.pieces import explain_piece, pieces
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.sensor_operations import Sensor
@@ -124,7 +124,7 @@ def send(
         reply = _sent(device, source, command, assignments, timeout)
         sensor = device.sensor
     if as_json:
-        emit_json(_told(sensor, reply), output)
+        emit_json(_reply_to_dict(sensor, reply), output)
     else:
         said, rows = describe_reply(sensor, reply)
         if rows:
@@ -206,7 +206,7 @@ def _write(
     parts = [
         (piece, part)
         for cut in rest
-        for piece, part in explained(sensor, cut)
+        for piece, part in explain_piece(sensor, cut)
         if not part.is_filler
     ]
     if as_json:
@@ -238,7 +238,7 @@ def _refuse_file(device: Device, source: str) -> None:
         )
 
 
-def _told(sensor: Sensor, reply: Reply) -> dict[str, Any]:
+def _reply_to_dict(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     told: dict[str, Any] = {
         "sensor": sensor.id,
         "command": reply.command,

@@ -22,7 +22,7 @@ from click.shell_completion import (
     shell_complete,
 )
 
-from lidarspec.detect.identification import declared
+from lidarspec.detect.identification import find_declared_sensor
 from lidarspec.device.settings import devices, named
 from lidarspec.errors import LidarSpecError
 from lidarspec.frames.schema import schema
@@ -67,7 +67,7 @@ class Bash(BashComplete):
         return f"{item.type},{item.value.removeprefix(self._broken)}"
 
 
-def completed(group: click.Command, instruction: str) -> int:
+def complete(group: click.Command, instruction: str) -> int:
     """Print what a shell asks for; the exit code."""
     try:
         with warnings.catch_warnings(
@@ -133,7 +133,7 @@ def _sensor(ctx: click.Context) -> Sensor | None:
     known = named(source)
     if known:
         return known.configured()
-    return declared(source)
+    return find_declared_sensor(source)
 
 
 def _frames(ctx: click.Context, incomplete: str) -> Iterable[str]:
@@ -157,13 +157,15 @@ def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
     command = ctx.params.get("command") or ""
     if sensor and frame in sensor.frames:
         fields = schema(sensor.frames[frame].tree).all_fields
-        return [f"{_assigned(path, info)}=" for path, info in fields.items() if info.const is None]
+        return [
+            f"{_format_path(path, info)}=" for path, info in fields.items() if info.const is None
+        ]
     if sensor and command in sensor.commands:
         return [f"{argument}=" for argument in sensor.commands[command].args]
     return ()
 
 
-def _assigned(path: str, info: FieldInfo) -> str:
+def _format_path(path: str, info: FieldInfo) -> str:
     """The path of a field for all elements of its arrays: "points[*].distance"."""
     *outer, last = path.split(".")
     steps = [*(f"{step}[*]" if step in info.axes else step for step in outer), last]

@@ -27,7 +27,7 @@ from lidarspec.cli.inputs import (
 from lidarspec.cli.options import BYTES, count_option, points_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note
-from lidarspec.detect.identification import detected
+from lidarspec.detect.identification import detect
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import recorder_like
 from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
@@ -365,7 +365,7 @@ def _describe_batch(totals: Counter[str], done_before: int, failed_count: int) -
 
 def _detect_sensor(source: str, target: str) -> Sensor:
     try:
-        return detected(source)
+        return detect(source)
     except UsageError as error:
         raise suggest(error, f"lidarspec convert {quote(source)} {quote(target)} -s ID") from None
     except WireError as error:

@@ -19,12 +19,12 @@ from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, voice
-from lidarspec.detect.doctor import computer, examined
+from lidarspec.detect.doctor import computer, examine
 from lidarspec.detect.heard import Heard
 from lidarspec.detect.identification import (
     Verdict,
     best,
-    chosen,
+    format_sensor_options,
     names,
     others_named,
     verdict,
@@ -232,7 +232,7 @@ def _text(match: Match, length: int) -> str:
             f" {chance}"
         ),
         f"  field: {match.place}{order}",
-        f"  over:  {match.span.told(match.place, length)}",
+        f"  over:  {match.span.describe(match.place, length)}",
         *(f"  note:  {remark}" for remark in match.remarks),
     ]
     if "\n" in match.paste:
@@ -292,7 +292,10 @@ def detect(
         unknown = _unknown(found)
     if as_json:
         emit_json(
-            {"sources": [_told(one) for one in found], "structure": _structure_told(unknown)},
+            {
+                "sources": [_verdict_to_dict(one) for one in found],
+                "structure": _structure_told(unknown),
+            },
             output,
         )
     elif fitting:
@@ -411,7 +414,7 @@ def _conclusions(
         if one.heard.failure is not None:
             yield f"{one.heard.failure}"
         elif one.sensor is not None:
-            yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.sensor)}"
+            yield f"next: lidarspec {_verb(one)} {_again(one)} {format_sensor_options(one.sensor)}"
         elif one.alike:
             yield (
                 f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, and nothing in"
@@ -426,7 +429,8 @@ def _conclusions(
                     "which unit it is, and where its beams point, no packet says: -O"
                     f" {files[0]}=FILE does"
                 )
-            yield f"next: lidarspec {_verb(one)} {_again(one)} {chosen(one.alike[0].sensor)}"
+            options = format_sensor_options(one.alike[0].sensor)
+            yield f"next: lidarspec {_verb(one)} {_again(one)} {options}"
         elif one.others:
             yield f"{_place(one.heard)}: {others_named(one)}"
             relative = next(iter(one.others))
@@ -520,7 +524,7 @@ def _again(one: Verdict) -> str:
     return quote(source)
 
 
-def _told(one: Verdict) -> dict[str, Any]:
+def _verdict_to_dict(one: Verdict) -> dict[str, Any]:
     """A verdict for JSON."""
     heard = one.heard
     return {
@@ -615,7 +619,7 @@ def doctor(
     if source is None:
         found = list(computer())
     else:
-        found = list(examined(source, sensor, seconds=duration))
+        found = list(examine(source, sensor, seconds=duration))
     if as_json:
         emit_json([vars(finding) for finding in found], output)
     else:

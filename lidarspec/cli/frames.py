@@ -18,8 +18,8 @@ from lidarspec.cli.terminal import note
 from lidarspec.detect.heard import Heard
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, values
-from lidarspec.explaining.listing import LINED, Line, told
-from lidarspec.explaining.pieces import Piece, explained, pieces
+from lidarspec.explaining.listing import LINED, Line, list_differences
+from lidarspec.explaining.pieces import Piece, explain_piece, pieces
 from lidarspec.explaining.wording import Span, number
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import selection as scans
@@ -262,7 +262,7 @@ class Selection:
 
     def _within(self, piece: Piece) -> Iterator[tuple[Piece, Explanation]]:
         try:
-            for part, what in explained(self._sensor, piece, self._frame):
+            for part, what in explain_piece(self._sensor, piece, self._frame):
                 if self._bad and what.is_filler:
                     continue
                 if self._frame not in (None, what.frame):
@@ -362,7 +362,9 @@ def _compare(
                 (piece for piece in second if piece.frame == first.frame),
                 Piece(0, heard.data, first.frame),
             )
-    (_, before), (_, after) = (next(explained(sensor, piece, frame)) for piece in (first, other))
+    (_, before), (_, after) = (
+        next(explain_piece(sensor, piece, frame)) for piece in (first, other)
+    )
     differing = before.differences(after)
     if as_json:
         emit_json(
@@ -377,7 +379,7 @@ def _compare(
         emit_lines(
             [
                 (Span(f"{sensor.id} {before.frame}", "title"),),
-                *told(differing, (len(before.data), len(after.data))),
+                *list_differences(differing, (len(before.data), len(after.data))),
             ],
             output,
         )

@@ -405,15 +405,16 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
         A description of its content, and the command-line options that read it; None if no sensor
         fits.
     """
-    from lidarspec.detect.identification import chosen, verdict
+    from lidarspec.detect.identification import format_sensor_options, verdict
 
     given = again(source)
     found = verdict(given).scores if given is not None else ()
     own = next((score.sensor.options for score in found if score.sensor.id == sensor.id), None)
     if own:
         told = " and ".join(f"{name}={value}" for name, value in own.items())
-        return f"does not say which data frames it holds: they are found with {told}", chosen(
-            sensor.configure(**own)
+        return (
+            f"does not say which data frames it holds: they are found with {told}",
+            format_sensor_options(sensor.configure(**own)),
         )
     others = [score.sensor for score in found if score.sensor.id != sensor.id]
     if not others:
@@ -423,7 +424,7 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
             "has no data frame of it; its frames are those of"
             f" {', '.join(other.id for other in others)}"
         ),
-        chosen(others[0]),
+        format_sensor_options(others[0]),
     )
 
 

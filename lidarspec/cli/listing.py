@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from lidarspec.cli.output import drawn, emit_parts
 from lidarspec.errors import printable
-from lidarspec.explaining.listing import Line, folded, text as plain_text
+from lidarspec.explaining.listing import Line, fold, text as plain_text
 
 #: the colours of what stands in a line, by its role.
 STYLES = {
@@ -50,6 +50,6 @@ def _colour(line: Line, width: int | None) -> str:
     from rich.text import Text
 
     drawing = Text()
-    for span in line if width is None else folded(line, width):
+    for span in line if width is None else fold(line, width):
         drawing.append(printable(span.text), STYLES.get(span.role))
     return drawn(drawing)

@@ -23,7 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def sensor_option(function: Function) -> Function:
     """``-s/--sensor``, and what it is configured with."""
-    return _named(configuring(function))  # type: ignore[return-value]
+    return _add_sensor_option(configuring(function))  # type: ignore[return-value]
 
 
 def configuring(function: Function) -> Function:
@@ -32,26 +32,28 @@ def configuring(function: Function) -> Function:
     """
 
     @functools.wraps(function)
-    def chosen(
+    def call_with_sensor(
         *args: Any,
         sensor_id: str | None,
         options: Sequence[str],
         calibration: str | None,
         **others: Any,
     ) -> Any:
-        return function(*args, sensor_id=configured(sensor_id, options, calibration), **others)
+        return function(
+            *args, sensor_id=configure_sensor(sensor_id, options, calibration), **others
+        )
 
-    return _optional(chosen)  # type: ignore[return-value]
+    return _optional(call_with_sensor)  # type: ignore[return-value]
 
 
 def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
     """The same options, as they are typed: `sensor_id`, `options` and `calibration`, as
-    `configured` takes them.
+    `configure_sensor` takes them.
     """
-    return _named(_optional(function))
+    return _add_sensor_option(_optional(function))
 
 
-def _named(function: Callable[..., Any]) -> Callable[..., Any]:
+def _add_sensor_option(function: Callable[..., Any]) -> Callable[..., Any]:
     told = "The sensor: an id, an alias, or a file ./mysensor.py."
     return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=told)(function)
 
@@ -68,7 +70,7 @@ def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
     )(unit)
 
 
-def configured(
+def configure_sensor(
     sensor_id: str | None, options: Sequence[str], calibration: str | None
 ) -> str | Sensor | None:
     """The id, or the sensor with these options.
@@ -318,7 +320,7 @@ def selecting(*names: str) -> Callable[[Function], Function]:
 
     def options(function: Function) -> Function:
         @functools.wraps(function)
-        def selected(*args: Any, **others: Any) -> Any:
+        def call_with_selection(*args: Any, **others: Any) -> Any:
             from lidarspec.scans.selection import Selection
 
             given = {name: value for name in names if (value := others.pop(name)) is not None}
@@ -329,7 +331,7 @@ def selecting(*names: str) -> Callable[[Function], Function]:
             return function(*args, selection=Selection(**given), **others)
 
         return functools.reduce(
-            lambda decorated, name: SELECTING[name](decorated), reversed(names), selected
+            lambda decorated, name: SELECTING[name](decorated), reversed(names), call_with_selection
         )  # type: ignore[return-value]
 
     return options

@@ -252,7 +252,7 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | N
     hangs = widths[-1] < min(full, PROSE) or sum(widths) + GAP * (len(widths) - 1) > room
     if hangs:
         widths = _widths([line[:-1] for line in lines], room)
-    return "\n".join(text.rstrip() for line in lines for text in _folded(line, widths, room))
+    return "\n".join(text.rstrip() for line in lines for text in _fold_row(line, widths, room))
 
 
 def _widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
@@ -266,19 +266,19 @@ def _widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
     return widths
 
 
-def _folded(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
+def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
     """The lines of one row; cells for which there is no width below it."""
 
-    def wrapped(cell: str, width: int) -> list[str]:
+    def wrap(cell: str, width: int) -> list[str]:
         if len(cell) > width:
             return textwrap.wrap(cell, width, break_long_words=False, break_on_hyphens=False)
         return [cell]
 
-    cells = [wrapped(cell, width) for cell, width in zip(line, widths, strict=False)]
+    cells = [wrap(cell, width) for cell, width in zip(line, widths, strict=False)]
     for parts in itertools.zip_longest(*cells, fillvalue=""):
         yield (" " * GAP).join(part.ljust(width) for part, width in zip(parts, widths, strict=True))
     for cell in line[len(widths) :]:
-        yield from (" " * HANGING + text for text in wrapped(cell, room - HANGING) if text)
+        yield from (" " * HANGING + text for text in wrap(cell, room - HANGING) if text)
 
 
 def drawn(what: Text) -> str:

@@ -15,7 +15,7 @@ from lidarspec.cli.inputs import nothing_came, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, count_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note, say
-from lidarspec.detect.identification import declared
+from lidarspec.detect.identification import find_declared_sensor
 from lidarspec.device.settings import named
 from lidarspec.device.source_recording import SourceRecording, recorder_like
 from lidarspec.errors import (
@@ -92,7 +92,7 @@ def record(
     if sensor_id:
         sensor = named_sensor(sensor_id)
     elif is_live(source):
-        sensor = declared(source)
+        sensor = find_declared_sensor(source)
     elif known:
         sensor = known.configured()
     task = SourceRecording(
@@ -107,7 +107,7 @@ def record(
     )
     interrupted = False
     try:
-        _recorded(task)
+        _print_recording(task)
     except KeyboardInterrupt:
         if task.recorder is None:
             raise
@@ -145,14 +145,15 @@ def _slice_error(source: str, target: str, times: str) -> UsageError:
     return suggest(UsageError("record copies a whole file; replay cuts a part out of it"), command)
 
 
-def _recorded(task: SourceRecording) -> None:
+def _print_recording(task: SourceRecording) -> None:
     with Progress() as progress, contextlib.closing(task.run()) as remarks:
         progress.follow(
-            remarks, lambda: _taken(task, task.recorder) if task.recorder is not None else ""
+            remarks,
+            lambda: _describe_recording(task, task.recorder) if task.recorder is not None else "",
         )
 
 
-def _taken(task: SourceRecording, kept: Appender) -> str:
+def _describe_recording(task: SourceRecording, kept: Appender) -> str:
     """What has been recorded, in words."""
     packets = f"{task.packets} packets, " if task.packets else ""
     return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
@@ -176,7 +177,7 @@ def _sum_up_recording(
             WireError(f"{source} holds nothing that was received"), "lidarspec record --help"
         )
     stats = device.stats if device is not None else None
-    summary = f"{kept.path}: {_taken(task, kept)}"
+    summary = f"{kept.path}: {_describe_recording(task, kept)}"
     if stats is not None and (damage := _describe_damage(stats)):
         summary += f"; {damage}"
     note(summary)

@@ -114,25 +114,25 @@ VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items
 ELSEWHERE = {"ros2": "lidarspec-ros2"}
 
 
-def _spoken(loudness: int, *names: str, help: str) -> click.Option:
+def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Option:
     """An option that says how much is said."""
 
-    def chosen(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    def set_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> None:
         if value:
             voice.loudness = loudness
 
-    return click.Option(names, is_flag=True, expose_value=False, callback=chosen, help=help)
+    return click.Option(names, is_flag=True, expose_value=False, callback=set_verbosity, help=help)
 
 
 #: the options of all verbs, but for those that have one of the same name.
 SPOKEN = (
-    _spoken(
+    _make_verbosity_option(
         -1,
         "-q",
         "--quiet",
         help="No remarks, and nothing on how far it is; failures are told all the same.",
     ),
-    _spoken(
+    _make_verbosity_option(
         1,
         "-v",
         "--verbose",
@@ -145,7 +145,7 @@ SPOKEN = (
 
 
 @functools.cache
-def added() -> dict[str, EntryPoint]:
+def find_added_verbs() -> dict[str, EntryPoint]:
     """The verbs of installed plugins, none of which is loaded for it; ours come first."""
     return {entry.name: entry for entry in entry_points(PLUGGED) if entry.name not in VERBS}
 
@@ -154,17 +154,17 @@ class Verbs(click.Group):
     """The group of all verbs; a verb's module is imported when the verb is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return [*VERBS, *added()]
+        return [*VERBS, *find_added_verbs()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name in VERBS:
             found: click.Command = getattr(
                 importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}"), cmd_name
             )
-        elif cmd_name in added():
+        elif cmd_name in find_added_verbs():
             from lidarspec.plugins import verb
 
-            found = verb(added()[cmd_name])
+            found = verb(find_added_verbs()[cmd_name])
         else:
             return None
         known = {param.name for param in found.params}
@@ -178,7 +178,7 @@ class Verbs(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] not in VERBS and args[0] not in added() and not ctx.resilient_parsing:
+        if args[0] not in VERBS and args[0] not in find_added_verbs() and not ctx.resilient_parsing:
             if args[0] in ELSEWHERE:
                 error = click.UsageError(
                     f"the verb {args[0]!r} comes with a plugin that is not installed", ctx
@@ -193,16 +193,18 @@ class Verbs(click.Group):
         for group, verbs in GROUPS.items():
             with formatter.section(group):
                 formatter.write_dl([(verb, text) for verb, (_, text) in verbs.items()])
-        if added():
+        if find_added_verbs():
             with formatter.section("plugins"):
-                formatter.write_dl([(verb, _from(entry)) for verb, entry in added().items()])
+                formatter.write_dl(
+                    [(verb, _from(entry)) for verb, entry in find_added_verbs().items()]
+                )
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
         """The verbs, none of which is loaded for it; and the options."""
         from click.shell_completion import CompletionItem
 
         known = {verb: text for verb, (_, text) in VERBS.items()} | {
-            verb: _from(entry) for verb, entry in added().items()
+            verb: _from(entry) for verb, entry in find_added_verbs().items()
         }
         found = [
             CompletionItem(verb, help=text)
@@ -216,9 +218,9 @@ class Verbs(click.Group):
     ) -> NoReturn:
         """Run one verb and exit with its code; no exception leaves this."""
         if instruction := os.environ.get("_LIDARSPEC_COMPLETE"):
-            from lidarspec.cli.completion import completed
+            from lidarspec.cli.completion import complete
 
-            sys.exit(completed(self, instruction))
+            sys.exit(complete(self, instruction))
         words = list(sys.argv[1:] if args is None else args)
         sys.exit(_run(self, words))
 
@@ -244,7 +246,9 @@ def _run(group: click.Group, words: list[str]) -> int:
         silence()
         return 0
     except Exception as error:
-        return report(error, next((word for word in words if word in VERBS or word in added()), ""))
+        return report(
+            error, next((word for word in words if word in VERBS or word in find_added_verbs()), "")
+        )
 
 
 def _spent(seconds: float) -> str:

@@ -204,7 +204,7 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
     except SpecError as error:
         return [f"plain evaluation: {error}"]
     if sweep:
-        frames = made.sealed(made.table([sweep(index) for index in range(PACKETS)]))
+        frames = made.seal(made.table([sweep(index) for index in range(PACKETS)]))
     else:
         frames = [sensor.example(frame)]
     sent = packed([Found(frame, 0, data) for data in frames])
@@ -230,7 +230,7 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     from lidarspec.plugins import tried
 
     found = tried()
-    rows = [[p.distribution, p.version, p.entry_point, _told(p)] for p in found]
+    rows = [[p.distribution, p.version, p.entry_point, _describe_plugin(p)] for p in found]
     if as_json:
         emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in found], output)
     else:
@@ -244,7 +244,7 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
         ctx.exit(FINDINGS)
 
 
-def _told(plugin: Plugin) -> str:
+def _describe_plugin(plugin: Plugin) -> str:
     """The sensors of a plugin, and what is wrong with it."""
     if plugin.error and not plugin.sensors:
         error = f"not loaded: {plugin.error}"
@@ -311,11 +311,11 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
 
 
 def _command_text(sensor: Sensor, name: str) -> str:
-    from lidarspec.explaining.wording import asked
+    from lidarspec.explaining.wording import format_argument_type
 
     command = _command(sensor, name)
     args = "".join(
-        f" {name}={asked(argument.kind)}"
+        f" {name}={format_argument_type(argument.kind)}"
         for name, argument in sensor.commands[name].arguments.items()
     )
     if command["reply"]:

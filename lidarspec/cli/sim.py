@@ -18,7 +18,7 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import DURATION, SHARE, configuring, count_option, sensor_option
 from lidarspec.cli.output import Progress, drawn, emit_json, size
 from lidarspec.cli.terminal import ended_by_terminate, note, say
-from lidarspec.detect.identification import chosen
+from lidarspec.detect.identification import format_sensor_options
 from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.errors import UsageError, suggest
 from lidarspec.known_sensors import no_sensors
@@ -182,7 +182,7 @@ def _tell(
     sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool
 ) -> None:
     """Where the sensor is, with its other links, and what to type next."""
-    following = f"lidarspec view {shlex.quote(source)} {chosen(sensor)}"
+    following = f"lidarspec view {shlex.quote(source)} {format_sensor_options(sensor)}"
     if as_json:
         emit_json(
             {

@@ -51,8 +51,8 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
         if colour is None:
             content = printable(content)
         else:
-            content = "".join(map(_coloured, _COLOURS.split(content)))
-    with _written():
+            content = "".join(map(_escape_part, _COLOURS.split(content)))
+    with _translate_write_errors():
         click.echo(content, nl=nl, color=colour)
 
 
@@ -99,7 +99,7 @@ def streams() -> Iterator[None]:
         warnings.showwarning = tell
         warnings.simplefilter("always", UserWarning)
         yield
-    with _written():
+    with _translate_write_errors():
         sys.stdout.flush()
 
 
@@ -108,14 +108,14 @@ def silence() -> None:
     _lose(sys.stdout)
 
 
-def _coloured(part: str) -> str:
+def _escape_part(part: str) -> str:
     if _COLOURS.fullmatch(part):
         return part
     return printable(part)
 
 
 @contextlib.contextmanager
-def _written() -> Iterator[None]:
+def _translate_write_errors() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:

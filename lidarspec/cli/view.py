@@ -119,7 +119,7 @@ def view(
         return
     if once or not interactive():
         with open_device(source, sensor_id) as device:
-            say(_printed(device, source, ramp, duration or PATIENCE, selection), colour=True)
+            say(_draw_once(device, source, ramp, duration or PATIENCE, selection), colour=True)
             conclude(device)
         return
     if is_live(source):
@@ -127,7 +127,7 @@ def view(
     else:
         switch = None
     with open_device(
-        source, sensor_id, record=switch.attached if switch else None, period=LOOK_S
+        source, sensor_id, record=switch.attach if switch else None, period=LOOK_S
     ) as device:
         if switch is not None:
             switch.sensor_id = device.sensor.id
@@ -251,7 +251,9 @@ def _show(device: Device, window: Window, *, taken: bool) -> None:
         device.close()
 
 
-def _printed(device: Device, source: str, ramp: str, patience: float, selection: Selection) -> str:
+def _draw_once(
+    device: Device, source: str, ramp: str, patience: float, selection: Selection
+) -> str:
     """One picture of the first whole scan, and a line about it.
 
     Raises:

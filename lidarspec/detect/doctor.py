@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from lidarspec.detect.identification import CLEAR, Verdict, said, verdict, verdicts
+from lidarspec.detect.identification import CLEAR, Verdict, read_info, verdict, verdicts
 from lidarspec.detect.listen import LISTEN, bauds, heard_as, started_first, udp_ports
 from lidarspec.errors import LidarSpecError, UsageError, printable, suggestion
 from lidarspec.sensor_operations import Sensor
@@ -41,7 +41,7 @@ class Finding:
     mend: str = ""
 
 
-def examined(
+def examine(
     source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN
 ) -> Iterator[Finding]:
     """What is right and wrong with a source, in the order of looking.
@@ -59,7 +59,7 @@ def examined(
     elif address.scheme == "udp":
         yield from _udp(text, address, sensor, seconds)
     else:
-        yield from _heard(text, sensor, seconds)
+        yield from _examine_bytes(text, sensor, seconds)
 
 
 def computer() -> Iterator[Finding]:
@@ -114,7 +114,7 @@ def _serial(
     problems = [finding for finding in (*_permission(port), *_in_use(port)) if not finding.ok]
     yield from problems or [Finding(True, f"{port} is there, and may be opened")]
     if not problems:
-        yield from _heard(source, sensor, seconds)
+        yield from _examine_bytes(source, sensor, seconds)
 
 
 def _permission(port: str) -> Iterator[Finding]:
@@ -151,7 +151,7 @@ def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -
         return
     before = ports.received()
     began = time.monotonic()
-    found = list(_heard(source, sensor, seconds))
+    found = list(_examine_bytes(source, sensor, seconds))
     yield from found
     if any("nothing came" in finding.text for finding in found):
         rates = {
@@ -230,7 +230,7 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
         yield Finding(False, text, "ip -br address")
 
 
-def _heard(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
     """What comes, and whether it is what should come."""
     try:
         if sensor is not None:
@@ -325,7 +325,9 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
             f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable,"
             " ground or baud rate",
         )
-    device = "".join(f", {role} {text}" for role, text in said(score.sensor, score.found).items())
+    device = "".join(
+        f", {role} {text}" for role, text in read_info(score.sensor, score.found).items()
+    )
     return Finding(
         True,
         f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in"

@@ -277,7 +277,7 @@ def _models(sensor: Sensor, found: Sequence[Found]) -> list[str]:
     return [name for name in names if name]
 
 
-def said(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
+def read_info(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
     """Return the values of the sensor's `info` fields in the last frame of each type.
 
     Returns:
@@ -443,7 +443,7 @@ def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     )
     return (
         f"{text}: {where}, over {covered} of the {length - match.place.size} other bytes"
-        f" ({match.span.told(match.place, length)})"
+        f" ({match.span.describe(match.place, length)})"
     )
 
 
@@ -578,7 +578,7 @@ def best(tried: Sequence[Verdict]) -> Verdict:
     return max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
 
 
-def detected(source: str | Path) -> Sensor:
+def detect(source: str | Path) -> Sensor:
     """Return the installed sensor that sends to a source.
 
     A source that declares its sensor, such as a recording, is not searched for frames.
@@ -589,7 +589,7 @@ def detected(source: str | Path) -> Sensor:
         UsageError: if several sensors fit equally well.
         SourceError: if the source cannot be opened.
     """
-    declared_sensor = declared(source)
+    declared_sensor = find_declared_sensor(source)
     if declared_sensor is not None:
         return declared_sensor
     found = verdicts(resolved(source))
@@ -607,7 +607,7 @@ def detected(source: str | Path) -> Sensor:
             f"{source}: several sensors send, {listed}; choose one with ?src=ADDRESS and -s"
         )
     if fitting[0].sensor is None:
-        example = chosen(fitting[0].alike[0].sensor)
+        example = format_sensor_options(fitting[0].alike[0].sensor)
         raise UsageError(
             f"{source}: {', '.join(names(fitting[0]))} send the same frames; name one, as with"
             f" {example}"
@@ -615,7 +615,7 @@ def detected(source: str | Path) -> Sensor:
     return fitting[0].sensor
 
 
-def chosen(sensor: Sensor) -> str:
+def format_sensor_options(sensor: Sensor) -> str:
     """Return the command-line options that select a sensor and its configuration."""
     return " ".join(
         [
@@ -641,7 +641,7 @@ def others_named(found: Verdict) -> str:
     )
 
 
-def declared(source: str | Path) -> Sensor | None:
+def find_declared_sensor(source: str | Path) -> Sensor | None:
     """Return the sensor that a source declares; None if it declares none.
 
     Sources that declare a sensor are devices of `lidarspec.toml`, recordings and simulated sensors.

@@ -91,7 +91,7 @@ def hear(
     if address is not None and address.scheme == "serial" and "baud" not in address.options:
         if has_no_baud(address.place):
             tell(text)
-            yield from _heard(with_option(text, "baud", ANY_BAUD), seconds, None, text)
+            yield from _hear(with_option(text, "baud", ANY_BAUD), seconds, None, text)
             return
         rates = bauds()
         if not rates:
@@ -106,7 +106,7 @@ def hear(
             if is_silent and baud in other_rates:
                 return
             tell(f"{text} at {baud} baud")
-            for heard in _heard(with_option(text, "baud", baud), seconds, baud, text):
+            for heard in _hear(with_option(text, "baud", baud), seconds, baud, text):
                 is_silent = is_silent and not heard.size
                 yield heard
     elif (
@@ -119,12 +119,12 @@ def hear(
         if not ports:
             example = with_option(text, "port", EXAMPLE_PORT)
             raise SourceError(f"{text}: no installed sensor declares a port; name one: {example}")
-        yield from _heard(with_option(text, "port", ports), seconds, None, text)
+        yield from _hear(with_option(text, "port", ports), seconds, None, text)
     else:
         baud = None
         if address is not None and "baud" in address.options:
             baud = int(address.options["baud"])
-        yield from _heard(text, seconds, baud, text)
+        yield from _hear(text, seconds, baud, text)
 
 
 def has_no_baud(port: str) -> bool:
@@ -132,12 +132,12 @@ def has_no_baud(port: str) -> bool:
     return os.path.realpath(port).startswith("/dev/pts/")
 
 
-def _heard(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
+def _hear(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
     with contextlib.closing(transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
         warnings: tuple[str, ...] = ()
         if isinstance(opened, LiveTransport):
-            chunks = _listened(opened, seconds)
+            chunks = _read_chunks(opened, seconds)
             if not chunks:
                 warnings = _strangers(opened)
         else:
@@ -190,7 +190,7 @@ def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
     return []
 
 
-def _listened(opened: LiveTransport, seconds: float) -> list[Chunk]:
+def _read_chunks(opened: LiveTransport, seconds: float) -> list[Chunk]:
     """Read chunks for some seconds, or until `PLENTY` bytes have arrived."""
     chunks: list[Chunk] = []
     end = time.monotonic() + seconds
@@ -258,7 +258,7 @@ class _Probe:
             self._turns(lambda: all(pending.done for pending in started), ANSWERED)
             self._turns(
                 lambda: sum(map(len, self._heard)) >= PLENTY,
-                ANSWERED if any(map(_answered, started)) else UNANSWERED,
+                ANSWERED if any(map(_is_answered, started)) else UNANSWERED,
             )
             found = list(self._heard)
             stopped = self._request(self._sensor.on_close)
@@ -289,7 +289,7 @@ class _Probe:
             self._session.receive(found, time.monotonic_ns())
 
 
-def _answered(pending: Pending) -> bool:
+def _is_answered(pending: Pending) -> bool:
     try:
         return pending.done and pending.result().confirmed
     except LidarSpecError:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.captures.bulk import Batch
-from lidarspec.detect.identification import said
+from lidarspec.detect.identification import read_info
 from lidarspec.device.first_frames import FirstFrames, find_first_frames, is_searched
 from lidarspec.device.senders import Senders, frame_senders
 from lidarspec.device.session import Reply
@@ -88,7 +88,7 @@ class Input(Protocol):
         known = self.told.get(item.frame)
         if known is None or not schema(self.sensor.frames[item.frame].tree).parts:
             return False
-        return not said(self.sensor, [known]).keys() <= said(self.sensor, [item]).keys()
+        return not read_info(self.sensor, [known]).keys() <= read_info(self.sensor, [item]).keys()
 
     @property
     def state(self) -> str:

@@ -15,7 +15,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, NoReturn, overload
 
-from lidarspec.detect.identification import contradiction, detected, said, simulated_sensor
+from lidarspec.detect.identification import contradiction, detect, read_info, simulated_sensor
 from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.packet_reader import PacketReader
@@ -146,7 +146,7 @@ class Device(Closing):
 
         Keys are those of "serial", "firmware", "model" and "temperature" that its frames contain.
         """
-        return said(self.sensor, self._input.told.values())
+        return read_info(self.sensor, self._input.told.values())
 
     @property
     def state(self) -> str:
@@ -588,7 +588,7 @@ def open(
     """
     settings = named(source)
     if sensor is None:
-        sensor = detected(source)
+        sensor = detect(source)
     return Device(
         source,
         named_sensor(sensor),

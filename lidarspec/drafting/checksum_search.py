@@ -93,7 +93,7 @@ class Changed(Checksum):
         object.__setattr__(self, "width", self.of.width)
 
     def __call__(self, data: Bytes) -> int:
-        return int(self._changed(np.array([self.of(data)], np.uint64))[0])
+        return int(self._add_constant(np.array([self.of(data)], np.uint64))[0])
 
     def describe(self) -> str:
         digits = self.width // 4
@@ -105,13 +105,13 @@ class Changed(Checksum):
         )
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return self._changed(batch(self.of, rows))
+        return self._add_constant(batch(self.of, rows))
 
     @property
     def _mask(self) -> int:
         return (1 << self.width) - 1
 
-    def _changed(self, values: Values) -> Values:
+    def _add_constant(self, values: Values) -> Values:
         constant = np.uint64(self.constant)
         if isinstance(self.of, Xor | WordXor):
             return values ^ constant
@@ -143,7 +143,7 @@ def search(
     return best_first(found)[:TOLD]
 
 
-def pasted(algorithm: Checksum) -> str:
+def format_algorithm(algorithm: Checksum) -> str:
     """The algorithm as a plugin writes it; a class where the package has none."""
     if isinstance(algorithm, Changed | WordSum):
         return _class(algorithm)
@@ -189,7 +189,7 @@ def _fitting(
     """An algorithm and its complements where they fit; a constant is fitted where there are frames
     to prove it.
     """
-    computed = few.computed(algorithm, place, span)
+    computed = few.compute_checksums(algorithm, place, span)
     mask = np.uint64((1 << 8 * place.size) - 1)
     orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
     for order in orders:
@@ -201,14 +201,14 @@ def _fitting(
             else:
                 found = []
         elif isinstance(algorithm, Xor | WordXor):
-            found = [_changed(algorithm, constant) for constant in _constant(there ^ computed)]
+            found = [_change(algorithm, constant) for constant in _constant(there ^ computed)]
         elif few.alone:
             if not there.any():
                 return
             found = [algorithm, Changed(algorithm, int(mask), negative=True)]
         else:
             found = [
-                _changed(algorithm, constant) for constant in _constant((there - computed) & mask)
+                _change(algorithm, constant) for constant in _constant((there - computed) & mask)
             ]
             found += [
                 Changed(algorithm, constant, negative=True)
@@ -232,7 +232,7 @@ def _fitting(
                 varied = 0.0
                 if isinstance(algorithm, Xor | WordXor) and span == Span():
                     remarks = (*remarks, ANYWHERE)
-                    varied = samples.varied(place)
+                    varied = samples.measure_variation(place)
                 yield Match(
                     one,
                     place,
@@ -241,7 +241,7 @@ def _fitting(
                     right,
                     len(samples),
                     doubtful,
-                    pasted(one),
+                    format_algorithm(one),
                     remarks,
                     "",
                     bool(fitted),
@@ -249,7 +249,7 @@ def _fitting(
                 )
 
 
-def _changed(algorithm: Checksum, constant: int) -> Checksum:
+def _change(algorithm: Checksum, constant: int) -> Checksum:
     if constant:
         return Changed(algorithm, constant)
     return algorithm
@@ -271,7 +271,7 @@ def _nibbles(samples: Samples) -> Iterator[Match]:
         there = samples.fields(place, "little")
         halves = (there & np.uint64(15)) | (there >> np.uint64(4)) & np.uint64(0xF0)
         for span in (Span("behind"), Span("all"))[: 1 + (front > 0)]:
-            right = int((samples.computed(Xor(), place, span) == halves).sum())
+            right = int((samples.compute_checksums(Xor(), place, span) == halves).sum())
             if enough(right, len(samples)) and doubt(8, halves, 0, 8) > 0:
                 remark = (
                     "its halves are the low nibbles of two bytes, low half first:"
@@ -307,7 +307,7 @@ def _class(algorithm: Checksum) -> str:
     base = changed.of
     steps = []
     if isinstance(base, Xor | WordXor):
-        value = f"{pasted(base)}(data) ^ 0x{changed.constant:X}"
+        value = f"{format_algorithm(base)}(data) ^ 0x{changed.constant:X}"
     elif isinstance(base, WordSum):
         steps = [
             f'words = [int.from_bytes(data[i : i + 2]{_PADDED[base.words]}, "{base.words}")'

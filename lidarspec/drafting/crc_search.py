@@ -269,7 +269,7 @@ def _varies_like_crc(samples: Samples, place: Place) -> bool:
 
 
 def _codewords(samples: Samples, place: Place, span: Span, reading: _Reading) -> Codewords:
-    rows = [row.tobytes() for group in samples.covered(place, span) for row in group]
+    rows = [row.tobytes() for group in samples.cut_span(place, span) for row in group]
     stored = samples.fields(place, reading.order).tolist()
     return [
         (len(row), reading.message(row) ^ reading.register(value))
@@ -315,7 +315,7 @@ def _fitting(
                 right,
                 len(samples),
                 doubtful,
-                pasted(crc),
+                format_crc(crc),
                 remarks,
                 name_of(crc),
                 open_,
@@ -354,7 +354,7 @@ def _iter_catalogue(
     few: Samples, place: Place, span: Span, reading: _Reading
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield the CRCs of the catalogue that are valid for the first frame."""
-    covered = few.covered(place, span)[0][0].tobytes()
+    covered = few.cut_span(place, span)[0][0].tobytes()
     stored = int(few.fields(place, reading.order)[0])
     yield from ((crc, 0, ()) for crc in reading.known() if crc(covered) == stored)
 
@@ -458,7 +458,7 @@ def _solve_registers(
         yield reading.crc(poly, init, xorout), 2, remarks
 
 
-def pasted(crc: Crc) -> str:
+def format_crc(crc: Crc) -> str:
     """Return the Python expression for a CRC in a plugin."""
     digits = crc.width // 4
     parts = [f"width={crc.width}", f"poly=0x{crc.poly:0{digits}X}"]

@@ -1,13 +1,13 @@
 """Create the Python distribution of a new sensor.
 
-`captured` drafts the sensor from a capture of unknown frames. `invented` writes an example sensor
-with all features.
+`make_draft_files` drafts the sensor from a capture of unknown frames. `make_example_files` writes
+an example sensor with all features.
 
 `draft` analyses unknown frames and returns a `Draft`. It searches the beginning of a stream for a
 structure, and then applies this structure to all bytes. Constant bytes at the start are the sync
 bytes. Fields that rise steadily are excluded as checksums: an XOR often fits there by coincidence.
-`drafted` writes a first spec from the `Draft`. Each field has a comment with its evidence, and
-fields without evidence are named ``unknown_N``.
+`make_template_values` writes a first spec from the `Draft`. Each field has a comment with its
+evidence, and fields without evidence are named ``unknown_N``.
 
 The files are made from templates in the package. A template line that ends in ``#if serial`` or
 ``#if udp`` is used only for sensors with that link.
@@ -479,7 +479,7 @@ class Field:
         yield f'{indent}"{self.name}"{gap}/ {self.code},'
 
 
-def drafted(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
+def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, str]:
     """Return the values for the template of a module: imports, struct, functions and arguments.
 
     Args:
@@ -759,7 +759,7 @@ def _check(draft: Draft, seal: Match, start: int) -> Field:
             *why,
             (
                 f"or {other.paste.splitlines()[0]} at byte {other.place.start(size)}"
-                f" over {other.span.told(other.place, size)}"
+                f" over {other.span.describe(other.place, size)}"
             ),
         )
     return Field(start, seal.place.size, "check", _integer(seal.place.size, seal.order), why)
@@ -964,19 +964,19 @@ class Names:
         }
 
 
-def invented(names: Names, link: Link) -> dict[str, str]:
+def make_example_files(names: Names, link: Link) -> dict[str, str]:
     """Return the files of a distribution with an example sensor: path -> text."""
     values = {**names.values(), "speed_remark": ", with code 3; else 0" if link == "serial" else ""}
     return _files(
         names,
         link,
         values,
-        filled("vectors.json", values, link),
+        fill_template("vectors.json", values, link),
         ("README.md", "module.py", "test_module.py"),
     )
 
 
-def captured(
+def make_draft_files(
     names: Names, link: Link, draft: Draft, *, origin: str, port: int | None
 ) -> dict[str, str]:
     """Return the files of a distribution with a sensor drafted from a capture: path -> text.
@@ -992,7 +992,7 @@ def captured(
         udp = "Udp(2368)},  # the port: this capture does not tell it"
     values = {
         **names.values(),
-        **drafted(draft, origin=origin, link=serial if link == "serial" else udp),
+        **make_template_values(draft, origin=origin, link=serial if link == "serial" else udp),
     }
     frames = [
         {
@@ -1026,9 +1026,9 @@ def _files(
         vectors: the text of the file of vectors.
         templates: the names of the templates of README, module and tests.
     """
-    readme, module, tests = (filled(template, values, link) for template in templates)
+    readme, module, tests = (fill_template(template, values, link) for template in templates)
     return {
-        "pyproject.toml": filled("pyproject.toml", values, link),
+        "pyproject.toml": fill_template("pyproject.toml", values, link),
         "README.md": readme,
         "LICENSE": distribution("lidarspec").read_text("licenses/LICENSE") or "",
         f"{names.module}/__init__.py": module,
@@ -1038,7 +1038,7 @@ def _files(
     }
 
 
-def filled(template: str, values: Mapping[str, str], link: Link) -> str:
+def fill_template(template: str, values: Mapping[str, str], link: Link) -> str:
     """Return the text of a template with values inserted."""
     text = (files("lidarspec") / "templates" / f"{template}.in").read_text(encoding="utf-8")
     chosen = _CONDITION.sub(lambda line: f"{line[1]}\n" if line[2] == link else "", text)

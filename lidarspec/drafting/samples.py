@@ -80,7 +80,7 @@ class Span:
         chosen = {"all": [before, behind], "before": [before], "behind": [behind]}[self.part]
         return [(first, last) for first, last in chosen if last > first]
 
-    def told(self, place: Place, length: int) -> str:
+    def describe(self, place: Place, length: int) -> str:
         """The bytes in words."""
         if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(
             b - a for a, b in self.ranges(place, length)
@@ -111,8 +111,7 @@ class Match:
         remarks: what else is to be said.
         name: what a catalogue calls it.
         open: whether other parameters fit these frames as well.
-        varied: how much that byte of its place varies that varies least, as `Samples.varied` has
-            it.
+        varied: the variation of its place, as from `Samples.measure_variation`.
     """
 
     algorithm: Checksum
@@ -211,22 +210,26 @@ class Samples:
             self._fields[place, order] = np.concatenate(columns).view(np.uint64)
         return self._fields[place, order]
 
-    def covered(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
+    def cut_span(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
         """The bytes that a span covers, group by group: (frames, bytes) each."""
         return [
             np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1)
             for group in self.groups
         ]
 
-    def computed(self, algorithm: Checksum, place: Place, span: Span) -> NDArray[np.uint64]:
+    def compute_checksums(
+        self, algorithm: Checksum, place: Place, span: Span
+    ) -> NDArray[np.uint64]:
         """The checksum of each frame, shape (n,)."""
         return np.concatenate(
-            [batch(algorithm, np.ascontiguousarray(rows)) for rows in self.covered(place, span)]
+            [batch(algorithm, np.ascontiguousarray(rows)) for rows in self.cut_span(place, span)]
         )
 
     def right(self, algorithm: Checksum, place: Place, span: Span, order: ByteOrder) -> int:
         """How many frames a checksum is right for."""
-        return int((self.computed(algorithm, place, span) == self.fields(place, order)).sum())
+        return int(
+            (self.compute_checksums(algorithm, place, span) == self.fields(place, order)).sum()
+        )
 
     def places(self, size: int) -> Iterator[Place]:
         """Where a checksum of so many bytes can stand: at the end, in front, and elsewhere; only
@@ -262,7 +265,7 @@ class Samples:
         """Whether there is one frame: too little to look anywhere but at the usual places."""
         return len(self) == 1
 
-    def varied(self, place: Place) -> float:
+    def measure_variation(self, place: Place) -> float:
         """How much that byte of a place varies that varies least: whether its values lie far apart,
         and how many are distinct.
 

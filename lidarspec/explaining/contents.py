@@ -15,7 +15,13 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-from lidarspec.detect.identification import Verdict, chosen, declared, names, verdicts
+from lidarspec.detect.identification import (
+    Verdict,
+    find_declared_sensor,
+    format_sensor_options,
+    names,
+    verdicts,
+)
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, suggest
 from lidarspec.recording.format import Header
@@ -270,7 +276,7 @@ def _last(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
 def _sent(found: Contents) -> list[Content]:
     """What was sent, of each sensor."""
     try:
-        if (known := declared(found.path)) is not None:
+        if (known := find_declared_sensor(found.path)) is not None:
             return [Content(found.path, (known.id,), None, "", _reading(found.path, known))]
     except LidarSpecError as error:
         found.warnings.append(str(error))
@@ -289,7 +295,11 @@ def _content(path: str, one: Verdict) -> Content:
         return Content(source, tuple(names(one)))
     best = one.alike[0]
     return Content(
-        source, tuple(names(one)), best.share, chosen(best.sensor), _reading(source, best.sensor)
+        source,
+        tuple(names(one)),
+        best.share,
+        format_sensor_options(best.sensor),
+        _reading(source, best.sensor),
     )
 
 
@@ -350,11 +360,11 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
             )
         )
     for content in found.contents:
-        lines.extend(_told(content))
+        lines.extend(_describe_content(content))
     return lines
 
 
-def _told(content: Content) -> Iterator[tuple[str, str]]:
+def _describe_content(content: Content) -> Iterator[tuple[str, str]]:
     if not content.sensors:
         yield "sensor", f"none that is installed sends such bytes ({content.source})"
         return

@@ -52,7 +52,7 @@ class Change(NamedTuple):
     offset: int
     value: int
 
-    def mended(self, data: bytes) -> bytes:
+    def repair(self, data: bytes) -> bytes:
         """The bytes as they were sent."""
         before = data[: self.offset]
         after = data[self.offset :]
@@ -190,7 +190,7 @@ def describe_damage(
             f"{'one' if len(found) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'}"
             f" {change.kind} would explain it"
         )
-        yield f"{explains}: {_place(change, before, values(change.mended(data)))}"
+        yield f"{explains}: {_place(change, before, values(change.repair(data)))}"
 
 
 def _place(change: Change, before: Mapping[str, Value], after: Mapping[str, Value]) -> str:

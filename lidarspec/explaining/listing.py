@@ -34,7 +34,7 @@ def text(line: Line) -> str:
     return "".join(span.text for span in line).rstrip()
 
 
-def folded(line: Line, width: int) -> Line:
+def fold(line: Line, width: int) -> Line:
     """A line with line breaks where it is wider than `width`; what goes on stands below the first
     piece of its text.
     """
@@ -100,7 +100,7 @@ class Listing:
             around = parents(row.path)
             for depth, path in enumerate(around):
                 if path not in above[depth : depth + 1]:
-                    yield self._line(row.offset, Span(""), _indented(path, depth), [])
+                    yield self._line(row.offset, Span(""), _indent_path(path, depth), [])
             above = around
             yield from self._row(row, len(around), drawn=self._drawn[index])
 
@@ -112,7 +112,7 @@ class Listing:
         yield self._line(
             row.offset,
             Span(parts[0].hex(" "), role),
-            _indented(row.path, depth),
+            _indent_path(row.path, depth),
             row.spans(drawn=drawn),
         )
         for row_number, part in enumerate(parts[1:], 1):
@@ -149,7 +149,7 @@ class Listing:
     def _names(self, index: int) -> Iterator[str]:
         row = self._rows[index]
         around = parents(row.path)
-        yield from (_indented(path, depth) for depth, path in enumerate([*around, row.path]))
+        yield from (_indent_path(path, depth) for depth, path in enumerate([*around, row.path]))
         if self._drawn[index]:
             yield from (
                 " " * LEVEL * (len(around) + 1) + value.path.removeprefix(f"{row.path}.")
@@ -165,11 +165,11 @@ def _bits(row: Row) -> list[tuple[bytes, bytes]]:
     ]
 
 
-def _indented(path: str, depth: int) -> str:
+def _indent_path(path: str, depth: int) -> str:
     return " " * LEVEL * depth + path.rpartition(".")[2]
 
 
-def told(differences: list[Difference], sizes: tuple[int, int]) -> Iterator[Line]:
+def list_differences(differences: list[Difference], sizes: tuple[int, int]) -> Iterator[Line]:
     """The differences of two frames of so many bytes: each field with both values, and the bits
     that differ below it.
     """
@@ -201,7 +201,7 @@ def _lines(difference: Difference) -> Iterator[Line]:
         moved = f" (in the second frame at {new.start:04x})"
     else:
         moved = ""
-    values = f"{_said(old)} -> {_said(new)}{change}{moved}"
+    values = f"{_format_value(old)} -> {_format_value(new)}{change}{moved}"
     yield (Span(f"{old.start:04x}  ", "offset"), Span(f"{difference.path}  ", "name"), Span(values))
     masks = difference.masks
     for start in range(0, len(masks), COMPARED):
@@ -228,6 +228,6 @@ def _missing(group: list[Difference], which: str) -> Line:
     return (Span(f"{'':6}{names}  ", "name"), Span(f"in the {which} frame alone"))
 
 
-def _said(value: Value) -> str:
+def _format_value(value: Value) -> str:
     text = str(value)
     return text or (hexed(value.raw, 0) if isinstance(value.raw, bytes) else str(number(value.raw)))

@@ -1,6 +1,6 @@
 """Split an input into pieces: valid frames, damaged frames, and the bytes between them.
 
-The decoder finds the valid frames, and `pieces` yields them as soon as it does. `explained`
+The decoder finds the valid frames, and `pieces` yields them as soon as it does. `explain_piece`
 searches the bytes between them for damaged frames. A damaged frame begins at constants that look
 like the start of a frame. It ends after the size of the frame, or one byte before or after that if
 another frame begins there, or at the start of the next frame.
@@ -147,7 +147,7 @@ def _split_input(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) ->
         start = end
 
 
-def explained(
+def explain_piece(
     sensor: Sensor, piece: Piece, frame: str | None = None
 ) -> Iterator[tuple[Piece, Explanation]]:
     """Yield a piece with its explanation.

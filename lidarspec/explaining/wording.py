@@ -64,16 +64,16 @@ class Point(NamedTuple):
         if math.isnan(self.azimuth_deg + self.elevation_deg):
             return "direction not known from this frame alone"
         level = round(self.elevation_deg, 2) == 0
-        direction = f"at {fixed(self.azimuth_deg, 2)} deg" + (
-            "" if level else f", {fixed(self.elevation_deg, 2)} deg up"
+        direction = f"at {format_fixed(self.azimuth_deg, 2)} deg" + (
+            "" if level else f", {format_fixed(self.elevation_deg, 2)} deg up"
         )
         if math.isnan(self.x):
             return f"{direction} -> {'no return' if math.isinf(self.range) else 'not valid'}"
-        if level and fixed(self.z, 3) == "0.000":
+        if level and format_fixed(self.z, 3) == "0.000":
             height = ""
         else:
-            height = f" z {fixed(self.z, 3)}"
-        return f"{direction} -> x {fixed(self.x, 3)} y {fixed(self.y, 3)}{height}"
+            height = f" z {format_fixed(self.z, 3)}"
+        return f"{direction} -> x {format_fixed(self.x, 3)} y {format_fixed(self.y, 3)}{height}"
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Value:
         if plain:
             text = str(self.raw)
         else:
-            text = fixed(self.physical, self.digits)
+            text = format_fixed(self.physical, self.digits)
         if self.unit == "deg/s":
             turns = f" = {self.physical / DEGREES_PER_TURN:.1f} Hz"
         else:
@@ -312,7 +312,7 @@ class Difference:
             or self.before.label
         ):
             return ""
-        step = fixed(self.after.physical - self.before.physical, self.before.digits)
+        step = format_fixed(self.after.physical - self.before.physical, self.before.digits)
         return f"{'' if step.startswith('-') else '+'}{step} {self.before.unit}".strip()
 
     def to_dict(self) -> dict[str, Any]:
@@ -352,7 +352,7 @@ def number(value: Any) -> Any:
     return value
 
 
-def fixed(value: float, digits: int | None) -> str:
+def format_fixed(value: float, digits: int | None) -> str:
     """Format a number with `digits` decimals, without a minus sign if the result is zero.
 
     Without `digits`, it has seven significant digits.
@@ -373,7 +373,7 @@ def limits(low: float, high: float, between: str = "..") -> str:
     )
 
 
-def asked(kind: Taken, between: str = "..") -> str:
+def format_argument_type(kind: Taken, between: str = "..") -> str:
     """Format the type of a command argument: its range if it is a number, else its name."""
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)

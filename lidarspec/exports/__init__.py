@@ -47,7 +47,7 @@ class UnknownExport(UnknownName):
     what = "export"
 
 
-def narrowed(sensor: Sensor, frame: str) -> Sensor:
+def select_frame(sensor: Sensor, frame: str) -> Sensor:
     """The sensor with one frame type alone, and no commands: what exports of a single message are
     made from.
 
@@ -136,20 +136,20 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
     return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
 
 
-def asked(node: tree.Node) -> list[tree.Ref]:
+def find_references(node: tree.Node) -> list[tree.Ref]:
     """The fields that the formulas of a node and of what is in it ask for, and those that lengths
     and conditions are held to.
     """
     found = [
         value
         for below in tree.nodes(node)
-        for value in (*tree.formulas(below), *held(below).values())
+        for value in (*tree.formulas(below), *find_held_formulas(below).values())
     ]
     found += [below.condition for below in tree.nodes(node) if isinstance(below, tree.Check)]
     return [ref for value in found for ref in tree.refs(value)]
 
 
-def held(node: tree.Node) -> dict[str, tree.Formula]:
+def find_held_formulas(node: tree.Node) -> dict[str, tree.Formula]:
     """What the fields that a node is have to say of other parts, by their paths."""
     return {
         info.path: info.rebuilt

@@ -31,7 +31,7 @@ from lidarspec.exports.c_fields import (
     comment,
     identifier,
     parameters,
-    quoted,
+    quote_bytes,
     word,
 )
 from lidarspec.frames.wire_table import Extent
@@ -286,7 +286,7 @@ def _iter_length_checks(layout: CLayout) -> Iterator[str]:
             if any(ref.info.axes for ref in refs(value)):
                 continue
             for ref in refs(value):
-                ends = [other.start + other.size for other in layout.named(ref.path)]
+                ends = [other.start + other.size for other in layout.find_entries(ref.path)]
                 yield from (f"if ({before}(int64_t)n < {end}) return 0;" for end in ends)
             for part in parts(value):
                 if (
@@ -367,7 +367,8 @@ def _iter_value_checks(layout: CLayout) -> Iterator[str]:
         node = entry.node
         if isinstance(node, Blob) and node.const is not None:
             yield _format_check(
-                entry, f"memcmp(p + {entry.start}, {quoted(node.const)}, {len(node.const)}) != 0"
+                entry,
+                f"memcmp(p + {entry.start}, {quote_bytes(node.const)}, {len(node.const)}) != 0",
             )
         elif isinstance(node, Check):
             yield _format_check(entry, f"!{layout.formula(node.condition)}")

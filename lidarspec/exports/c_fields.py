@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from lidarspec.exports import Message, Refused, asked
+from lidarspec.exports import Message, Refused, find_references
 from lidarspec.frames.wire_table import Extent, meaning, unit_text
 from lidarspec.spec import tree
 
@@ -80,7 +80,7 @@ def comment(*texts: str) -> str:
     return ""
 
 
-def quoted(data: bytes) -> str:
+def quote_bytes(data: bytes) -> str:
     """Bytes as a C string, each as a literal of its own, so that no escape runs into the next."""
     return '"' + "".join(f"\\{byte:03o}" for byte in data) + '"'
 
@@ -175,11 +175,11 @@ class Entry:
         return " && ".join(filter(None, (self.where, *inside)))
 
 
-def given(node: tree.Node, depth: int) -> str:
+def format_size_arguments(node: tree.Node, depth: int) -> str:
     """The arguments by which a size is asked for in so many arrays; where it is the same for all
     elements, it is that of the first.
     """
-    is_own = any(ref.info.axes for ref in asked(node))
+    is_own = any(ref.info.axes for ref in find_references(node))
     if is_own:
         return arguments(depth)
     return ", ".join(["p", *["0"] * depth])
@@ -205,7 +205,7 @@ class CLayout:
         self.size = self.extent(top)
         self._visit(top)
 
-    def named(self, path: str) -> list[Entry]:
+    def find_entries(self, path: str) -> list[Entry]:
         """Every entry of the numbers, bytes or bits at a path: one, unless alternatives have it
         each.
         """
@@ -243,7 +243,7 @@ class CLayout:
         """The number of elements of an array in so many others: a number, or C."""
         if isinstance(node.count, int):
             return node.count
-        return f"(int64_t){self.name(node.axis, 'count')}({given(node, depth)})"
+        return f"(int64_t){self.name(node.axis, 'count')}({format_size_arguments(node, depth)})"
 
     def extent(self, entry: Entry) -> Extent:
         """The size of what stands somewhere."""
@@ -258,7 +258,7 @@ class CLayout:
                     (
                         (
                             f"(int64_t){self.name(entry.path, 'size')}"
-                            f"({given(entry.node, entry.depth)})"
+                            f"({format_size_arguments(entry.node, entry.depth)})"
                         ),
                     ),
                 )
@@ -268,9 +268,8 @@ class CLayout:
                 sizes = self.sizes(entry)
                 if len({str(size) for _, size in sizes}) == 1:
                     return sizes[0][1]
-                return Extent(
-                    0, (f"(int64_t){self.extent_name(entry)}({given(entry.node, entry.depth)})",)
-                )
+                arguments = format_size_arguments(entry.node, entry.depth)
+                return Extent(0, (f"(int64_t){self.extent_name(entry)}({arguments})",))
             case tree.Parts():
                 raise Refused(
                     f"{entry.path}: parts of sizes of their own, of which none has a place without"
@@ -339,7 +338,7 @@ class CLayout:
 
     def _element(self, entry: Entry, node: tree.Repeat) -> Extent:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
-        if size.terms and any(node.axis in ref.info.axes for ref in asked(node.element)):
+        if size.terms and any(node.axis in ref.info.axes for ref in find_references(node.element)):
             raise Refused(
                 f"{node.axis}: its elements differ in size, so that none has a place of its own"
                 " without reading those before it"
@@ -415,7 +414,7 @@ def accesses(layout: CLayout, path: str) -> list[Entry]:
     """All ways to read a field: an entry for each."""
     return [
         access
-        for entry in layout.named(path)
+        for entry in layout.find_entries(path)
         for access in entry.fields
         if access.info.path == path
     ]
@@ -528,7 +527,7 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
             kind,
             name,
             depth,
-            [(access.condition, f"({kind}){_grouped(access.expression)}") for access in ways],
+            [(access.condition, f"({kind}){_group(access.expression)}") for access in ways],
         )
     if any(access.conditions for access in ways):
         places = dict.fromkeys(access.where or "1" for access in ways)
@@ -561,7 +560,7 @@ def _function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> 
     return "\n".join([head, "{", *lines, "}"])
 
 
-def _grouped(expression: str) -> str:
+def _group(expression: str) -> str:
     if " " in expression and not expression.startswith(("lidarspec_", "p[")):
         return f"({expression})"
     return expression

@@ -2,11 +2,11 @@
 
 A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in the
 order of the wire (`seq`), calculated `instances` and inner `types`, and is plain data until `yaml`
-writes the document. Formulas name a field by its way from the type that asks (`reached`), since
-Kaitai knows no paths from the top. Bit blocks become bit-sized integers where one of Kaitai's two
-bit orders meets their parts in a row, else bytes and calculated instances; a field with a scale
-gets an instance with the physical value. Checksums, plausibility and what points are made of cannot
-be said in Kaitai: checksums are named in the documentation of their fields.
+writes the document. Formulas name a field by its way from the type that asks
+(`format_reference`), since Kaitai knows no paths from the top. Bit blocks become bit-sized
+integers if one of Kaitai's two bit orders yields their parts in a row, else bytes and calculated
+instances. A field with a scale gets an instance with the physical value. Kaitai cannot express
+checksums, plausibility tests and points: checksums are named in the documentation of their fields.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def identifier(name: str) -> str:
 Scope = tuple[str | None, ...]
 
 
-def reached(scope: Scope, ref: tree.Ref) -> str:
+def format_reference(scope: Scope, ref: tree.Ref) -> str:
     """A field as an integer, by its way from a type.
 
     Raises:
@@ -113,7 +113,7 @@ _OPERATIONS = {
 
 def number(formula: tree.Formula, scope: Scope) -> str:
     """A formula as an integer."""
-    return tree.written(formula, functools.partial(reached, scope), _OPERATIONS)
+    return tree.written(formula, functools.partial(format_reference, scope), _OPERATIONS)
 
 
 def truth(formula: tree.Formula, scope: Scope) -> str:
@@ -151,7 +151,8 @@ def block_type(
     ordered = _in_order(block)
     if ordered is None:
         calculated = {
-            _name(part): {"value": _assembled(part, "raw")} | doc(part.info) for part in block.parts
+            _name(part): {"value": _assemble_part(part, "raw")} | doc(part.info)
+            for part in block.parts
         }
         return [{"id": "raw", "size": block.size}], calculated
     seq: list[Attribute] = []
@@ -186,7 +187,7 @@ def inline(
     if "repeat" in more:
         return None
     return {"id": f"{name}_raw", "size": block.size, **more}, {
-        name: {"value": _assembled(part, f"{name}_raw")} | _condition(more)
+        name: {"value": _assemble_part(part, f"{name}_raw")} | _condition(more)
     }
 
 
@@ -258,7 +259,7 @@ def _starts(bits: BitField, suffix: str) -> set[int]:
     }
 
 
-def _assembled(part: tree.Part, raw: str) -> str:
+def _assemble_part(part: tree.Part, raw: str) -> str:
     """A part as an expression of the block's bytes."""
     terms = []
     for segment in part.bits.segments:
@@ -394,7 +395,7 @@ class _Types:
                 kaitai.seq.append(self._plain(node, scope) | more)
                 self._physical(kaitai, node.info, more)
             case _:
-                self._typed(kaitai, node.name, node, scope, **more)
+                self._add_typed(kaitai, node.name, node, scope, **more)
 
     def _parts(self, kaitai: _Type, node: tree.Parts, scope: Scope, **more: Any) -> None:
         """Add parts; those of one kind, since Kaitai chooses a type before it reads it."""
@@ -420,9 +421,11 @@ class _Types:
             else:
                 condition = f"{number(node.size, scope)} != 0"
             more |= {"repeat": "until", "repeat-until": f"{ends} == 0", "if": condition}
-        self._typed(kaitai, node.name, kind.element, scope, **more)
+        self._add_typed(kaitai, node.name, kind.element, scope, **more)
 
-    def _typed(self, kaitai: _Type, name: str, node: tree.Node, scope: Scope, **more: Any) -> None:
+    def _add_typed(
+        self, kaitai: _Type, name: str, node: tree.Node, scope: Scope, **more: Any
+    ) -> None:
         """Add an attribute whose type is one of its own."""
         name = identifier(name)
         kaitai.types[name] = self._type(node, scope)
@@ -450,7 +453,7 @@ class _Types:
         elif isinstance(element, tree.Block) and (plain := inline(element, more)) is not None:
             kaitai.seq.append(plain[0] | self._doc(element.info))
         else:
-            self._typed(kaitai, node.name, element, scope, **more)
+            self._add_typed(kaitai, node.name, element, scope, **more)
 
     def _switch(
         self,

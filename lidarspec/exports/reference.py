@@ -14,7 +14,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.explaining.wording import asked, describe_losses
+from lidarspec.explaining.wording import describe_losses, format_argument_type
 from lidarspec.frames.wire_table import frame_size, wire_table
 from lidarspec.framing.results import Counters, Found, packed
 from lidarspec.packets.stream import PacketStream
@@ -124,18 +124,18 @@ def _clock(clock: Clock) -> str:
 
 def _commands(sensor: Sensor) -> Iterator[str]:
     rows = [
-        (f"`{name}`", _asked(sensor, name), _answer(command), effect(sensor, name))
+        (f"`{name}`", _find_request(sensor, name), _answer(command), effect(sensor, name))
         for name, command in sensor.commands.items()
     ]
     return _table(["command", "bytes or arguments", "reply", ""], rows)
 
 
-def _asked(sensor: Sensor, name: str) -> str:
+def _find_request(sensor: Sensor, name: str) -> str:
     command = sensor.commands[name]
     said = _levels(command.lines)
     if command.frame and command.args:
         args = " and ".join(
-            f"`{name}` {asked(argument.kind, ' to ')}"
+            f"`{name}` {format_argument_type(argument.kind, ' to ')}"
             for name, argument in command.arguments.items()
         )
         said.insert(0, f"`{command.frame}` with {args}")

@@ -62,7 +62,7 @@ def pyi(sensor: Sensor) -> str:
             message.root, names[message.name], f"A frame of the type {message.name}."
         )
     parts = [
-        _HEAD.format(id=sensor.id, title=_quoted(f"{sensor.vendor} {sensor.model}")),
+        _HEAD.format(id=sensor.id, title=_quote(f"{sensor.vendor} {sensor.model}")),
         *classes.done,
         _sensor(sensor, frames, names),
     ]
@@ -100,7 +100,7 @@ class _Classes:
         self.taken.add(name)
         lines = [line for member in self._members(node) for line in self._attribute(name, *member)]
         self.done.append(
-            "\n".join([f"class {name}:", f'    """{_quoted(says)}"""', "", *(lines or ["    ..."])])
+            "\n".join([f"class {name}:", f'    """{_quote(says)}"""', "", *(lines or ["    ..."])])
         )
         return name
 
@@ -134,7 +134,7 @@ class _Classes:
         )
         return [
             line if not keyword.iskeyword(name) else f"    # {line.strip()}",
-            *([f'    """{_quoted(said)}"""'] if said else []),
+            *([f'    """{_quote(said)}"""'] if said else []),
         ]
 
     def _type(self, owner: str, name: str, node: Node) -> str:
@@ -229,5 +229,5 @@ def _command(name: str, command: Command) -> str:
     )
 
 
-def _quoted(said: str) -> str:
+def _quote(said: str) -> str:
     return said.replace("\\", "\\\\").replace('"', "'")

@@ -18,7 +18,7 @@ from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Message, Refused, asked, held, messages
+from lidarspec.exports import Message, Refused, find_held_formulas, find_references, messages
 from lidarspec.frames.layout_tree import prefix_of
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import (
@@ -76,7 +76,7 @@ def _function(value: tree.Formula, missing: str = "") -> Code:
     """
     return Code(
         "function(v) return"
-        f" {tree.written(value, lambda ref: f'(v[{quoted(ref.path)}]{missing})', _OPERATIONS)} end"
+        f" {tree.written(value, lambda ref: f'(v[{quote_lua(ref.path)}]{missing})', _OPERATIONS)} end"
     )
 
 
@@ -85,7 +85,7 @@ def lua(value: Any, indent: str = "") -> str:
     if isinstance(value, Code):
         return str(value)
     if isinstance(value, str):
-        return quoted(value)
+        return quote_lua(value)
     if isinstance(value, bool | int | float):
         return json.dumps(value, allow_nan=False)
     deeper = indent + "  "
@@ -107,7 +107,7 @@ def _key(key: object) -> str:
     return f"[{lua(key)}]"
 
 
-def quoted(text: str | bytes) -> str:
+def quote_lua(text: str | bytes) -> str:
     """A Lua string; what is not printable ASCII as decimal escapes."""
     data = text.encode() if isinstance(text, str) else text
     return (
@@ -138,8 +138,10 @@ class _Writer:
     def __init__(self, message: Message, prefix: str) -> None:
         self.message = message
         self.prefix = prefix
-        lengths = {path for node in tree.nodes(message.root) for path in held(node)}
-        self.kept = {ref.path for ref in asked(message.root)} | message.seals.keys() | lengths
+        lengths = {path for node in tree.nodes(message.root) for path in find_held_formulas(node)}
+        self.kept = (
+            {ref.path for ref in find_references(message.root)} | message.seals.keys() | lengths
+        )
         self.marked = {path for seal in message.seals.values() for path in seal.over or ()}
         self.types: dict[str, str] = {}
 
@@ -223,7 +225,7 @@ class _Writer:
             "size": formula(node.size),
             "keep": self._keep(path),
         }
-        table["const"] = Code(quoted(node.const)) if node.const is not None else None
+        table["const"] = Code(quote_lua(node.const)) if node.const is not None else None
         return table | {
             "skip": (
                 self._skip(node.info, node.size)
@@ -281,7 +283,11 @@ class _Writer:
             members.append(table | {"mark": path} if path in self.marked and member.name else table)
         sizes = [None if "mark" in member else member.get("skip") for member in members]
         total = None if None in sizes else sum(filter(None, sizes))
-        inside = {path: value for below in tree.nodes(node) for path, value in held(below).items()}
+        inside = {
+            path: value
+            for below in tree.nodes(node)
+            for path, value in find_held_formulas(below).items()
+        }
         lengths = [
             {"path": path, "value": _function(value, " or 0")}
             for path, value in inside.items()
@@ -400,15 +406,15 @@ class _Writer:
         if labels:
             valued = (
                 "{"
-                + ", ".join(f"[{value}] = {quoted(text)}" for value, text in labels.items())
+                + ", ".join(f"[{value}] = {quote_lua(text)}" for value, text in labels.items())
                 + "}"
             )
         else:
             valued = "nil"
         masked = f"0x{mask:x}" if mask is not None else "nil"
         return Code(
-            f"new({quoted(abbreviation)}, {quoted(name)}, ftypes.{kind}, base.{base}, {valued},"
-            f" {masked}, {quoted(docs)})"
+            f"new({quote_lua(abbreviation)}, {quote_lua(name)}, ftypes.{kind}, base.{base}, {valued},"
+            f" {masked}, {quote_lua(docs)})"
         )
 
     def _keep(self, path: str) -> str | None:
@@ -594,8 +600,8 @@ def dissector(sensor: Sensor) -> str:
         title=title,
         version=__version__,
         source=sensor.source,
-        name=quoted(name),
-        title_quoted=quoted(title),
+        name=quote_lua(name),
+        title_quoted=quote_lua(title),
     )
     walker = (
         resources.files("lidarspec.exports").joinpath("wireshark.lua").read_text(encoding="utf-8")

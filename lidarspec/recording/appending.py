@@ -276,7 +276,7 @@ class Appender:
                 return
             is_first = not self._waiting
             if self._untold:
-                self._waiting += self._told(self._untold)
+                self._waiting += self._make_drop_record(self._untold)
                 self._untold = 0
             self._waiting += record
             self._taken += 1
@@ -286,7 +286,7 @@ class Appender:
             if is_first or len(self._waiting) >= FLUSH_BYTES:
                 self._changed.notify_all()
 
-    def _told(self, dropped: int) -> bytes:
+    def _make_drop_record(self, dropped: int) -> bytes:
         """The record that tells that so many were dropped, where the format has one."""
         return b""
 

@@ -197,7 +197,7 @@ class Record:
     quiet: bool = False
 
 
-def packed(
+def pack_record(
     kind: int,
     data: bytes,
     at: int | None = None,
@@ -312,7 +312,7 @@ class Recording(Closing):
             high = self._file.seek(0, os.SEEK_END)
             while high - low > 2 * (LARGEST + _BLOCK):
                 middle = (low + high) // 2
-                found = self._received(middle, high)
+                found = self._find_received(middle, high)
                 if found is None or found[0] >= at:
                     high = middle
                 else:
@@ -320,7 +320,7 @@ class Recording(Closing):
             self._go(low)
         return low > here
 
-    def _received(self, start: int, stop: int) -> tuple[int, int] | None:
+    def _find_received(self, start: int, stop: int) -> tuple[int, int] | None:
         """Time and offset of the first record between two places that was received, and when is
         known.
         """
@@ -329,7 +329,7 @@ class Recording(Closing):
             size = self._good()
             place = self._place
             if size > 0:
-                kind, record = _unpacked(self._window[place : place + size])
+                kind, record = _unpack_record(self._window[place : place + size])
                 if kind == RECEIVED and record.at is not None:
                     return record.at, self.offset
                 self._skip(size)
@@ -379,7 +379,7 @@ class Recording(Closing):
         """Kind and content of every good record."""
         while self._holds(1):
             if (size := self._good()) > 0:
-                kind, record = _unpacked(self._window[self._place : self._place + size])
+                kind, record = _unpack_record(self._window[self._place : self._place + size])
                 self._skip(size)
                 self.records += 1
                 yield kind, record
@@ -446,7 +446,7 @@ class Recording(Closing):
         return left
 
 
-def _unpacked(record: bytes) -> tuple[int, Record]:
+def _unpack_record(record: bytes) -> tuple[int, Record]:
     _, kind, flags, addresses, size, at = _HEAD.unpack_from(record)
     start = _HEAD.size + addresses
     sender, receiver = _endpoints(record[_HEAD.size : start]) or (None, None)

@@ -36,7 +36,7 @@ from lidarspec.recording.format import (
     RECEIVED,
     SENT,
     Header,
-    packed,
+    pack_record,
     size_at,
 )
 from lidarspec.sensor_operations import Sensor
@@ -99,7 +99,7 @@ class Recorder(Appender):
     ) -> None:
         self.header = _header(sensor, str(source), datagrams=datagrams, baud=baud)
         super().__init__(path, _record_size, overwrite=overwrite)
-        self._put(MAGIC + packed(HEADER, self.header.to_json(), self.header.wall_ns))
+        self._put(MAGIC + pack_record(HEADER, self.header.to_json(), self.header.wall_ns))
         try:
             self.sync()
         except BaseException:
@@ -117,7 +117,7 @@ class Recorder(Appender):
                 not start
             )
             self._put(
-                packed(
+                pack_record(
                     kind, data, chunk.at, flags=flags, sender=chunk.sender, receiver=chunk.receiver
                 ),
                 len(data),
@@ -129,7 +129,7 @@ class Recorder(Appender):
         """
         self._put(_event(name, time.time_ns() if at is None else at, details))
 
-    def _told(self, dropped: int) -> bytes:
+    def _make_drop_record(self, dropped: int) -> bytes:
         return _event("dropped", time.time_ns(), {"records": dropped})
 
 
@@ -345,7 +345,7 @@ def _header(
 
 
 def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
-    return packed(EVENT, json.dumps({"event": name, **details}, default=str).encode(), at)
+    return pack_record(EVENT, json.dumps({"event": name, **details}, default=str).encode(), at)
 
 
 def _record_size(data: bytes | bytearray, at: int) -> int:

@@ -38,7 +38,7 @@ class RecordingSwitch:
         self.trouble = ""
         self.written: list[tuple[str, int]] = []
 
-    def attached(self, opened: Transport) -> Log:
+    def attach(self, opened: Transport) -> Log:
         """Itself, as the recorder of an open transport: what `open(record=...)` calls."""
         self._opened = opened
         return self

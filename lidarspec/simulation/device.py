@@ -26,7 +26,7 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.faults import Faults, FaultyLink
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.simulation.scenes import Scene, furnished
+from lidarspec.simulation.scenes import Scene, make_room
 from lidarspec.simulation.simulator import Rest, Simulation, simulation
 from lidarspec.spec.description import Answer, Command, Frame
 from lidarspec.spec.links import is_datagram
@@ -136,7 +136,7 @@ class Answering:
         if declared.imu is not None:
             rest = self._rests.setdefault(name, Rest(self._sensor, name, given[0]))
             rest.fill(table, self._shake, [numbers.start])
-        return self._makers[name].sealed(table)
+        return self._makers[name].seal(table)
 
     def _answer(self, answer: Answer, request: Request) -> Answered:
         if isinstance(answer, bytes):
@@ -144,9 +144,9 @@ class Answering:
         if isinstance(answer, int | float):
             return Answered(pause=float(answer))
         name, values = (answer, {}) if isinstance(answer, str) else answer
-        return Answered(name, self.frame(name, {**self._agreed(name, request), **values}))
+        return Answered(name, self.frame(name, {**self._matching_values(name, request), **values}))
 
-    def _agreed(self, name: str, request: Request) -> dict[str, Any]:
+    def _matching_values(self, name: str, request: Request) -> dict[str, Any]:
         """The physical values that tie a reply to its request."""
         fields = codec(self._sensor.frames[name]).schema.fields
         raw = {
@@ -310,7 +310,7 @@ class SimulatedDevice:
         self.heard = list[str]()
         self.sent = Counter[str]()
         self.lines = {name: self._line(name, seed) for name in sensor.links}
-        self._scene = scene or furnished(seed)
+        self._scene = scene or make_room(seed)
         self._source = random.Random(f"device {seed}")
         self._answering = Answering(sensor, self.faults.shake)
         self._plan: list[_Due] = []
@@ -364,7 +364,7 @@ class SimulatedDevice:
 
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
         """Bytes, or a datagram, that arrive at the device."""
-        self._plugged(now)
+        self._switch_plug(now)
         if self.present:
             for request in self._answering.requests(data, now, link):
                 self._obey(request, self._clock(now))
@@ -379,7 +379,7 @@ class SimulatedDevice:
         """What leaves the device by now, with its type: (link, type, bytes) a datagram; of a byte
         stream all in one, without a type.
         """
-        self._plugged(now)
+        self._switch_plug(now)
         if not self.present:
             return []
         self._time = self._clock(now) + (AHEAD if math.isinf(self.rate) else 0)
@@ -512,7 +512,7 @@ class SimulatedDevice:
         self._planned += 1
         heapq.heappush(self._plan, _Due(at, self._planned, link, frame, data))
 
-    def _plugged(self, now: int) -> None:
+    def _switch_plug(self, now: int) -> None:
         """Pull the plug, or put it in, where it is time."""
         if self._plug is None or now < self._plug:
             return

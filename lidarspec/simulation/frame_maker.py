@@ -109,15 +109,15 @@ class FrameMaker:
 
     def frame(self, values: Values) -> bytes:
         """One frame, sealed."""
-        return self.sealed(self.table([values]))[0]
+        return self.seal(self.table([values]))[0]
 
-    def sealed(self, table: Rows) -> list[bytes]:
+    def seal(self, table: Rows) -> list[bytes]:
         """The frames of a table as they are sent.
 
         Raises:
             SpecError: where its wire form cannot write a value.
         """
-        structs = sealed(table)
+        structs = seal_frames(table)
         if self._coder is None:
             return structs
         frames = list[bytes]()
@@ -194,7 +194,7 @@ class FrameMaker:
         if asked and asked[0] not in values:
             raw: dict[str, Any] = {}
             for path in asked[1:]:
-                nested(raw, path, self._raw(values, path))
+                set_nested(raw, path, self._raw(values, path))
             fill_in(formula, raw, number, self.schema.fields, axis)
             values[asked[0]] = self.schema.fields[asked[0]].physical(member(raw, asked[0]))
 
@@ -265,7 +265,7 @@ class FrameMaker:
         return info.initial
 
 
-def nested(values: dict[str, Any], path: str, value: Any) -> None:
+def set_nested(values: dict[str, Any], path: str, value: Any) -> None:
     """Put a value into nested mappings."""
     *parents, name = path.split(".")
     for parent in parents:
@@ -273,7 +273,7 @@ def nested(values: dict[str, Any], path: str, value: Any) -> None:
     values[name] = value
 
 
-def sealed(table: Rows) -> list[bytes]:
+def seal_frames(table: Rows) -> list[bytes]:
     """The frames of a table in order, with constants and checksums in place."""
     frames = [b""] * len(table)
     for group in table.groups:

@@ -166,7 +166,7 @@ def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time:
     if not len(where):
         return
 
-    def chosen(value: Value) -> Any:
+    def select(value: Value) -> Any:
         if np.ndim(value) == 0:
             return value
         return np.broadcast_to(value, found.shape).reshape(-1)[where]
@@ -174,8 +174,8 @@ def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time:
     enter = np.full(len(where), -np.inf)
     leave = np.full(len(where), np.inf)
     for corner, other, start, beam in zip(low, high, origin, beams, strict=True):
-        first = (chosen(corner) - chosen(start)) / chosen(beam)
-        second = (chosen(other) - chosen(start)) / chosen(beam)
+        first = (select(corner) - select(start)) / select(beam)
+        second = (select(other) - select(start)) / select(beam)
         np.fmax(enter, np.fmin(first, second), out=enter)
         np.fmin(leave, np.fmax(first, second), out=leave)
     hit = (enter > 0) & (enter <= leave)
@@ -192,7 +192,7 @@ def _near(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: V
     return (squared <= 0) | (along >= np.sqrt(np.maximum(squared, 0)))
 
 
-def furnished(seed: int = 0) -> Room:
+def make_room(seed: int = 0) -> Room:
     """Return a room with boxes and a walking person.
 
     Each seed gives another room, the same one every time.

@@ -37,7 +37,7 @@ from lidarspec.packets.clocks import clock_ns
 from lidarspec.points.conventions import coordinates, direction_of
 from lidarspec.points.plain import parts_of
 from lidarspec.sensor_operations import Sensor
-from lidarspec.simulation.frame_maker import FrameMaker, sealed
+from lidarspec.simulation.frame_maker import FrameMaker, seal_frames
 from lidarspec.simulation.scenes import Room, Scene
 from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
@@ -136,7 +136,7 @@ class Measurement:
         intensity = self.beams(table).intensity
         self._given = given
         self._intensity = "" if intensity in given else intensity
-        self._targets = () if self._encode else self._traced(table)
+        self._targets = () if self._encode else self._trace_targets(table)
         self._coupled = self._encode is not None or self._turning(table)
 
     @classmethod
@@ -162,7 +162,7 @@ class Measurement:
         known: dict[str, NDArray[Any]] = {}
         for attempt in range(ROUNDS):
             beams = self.beams(table)
-            ranges = self._measured(beams, scene, times)
+            ranges = self._measure(beams, scene, times)
             if attempt == ROUNDS - 2:
                 blind = ~np.isclose(ranges, before)
             before = ranges
@@ -216,7 +216,7 @@ class Measurement:
             places=places,
         )
 
-    def _measured(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
+    def _measure(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
         """Metres along each beam; 0 where the sensor does not reach, or nobody knows where the beam
         goes.
         """
@@ -265,7 +265,7 @@ class Measurement:
             return most
         return min(most, *(form.largest(leaf.size) for leaf in leaves))
 
-    def _traced(self, table: Rows) -> tuple[Target, ...]:
+    def _trace_targets(self, table: Rows) -> tuple[Target, ...]:
         """The fields in metres that the ranges of the points answer to."""
         found: list[Target] = []
         for path, info in table.schema.fields.items():
@@ -273,7 +273,7 @@ class Measurement:
                 path in group.layout.leaves for group in table.groups
             ):
                 continue
-            answer = self._probed(table, [path], PROBE)[0].range
+            answer = self._probe(table, [path], PROBE)[0].range
             expected = info.physical(PROBE)
             for spot in self._inner(table, answer):
                 part = _part(answer, spot)
@@ -303,7 +303,7 @@ class Measurement:
             if not metres and (info.unit or info.kind != "int" or not info.axes):
                 continue
             answers = [
-                beams.range for beams in self._probed(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
+                beams.range for beams in self._probe(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
             ]
             for spot in self._inner(table, answers[0]):
                 once, twice, thrice = (_part(answer, spot) for answer in answers)
@@ -312,7 +312,7 @@ class Measurement:
                     found.append(Target(path, spot, None))
         return found
 
-    def _probed(self, table: Rows, paths: Iterable[str], *probes: int) -> list[Beams]:
+    def _probe(self, table: Rows, paths: Iterable[str], *probes: int) -> list[Beams]:
         """The beams while some fields have one value and another; the table is left as it was."""
         before = {path: table.raw(path) for path in paths}
         beams = []
@@ -330,7 +330,7 @@ class Measurement:
             return target.step, target.zero
         once, twice = (
             _part(beams.range, target.inner)
-            for beams in self._probed(table, [target.path], PROBE, 2 * PROBE)
+            for beams in self._probe(table, [target.path], PROBE, 2 * PROBE)
         )
         return (twice - once) / PROBE, 2 * once - twice
 
@@ -343,7 +343,7 @@ class Measurement:
 
     def _turning(self, table: Rows) -> bool:
         """Whether directions depend on ranges."""
-        first, second = self._probed(
+        first, second = self._probe(
             table, [target.path for target in self._targets], PROBE, 2 * PROBE
         )
         same = (
@@ -365,7 +365,7 @@ class Placement(Measurement):
         beams = self.beams(table)
         azimuth, elevation = self._directions(numbers, beams.range.shape[1:])
         beams = replace(beams, azimuth=azimuth, elevation=elevation)
-        ranges = self._measured(beams, scene, times)
+        ranges = self._measure(beams, scene, times)
         for path, raw in self._values(table, beams, ranges, []).items():
             store(table, path, raw)
         if self._intensity and not self._encode:
@@ -412,12 +412,12 @@ class Placement(Measurement):
         for inner in dict.fromkeys(target.inner for target in self._targets):
             paths = [target.path for target in self._targets if target.inner == inner]
             infos = [table.schema.fields[path] for path in paths]
-            zero, *ones = (_part(places, inner) for places in self._moved(table, paths))
+            zero, *ones = (_part(places, inner) for places in self._move(table, paths))
             slopes = np.stack([(one - zero) / PROBE for one in ones])
             raw = [
                 whole(info, column)
                 for info, column in zip(
-                    infos, _solved(slopes, _part(aims, inner) - zero), strict=True
+                    infos, _solve(slopes, _part(aims, inner) - zero), strict=True
                 )
             ]
             kept = _part(ranges, inner) > 0
@@ -432,19 +432,19 @@ class Placement(Measurement):
             }
         return found
 
-    def _moved(self, table: Rows, paths: Sequence[str]) -> list[Floats]:
+    def _move(self, table: Rows, paths: Sequence[str]) -> list[Floats]:
         """The coordinates while all of these fields are 0, and with each of them at its probing
         value; (3, n, ...) each.
         """
         before = {path: table.raw(path) for path in paths}
         for path in paths:
             store(table, path, np.array(0))
-        beams = [self.beams(table), *(self._probed(table, [path], PROBE)[0] for path in paths)]
+        beams = [self.beams(table), *(self._probe(table, [path], PROBE)[0] for path in paths)]
         for path, raw in before.items():
             store(table, path, raw)
         return [each.places for each in beams if each.places is not None]
 
-    def _traced(self, table: Rows) -> tuple[Target, ...]:
+    def _trace_targets(self, table: Rows) -> tuple[Target, ...]:
         """The fields of points, in metres or without a unit, that coordinates are linear in."""
         found = []
         for path, info in table.schema.fields.items():
@@ -458,7 +458,7 @@ class Placement(Measurement):
                 continue
             places = [
                 beams.places
-                for beams in self._probed(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
+                for beams in self._probe(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
                 if beams.places is not None
             ]
             for spot in self._inner(table, places[0][0]):
@@ -474,7 +474,7 @@ class Placement(Measurement):
         return False
 
 
-def _solved(slopes: Floats, aims: Floats) -> Floats:
+def _solve(slopes: Floats, aims: Floats) -> Floats:
     """What fields have to be, (k, n, ...), that move values by `slopes`, (k, m, n, ...), for these
     to be at `aims`, (m, n, ...).
     """
@@ -546,7 +546,7 @@ class PartRows(Rows):
 
     def put_back(self) -> None:
         """Write the parts into their frames, sealed."""
-        left = iter(sealed(self))
+        left = iter(seal_frames(self))
         axis, kind = self.place
         spots = list[tuple[int, int, NDArray[np.uint8]]]()
         for group, buffer, walked in self.frames.walks(axis):
@@ -629,14 +629,14 @@ class Rest:
         before = {path: table.raw(path) for path in self._targets}
         for path in self._targets:
             store(table, path, np.array(0))
-        zero = self._felt(table)
-        slopes = np.stack([self._probed(table, path) - zero for path in self._targets]) / PROBE
+        zero = self._read_motion(table)
+        slopes = np.stack([self._probe(table, path) - zero for path in self._targets]) / PROBE
         if shake:
             aims = np.random.default_rng(seed).normal(0.0, shake, zero.shape)
         else:
             aims = np.zeros(zero.shape)
         aims[5] += GRAVITY
-        for path, raw in zip(self._targets, _solved(slopes, aims - zero), strict=True):
+        for path, raw in zip(self._targets, _solve(slopes, aims - zero), strict=True):
             info = table.schema.fields[path]
             store(
                 table,
@@ -652,7 +652,7 @@ class Rest:
 
     def _answering(self, table: Rows) -> list[str]:
         """The fields that what is felt is linear in."""
-        zero = self._felt(table)
+        zero = self._read_motion(table)
         found = list[str]()
         for path, info in table.schema.fields.items():
             if info.kind not in ("int", "float") or info.const is not None or path in self._given:
@@ -661,7 +661,7 @@ class Rest:
             answers = []
             for probe in (0, PROBE, 2 * PROBE):
                 store(table, path, np.array(probe))
-                answers.append(self._felt(table))
+                answers.append(self._read_motion(table))
             store(table, path, before)
             none, once, twice = answers
             if (once != none).any() and np.allclose(twice - once, once - none):
@@ -674,14 +674,14 @@ class Rest:
             )
         return found
 
-    def _probed(self, table: Rows, path: str) -> Floats:
+    def _probe(self, table: Rows, path: str) -> Floats:
         """What is felt while one of the fields has its probing value, and the others are 0."""
         store(table, path, np.array(PROBE))
-        felt = self._felt(table)
+        felt = self._read_motion(table)
         store(table, path, np.array(0))
         return felt
 
-    def _felt(self, table: Rows) -> Floats:
+    def _read_motion(self, table: Rows) -> Floats:
         """Angular velocities, then accelerations: (6, n, ...)."""
         batch = _batch(self._sensor, table)
         function = self._sensor.imu_of(_name(self._frame, table))
@@ -849,7 +849,7 @@ class Simulation:
             self._measurement.fill(table, numbers, scene, seconds)
         if self._rest is not None:
             self._rest.fill(table, shake, [start])
-        return Block(self._maker.sealed(table)[:count], times[: count + 1])
+        return Block(self._maker.seal(table)[:count], times[: count + 1])
 
     def _with_points(self, table: Rows) -> Rows:
         """What points are made of: frames, or the parts in them."""

@@ -26,7 +26,7 @@ from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import SourceError, SpecError, UnknownSensor
 from lidarspec.plugins import Registry, file_and_id, file_module, registry
 from lidarspec.sensor_operations import Sensor
-from lidarspec.testing.declared import declared
+from lidarspec.testing.declared import check_declaration
 from lidarspec.testing.findings import Finding, left_over
 from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.subject import EXAMPLES, Subject
@@ -103,7 +103,7 @@ def target(text: str | Path) -> Target:
 def _file(file: Path, wanted: str) -> Target:
     found = Target(files=[file], vectors=_vectors([file]))
     try:
-        found.sensors = _added(file_module(file), str(file))
+        found.sensors = _load_sensors(file_module(file), str(file))
         found.family = tuple(sensor.id for sensor in found.sensors[1:] and found.sensors)
         found.findings += _holders(found.sensors, file)
         if not found.sensors:
@@ -162,7 +162,7 @@ def _distribution(entries: list[EntryPoint]) -> Target:
     found = Target()
     for entry in entries:
         try:
-            sensors = _added(entry.load(), entry.value)
+            sensors = _load_sensors(entry.load(), entry.value)
         except (Exception, SystemExit) as error:
             finding = loading(error, module_files(entry.value))
             found.findings.append(
@@ -179,7 +179,7 @@ def _distribution(entries: list[EntryPoint]) -> Target:
     failing = [
         plugin
         for plugin in registry().plugins
-        if _normal(plugin.distribution) in names and _said(plugin.error) == "LS010"
+        if _normal(plugin.distribution) in names and _strip_markup(plugin.error) == "LS010"
     ]
     found.findings += [Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing]
     found.findings += _rivals(found.sensors)
@@ -194,7 +194,7 @@ def _rivals(sensors: list[Sensor]) -> list[Finding]:
     refused = [
         plugin
         for plugin in registry().plugins
-        if _said(plugin.error) == "LS005" and plugin.error.partition(":")[0] in names
+        if _strip_markup(plugin.error) == "LS005" and plugin.error.partition(":")[0] in names
     ]
     return [
         Finding("LS005", f"{plugin.distribution} has {plugin.error}", plugin.entry_point)
@@ -222,7 +222,7 @@ def _holders(sensors: list[Sensor], file: Path) -> list[Finding]:
     ]
 
 
-def _added(plugin: Any, name: str) -> list[Sensor]:
+def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
     """The sensors of a plugin, loaded on its own, with its own hooks applied.
 
     Raises:
@@ -286,13 +286,13 @@ def _loading_rule(error: BaseException, cause: BaseException) -> str:
     if "sizeof" in functions or "_sizeof" in functions:
         return "LS008"
     if isinstance(cause, SpecError):
-        return _said(str(cause)) or "LS007"
+        return _strip_markup(str(cause)) or "LS007"
     if "lidarspec_sensors" in functions:
         return "LS006"
     return "LS001"
 
 
-def _said(text: str) -> str:
+def _strip_markup(text: str) -> str:
     return next((code for words, code in SAID if words in text), "")
 
 
@@ -341,10 +341,10 @@ class Places:
         ]
         self._others: dict[tuple[str, str], Spot] = {}
         for file, tree in trees.items():
-            for kind, name, line in _named(tree):
+            for kind, name, line in _iter_names(tree):
                 self._others.setdefault((kind, name), (file, line))
 
-    def placed(self, finding: Finding, sensor: Sensor | None = None) -> Finding:
+    def locate(self, finding: Finding, sensor: Sensor | None = None) -> Finding:
         """The finding with the file and line of what it is about, where they can be told."""
         if finding.file:
             return finding
@@ -395,7 +395,7 @@ def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
     return None
 
 
-def _named(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
+def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
     """What may be a key, a frame type or a sensor: kind, name and line."""
     for node in ast.walk(tree):
         match node:
@@ -439,7 +439,7 @@ WALL_CLOCKS = frozenset(
 BROAD = frozenset({"Exception", "BaseException"})
 
 
-def written(trees: Mapping[str, ast.Module]) -> list[Finding]:
+def check_texts(trees: Mapping[str, ast.Module]) -> list[Finding]:
     """The findings in the text of some modules, by file."""
     return [
         Finding(code, what, file=file, line=node.lineno)
@@ -603,8 +603,8 @@ def reports(
     places = Places(trees)
     known = {sensor.id: sensor for sensor in target.sensors}
     mistakes = [
-        places.placed(finding, known.get(finding.sensor)) for finding in target.findings
-    ] + written(trees)
+        places.locate(finding, known.get(finding.sensor)) for finding in target.findings
+    ] + check_texts(trees)
     single = [sensor for sensor in target.sensors if len(target.sensors) == 1]
     if mistakes and not single:
         yield Report(name, mistakes)
@@ -655,7 +655,7 @@ def _report(
         report.skipped["all properties"] = "it has no frames before it is configured with its file"
         return report
     watch(f"{sensor.id}: declaration", 0)
-    report.findings += declared(subject)
+    report.findings += check_declaration(subject)
     for done, one in enumerate(PROPERTIES):
         known = sorted(
             {finding.code for finding in left_over(report.findings, sensor, whole=False)}
@@ -675,7 +675,7 @@ def _report(
         {(finding.code, finding.path): finding for finding in reversed(report.findings)}.values()
     )[::-1]
     left = left_over(distinct, sensor, whole=ELSE not in report.skipped and not subject.tested)
-    report.findings = [places.placed(finding, sensor) for finding in left]
+    report.findings = [places.locate(finding, sensor) for finding in left]
     report.measured = subject.measured
     report.picture = subject.picture and {
         **dict(sorted(subject.picture.items())),

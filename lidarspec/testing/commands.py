@@ -10,7 +10,7 @@ from typing import Any
 
 from lidarspec.device.session import Reply, Session, found_at, learned
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
-from lidarspec.explaining.wording import asked
+from lidarspec.explaining.wording import format_argument_type
 from lidarspec.frames.commands import argument_slot, raw_argument
 from lidarspec.frames.parse import identify
 from lidarspec.framing.results import Found
@@ -106,7 +106,7 @@ def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
                 continue
             raise Violation(
                 "LS602",
-                f"{key} = {outside} is sent, and {asked(kind)} is declared",
+                f"{key} = {outside} is sent, and {format_argument_type(kind)} is declared",
                 f"commands.{name}.args.{key}",
             )
 
@@ -165,7 +165,7 @@ def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
     refused = ""
     for share in (0.0, 0.37, 1.0) if command.args else (0.0,):
         try:
-            reply = _asked(subject, name, arguments(subject, name, share))
+            reply = _ask(subject, name, arguments(subject, name, share))
         except CommandError as error:
             refused = refused or str(error)
             continue
@@ -197,7 +197,7 @@ def _learn(subject: Subject, name: str, reply: Reply) -> None:
         raise Violation("LS604", what, f"commands.{name}") from error
 
 
-def _asked(subject: Subject, name: str, given: dict[str, float]) -> Reply:
+def _ask(subject: Subject, name: str, given: dict[str, float]) -> Reply:
     """The reply of a simulated sensor to a command.
 
     Raises:

@@ -44,7 +44,7 @@ def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
         return
     try:
         maker = FrameMaker(subject.sensor, name)
-        frames = maker.sealed(maker.table([sweep(number) for number in FAR_PACKETS]))
+        frames = maker.seal(maker.table([sweep(number) for number in FAR_PACKETS]))
         packets = read(subject, name, frames, by_clock=False)
         readings = clock_ns(subject.sensor, packets.batch())
     except LidarSpecError:  # a property of its own says what fails

@@ -29,7 +29,7 @@ from lidarspec.spec.fields import factor, is_unit
 from lidarspec.spec.syntax import is_expression
 from lidarspec.spec.tree import Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
-from lidarspec.testing.geometry import field_of, traced, used
+from lidarspec.testing.geometry import field_of, find_fields, trace_points
 from lidarspec.testing.subject import Subject
 
 #: field names that stand for a measure.
@@ -76,10 +76,15 @@ PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IG
 Findings = Iterator[tuple[str, str, str]]
 
 
-def declared(subject: Subject) -> list[Finding]:
+def check_declaration(subject: Subject) -> list[Finding]:
     """The findings in a declaration, as (code, what, path) made into findings of this sensor."""
     sensor = subject.sensor
-    checks: list[Findings] = [_sensor(sensor), _asked(sensor), _clock(sensor), _options(sensor)]
+    checks: list[Findings] = [
+        _sensor(sensor),
+        _check_required_fields(sensor),
+        _clock(sensor),
+        _options(sensor),
+    ]
     checks += [_frame(subject, name, frame) for name, frame in subject.frames.items()]
     checks += [_points(subject, name) for name in subject.sensor.data_frames]
     checks += [_reach(subject)]
@@ -107,7 +112,7 @@ def _sensor(sensor: Sensor) -> Findings:
         yield "LS210", f"range_limits are {low:g} .. {high:g}", "range_limits"
 
 
-def _asked(sensor: Sensor) -> Findings:
+def _check_required_fields(sensor: Sensor) -> Findings:
     """The fields that scans, clock and counter come from have to be there."""
     known = {
         path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.named
@@ -233,7 +238,7 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
         except LidarSpecError:
             return
         layouts = [layout for layout in found if isinstance(layout, Layout)]
-        yield from _covered(name, layouts)
+        yield from _find_uncovered(name, layouts)
         if frame.direction == "in":
             yield from _sync(subject, name, frame, engine)
             yield from _strength(subject, name, frame, layouts)
@@ -307,7 +312,7 @@ def _names(subject: Subject, name: str, frame: Frame) -> Findings:
     """Fields whose names stand for a measure, without a unit; `Scaled(..., "")` says that it is a
     pure number.
     """
-    pure = _measured(frame) | (_multiplied(subject, name) if frame.data else set())
+    pure = _find_pure_numbers(frame) | (_find_multiplied(subject, name) if frame.data else set())
     for path, info in codec(frame).schema.all_fields.items():
         if (
             info.name in MEASURES
@@ -323,12 +328,12 @@ def _names(subject: Subject, name: str, frame: Frame) -> Findings:
             )
 
 
-def _multiplied(subject: Subject, name: str) -> set[str]:
+def _find_multiplied(subject: Subject, name: str) -> set[str]:
     """The fields that make ranges together with another one, which has the unit."""
     try:
         infos = [
             field_of(subject, name, node)
-            for node in used(getattr(traced(subject, name), "range", None))
+            for node in find_fields(getattr(trace_points(subject, name), "range", None))
         ]
     except Exception:  # said elsewhere
         return set()
@@ -338,7 +343,7 @@ def _multiplied(subject: Subject, name: str) -> set[str]:
     return set()
 
 
-def _measured(frame: Frame, *, with_scale: bool = False) -> set[str]:
+def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
     """Return the paths of fields that are declared as pure numbers: Scaled with an empty unit.
 
     Args:
@@ -373,7 +378,7 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
         yield "LS207", f"it returns {answer!r} whatever the frame is", f"{name}.plausible"
 
 
-def _covered(name: str, layouts: list[Layout]) -> Findings:
+def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
     """Yield fields of a sealed frame that none of its checksums covers.
 
     Many checksums begin behind the header. Fields in front of all checksums are no findings.
@@ -467,7 +472,7 @@ def _weak_bits(sensor: Sensor, frame: Frame) -> int:
 def _points(subject: Subject, name: str) -> Findings:
     """Whether `points` can be traced, and where its columns come from."""
     try:
-        result = traced(subject, name)
+        result = trace_points(subject, name)
     except Untraceable as reason:
         yield "LS208", str(reason), f"{name}.points"
         return
@@ -483,19 +488,21 @@ def _intensity(subject: Subject, name: str, result: Any) -> Findings:
     """An intensity that comes from a field of another name, while no column uses the field that is
     named so.
     """
-    own = [field_of(subject, name, node) for node in used(getattr(result, "intensity", None))]
+    own = [
+        field_of(subject, name, node) for node in find_fields(getattr(result, "intensity", None))
+    ]
     if not own or any(info is None or INTENSITY.search(info.path) for info in own):
         return
     columns = [getattr(result, one.name) for one in fields(result)]
     taken = {
         info.path
         for value in columns
-        for node in used(value)
+        for node in find_fields(value)
         if (info := field_of(subject, name, node)) is not None
     }
     ranges = [
         info
-        for node in used(getattr(result, "range", None))
+        for node in find_fields(getattr(result, "range", None))
         if (info := field_of(subject, name, node)) is not None
     ]
     axes = {info.axes for info in ranges if info.axes}
@@ -515,7 +522,7 @@ def _reach(subject: Subject) -> Findings:
     reach: list[tuple[float, str]] = []
     for name in subject.sensor.data_frames:
         try:
-            result = traced(subject, name)
+            result = trace_points(subject, name)
         except Exception:  # said elsewhere
             return
         value = getattr(result, "range", None)
@@ -548,7 +555,7 @@ def _column(
     subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]
 ) -> Findings:
     """A column that no field in a unit of its kind goes into."""
-    infos = [field_of(subject, name, node) for node in used(value, looked_up=False)]
+    infos = [field_of(subject, name, node) for node in find_fields(value, looked_up=False)]
     measured = [info for info in infos if info is not None and factor(info.unit, "m") is not None]
     if column == "range" and measured and all(CODE.fullmatch(info.name) for info in measured):
         yield (
@@ -561,7 +568,7 @@ def _column(
         factor(info.unit, unit) is not None for info in infos if info is not None for unit in units
     ):
         bare = [info for info in free if not is_unit(info.unit)]
-        pure = _measured(subject.sensor.frames[name], with_scale=column == "azimuth")
+        pure = _find_pure_numbers(subject.sensor.frames[name], with_scale=column == "azimuth")
         if bare and not {info.path for info in bare} & pure:
             order = list(subject.fields(name))
             first = min(

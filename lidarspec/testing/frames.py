@@ -317,7 +317,7 @@ def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
     @seed(0)
     @settings(max_examples=number, derandomize=False, report_multiple_bugs=False, **quiet)
     @given(st.data())
-    def edited(data: Any) -> None:
+    def check_edited(data: Any) -> None:
         parsed = copy.deepcopy(bases[data.draw(st.integers(0, len(bases) - 1))])
         spots = list(material.integers(parsed))
         places = [place for place, (_, _, path) in enumerate(spots) if path in values]
@@ -331,7 +331,7 @@ def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
             _check(subject, name, parsed, spots, edits)
 
     try:
-        edited()
+        check_edited()
     except Violation as found:
         raise Violation(found.code, found.what, found.path) from None
 
@@ -408,7 +408,7 @@ def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
                 name,
             )
         except Exception as error:
-            raise _undocumented(error, f"cut at byte {end} of {len(data)}", name) from error
+            raise _undocumented_error(error, f"cut at byte {end} of {len(data)}", name) from error
         else:
             raise Violation("LS307", f"cut at byte {end} of {len(data)}, and it passes", name)
 
@@ -419,14 +419,14 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> Non
     source = subject.source(f"mutations {name}")
     types = (name, None) if len(sensor.frames) <= MANY else (name,)
     for seed in subject.seeds(name, share=4):
-        data = material.mutated(subject.example(name, seed=seed % 8), source)
+        data = material.mutate(subject.example(name, seed=seed % 8), source)
         for kind, verify in itertools.product(types, (True, False)):
             try:
                 sensor.parse(data, frame=kind, verify=verify)
             except WireError:
                 continue
             except Exception as error:
-                raise _undocumented(error, f"parsing {data.hex(' ')[:200]}", name) from error
+                raise _undocumented_error(error, f"parsing {data.hex(' ')[:200]}", name) from error
 
 
 def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
@@ -488,7 +488,7 @@ def _flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequ
     return sorted({*chosen, *source.sample(range(length), number - len(chosen))})
 
 
-def _undocumented(error: Exception, what: str, name: str) -> Violation:
+def _undocumented_error(error: Exception, what: str, name: str) -> Violation:
     code = "LS115" if isinstance(error, SpecError) else "LS308"
     return Violation(
         code,

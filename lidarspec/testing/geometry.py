@@ -34,7 +34,7 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
 from lidarspec.points.plain import evaluate_plainly
 from lidarspec.simulation.frame_maker import FrameMaker
-from lidarspec.simulation.scenes import Room, furnished
+from lidarspec.simulation.scenes import Room, make_room
 from lidarspec.simulation.simulator import simulation
 from lidarspec.spec import OnWrap, Polar
 from lidarspec.spec.fields import factor
@@ -98,9 +98,7 @@ def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYT
             made.append(maker.frame(sweep(0)))
         packets = min(packets, max(total // len(made[0]), LEAST_PACKETS))
         if len(made) < packets:
-            made += maker.sealed(
-                maker.table([sweep(number) for number in range(len(made), packets)])
-            )
+            made += maker.seal(maker.table([sweep(number) for number in range(len(made), packets)]))
     except LidarSpecError:
         return []
     return made[:packets]
@@ -119,7 +117,7 @@ def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = T
     return sensor.decode(frames if sensor.datagrams else b"".join(frames), name)
 
 
-def traced(subject: Subject, name: str) -> Any:
+def trace_points(subject: Subject, name: str) -> Any:
     """What `points` returns for traced columns of one example; None where the frame is not
     compiled.
 
@@ -144,7 +142,7 @@ def _trace_points(subject: Subject, name: str) -> Any:
     )[0]
 
 
-def used(*values: Any, looked_up: bool = True) -> list[Node]:
+def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
     """Return the fields that traced values are made of.
 
     Args:
@@ -179,7 +177,7 @@ def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np
     with np.errstate(all="ignore"):
         polar = subject.sensor.points_of(packets.frame)(Fields(batch))
         if not isinstance(polar, Polar):
-            return _declared(subject, name)
+            return _declared_directions(subject, name)
         arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)
     shape = np.broadcast_shapes(
         (len(packets), *(1,) * len(axes)), *(array.shape for array in arrays)
@@ -196,7 +194,7 @@ def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np
     return [angles[mask] for angles in whole]
 
 
-def _declared(subject: Subject, name: str) -> list[NDArray[np.float64]] | None:
+def _declared_directions(subject: Subject, name: str) -> list[NDArray[np.float64]] | None:
     """The directions of the first frames that are declared for a simulation; None where there are
     none.
     """
@@ -482,12 +480,12 @@ def _angles_of_points(subject: Subject, name: str) -> dict[str, FieldInfo]:
     """
     angles = {path: info for path, info in subject.fields(name).items() if info.unit in FULL_TURNS}
     try:
-        result = traced(subject, name)
+        result = trace_points(subject, name)
     except Exception:  # a property of its own says what fails
         return angles
     if result is None:
         return angles
-    nodes = used(*vars(result).values())
+    nodes = find_fields(*vars(result).values())
     sources = {info.path for info in (field_of(subject, name, node) for node in nodes) if info}
     return {path: info for path, info in angles.items() if info.optional or path in sources}
 
@@ -603,7 +601,7 @@ def half_step(subject: Subject, name: str) -> float:
 
 def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     """Packets simulated in a room decode to points on its walls, within the steps of the format."""
-    room = furnished(len(subject.sensor.id))
+    room = make_room(len(subject.sensor.id))
     room = Room(room.walls, room.boxes)
     is_long = subject.sensor.frames[name].max_length > LONG_FRAME_BYTES
     try:

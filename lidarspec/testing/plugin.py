@@ -60,12 +60,12 @@ def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Serve
 
     with ExitStack() as stack:
 
-        def opened(wanted: Any = None, **more: Any) -> Served:
+        def serve_sensor(wanted: Any = None, **more: Any) -> Served:
             return stack.enter_context(
                 ports.virtual_port(wanted or request.getfixturevalue("sensor"), **more)
             )
 
-        yield opened
+        yield serve_sensor
 
 
 @pytest.fixture

@@ -120,7 +120,7 @@ class Property:
                     Finding(error.rule or _rule_of(error), error.reason, path, subject.sensor.id)
                 )
             except Exception as error:
-                found.append(_unexpected(error, ".".join(case), subject))
+                found.append(_unexpected_error(error, ".".join(case), subject))
         return found
 
 
@@ -261,7 +261,7 @@ def _rule_of(error: SpecError) -> str:
     return "LS414"
 
 
-def _unexpected(error: Exception, path: str, subject: Subject) -> Finding:
+def _unexpected_error(error: Exception, path: str, subject: Subject) -> Finding:
     """The finding for an exception that nobody documented, at the plugin's own line where it comes
     from one.
     """

@@ -60,7 +60,7 @@ def pieces(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes
         start += size
 
 
-def mutated(
+def mutate(
     data: bytes, source: random.Random, words: Sequence[bytes] = (), spots: Sequence[int] = ()
 ) -> bytes:
     """The bytes with a few of them changed, dropped, doubled or put in, or cut short.
@@ -290,7 +290,8 @@ class Subject:
                 if path.partition(".")[0] == frame
             }
             self._drawers[frame] = {
-                path: _pooled(how) if hasattr(how, "example") else how for path, how in mine.items()
+                path: _make_pool(how) if hasattr(how, "example") else how
+                for path, how in mine.items()
             }
         return self._drawers[frame]
 
@@ -341,7 +342,7 @@ def _has_same_exchange(one: Sensor, other: Sensor, name: str) -> bool:
     )
 
 
-def _pooled(strategy: Any) -> Callable[[random.Random], int]:
+def _make_pool(strategy: Any) -> Callable[[random.Random], int]:
     """Values of a hypothesis strategy, the same in every run."""
     from hypothesis import HealthCheck, Phase, given, settings
 

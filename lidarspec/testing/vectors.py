@@ -115,7 +115,7 @@ def vectors_hold(subject: Subject, only: str = "") -> None:
         require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
         data = unhexed(vector["hex"])
         name = vector["frame"]
-        parsed = _parsed(subject, name, data, place)
+        parsed = _parse_vector(subject, name, data, place)
         _values(subject, name, data, parsed, vector, place)
         require(
             subject.sensor.build(name, parsed) == data,
@@ -179,7 +179,7 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
         return
     pinned: dict[str, bool] = {}
     for vector in vectors:
-        read_as = dict(leaves(_parsed(subject, name, unhexed(vector["hex"]), name)))
+        read_as = dict(leaves(_parse_vector(subject, name, unhexed(vector["hex"]), name)))
         for path in (*vector.get("values", {}), *vector.get("units", {})):
             plain = re.sub(r"\[\d+\]", "", path)
             pinned[plain] = pinned.get(plain, False) or bool(read_as.get(path))
@@ -334,7 +334,7 @@ def _in_words(match: Match, length: int) -> str:
         algorithm = match.algorithm.describe()
     else:
         algorithm = match.paste
-    return f"{algorithm} over {match.span.told(match.place, length)}{order}"
+    return f"{algorithm} over {match.span.describe(match.place, length)}{order}"
 
 
 def _common(frames: list[bytes]) -> list[Match]:
@@ -464,7 +464,7 @@ def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
     return not ids or subject.sensor.id in ids
 
 
-def _parsed(subject: Subject, name: str, data: bytes, place: str) -> Any:
+def _parse_vector(subject: Subject, name: str, data: bytes, place: str) -> Any:
     """The vector parsed; where its checksum is at fault, the ones that would fit are named."""
     try:
         return subject.sensor.parse(data, frame=name)

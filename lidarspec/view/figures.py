@@ -55,7 +55,7 @@ STYLE = {
 _Drawing = TypeVar("_Drawing", bound=Callable[..., Any])
 
 
-def _styled(draw: _Drawing) -> _Drawing:
+def _with_style(draw: _Drawing) -> _Drawing:
     """A function that draws, in the style of these figures."""
 
     @functools.wraps(draw)
@@ -66,7 +66,7 @@ def _styled(draw: _Drawing) -> _Drawing:
     return drawn  # type: ignore[return-value]
 
 
-@_styled
+@_with_style
 def save(figure: Any, target: Any, suffix: str) -> None:
     """Write a figure to a path or a binary file, in the format of a suffix."""
     figure.savefig(
@@ -77,7 +77,7 @@ def save(figure: Any, target: Any, suffix: str) -> None:
     )
 
 
-@_styled
+@_with_style
 def of_scan(scan: Scan, look: Look, title: str) -> Any:
     """A scan from above, forward up, and where it is not flat from its right side, all metres
     alike.
@@ -131,7 +131,7 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
     return figure
 
 
-@_styled
+@_with_style
 def of_intensities(scans: Iterable[Scan], title: str) -> Any:
     """How often each intensity comes.
 
@@ -167,7 +167,7 @@ def of_intensities(scans: Iterable[Scan], title: str) -> Any:
     return figure
 
 
-@_styled
+@_with_style
 def of_ranges(scans: Iterable[Scan], title: str) -> Any:
     """How many returns there are at each range, over time, and the median; of many scans an even
     choice is shown.
@@ -221,7 +221,7 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
     return figure
 
 
-@_styled
+@_with_style
 def of_rates(rates: Rates, title: str) -> Any:
     """Packets and scans a second, and the shares that are lost or wrong, over time.
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import UsageError, printable
 from lidarspec.explaining.explanation import Explanation
 from lidarspec.explaining.listing import parents
-from lidarspec.exports import narrowed
+from lidarspec.exports import select_frame
 from lidarspec.exports.diagram import svg as diagram
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
@@ -139,7 +139,7 @@ def sensor(value: Sensor) -> str:
 def _diagram(sensor: Sensor, name: str) -> str:
     frame = sensor.frames[name]
     try:
-        drawn = diagram(narrowed(sensor, name))
+        drawn = diagram(select_frame(sensor, name))
     except UsageError as refused:
         drawn = f"<div>{escape(str(refused))}</div>"
     title = f'<summary style="cursor:pointer">{escape(name)}</summary>'

@@ -73,7 +73,7 @@ class Keys:
         """Give the terminal back."""
 
 
-def decoded(text: str) -> list[str]:
+def decode_keys(text: str) -> list[str]:
     """The keys in what a POSIX terminal sent; sequences of other keys are left out."""
     keys = _KEY.finditer(text)
     return [
@@ -126,7 +126,7 @@ else:
             data = os.read(self._descriptor, 1024)
             if not data:  # the terminal went away
                 raise EOFError("the terminal was closed")
-            return decoded(data.decode("utf-8", "replace"))
+            return decode_keys(data.decode("utf-8", "replace"))
 
         def __enter__(self) -> Self:
             tty.setcbreak(self._descriptor, termios.TCSANOW)

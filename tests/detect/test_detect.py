@@ -17,8 +17,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import CommandError, SourceError, UsageError, WireError, simulate
-from lidarspec.detect import identification as detect, listen
-from lidarspec.detect.identification import detected, fitting, scores, verdict, verdicts
+from lidarspec.detect import identification, listen
+from lidarspec.detect.identification import detect, fitting, scores, verdict, verdicts
 from lidarspec.detect.listen import Heard, bauds, hear, probe, started_first, udp_ports
 from lidarspec.drafting.crc_search import DIVISION_WORK, QUICK_WORK, crc_matches, remainder
 from lidarspec.drafting.periods import structure
@@ -77,14 +77,14 @@ FEW = (
 def few_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let detection know few sensors: each of them costs time."""
     few = {name: ls.sensor(name) for name in sorted(FEW)}
-    for module in (detect, listen):
+    for module in (identification, listen):
         monkeypatch.setattr(module, "sensors", lambda: few)
 
 
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen until enough has come, however slow the machine is."""
-    monkeypatch.setitem(detect.verdicts.__kwdefaults__, "seconds", TIMEOUT_S)
+    monkeypatch.setitem(identification.verdicts.__kwdefaults__, "seconds", TIMEOUT_S)
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -92,13 +92,13 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     "name", ["ldrobot/ld06_3_consecutive_frames.bin", "velodyne/hdl32e/sample_velodyne_hdl32.pcap"]
 )
 def test_a_capture_is_its_sensors_among_a_few(name: str) -> None:
-    assert detected(capture(name)).id == CAPTURED[name]
+    assert detect(capture(name)).id == CAPTURED[name]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAPTURED)
 def test_every_capture_is_its_sensors(name: str) -> None:
-    assert detected(capture(name)).id == CAPTURED[name]
+    assert detect(capture(name)).id == CAPTURED[name]
 
 
 def test_no_capture_is_left_out() -> None:
@@ -118,7 +118,7 @@ def test_captures_of_others_are_nobodys(name: str, monkeypatch: pytest.MonkeyPat
     rest = {other: sensor for other, sensor in ls.sensors().items() if sensor.vendor not in theirs}
     monkeypatch.setattr("lidarspec.detect.identification.sensors", lambda: rest)
     with pytest.raises(WireError, match="no installed sensor's frames"):
-        detected(capture(name))
+        detect(capture(name))
 
 
 @pytest.mark.slow
@@ -130,7 +130,7 @@ def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str)
         assert found.sensor is None
         assert {score.sensor.id for score in found.alike} == ALIKE[name]
     with pytest.raises(UsageError, match="send the same frames"):
-        detected(capture(name))
+        detect(capture(name))
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -215,7 +215,7 @@ def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None
     with pytest.raises(
         WireError, match=f"these are frames of {name} .*, which no installed plugin reads"
     ):
-        detected(tmp_path / "one.bin")
+        detect(tmp_path / "one.bin")
 
 
 @pytest.mark.slow
@@ -310,7 +310,7 @@ def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path:
     )
     path.write_bytes(data)
     with pytest.raises(WireError, match="their checksums are never right") as error:
-        detected(path)
+        detect(path)
     assert error.value.__notes__ == [f"next: lidarspec crc {path}"]
     noise = random.Random(2)
     sealed_by_chance = [frame[:46] + noise.randbytes(1) for frame in firmware_bug(60)]
@@ -351,8 +351,8 @@ def test_damage_does_not_hide_a_sensor() -> None:
 )
 def test_a_simulated_port_is_its_sensors(name: str) -> None:
     with virtual_port(name) as made:
-        assert detected(made.path).id == name
-        assert detected(f"serial://{made.path}?baud=230400").id == name
+        assert detect(made.path).id == name
+        assert detect(f"serial://{made.path}?baud=230400").id == name
 
 
 @pytest.mark.slow
@@ -361,7 +361,7 @@ def test_a_sensor_that_has_to_be_started_first() -> None:
     assert {"cspc-m1c1-mini", "slamtec-rplidar-a1"} <= {sensor.id for sensor in started_first()}
     with virtual_port("cspc-m1c1-mini") as made:
         with pytest.raises(CommandError, match="nothing comes") as error:
-            detected(made.path)
+            detect(made.path)
         assert error.value.__notes__ == [f"next: lidarspec doctor {made.path}"]
         assert made.device.heard == []
         heard = next(heard for heard in probe(made.path) if heard.size)
@@ -399,8 +399,8 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
                 for one in verdicts(f"udp://127.0.0.1:{target}")
             }
             with pytest.raises(UsageError, match="several sensors send"):
-                detected(f"udp://127.0.0.1:{target}")
-            assert detected(f"udp://127.0.0.1:{target}?src=127.0.0.2").id == "hesai-xt32"
+                detect(f"udp://127.0.0.1:{target}")
+            assert detect(f"udp://127.0.0.1:{target}?src=127.0.0.2").id == "hesai-xt32"
     assert found == {"127.0.0.1": "velodyne-vlp16", "127.0.0.2": "hesai-xt32"}
 
 
@@ -410,7 +410,7 @@ def test_bytes_at_the_wrong_rate_fit_nobody(tmp_path: Path) -> None:
     source = random.Random(6)
     with port(tmp_path) as made, working(lambda stop: _noise(made, source, stop)) as stop:
         with pytest.raises(WireError, match="no installed sensor"):
-            detected(made.name)
+            detect(made.name)
         stop.set()
         made.discard()
 
@@ -422,12 +422,12 @@ def _noise(made: Port, source: random.Random, stop: threading.Event) -> None:
 
 def test_what_cannot_be_opened_is_the_systems_fault(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no such port"):
-        detected("/dev/ttyNONE7")
+        detect("/dev/ttyNONE7")
     with pytest.raises(UsageError, match="standard input"):
-        detected("-")
+        detect("-")
     (tmp_path / "empty.bin").write_bytes(b"")
     with pytest.raises(WireError, match="no bytes"):
-        detected(tmp_path / "empty.bin")
+        detect(tmp_path / "empty.bin")
 
 
 def test_what_is_listened_to() -> None:
@@ -458,7 +458,7 @@ def test_of_sensors_with_the_same_frames_those_of_the_vendor_with_most_of_them_c
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     few = {name: ls.sensor(name) for name in ("cspc-coin-d4", "ydlidar-s4b", "ydlidar-tmini")}
-    monkeypatch.setattr(detect, "sensors", lambda: few)
+    monkeypatch.setattr(identification, "sensors", lambda: few)
     found = verdict(Heard("", tuple(simulate(few["cspc-coin-d4"], 30))))
     assert [score.sensor.id for score in found.alike] == [
         "ydlidar-s4b",

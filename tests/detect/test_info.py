@@ -7,8 +7,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import lidarspec as ls
-from lidarspec.detect.doctor import examined
-from lidarspec.detect.identification import said
+from lidarspec.detect.doctor import examine
+from lidarspec.detect.identification import read_info
 from lidarspec.framing.results import Found
 from tests.cli.running import ran
 from tests.made_captures import frame, pcap
@@ -18,11 +18,11 @@ def test_texts_bytes_and_numbers_with_units_are_told() -> None:
     helios = ls.sensor("robosense-helios16p")
     difop = helios.parse(helios.example("difop"))
     difop.serial_number, difop.top_firmware = b"\x11\x22\x33\x44\x55\x66", b"v1.2\0"
-    found = said(helios, [Found("difop", 0, helios.build("difop", difop))])
+    found = read_info(helios, [Found("difop", 0, helios.build("difop", difop))])
     assert found == {"serial": "112233445566", "firmware": "v1.2"}
     puck = ls.sensor("velodyne-vlp16")
     position = puck.parse(puck.example("position"))
-    told = said(puck, [Found("position", 0, puck.build("position", position))])["temperature"]
+    told = read_info(puck, [Found("position", 0, puck.build("position", position))])["temperature"]
     assert told.endswith(" degC")
 
 
@@ -40,7 +40,7 @@ def test_a_device_and_doctor_tell_what_was_said_last(tmp_path: Path) -> None:
         for _ in device.scans():
             pass
         assert device.info["serial"] == "112233445566"
-    assert any("serial 112233445566" in finding.text for finding in examined(path, helios))
+    assert any("serial 112233445566" in finding.text for finding in examine(path, helios))
 
 
 def test_show_says_where_it_stands_and_in_which_unit() -> None:

@@ -145,7 +145,7 @@ def test_frames_of_one_length_leave_init_and_xorout_open_and_say_so() -> None:
 @pytest.mark.slow
 def test_what_the_checksum_leaves_out_in_front() -> None:
     match = found(sealed(CRCS["CRC-16/MODBUS"], skip=2))
-    assert (match.name, match.span.head, match.span.told(match.place, 34)) == (
+    assert (match.name, match.span.head, match.span.describe(match.place, 34)) == (
         "CRC-16/MODBUS",
         2,
         "all other bytes but the first 2",

@@ -15,7 +15,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import UsageError, WireError
 from lidarspec.drafting.checksum_search import Changed
-from lidarspec.drafting.draft import Draft, Names, draft, drafted as text_of
+from lidarspec.drafting.draft import Draft, Names, draft, make_template_values as text_of
 from lidarspec.drafting.periods import candidates
 from lidarspec.drafting.samples import Place
 from lidarspec.expressions.columns import aligned

@@ -41,7 +41,7 @@ def assert_damaged_input_reads_alike(sensor: Sensor, count: int = DAMAGED_CONVER
     assert_backends_agree(sensor, material.delivery(sensor, frames))
     for _ in range(count):
         noisy = [
-            (name, material.mutated(data, source) if source.random() < 0.4 else data)
+            (name, material.mutate(data, source) if source.random() < 0.4 else data)
             for name, data in frames
         ]
         assert_backends_agree(sensor, material.delivery(sensor, noisy))

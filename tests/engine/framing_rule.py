@@ -45,7 +45,7 @@ def any_split_gives_the_same(subject: Subject, length: int = LENGTH) -> None:
     """
     sensor = subject.sensor
     source = subject.source("splits")
-    data = material.mutated(subject.stream(rounds=1), source) + subject.stream(seed=1, rounds=1)
+    data = material.mutate(subject.stream(rounds=1), source) + subject.stream(seed=1, rounds=1)
     data = data[: max(length // 2, 2 * _longest_frame(sensor))]
     offsets = material.places(len(data), source)
     if length < LENGTH:
@@ -165,7 +165,7 @@ def announcements_may_change_with_every_frame(subject: Subject, length: int = LE
             (1, sensor.frames[name].confirm)
         )
         data += source.choice(
-            (frame, frame, frame[: source.randint(1, 5)], material.mutated(frame, source))
+            (frame, frame, frame[: source.randint(1, 5)], material.mutate(frame, source))
         )
     assert_like_oracle(subject, data, "announcements in any order")
     _assert_same_in_pieces(sensor, data, [list(material.pieces(data, source)) for _ in range(10)])

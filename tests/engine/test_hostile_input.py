@@ -37,7 +37,7 @@ def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str, times: int) -> 
     ]
     for _ in range(times * (SHAPE_FRAMES if name in SHAPES else REPRESENTATIVE_FRAMES)):
         frame, data = source.choice(examples)
-        mutated = material.mutated(data, source)
+        mutated = material.mutate(data, source)
         with contextlib.suppress(WireError):
             sensor.parse(mutated, frame=frame, verify=source.random() < 0.7)
 
@@ -49,7 +49,7 @@ def test_decoding_mutated_frames_raises_nothing(name: str) -> None:
     source = subject.source("hostile streams")
     frames = subject.conversation(rounds=1)
     mutated = [
-        (frame, material.mutated(data, source))
+        (frame, material.mutate(data, source))
         for frame, data in source.choices(frames, k=DECODED_FRAMES)
     ]
     mutated += frames

@@ -10,7 +10,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import explain
-from lidarspec.explaining.listing import folded, parents, text, told
+from lidarspec.explaining.listing import fold, list_differences, parents, text
 from lidarspec.explaining.wording import Span, bit_picture
 from tests.cli.running import EXAMPLE, printed, process, ran
 from tests.representatives import load_sensor
@@ -58,12 +58,15 @@ def test_differences_are_told_field_by_field_and_to_the_bit() -> None:
     first, second = explain(EXAMPLE, STL), explain(other, STL)
     found = first.differences(second)
     assert [part.path for part in found] == ["end_angle", "crc"]
-    assert [text(line) for line in told(found, (47, 47))][:3] == [
+    assert [text(line) for line in list_differences(found, (47, 47))][:3] == [
         "002a  end_angle  334.70 deg -> 334.71 deg (+0.01 deg)",
         "      - be 82        .......0 ..",
         "      + bf 82        .......1 ..",
     ]
-    assert text(list(told(first.differences(first), (47, 47)))[-1]) == "47 bytes, all alike"
+    assert (
+        text(list(list_differences(first.differences(first), (47, 47)))[-1])
+        == "47 bytes, all alike"
+    )
 
 
 def test_fields_that_one_frame_alone_has_are_told_together() -> None:
@@ -75,7 +78,9 @@ def test_fields_that_one_frame_alone_has_are_told_together() -> None:
     ]
     shown = [
         text(line)
-        for line in told(parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data)))
+        for line in list_differences(
+            parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data))
+        )
     ]
     assert "      samples[1].distance to samples[2].exposure  in the second frame alone" in shown
 
@@ -133,10 +138,10 @@ def test_long_lines_are_folded_below_their_text() -> None:
         Span("some words that are too many for it"),
     )
     assert (
-        text(folded(line, 44))
+        text(fold(line, 44))
         == "0000  aa  name  some words that are too many\n                for it"
     )
-    assert folded(line, 20) == line
+    assert fold(line, 20) == line
 
 
 @pytest.mark.slow

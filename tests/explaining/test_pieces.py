@@ -12,7 +12,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import UnknownFrame
-from lidarspec.explaining.pieces import NEAREST, explained, pieces
+from lidarspec.explaining.pieces import NEAREST, explain_piece, pieces
 from lidarspec.spec import Chunk
 from tests.representatives import load_sensor
 
@@ -29,7 +29,7 @@ def told(
     """
     sent = list(sent)
     found = pieces(sensor, map(Chunk, sent), datagrams=datagrams)
-    parts = [part for piece in found for part in explained(sensor, piece)]
+    parts = [part for piece in found for part in explain_piece(sensor, piece)]
     assert b"".join(piece.data for piece, _ in parts) == b"".join(sent)
     assert [piece.offset for piece, _ in parts] == [
         0,

@@ -202,7 +202,7 @@ def test_damaged_frames_are_none_of_either_s(reader: Path) -> None:
     frames = []
     for sensor, name in distinct_frames(subjects().values()):
         data = sensor.example(name, seed=1)
-        frames += [(sensor, name, material.mutated(data, source)) for _ in range(12)]
+        frames += [(sensor, name, material.mutate(data, source)) for _ in range(12)]
         frames += [(sensor, name, data[:cut]) for cut in {1, len(data) // 2, len(data) - 1}]
     verdicts = [_is_frame(sensor, name, data) for sensor, name, data in frames]
     assert {True, False} <= set(verdicts)

@@ -19,7 +19,7 @@ from construct import Bytes, Const, Struct
 
 import lidarspec as ls
 from lidarspec import Sensor
-from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, narrowed
+from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, select_frame
 from lidarspec.exports.diagram import BIT_WIDTH, LEFT_MARGIN, ROW_BITS
 from lidarspec.frames.schema import schema
 from lidarspec.spec import Command, Frame
@@ -137,7 +137,7 @@ def assert_diagram_is_complete(sensor: Sensor) -> None:
 
 
 def test_boxes_do_not_overlap_and_fill_their_bits() -> None:
-    root = ElementTree.fromstring(export(narrowed(ls.sensor("cspc-m1c1-mini"), "info"), "svg"))
+    root = ElementTree.fromstring(export(select_frame(ls.sensor("cspc-m1c1-mini"), "info"), "svg"))
     seen: set[tuple[float, float]] = set()
     for box in root.iter("{http://www.w3.org/2000/svg}rect"):
         if "x" in box.attrib:
@@ -262,7 +262,7 @@ def test_the_verb_prints_and_writes_every_kind(kind: str, tmp_path: Path) -> Non
     assert printed == export(ls.sensor("robosense-m1"), kind)
     ran("export", kind, "robosense-m1", "-o", tmp_path / "out", "--frame", "difop")
     alone = (tmp_path / "out").read_text(encoding="utf-8")
-    assert alone == export(narrowed(ls.sensor("robosense-m1"), "difop"), kind)
+    assert alone == export(select_frame(ls.sensor("robosense-m1"), "difop"), kind)
     assert "return_seq" not in alone
 
 

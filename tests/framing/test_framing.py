@@ -17,7 +17,7 @@ import lidarspec.spec
 from lidarspec import Sensor, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Checksummed, Frame, Sum, tree
-from lidarspec.testing.subject import Subject, mutated
+from lidarspec.testing.subject import Subject, mutate
 from tests.agreement import assert_backends_agree
 from tests.by_construct import reader
 from tests.engine import against_construct
@@ -81,7 +81,7 @@ def test_each_datagram_is_judged_by_its_own_bytes_alone(sensor: Sensor) -> None:
     for _ in range(DATAGRAMS):
         frame = source.choice(examples)
         head = frame[: source.randint(1, 12)] + source.randbytes(source.randint(0, 3))
-        datagrams.append(source.choice((head, frame, mutated(frame, source))))
+        datagrams.append(source.choice((head, frame, mutate(frame, source))))
     together = sensor.decoder(stream=False)
     each = sensor.decoder(stream=False)
     found = together.datagrams(datagrams)

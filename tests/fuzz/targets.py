@@ -37,7 +37,7 @@ from lidarspec.recording.format import (
     RECEIVED,
     Header,
     Recording,
-    packed,
+    pack_record,
 )
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.stores import digest, stamp
@@ -111,7 +111,7 @@ class Target:
             if source.random() < 0.8
             else [other[start : start + source.choice((4, 64, LONGEST))]]
         )
-        found = material.mutated(data, source, words, self.spots(data))[:LONGEST]
+        found = material.mutate(data, source, words, self.spots(data))[:LONGEST]
         return self.mended(found) if source.random() < 0.5 else found
 
 
@@ -432,7 +432,7 @@ def _manifest(folder: Path) -> Target:
         Path(piece.target).touch()
         (results / MANIFEST).write_bytes(data)
         with contextlib.closing(Manifest(str(results))) as manifest:
-            manifest.finished(piece)
+            manifest.find_records(piece)
             manifest.clear(piece)
 
     def examples() -> list[bytes]:
@@ -440,7 +440,7 @@ def _manifest(folder: Path) -> Target:
         made_of = stamp(str(source))
         counts = {"first_scan": 0, "scans": 3, "points": 900, "warnings": []}
         done = piece.record(**made_of, digest=digest(str(source)), **counts, output=piece.output)
-        failed = replace(piece, number=1).failed(ls.SourceError("gone"))
+        failed = replace(piece, number=1).describe_failure(ls.SourceError("gone"))
         return [b"".join(json.dumps(record).encode() + b"\n" for record in (done, failed))]
 
     return Target(
@@ -458,14 +458,14 @@ def recorded(sensor: str, frames: Iterable[bytes]) -> bytes:
     datagrams = ls.sensor(sensor).datagrams
     sender = {"sender": ("192.0.2.1", 2368), "receiver": ("192.0.2.2", 2368)} if datagrams else {}
     records = [
-        packed(RECEIVED, frame, 10**18 + index, flags=DATAGRAM * datagrams, **sender)
+        pack_record(RECEIVED, frame, 10**18 + index, flags=DATAGRAM * datagrams, **sender)
         for index, frame in enumerate(frames)
     ]
-    event = packed(EVENT, json.dumps({"event": "disconnected"}).encode(), 10**18)
+    event = pack_record(EVENT, json.dumps({"event": "disconnected"}).encode(), 10**18)
     return b"".join(
         [
             MAGIC,
-            packed(HEADER, Header(sensor, source="x", datagrams=datagrams).to_json(), 10**18),
+            pack_record(HEADER, Header(sensor, source="x", datagrams=datagrams).to_json(), 10**18),
             *records,
             event,
         ]

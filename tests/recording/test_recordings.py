@@ -30,7 +30,7 @@ from lidarspec.recording.format import (
     Header,
     Record,
     Recording,
-    packed,
+    pack_record,
     read_header,
     size_at,
 )
@@ -176,9 +176,9 @@ def test_records_behind_a_damaged_header_can_be_salvaged(path: Path) -> None:
 def test_a_kind_of_record_from_the_future_is_passed_over(path: Path) -> None:
     record(path, CHUNKS, datagrams=True)
     with path.open("ab") as file:
-        file.write(packed(9, b"what may come", 1) + packed(1, b"after", 2))
+        file.write(pack_record(9, b"what may come", 1) + pack_record(1, b"after", 2))
     assert [item.data for item in read(path)][-1] == b"after"
-    path.write_bytes(MAGIC + packed(HEADER, b'{"version": 2}'))
+    path.write_bytes(MAGIC + pack_record(HEADER, b'{"version": 2}'))
     with pytest.raises(SourceError, match="format 2"):
         Recording(path)
 
@@ -186,7 +186,7 @@ def test_a_kind_of_record_from_the_future_is_passed_over(path: Path) -> None:
 @pytest.mark.parametrize("salvage", [False, True])
 def test_hostile_files_cost_neither_memory_nor_exceptions(path: Path, *, salvage: bool) -> None:
     source = random.Random(3)
-    header = MAGIC + packed(HEADER, b"{}")
+    header = MAGIC + pack_record(HEADER, b"{}")
     claims = _HEAD.pack(b"\xb5LS\x1e", 1, 0, 255, 65535, 0)
     sealed = (
         _HEAD.pack(b"\xb5LS\x1e", 1, 0, 4, 0, 0) + b"\x09\x00\x00\x00"
@@ -547,7 +547,7 @@ def test_a_recording_opens_no_descriptor_and_no_file_elsewhere(
     data = (folder / "a.lsr").read_bytes()
     header = Header(sensor=HESAI, options={"calibration": value}, datagrams=True).to_json()
     (folder / "a.lsr").write_bytes(
-        MAGIC + packed(0, header) + data[len(MAGIC) + size_at(data, len(MAGIC)) :]
+        MAGIC + pack_record(0, header) + data[len(MAGIC) + size_at(data, len(MAGIC)) :]
     )
     with pytest.raises(
         UsageError, match=rf"a\.lsr: it was recorded with an option .*-s {HESAI} -O .*{told}"
@@ -580,7 +580,7 @@ NO_EVENTS = [
 def test_an_event_that_is_none_is_a_fault_of_its_recording(path: Path) -> None:
     record(path, CHUNKS[:2])
     with path.open("ab") as file:
-        file.write(b"".join(packed(3, event) for event in NO_EVENTS))
+        file.write(b"".join(pack_record(3, event) for event in NO_EVENTS))
     with contextlib.closing(transport(path)) as opened:
         assert len(list(opened.chunks())) == 2
     assert opened.warnings == [

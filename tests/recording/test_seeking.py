@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.recording.format import LARGEST, MARK, RECEIVED, Recording, packed
+from lidarspec.recording.format import LARGEST, MARK, RECEIVED, Recording, pack_record
 from lidarspec.recording.recorders import Recorder
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.protocol import Chunk
@@ -77,7 +77,7 @@ def test_a_time_that_was_passed_or_that_nobody_knows_moves_nothing(
     timeless = tmp_path / "timeless.lsr"
     timeless.write_bytes(
         recording.read_bytes()[: recording.read_bytes().index(MARK, 12)]
-        + packed(RECEIVED, bytes(300)) * 2000
+        + pack_record(RECEIVED, bytes(300)) * 2000
     )
     with Recording(timeless) as file:
         assert not file.seek(START + STEP)

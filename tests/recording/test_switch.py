@@ -20,7 +20,7 @@ def open_switch(folder: Path) -> RecordingSwitch:
     switch = RecordingSwitch(f"sim:{FLAT}", folder)
     switch.sensor_id = FLAT
     with contextlib.closing(transport(f"sim:{FLAT}")) as opened:
-        switch.attached(opened)
+        switch.attach(opened)
     return switch
 
 

@@ -15,7 +15,7 @@ import lidarspec as ls
 from lidarspec import Sensor, SourceError, SpecError, UsageError, simulate
 from lidarspec.errors import PluginError
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.simulation.scenes import Box, Mover, Room, furnished, read_scene, scene_of
+from lidarspec.simulation.scenes import Box, Mover, Room, make_room, read_scene, scene_of
 from lidarspec.simulation.simulator import simulation
 from lidarspec.spec import Cartesian, Frame, Polar, Scaled, Serial, Simulation, Udp, stack
 from lidarspec.testing.geometry import off
@@ -100,7 +100,7 @@ def _seen(
 
 def furnished_room(seed: int) -> Room:
     """Return a room in which nothing moves."""
-    room = furnished(seed)
+    room = make_room(seed)
     return Room(room.walls, room.boxes)
 
 
@@ -205,8 +205,8 @@ def test_what_a_device_sees_moves_with_its_own_time() -> None:
 
 
 def test_a_seed_makes_a_room_and_the_same_one_each_time() -> None:
-    assert furnished(3) == furnished(3) != furnished(4)
-    assert furnished() == furnished(0)
+    assert make_room(3) == make_room(3) != make_room(4)
+    assert make_room() == make_room(0)
 
 
 @pytest.mark.parametrize("start", [0, 7, 1000])
@@ -292,7 +292,7 @@ def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: 
 def test_coordinates_give_the_scene_back_along_the_directions_that_are_declared(
     sensor: Sensor,
 ) -> None:
-    room = furnished(3)
+    room = make_room(3)
     room = Room(room.walls, room.boxes)
     out, device = streamed(sensor, 1.3, room)
     packets = sensor.decode(out)

@@ -25,7 +25,7 @@ import numpy as np
 
 import lidarspec as ls
 from lidarspec import Scan, Sensor
-from lidarspec.recording.format import DATAGRAM, HEADER, MAGIC, RECEIVED, Header, packed
+from lidarspec.recording.format import DATAGRAM, HEADER, MAGIC, RECEIVED, Header, pack_record
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Serial
 from lidarspec.testing import subject as material
@@ -386,7 +386,11 @@ def nothing_runs(share: float) -> Figure:
         frame = ls.sensor("hesai-xt16").example("data")
         for index, value in enumerate((0, "angles.csv", "/etc/passwd", "../x")):
             header = Header("hesai-xt16", {"calibration": value}, datagrams=True).to_json()
-            parts = [MAGIC, packed(HEADER, header, 1), packed(RECEIVED, frame, 2, flags=DATAGRAM)]
+            parts = [
+                MAGIC,
+                pack_record(HEADER, header, 1),
+                pack_record(RECEIVED, frame, 2, flags=DATAGRAM),
+            ]
             (folder / f"{index}.lsr").write_bytes(b"".join(parts))
         ran = opened = 0
         for source in ("front", "0.lsr", "1.lsr", "2.lsr", "3.lsr"):

@@ -56,7 +56,7 @@ from lidarspec.spec import (
 from lidarspec.testing import frames
 from lidarspec.testing.check import Target, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
-from lidarspec.testing.declared import declared
+from lidarspec.testing.declared import check_declaration
 from lidarspec.testing.findings import Violation, left_over
 from lidarspec.testing.frames import (
     values_in_units_build_the_same_bytes,
@@ -262,7 +262,7 @@ def test_what_contradicts_itself_is_named(plugin: Any, code: str) -> None:
             one for one in PROPERTIES if one.function.__module__.endswith("testing.consistency")
         ]
         findings = [
-            *declared(subject),
+            *check_declaration(subject),
             *(finding for one in consistent for finding in one.findings(subject)),
         ]
         return {finding.code for finding in findings}
@@ -323,7 +323,10 @@ def test_an_edit_is_read_back_beside_integers_that_cannot_be_edited() -> None:
 
 def left(sensor: Sensor) -> set[str]:
     """What its declaration leaves over."""
-    return {finding.code for finding in left_over(declared(Subject(sensor)), sensor, whole=True)}
+    return {
+        finding.code
+        for finding in left_over(check_declaration(Subject(sensor)), sensor, whole=True)
+    }
 
 
 def test_what_is_meant_is_acknowledged_with_a_reason() -> None:

@@ -20,7 +20,7 @@ from lidarspec.spec import (
     Xor,
 )
 from lidarspec.testing.commands import the_simulated_sensor_answers
-from lidarspec.testing.declared import declared
+from lidarspec.testing.declared import check_declaration
 from lidarspec.testing.findings import left_over
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES
@@ -31,7 +31,10 @@ from tests.broken import interpreted, sound
 
 def declared_codes(sensor: Sensor) -> set[str]:
     """Return the rules that a declaration alone breaks."""
-    return {finding.code for finding in left_over(declared(Subject(sensor)), sensor, whole=True)}
+    return {
+        finding.code
+        for finding in left_over(check_declaration(Subject(sensor)), sensor, whole=True)
+    }
 
 
 def found_by(function: Any, sensor: Sensor) -> set[str]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lidarspec.view.canvas import STRONG, Canvas
-from lidarspec.view.screen import decoded
+from lidarspec.view.screen import decode_keys
 from lidarspec.view.window import Choice
 
 
@@ -28,7 +28,7 @@ from lidarspec.view.window import Choice
     ],
 )
 def test_keys_of_a_terminal(text: str, keys: list[str]) -> None:
-    assert decoded(text) == keys
+    assert decode_keys(text) == keys
 
 
 def test_keys_change_what_is_shown() -> None:

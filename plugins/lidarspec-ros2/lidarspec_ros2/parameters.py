@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from lidarspec.cli.options import configured
-from lidarspec.detect.identification import declared, detected
+from lidarspec.cli.options import configure_sensor
+from lidarspec.detect.identification import detect, find_declared_sensor
 from lidarspec.device.device import Device
 from lidarspec.device.settings import named
 from lidarspec.errors import UsageError
@@ -262,7 +262,7 @@ class Settings:
             UsageError, WireError, SourceError: as the command line.
         """
         sensor = self._configured_sensor()
-        return detected(self["source"]) if sensor is None else sensor
+        return detect(self["source"]) if sensor is None else sensor
 
     def known_sensor(self) -> Sensor | None:
         """Return the sensor that the parameters or the source name; None if it must be detected.
@@ -272,12 +272,12 @@ class Settings:
             SourceError: for a file that cannot be opened.
         """
         sensor = self._configured_sensor()
-        return declared(self["source"]) if sensor is None else sensor
+        return find_declared_sensor(self["source"]) if sensor is None else sensor
 
     def _configured_sensor(self) -> Sensor | None:
         """Return the sensor that the parameters name, with its options; None if they name none."""
         options = [option for option in self["options"] if option]
-        sensor = configured(self["sensor"] or None, options, self["calibration"] or None)
+        sensor = configure_sensor(self["sensor"] or None, options, self["calibration"] or None)
         return None if sensor is None else named_sensor(sensor)
 
     def mount(self) -> Mount | None:

@@ -116,7 +116,7 @@ class Guard:
         host = headers.get("host", "")
         origin = headers.get("origin")
         if not self._is_own_host(host):
-            return _refused(OTHER_HOST)
+            return _refuse(OTHER_HOST)
         if origin is None:
             is_own_page = scope["type"] == "http"  # browsers name the origin of each socket
         else:
@@ -125,7 +125,7 @@ class Guard:
             site = headers.get("sec-fetch-site", "same-origin")
             is_own_page = is_own_page and site in ("same-origin", "none")
         if not is_own_page:
-            return _refused(OTHER_PAGE)
+            return _refuse(OTHER_PAGE)
         token = QueryParams(scope["query_string"]).get("token", "")
         if not secrets.compare_digest(token.encode(), self._token):
             return HTMLResponse(TOKEN_NEEDED, 403, {"connection": "close"})
@@ -143,7 +143,7 @@ class Guard:
         return name.lower() in self._names or (self._is_anywhere and is_address(name.strip("[]")))
 
 
-def _refused(reason: str) -> Response:
+def _refuse(reason: str) -> Response:
     return PlainTextResponse(reason, 403, {"connection": "close"})
 
 

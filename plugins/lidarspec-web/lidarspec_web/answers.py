@@ -124,7 +124,7 @@ class Answers:
             "explanation": explanation.to_dict(),
         }
 
-    def numbered(self, number: int, backlog: Backlog) -> dict[str, Any]:
+    def find_frame(self, number: int, backlog: Backlog) -> dict[str, Any]:
         """Return a frame by its number."""
         taken = backlog.frame(number)
         if taken is None:
@@ -143,9 +143,9 @@ class Answers:
             return _gone(f"the frame of point {index}")
         return self.frame(taken, "point", place)
 
-    def damaged(self, number: int, backlog: Backlog) -> dict[str, Any]:
+    def find_damaged(self, number: int, backlog: Backlog) -> dict[str, Any]:
         """Return a damaged piece with what would explain the damage."""
-        piece = backlog.broken(number)
+        piece = backlog.find_damaged(number)
         if piece is None:
             return _gone(f"damaged piece {number}")
         return {
@@ -158,7 +158,7 @@ class Answers:
             "explanation": backlog.explain_damaged(piece),
         }
 
-    def composed(self, name: str, texts: Mapping[str, str]) -> dict[str, Any]:
+    def compose_command(self, name: str, texts: Mapping[str, str]) -> dict[str, Any]:
         """Return the bytes of a command, explained.
 
         Args:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarspec import Decoder, Sensor, WireError
 from lidarspec.explaining.explanation import Explanation
-from lidarspec.explaining.pieces import Piece, explained
+from lidarspec.explaining.pieces import Piece, explain_piece
 from lidarspec.framing.results import Frames, Numbers, array_of
 from lidarspec.scans.provenance import PointOrigin
 
@@ -183,7 +183,7 @@ class Backlog:
             self._input_size = 0
             self._end = 0
 
-    def frozen(self) -> Backlog:
+    def freeze(self) -> Backlog:
         """Return a backlog of the frames and damaged pieces of now, to which nothing is added."""
         copy = Backlog(self.sensor)
         with self._lock:
@@ -224,7 +224,7 @@ class Backlog:
             return None
         return Taken(None, place.frame, place.host_ns or -1, place.data)
 
-    def broken(self, number: int) -> Damaged | None:
+    def find_damaged(self, number: int) -> Damaged | None:
         """Return a damaged piece by its number, None if it is not kept."""
         return next((piece for piece in self.since(number) if piece.number == number), None)
 
@@ -239,7 +239,9 @@ class Backlog:
         It has the rows of each damaged frame in it, with the change that would explain the damage,
         and of the bytes between them.
         """
-        parts = list(explained(self.sensor, Piece(piece.offset, piece.data, "", piece.datagram)))
+        parts = list(
+            explain_piece(self.sensor, Piece(piece.offset, piece.data, "", piece.datagram))
+        )
         frames = [explanation for _, explanation in parts if explanation.frame]
         rows = []
         for part, explanation in parts:

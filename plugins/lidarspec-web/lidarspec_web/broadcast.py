@@ -182,7 +182,7 @@ class Broadcast:
         """Return the time in seconds since 1970, by the clock that stamps arrivals."""
         return self._clock.now() * 1e-9
 
-    def numbered(self, number: int) -> Shown | None:
+    def find_scan(self, number: int) -> Shown | None:
         """Return a scan by its number, None if no page holds it any more."""
         return self._by_number.get(number)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lidarspec import Sensor
-from lidarspec.explaining.wording import asked
+from lidarspec.explaining.wording import format_argument_type
 from lidarspec.exports.reference import effect
 from lidarspec.frames.commands import argument_slot
 from lidarspec.spec.arguments import Range
@@ -56,7 +56,7 @@ def _argument(sensor: Sensor, name: str, argument: str) -> dict[str, Any]:
     info = argument_slot(sensor, name, argument).info
     field = {"name": argument, "unit": info.unit, "default": None}
     if not isinstance(kind, Range):
-        text = ": ".join(filter(None, (info.docs, asked(kind))))
+        text = ": ".join(filter(None, (info.docs, format_argument_type(kind))))
         return {**field, "text": text, "low": None, "high": None, "choices": []}
     labels = {float(info.physical(raw)): label for raw, label in info.labels.items()}
     choices = [

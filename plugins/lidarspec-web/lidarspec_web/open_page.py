@@ -313,7 +313,7 @@ class OpenPage:
         elif self._frozen is not None:
             return
         else:
-            self._frozen = self._broadcast.backlog.frozen()
+            self._frozen = self._broadcast.backlog.freeze()
         self._state_due = 0.0
         self.notify()
 
@@ -351,14 +351,14 @@ class OpenPage:
             self._reply_later("frame", lambda: self._answers.origin(shown, scan, index, backlog))
         elif "damaged" in request:
             number = round(_number(request, "damaged", 0, MAX_NUMBER))
-            self._reply_later("frame", lambda: self._answers.damaged(number, backlog))
+            self._reply_later("frame", lambda: self._answers.find_damaged(number, backlog))
         else:
             number = round(_number(request, "number", 0, MAX_NUMBER))
-            self._reply_later("frame", lambda: self._answers.numbered(number, backlog))
+            self._reply_later("frame", lambda: self._answers.find_frame(number, backlog))
 
     def _compose(self, request: Mapping[str, Any]) -> None:
         name, arguments = _command(request)
-        self._reply_later("compose", lambda: self._answers.composed(name, arguments), name)
+        self._reply_later("compose", lambda: self._answers.compose_command(name, arguments), name)
 
     def _send_command(self, request: Mapping[str, Any]) -> None:
         name, arguments = _command(request)

@@ -202,7 +202,7 @@ class Site:
             return PlainTextResponse(f"a scan is saved as {', '.join(saves())}", 404)
         shown = None
         if number.isdecimal() and len(number) < MAX_NUMBER_DIGITS:
-            shown = self._broadcast.numbered(int(number))
+            shown = self._broadcast.find_scan(int(number))
         if shown is None:
             return PlainTextResponse("this scan is not kept any more: pause before saving", 404)
         return self._saves.response(shown, suffix)

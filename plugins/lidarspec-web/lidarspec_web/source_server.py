@@ -52,7 +52,7 @@ class SourceServer:
         self.switch: RecordingSwitch | None = None
         if is_live(source):
             self.switch = RecordingSwitch(source, folder or Path.cwd())
-        record = None if self.switch is None else self.switch.attached
+        record = None if self.switch is None else self.switch.attach
         device = open_device(source, sensor, record=record, period=LOOK_S)
         if self.switch is not None:
             self.switch.sensor_id = device.sensor.id

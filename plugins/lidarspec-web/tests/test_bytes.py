@@ -77,7 +77,7 @@ def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -
     with Station(source, tmp_path) as station, station.page() as page:
         page.scan()
         header, columns = page.scan()
-        shown = station.broadcast.numbered(header["scan"])
+        shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         assert page.scan()[0]["scan"] > header["scan"]
         asked = ASKED if sensor == FLAT else ASKED_OF_LONG_FRAMES
@@ -103,7 +103,7 @@ def test_a_point_of_a_file_leads_to_its_frame(
         page.say("seek", to=to)
         header, columns = page.scan_at(to)
         assert page.asked("frame", number=0)["is"] == "gone"  # of what was read before
-        shown = station.broadcast.numbered(header["scan"])
+        shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         for spot in range(0, header["points"], header["points"] // ASKED_OF_LONG_FRAMES):
             agree(page, header, columns, spot, shown.scan)
@@ -117,7 +117,7 @@ def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
     ):
         page.state(lambda state: state["figures"] and state["figures"]["lost"])
         header, columns = page.scan()
-        shown = station.broadcast.numbered(header["scan"])
+        shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         for spot in range(0, header["points"], header["points"] // ASKED):
             agree(page, header, columns, spot, shown.scan)
@@ -130,7 +130,7 @@ def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(
     monkeypatch.setattr("lidarspec_web.backlog.MAX_INPUT_BYTES", 1)
     with Station(f"sim:{SOLID}?{SLOWLY}", tmp_path) as station, station.page() as page:
         header, columns = page.scan()
-        shown = station.broadcast.numbered(header["scan"])
+        shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         agree(page, header, columns, 7, shown.scan)
         assert page.asked("frame", number=0) == {"is": "gone", "what": "frame 0"}

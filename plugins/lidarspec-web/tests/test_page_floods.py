@@ -91,18 +91,18 @@ def test_a_page_that_asks_without_end_waits_for_itself(
     nothing.
     """
     counts = Counter[str]()
-    delay_s, frozen = RateLimit.delay_s, Backlog.frozen
+    delay_s, frozen = RateLimit.delay_s, Backlog.freeze
 
     def counted_delay_s(limit: RateLimit, now: float) -> float:
         counts["messages"] += 1
         return delay_s(limit, now)
 
-    def counted_frozen(backlog: Backlog) -> Backlog:
-        counts["frozen"] += 1
+    def counted_freeze(backlog: Backlog) -> Backlog:
+        counts["freeze"] += 1
         return frozen(backlog)
 
     monkeypatch.setattr(RateLimit, "delay_s", counted_delay_s)
-    monkeypatch.setattr(Backlog, "frozen", counted_frozen)
+    monkeypatch.setattr(Backlog, "freeze", counted_freeze)
     with station.page() as flooding, station.page() as other:
         flooding.scan()
         for _ in range(FLOOD):
@@ -111,7 +111,7 @@ def test_a_page_that_asks_without_end_waits_for_itself(
             assert other.scan()[1]["x"].size
         assert other.asked("frame", number=0)["is"] == "frame"
         assert 4 < counts["messages"] < FLOOD / 2
-        assert counts["frozen"] == 1
+        assert counts["freeze"] == 1
 
 
 def test_questions_of_a_page_are_answered_in_their_order(station: Station) -> None:

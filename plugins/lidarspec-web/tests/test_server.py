@@ -62,7 +62,7 @@ def test_scans_are_those_of_the_sensor_and_always_the_newest(tmp_path: Path) -> 
             time.sleep(0.01)
         header, columns = page.scan()
         assert header["scan"] >= first["scan"] + 4  # those between were not waited for
-        shown = station.broadcast.numbered(header["scan"])
+        shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         assert np.array_equal(columns["x"], shown.scan.points.x[columns["index"]])
         assert header["position"] > first["position"]
