@@ -67,7 +67,7 @@ def entry_points(group: str) -> list[EntryPoint]:
     those of the first.
     """
     try:
-        found = [entry for folder in _distributions() for entry in _declared(folder, group)]
+        found = [entry for folder in _distributions() for entry in _iter_declared(folder, group)]
     except _NotOnlyFolders:
         found = _by_metadata(group)
     return sorted(found, key=lambda entry: (entry.name, entry.value))
@@ -82,7 +82,7 @@ def _distributions() -> Iterator[str]:
         raise _NotOnlyFolders
     seen = set()
     for place in sys.path:
-        for name in _listed(place or os.curdir):
+        for name in _list_names(place or os.curdir):
             stem, kind = os.path.splitext(name)
             if kind.lower() in _FOLDERS:
                 distribution = normal(stem.partition("-")[0])
@@ -96,7 +96,7 @@ def normal(distribution: str) -> str:
     return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
-def _listed(place: str) -> list[str]:
+def _list_names(place: str) -> list[str]:
     if place.lower().rstrip("/\\").endswith(".egg"):
         raise _NotOnlyFolders
     try:
@@ -107,7 +107,7 @@ def _listed(place: str) -> list[str]:
         return []
 
 
-def _declared(folder: str, group: str) -> Iterator[EntryPoint]:
+def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
     """The entry points of a group that one distribution declares; where not all can be read, one
     that says so among the modules.
     """

@@ -284,11 +284,11 @@ def did_you_mean(
     else:
         named = [by_letters[other] for other in close]
     if named:
-        return f"; did you mean {listed(named)}?"
+        return f"; did you mean {format_names(named)}?"
     return ""
 
 
-def listed(names: Sequence[str]) -> str:
+def format_names(names: Sequence[str]) -> str:
     """Names in words: 'a', 'b' or 'c'."""
     *others, last = map(repr, names)
     if others:

@@ -222,7 +222,7 @@ class Registry:
         self._offered: dict[Home, list[EntryPoint]] = {}
         self._tried: dict[EntryPoint, Plugin] = {}
         self._modules = [
-            _loaded(entry, entry.name, functools.partial(self._add_module, entry))
+            _load_entry(entry, entry.name, functools.partial(self._add_module, entry))
             for entry in modules
         ]
         for entry in offered:
@@ -237,9 +237,9 @@ class Registry:
         """
         self._load_all()
         offered = [self._together(entries) for entries in self._offered.values()]
-        return [self._judged(plugin) for plugin in (*self._modules, *offered)]
+        return [self._judge(plugin) for plugin in (*self._modules, *offered)]
 
-    def _judged(self, plugin: Plugin) -> Plugin:
+    def _judge(self, plugin: Plugin) -> Plugin:
         """The plugin with the ids that it has, and the first name that another has, or that nobody
         can be said to have.
         """
@@ -289,7 +289,7 @@ class Registry:
 
     def _load(self, entry: EntryPoint) -> None:
         if entry not in self._tried:
-            self._tried[entry] = _loaded(
+            self._tried[entry] = _load_entry(
                 entry, entry.name, functools.partial(self._add_offered, entry)
             )
 
@@ -437,7 +437,7 @@ class Registry:
             for entries in self._offered.values()
             if any(entry in self._tried for entry in entries)
         ]
-        return [plugin for plugin in map(self._judged, (*self._modules, *offered)) if plugin.error]
+        return [plugin for plugin in map(self._judge, (*self._modules, *offered)) if plugin.error]
 
     def list_sensors(self) -> list[KnownSensor]:
         """Return a row for each installed sensor, sorted by id; only plugins that the table does
@@ -499,7 +499,9 @@ class Registry:
                 name, known, aliases, self._failed_modules()
             )
         if name not in self._ready:
-            self._ready.setdefault(name, self.hooked(found))  # another thread may have been first
+            self._ready.setdefault(
+                name, self.apply_hooks(found)
+            )  # another thread may have been first
         return self._ready[name]
 
     def _load_error(self, name: str) -> UnknownSensor | None:
@@ -520,30 +522,28 @@ class Registry:
             if plugin.error and not plugin.sensors
         }
 
-    def hooked(self, sensor: Sensor) -> Sensor:
+    def apply_hooks(self, sensor: Sensor) -> Sensor:
         """The sensor with the checksum and points hooks of all plugins applied to it."""
-        frames = {name: self._sealed(sensor, frame) for name, frame in sensor.frames.items()}
+        frames = {name: self._seal(sensor, frame) for name, frame in sensor.frames.items()}
         points = self._manager.hook.lidarspec_points
         if not points.get_hookimpls():
-            return replace(sensor, frames=frames, hooked=self.hooked)
+            return replace(sensor, frames=frames, hooked=self.apply_hooks)
 
-        def asked(function: Any) -> Any:
+        def ask(function: Any) -> Any:
             if isinstance(function, Mapping):
-                return {path: asked(own) for path, own in function.items()}
+                return {path: ask(own) for path, own in function.items()}
             if function is None or isinstance(function, HookedPoints):
                 return function
             return HookedPoints(sensor, function, points)
 
-        frames = {
-            name: replace(frame, points=asked(frame.points)) for name, frame in frames.items()
-        }
-        return replace(sensor, frames=frames, points=asked(sensor.points), hooked=self.hooked)
+        frames = {name: replace(frame, points=ask(frame.points)) for name, frame in frames.items()}
+        return replace(sensor, frames=frames, points=ask(sensor.points), hooked=self.apply_hooks)
 
     def call(self, hook: str, **arguments: Any) -> Any:
         """The result of another hook."""
         return getattr(self._manager.hook, hook)(**arguments)
 
-    def _sealed(self, sensor: Sensor, frame: Frame) -> Frame:
+    def _seal(self, sensor: Sensor, frame: Frame) -> Frame:
         """The frame with the checksum of the first hook that has one for it; a hook that fails is
         named and passed over.
         """
@@ -552,15 +552,15 @@ class Registry:
             try:
                 algorithm = hook.function(**{name: arguments[name] for name in hook.argnames})
                 if algorithm is not None:
-                    return _resealed(frame, algorithm)
+                    return _reseal(frame, algorithm)
             except Exception as error:
-                self._failed(
+                self._record_failure(
                     hook.plugin_name,
                     f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}",
                 )
         return frame
 
-    def _failed(self, name: str, reason: str) -> None:
+    def _record_failure(self, name: str, reason: str) -> None:
         for index, plugin in enumerate(self._modules):
             if ":".join(plugin.home) == name and not plugin.error:
                 self._modules[index] = replace(
@@ -695,7 +695,7 @@ def _describe_place(thread: threading.Thread) -> str:
     return f" at {module_frames[-1].filename}, line {module_frames[-1].lineno}"
 
 
-def _loaded(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
+def _load_entry(entry: EntryPoint, names: str, add: Callable[[Any], list[str]]) -> Plugin:
     """Load and register an entry point; return the resulting plugin.
 
     An exception is stored in the plugin, so that it does not affect other plugins.
@@ -717,7 +717,7 @@ def _letters(name: str) -> str:
     return re.sub(r"[\W_]", "", name).lower()
 
 
-def _resealed(frame: Frame, algorithm: Any) -> Frame:
+def _reseal(frame: Frame, algorithm: Any) -> Frame:
     if not isinstance(algorithm, Checksum):
         raise SpecError(f"returns a Checksum or None, not {type(algorithm).__name__}")
     struct = prepare(frame.struct)
@@ -759,7 +759,7 @@ def registry() -> Registry:
     return _registries[-1]
 
 
-def tried() -> list[Plugin]:
+def try_plugins() -> list[Plugin]:
     """Every plugin that was found: loaded in another process, and here where it neither hangs there
     nor ends the process.
     """
@@ -879,7 +879,7 @@ def load_hooks(entry: EntryPoint) -> Registry:
     """
     hooks = Registry()
     place = f"{entry.distribution}:{entry.module}"
-    loaded = _loaded(entry, entry.name, functools.partial(hooks.add, name=place))
+    loaded = _load_entry(entry, entry.name, functools.partial(hooks.add, name=place))
     if loaded.error:
         raise SpecError(loaded.error, path=entry.distribution)
     return hooks
@@ -964,7 +964,7 @@ def _from_file(text: str) -> Sensor:
     if wanted and wanted not in ids:
         raise UnknownSensor(wanted, ids, place=str(file))
     chosen = local.sensor(wanted or ids[0])
-    return registry().hooked(chosen)
+    return registry().apply_hooks(chosen)
 
 
 def file_module(file: Path) -> ModuleType:
@@ -1009,8 +1009,8 @@ def rebuilt(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
     return known.configure(**options) if options else known
 
 
-def _reduced(value: Sensor) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:
+def _reduce(value: Sensor) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:
     return rebuilt, (value.id, dict(value.options))
 
 
-copyreg.pickle(Sensor, _reduced)
+copyreg.pickle(Sensor, _reduce)

@@ -60,12 +60,12 @@ def foreign(path: Path) -> str:
     for place in (path, path.parent):
         with system_errors(place):
             status = place.stat()
-        if reason := shared(status, _WRITABLE_BY_ALL):
+        if reason := describe_sharing(status, _WRITABLE_BY_ALL):
             return f"{place} {reason}"
     return ""
 
 
-def shared(status: os.stat_result, others: int) -> str:
+def describe_sharing(status: os.stat_result, others: int) -> str:
     """Why something is not the user's own, such as "belongs to user 0"; "" where it is, and on
     Windows, where a user's folders are.
 

@@ -24,7 +24,7 @@ from lidarspec.explaining.pieces import explain_piece, pieces
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.hexadecimal import unhexed
+from lidarspec.transports.hexadecimal import parse_hex
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
 
@@ -136,7 +136,7 @@ def send(
 
 def _bytes(digits: str) -> bytes:
     try:
-        return unhexed(digits)
+        return parse_hex(digits)
     except ValueError as error:
         raise UsageError(f"--hex takes bytes in hexadecimal: {error}") from None
 

@@ -23,7 +23,7 @@ from click.shell_completion import (
 )
 
 from lidarspec.detect.identification import find_declared_sensor
-from lidarspec.device.settings import devices, named
+from lidarspec.device.settings import devices, find_device
 from lidarspec.errors import LidarSpecError
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import registry, sensor as named_sensor
@@ -130,9 +130,9 @@ def _sensor(ctx: click.Context) -> Sensor | None:
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])
     source = ctx.params.get("source") or ""
-    known = named(source)
+    known = find_device(source)
     if known:
-        return known.configured()
+        return known.configure()
     return find_declared_sensor(source)
 
 

@@ -42,7 +42,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.base import data_link
-from lidarspec.transports.open_url import live_address, resolved
+from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
 from lidarspec.transports.protocol import no_bytes
 
@@ -277,7 +277,7 @@ def detect(
     if source is None:
         found = list(_everywhere(duration, start=start))
     else:
-        source = resolved(source)
+        source = resolve(source)
         with Progress() as progress:
             found = _one(
                 source,

@@ -41,7 +41,7 @@ from lidarspec.plugins import sensors
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Times, iter_received
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, unhexed
+from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, parse_hex
 from lidarspec.transports.protocol import Chunk, no_bytes
 
 if TYPE_CHECKING:
@@ -82,15 +82,15 @@ def open_input(
         reading = _file(text, times)
     else:
         try:
-            if not (data := unhexed(text)):
+            if not (data := parse_hex(text)):
                 raise ValueError("there are no digits")
             reading = _beginning(
                 text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False
             )
         except ValueError as error:
-            from lidarspec.device.settings import named
+            from lidarspec.device.settings import find_device
 
-            if (device := named(text)) is None:
+            if (device := find_device(text)) is None:
                 raise _no_bytes(words, error) from None
             reading = open_input([device.source], times)
     with reading as given:
@@ -236,12 +236,12 @@ def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
         if word == "-"
         else [word, word.partition("?")[0], word.rpartition(":")[0], word.partition("=")[2]]
     )
-    from lidarspec.device.settings import named
+    from lidarspec.device.settings import find_device
 
     with contextlib.suppress(
         LidarSpecError
     ):  # settings that are wrong are told of where a name is looked up
-        known = named(word)
+        known = find_device(word)
         yield from (
             (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
         )

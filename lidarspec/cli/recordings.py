@@ -16,7 +16,7 @@ from lidarspec.cli.options import DURATION, SPEED, count_option, selecting, sens
 from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note, say
 from lidarspec.detect.identification import find_declared_sensor
-from lidarspec.device.settings import named
+from lidarspec.device.settings import find_device
 from lidarspec.device.source_recording import SourceRecording, recorder_like
 from lidarspec.errors import (
     CommandError,
@@ -87,14 +87,14 @@ def record(
     if times is not None:
         raise _slice_error(source, target, times)
     refuse_overwriting(target, source, sensor_id)
-    known = named(source)
+    known = find_device(source)
     sensor: Sensor | None = None
     if sensor_id:
         sensor = named_sensor(sensor_id)
     elif is_live(source):
         sensor = find_declared_sensor(source)
     elif known:
-        sensor = known.configured()
+        sensor = known.configure()
     task = SourceRecording(
         source,
         target,

@@ -227,9 +227,9 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     They are loaded in another process first, and if anything is wrong, each in one of its own, so
     that one that hangs or ends the program is named. Exit code 1 where something is wrong.
     """
-    from lidarspec.plugins import tried
+    from lidarspec.plugins import try_plugins
 
-    found = tried()
+    found = try_plugins()
     rows = [[p.distribution, p.version, p.entry_point, _describe_plugin(p)] for p in found]
     if as_json:
         emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in found], output)

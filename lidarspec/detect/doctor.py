@@ -19,7 +19,7 @@ from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports import ports
 from lidarspec.transports.addresses import Address, with_option
 from lidarspec.transports.base import data_link
-from lidarspec.transports.open_url import live_address, resolved
+from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.protocol import no_bytes
 from lidarspec.transports.udp import BUFFER, shortfall
 
@@ -50,7 +50,7 @@ def examine(
         sensor: whose bytes are expected; found out where left out.
         seconds: to listen for.
     """
-    text = resolved(source)
+    text = resolve(source)
     address = live_address(text)
     if address is None:
         yield from _file(text, sensor)
@@ -118,7 +118,7 @@ def _serial(
 
 
 def _permission(port: str) -> Iterator[Finding]:
-    if not ports.allowed(port):
+    if not ports.is_allowed(port):
         group = ports.group(port)
         text = f"{port}: this user may not open it"
         by_group = Finding(
@@ -149,14 +149,14 @@ def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -
     yield from _buffer()
     if busy:
         return
-    before = ports.received()
+    before = ports.count_received()
     began = time.monotonic()
     found = list(_examine_bytes(source, sensor, seconds))
     yield from found
     if any("nothing came" in finding.text for finding in found):
         rates = {
             name: (count - before.get(name, count)) / (time.monotonic() - began)
-            for name, count in ports.received().items()
+            for name, count in ports.count_received().items()
         }
         yield from _interfaces(numbers, host, rates)
 

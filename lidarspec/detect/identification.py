@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from lidarspec.detect.heard import Heard
 from lidarspec.detect.listen import LISTEN, hear, ignore
 from lidarspec.detect.uninstalled import suggest_installation
-from lidarspec.device.settings import named
+from lidarspec.device.settings import find_device
 from lidarspec.drafting.checksum_search import search
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
 from lidarspec.expressions.columns import Fields
@@ -48,7 +48,7 @@ from lidarspec.spec.links import Serial
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import live_address, resolved, transport
+from lidarspec.transports.open_url import live_address, resolve, transport
 from lidarspec.transports.protocol import no_bytes
 
 #: Relative tolerance of the pace of a clock.
@@ -592,7 +592,7 @@ def detect(source: str | Path) -> Sensor:
     declared_sensor = find_declared_sensor(source)
     if declared_sensor is not None:
         return declared_sensor
-    found = verdicts(resolved(source))
+    found = verdicts(resolve(source))
     fitting = [one for one in found if one.scores]
     if not fitting:
         raise _no_sensor_error(str(source), found)
@@ -650,9 +650,9 @@ def find_declared_sensor(source: str | Path) -> Sensor | None:
         UsageError: for standard input.
         SourceError: if the file cannot be opened.
     """
-    device = named(source)
+    device = find_device(source)
     if device is not None:
-        configured = device.configured()
+        configured = device.configure()
     else:
         configured = None
     if configured is not None:

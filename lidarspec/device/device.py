@@ -20,7 +20,7 @@ from lidarspec.device.arrivals import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.packet_reader import PacketReader
 from lidarspec.device.session import Reply
-from lidarspec.device.settings import named
+from lidarspec.device.settings import find_device
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.framing.decoder import Witness
 from lidarspec.framing.results import Counters, Found
@@ -586,7 +586,7 @@ def open(
         UsageError, WireError: if the sensor was omitted and several fit, or none.
         CommandError: if the device does not start.
     """
-    settings = named(source)
+    settings = find_device(source)
     if sensor is None:
         sensor = detect(source)
     return Device(

@@ -62,7 +62,7 @@ class Named:
     hidden: str = ""
     believed: bool = True
 
-    def configured(self) -> Sensor | None:
+    def configure(self) -> Sensor | None:
         """The sensor with its options; None where it is to be detected.
 
         Raises:
@@ -87,7 +87,7 @@ class Named:
             raise UsageError(f"{place}: {error}") from None
         return configured
 
-    def refused(self) -> UsageError | None:
+    def refusal(self) -> UsageError | None:
         """Why a file that is not believed cannot have this device; None where it can."""
         if self.believed:
             return None
@@ -119,7 +119,7 @@ class Named:
         return suggest(error, f"lidarspec trust {quote(str(Path(self.file).parent))}")
 
 
-def named(source: str | Path) -> Named | None:
+def find_device(source: str | Path) -> Named | None:
     """The device of this name; None for every other SOURCE.
 
     Raises:
@@ -145,7 +145,7 @@ def named(source: str | Path) -> Named | None:
     device = known.get(word)
     if device is None:
         return None
-    if refused := device.refused():
+    if refused := device.refusal():
         raise refused
     if device.hidden:
         warnings.warn(

@@ -23,7 +23,7 @@ from itertools import combinations, product, zip_longest
 import numpy as np
 
 from lidarspec.drafting.samples import Match, Place, Samples, Span, anywhere, doubt, enough, spans
-from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflected
+from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflect
 
 #: Largest degree of the cofactors that are tried to find a divisor, one by one.
 MAX_COFACTOR_DEGREE = 11
@@ -169,7 +169,7 @@ class _Reading:
 
     def register(self, value: int) -> int:
         if self.refout:
-            return reflected(value, self.width)
+            return reflect(value, self.width)
         return value
 
     def init_term(self, init: int, size: int) -> int:

@@ -22,7 +22,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Octets, Range
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.tree import FieldInfo, evaluated
-from lidarspec.transports.hexadecimal import unhexed
+from lidarspec.transports.hexadecimal import parse_hex
 
 _STEP = r"\w+(?:\[(?:\d+|\*)\])*"
 _PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")
@@ -85,7 +85,7 @@ def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
 
 def _octets(text: str, place: str) -> bytes:
     try:
-        return unhexed(text)
+        return parse_hex(text)
     except ValueError:
         raise UsageError(f"{place} takes bytes in hexadecimal, not {text!r}") from None
 

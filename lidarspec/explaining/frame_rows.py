@@ -16,7 +16,7 @@ from lidarspec.frames.plain import plain_fields
 from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
-from lidarspec.frames.wire_table import bit_text, hexed
+from lidarspec.frames.wire_table import bit_text, format_hex
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import UNNAMED, FieldInfo, exact, listed
 
@@ -149,8 +149,8 @@ class FrameRows:
     def _remark(self, each: WireField, info: FieldInfo) -> str:
         """Return what is wrong with a value; "" if nothing is."""
         if info.const is not None and each.raw != info.const:
-            shown = hexed(each.raw, info.bits)
-            return f"wrong: {shown}, expected {hexed(info.const, info.bits)}"
+            shown = format_hex(each.raw, info.bits)
+            return f"wrong: {shown}, expected {format_hex(info.const, info.bits)}"
         if info.allowed is not None and each.raw not in info.allowed:
             return f"wrong: {each.raw}, expected {listed(info.allowed)}"
         if info.held and self._fault is not None and self._fault.path == each.path:
@@ -199,8 +199,8 @@ def _verdict(seal: PlacedSeal) -> tuple[str, bool]:
     algorithm = seal.seal.algorithm
     count = sum(end - start for start, end in seal.seal.spans)
     plural = "s" if count != 1 else ""
-    stored = hexed(seal.stored, algorithm.width)
-    computed = hexed(seal.computed, algorithm.width)
+    stored = format_hex(seal.stored, algorithm.width)
+    computed = format_hex(seal.computed, algorithm.width)
     if seal.stored == seal.computed:
         verdict = "ok"
     elif seal.is_right:

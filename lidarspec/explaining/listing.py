@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 from lidarspec.explaining.wording import Difference, Row, Span, Value, bit_picture, number
-from lidarspec.frames.wire_table import hexed
+from lidarspec.frames.wire_table import format_hex
 
 #: bytes in a line, spaces of a level of nesting, and the widest columns of bits and of names.
 LINED = 8
@@ -230,4 +230,6 @@ def _missing(group: list[Difference], which: str) -> Line:
 
 def _format_value(value: Value) -> str:
     text = str(value)
-    return text or (hexed(value.raw, 0) if isinstance(value.raw, bytes) else str(number(value.raw)))
+    return text or (
+        format_hex(value.raw, 0) if isinstance(value.raw, bytes) else str(number(value.raw))
+    )

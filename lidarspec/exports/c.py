@@ -36,7 +36,7 @@ from lidarspec.exports.c_fields import (
 )
 from lidarspec.frames.wire_table import Extent
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
-from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflected
+from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflect
 from lidarspec.spec.tree import (
     Blob,
     Block,
@@ -174,7 +174,7 @@ def _make_crc_body(crc: Crc) -> _Body:
     table = ",\n    ".join(
         ", ".join(entries[first : first + per_line]) for first in range(0, 256, per_line)
     )
-    start = reflected(crc.init, crc.width)
+    start = reflect(crc.init, crc.width)
     begin = f"static const uint{size}_t table[256] = {{\n    {table}}};\n"
     begin += f"uint{size}_t total = {_format_literal(start if crc.refin else mirrored_bytes(start), size)};"
     step = f"total = (uint{size}_t)(table[(total ^ byte) & 0xff] ^ total >> 8);"

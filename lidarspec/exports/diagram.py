@@ -20,11 +20,11 @@ from lidarspec.frames.wire_table import (
     Extent,
     bit_text,
     branches,
+    describe_end,
     extent,
     frame_size,
     meaning,
     phrase,
-    ruled,
     unit_text,
 )
 from lidarspec.spec import Sensor, tree
@@ -127,7 +127,7 @@ class _Cells:
                     items = kinds[0][1]
                 else:
                     items = tuple(Group(name, items, optional=True) for name, items in kinds)
-                return (Group(f"{node.name}: {ruled(node)}", items),)
+                return (Group(f"{node.name}: {describe_end(node)}", items),)
             case tree.When() | tree.Select():
                 parts = (
                     (label, self.visit(branch, start, depth)) for label, branch in branches(node)

@@ -52,7 +52,7 @@ def build(
     declared = sensor.frames[frame]
     place = f"{sensor.id} {frame}"
     checker = _Values(schema(declared.tree), known_paths(declared.tree), place, units=units)
-    given = checker.checked({**(value or {}), **values}, "")
+    given = checker.check({**(value or {}), **values}, "")
     layouts = frame_layouts(declared)
     if isinstance(layouts, NotCompilable):
         fill_counts(given, schema(declared.tree))
@@ -86,7 +86,7 @@ class _Values:
         self._place = place
         self._units = units
 
-    def checked(self, value: Any, path: str, shown: str = "") -> Any:
+    def check(self, value: Any, path: str, shown: str = "") -> Any:
         info = self._table.all_fields.get(path)
         if info is not None and info.kind == "other" and not (self._units and info.scaled):
             return value  # construct alone knows what it takes
@@ -99,7 +99,7 @@ class _Values:
         if isinstance(value, list | tuple):
             found = []
             for index, element in enumerate(value):
-                found.append(self.checked(element, path, f"{shown}[{index}]"))
+                found.append(self.check(element, path, f"{shown}[{index}]"))
             if info is not None and info.kind == "bytes":
                 return self._bytes(found, shown)
             return found
@@ -117,7 +117,7 @@ class _Values:
                 raise UnknownField(
                     below, [known for known in self._known if known], place=self._place
                 )
-            found[name] = self.checked(element, below, f"{shown}.{name}" if shown else name)
+            found[name] = self.check(element, below, f"{shown}.{name}" if shown else name)
         return found
 
     def _bytes(self, found: list[Any], shown: str) -> bytes | list[Any]:

@@ -166,7 +166,7 @@ def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str)
         bottom, top = info.limits if info.kind == "int" else (raw, raw)
         return min(max(raw, bottom), top)
     try:
-        data = kind.packed(value, slot.room)
+        data = kind.pack(value, slot.room)
     except ValueError:
         raise UsageError(
             f"{place}: {argument} is {kind.words(slot.room)}, not {value!r:.60}"
@@ -175,10 +175,10 @@ def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str)
         if isinstance(value, bytes):
             return data
         return str(value)
-    return _placed(slot, data)
+    return _to_raw_value(slot, data)
 
 
-def _placed(slot: Slot, data: bytes) -> Any:
+def _to_raw_value(slot: Slot, data: bytes) -> Any:
     """Return bytes as the raw value of a field.
 
     The field is plain bytes, an array of numbers, or one number in network order.
@@ -201,5 +201,5 @@ def _found_out(sensor: SensorDescription, name: str, path: str, value: Filled, g
         return given
     slot = _slot(sensor, name, path, f"commands.{name}.values.{path}")
     if given is None:
-        return _placed(slot, bytes(slot.room or 4))
+        return _to_raw_value(slot, bytes(slot.room or 4))
     return raw_argument(slot, value, given, path, f"{sensor.id} {name}")

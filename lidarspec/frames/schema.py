@@ -314,7 +314,7 @@ def _block(
 
 def _add(fields: dict[str, FieldInfo], info: FieldInfo) -> None:
     known = fields.get(info.path)
-    fields[info.path] = info if known is None else _merged(known, info)
+    fields[info.path] = info if known is None else _merge_fields(known, info)
 
 
 def _count(
@@ -333,7 +333,7 @@ def _count(
         arrays[axis] = None if isinstance(count, int) else count
 
 
-def _merged(known: FieldInfo, other: FieldInfo) -> FieldInfo:
+def _merge_fields(known: FieldInfo, other: FieldInfo) -> FieldInfo:
     """One column for a field that several branches declare."""
     kinds = {known.kind, other.kind}
     if (

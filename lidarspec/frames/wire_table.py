@@ -85,7 +85,7 @@ class Extent:
 def wire_table(frame: Frame) -> tuple[WireRow, ...]:
     """The rows of a frame type in the order of the wire."""
     seals = {
-        path: _sealed(node)
+        path: _describe_seal(node)
         for node in tree.nodes(frame.tree)
         if isinstance(node, tree.Sealed)
         for path in node.fields
@@ -181,7 +181,7 @@ def _rows(
                 "parts",
                 shown,
                 "",
-                "; ".join(filter(None, (condition, ruled(node)))),
+                "; ".join(filter(None, (condition, describe_end(node)))),
             )
             for kind in node.kinds:
                 said = f"{kind.name} in it" if kind.name else ""
@@ -273,7 +273,7 @@ def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     return [*cases, (f"for other values of {key}", node.default)]
 
 
-def ruled(node: tree.Parts) -> str:
+def describe_end(node: tree.Parts) -> str:
     """What says where the last one of some parts is, in words."""
     if node.count is not None:
         return f"{phrase(node.count)} parts of sizes of their own"
@@ -346,7 +346,7 @@ def meaning(info: tree.FieldInfo) -> str:
     It has its constant, the formula it follows from, its text and the names of its values.
     """
     if info.const is not None:
-        const = f"always {hexed(info.const, info.bits)}"
+        const = f"always {format_hex(info.const, info.bits)}"
     else:
         const = ""
     const = const or (
@@ -362,7 +362,7 @@ def meaning(info: tree.FieldInfo) -> str:
     )
 
 
-def hexed(value: object, bits: int) -> str:
+def format_hex(value: object, bits: int) -> str:
     """Bytes and integers in hexadecimal, integers with all digits of their width."""
     if isinstance(value, bytes | bytearray):
         return value.hex(" ")
@@ -371,7 +371,7 @@ def hexed(value: object, bits: int) -> str:
     return repr(value)
 
 
-def _sealed(node: tree.Sealed) -> str:
+def _describe_seal(node: tree.Sealed) -> str:
     """What is said of the fields that hold a checksum."""
     if node.declared:
         name = node.declared.describe()

@@ -49,7 +49,7 @@ class Text:
             f"a text of up to {min(self.size, room or self.size)} bytes in {self.encoding.upper()}"
         )
 
-    def packed(self, value: Any, room: int | None) -> bytes:
+    def pack(self, value: Any, room: int | None) -> bytes:
         """The bytes of a text; ValueError for what it does not take."""
         if isinstance(value, str):
             data = value.encode(self.encoding)
@@ -75,7 +75,7 @@ class Address:
             return "an IPv4 address"
         return "an IP address"
 
-    def packed(self, value: Any, room: int | None) -> bytes:
+    def pack(self, value: Any, room: int | None) -> bytes:
         """The bytes of an address; ValueError for what is none, or does not fit."""
         from ipaddress import ip_address  # which takes longer to import than all else here
 
@@ -98,7 +98,7 @@ class Octets:
             return "bytes"
         return f"{room} bytes"
 
-    def packed(self, value: Any, room: int | None) -> bytes:
+    def pack(self, value: Any, room: int | None) -> bytes:
         """The bytes; ValueError for what are none, or not so many."""
         if not isinstance(value, bytes | bytearray) or room not in (None, len(value)):
             raise ValueError

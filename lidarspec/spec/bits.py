@@ -116,7 +116,7 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
         _field(keys, pairs, flag=isinstance(base[keys], bool)) for keys, pairs in weights.items()
     ]
     known = [field for field in fields if field is not None]
-    if len(known) == len(fields) and _confirmed(parse, size, known):
+    if len(known) == len(fields) and _confirm(parse, size, known):
         return known
     return None
 
@@ -153,7 +153,7 @@ def _segments(targets: dict[int, int]) -> Iterator[Segment]:
         yield Segment(bits[0] // 8, ((1 << len(bits)) - 1) << low, low, targets[bits[0]])
 
 
-def _confirmed(parse: Parse, size: int, fields: list[BitField]) -> bool:
+def _confirm(parse: Parse, size: int, fields: list[BitField]) -> bool:
     import random  # nothing else that finding a sensor imports needs it
 
     source = random.Random(size)

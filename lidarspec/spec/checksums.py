@@ -107,7 +107,7 @@ class Crc(Checksum):
     @property
     def start(self) -> int:
         """The register before the first byte, in wire order."""
-        start = reflected(self.init, self.width)
+        start = reflect(self.init, self.width)
         if self.refin:
             return start
         return mirrored_bytes(start)
@@ -120,7 +120,7 @@ class Crc(Checksum):
                 int.from_bytes(register.to_bytes(size, "little"), "big") >> 8 * size - self.width
             )
         return (
-            register if self.refin == self.refout else reflected(register, self.width)
+            register if self.refin == self.refout else reflect(register, self.width)
         ) ^ self.xorout
 
 
@@ -272,7 +272,7 @@ def _powers(bits: int, count: int) -> tuple[int, ...]:
     return tuple(bits << power for power in reversed(range(max(count - 1, 0).bit_length())))
 
 
-def reflected(value: int, width: int) -> int:
+def reflect(value: int, width: int) -> int:
     """The value with its bits in the opposite order."""
     return int(f"{value:0{width}b}"[::-1], 2)
 
@@ -288,7 +288,7 @@ def mirrored_bytes(register: int) -> int:
 def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
     """The register after one byte, by the XOR of that byte and the register's low byte."""
     table = list(range(256))
-    feedback = reflected(poly, width)
+    feedback = reflect(poly, width)
     for _ in range(8):
         table = [register >> 1 ^ (feedback if register & 1 else 0) for register in table]
     return tuple(table if refin else (mirrored_bytes(table[byte]) for byte in MIRROR))
@@ -380,7 +380,7 @@ def _zlib_crc(algorithm: Crc) -> Single | None:
         True,
     ):
         return None
-    start = reflected(algorithm.init, 32) ^ 0xFFFFFFFF
+    start = reflect(algorithm.init, 32) ^ 0xFFFFFFFF
     end = algorithm.xorout ^ 0xFFFFFFFF
     return lambda data: zlib.crc32(data, start) ^ end
 

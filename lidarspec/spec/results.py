@@ -81,7 +81,7 @@ class Extra:
             object.__setattr__(self, "dtype", kind)
 
 
-def _named(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
+def _name_extras(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
     """The further columns of points by name, each with what it is in.
 
     Raises:
@@ -137,7 +137,7 @@ class Polar:
     extra: Mapping[str, Extra | Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "extra", _named(self.extra))
+        object.__setattr__(self, "extra", _name_extras(self.extra))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +175,7 @@ class Cartesian:
     extra: Mapping[str, Extra | Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "extra", _named(self.extra))
+        object.__setattr__(self, "extra", _name_extras(self.extra))
 
 
 Points = Polar | Cartesian

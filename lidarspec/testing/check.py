@@ -229,7 +229,7 @@ def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
         Exception: whatever it fails with.
     """
     if isinstance(plugin, Sensor):
-        return [registry().hooked(plugin)]
+        return [registry().apply_hooks(plugin)]
     local = Registry()
     ids = local.add(plugin, name=name)
     sensors = [local.sensor(one) for one in ids]
@@ -244,7 +244,7 @@ def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
                     f"lidarspec_checksum for {sensor.id}: {type(error).__name__}: {error}",
                     rule="LS010",
                 ) from error
-    return [registry().hooked(sensor) for sensor in sensors]
+    return [registry().apply_hooks(sensor) for sensor in sensors]
 
 
 def loading(error: BaseException, files: list[Path]) -> Finding:

@@ -38,7 +38,7 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
 from lidarspec.testing.subject import SHORT, Subject, seals
-from lidarspec.transports.hexadecimal import unhexed
+from lidarspec.transports.hexadecimal import parse_hex
 from lidarspec.trust import document
 
 #: what a point may differ by: metres and radians as manuals print them.
@@ -113,7 +113,7 @@ def vectors_hold(subject: Subject, only: str = "") -> None:
         if isinstance(vector, Violation):
             raise vector
         require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
-        data = unhexed(vector["hex"])
+        data = parse_hex(vector["hex"])
         name = vector["frame"]
         parsed = _parse_vector(subject, name, data, place)
         _values(subject, name, data, parsed, vector, place)
@@ -125,7 +125,7 @@ def vectors_hold(subject: Subject, only: str = "") -> None:
         )
         if "command" in vector:
             if "reply" in vector:
-                answer = unhexed(vector["reply"])
+                answer = parse_hex(vector["reply"])
             else:
                 answer = None
             an_exchange_holds(
@@ -179,7 +179,7 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
         return
     pinned: dict[str, bool] = {}
     for vector in vectors:
-        read_as = dict(leaves(_parse_vector(subject, name, unhexed(vector["hex"]), name)))
+        read_as = dict(leaves(_parse_vector(subject, name, parse_hex(vector["hex"]), name)))
         for path in (*vector.get("values", {}), *vector.get("units", {})):
             plain = re.sub(r"\[\d+\]", "", path)
             pinned[plain] = pinned.get(plain, False) or bool(read_as.get(path))
@@ -211,7 +211,9 @@ def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
     ]
     quadrants = {(point["x"] > 0, point["y"] > 0) for point in placed if point["x"] and point["y"]}
     clouds = [
-        read(subject, name, [unhexed(vector["hex"])] * subject.sensor.frames[name].confirm).points()
+        read(
+            subject, name, [parse_hex(vector["hex"])] * subject.sensor.frames[name].confirm
+        ).points()
         for vector in vectors
     ]
     ranges = np.concatenate([np.empty(0), *(cloud.range[cloud.valid] for cloud in clouds)])
@@ -252,7 +254,7 @@ def every_checksum_is_checked(subject: Subject, name: str) -> None:
     named = [path for path in free if CHECK.fullmatch(fields[path].name)]
     try:
         frames = [
-            unhexed(vector["hex"])
+            parse_hex(vector["hex"])
             for vector in entries(subject).values()
             if vector["frame"] == name
         ]
@@ -435,8 +437,8 @@ def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
         place,
     )
     try:
-        unhexed(vector.get("hex", "-"))
-        unhexed(vector.get("reply", ""))
+        parse_hex(vector.get("hex", "-"))
+        parse_hex(vector.get("reply", ""))
     except ValueError:
         raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
     return True
@@ -471,7 +473,7 @@ def _parse_vector(subject: Subject, name: str, data: bytes, place: str) -> Any:
     except WireError as error:
         if ": checksum " not in error.reason:
             raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
-        same = [unhexed(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
+        same = [parse_hex(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
         fitting = [
             _in_words(match, len(data))
             for match in _fitting(subject, name, error.path, same, data)[:2]

@@ -100,14 +100,14 @@ class HexText:
             for reader in (self._frame, self._cell):
                 if (chunk := reader(text)) is not None:
                     return chunk
-            at, text = _timed(text)
+            at, text = _split_time(text)
             if (data := self._row(text)) is not None:
                 return Chunk(data, at)
             if reason := next(
                 (reason for form, reason in AMBIGUOUS.items() if form.fullmatch(text)), ""
             ):
                 raise ValueError(reason)
-        data = self._plain(self._uncommented(text))
+        data = self._plain(self._strip_comments(text))
         if data and self._position is not None:
             raise ValueError("the lines before have offsets, and this one has none")
         return Chunk(data, at)
@@ -183,7 +183,7 @@ class HexText:
         self._position += len(data)
         return data
 
-    def _uncommented(self, text: str) -> str:
+    def _strip_comments(self, text: str) -> str:
         """A line without its comments."""
         kept = ""
         while True:
@@ -219,7 +219,7 @@ class HexText:
         return _digits(f"{words} {rest}")
 
 
-def _timed(text: str) -> tuple[int | None, str]:
+def _split_time(text: str) -> tuple[int | None, str]:
     """The time that a line begins with, ns, and what is behind it."""
     if found := _SECONDS.match(text):
         return _nanoseconds(found["at"]), text[found.end() :]
@@ -354,7 +354,7 @@ def between(text: str) -> int:
     )
 
 
-def unhexed(text: str) -> bytes:
+def parse_hex(text: str) -> bytes:
     """The bytes that hexadecimal text stands for.
 
     Raises:

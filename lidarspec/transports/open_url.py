@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qs
 
-from lidarspec.device.settings import named
+from lidarspec.device.settings import find_device
 from lidarspec.errors import SpecError, UnknownOption, UsageError
 from lidarspec.plugins import registry
 from lidarspec.sensor_operations import Sensor
@@ -44,10 +44,10 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
         SourceError: where it cannot be opened.
         SpecError: where a plugin gives something that is no `Transport`.
     """
-    text = resolved(source)
+    text = resolve(source)
     address = live_address(text)
     if address is not None:
-        return _opened(address, sensor)
+        return _open(address, sensor)
     path, mark, query = text.rpartition("?")
     if mark and not os.path.exists(text):
         options = parse_qs(query, keep_blank_values=True)
@@ -80,9 +80,9 @@ def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
     raise UsageError(f"{source} is a file: nothing can be sent to it")
 
 
-def resolved(source: str | Path) -> str:
+def resolve(source: str | Path) -> str:
     """The SOURCE itself: that of the device where it is the name of one in `lidarspec.toml`."""
-    device = named(source)
+    device = find_device(source)
     if device is None:
         return str(source)
     return device.source
@@ -90,7 +90,7 @@ def resolved(source: str | Path) -> str:
 
 def is_live(source: str | Path) -> bool:
     """Whether a SOURCE, or the device of this name, goes on by itself."""
-    return live_address(resolved(source)) is not None
+    return live_address(resolve(source)) is not None
 
 
 def live_address(source: str | Path) -> Address | None:
@@ -144,7 +144,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     found, port = Address(said, "", said).host_and_port()
     known = found or host
     if isinstance(link, Tcp) and known:
-        return live(f"tcp://{_bracketed(known)}:{port or link.port}")
+        return live(f"tcp://{_bracket(known)}:{port or link.port}")
     if isinstance(link, Http) and known:
         from lidarspec.transports.http import HttpTransport
 
@@ -161,7 +161,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
             port or (link.ports[0] if known and link.ports else link.broadcast),
         )
         own = "::" if ":" in remote[0] else ""
-        label = f"udp://{_bracketed(remote[0])}:{remote[1]}"
+        label = f"udp://{_bracket(remote[0])}:{remote[1]}"
         return UdpTransport(
             label,
             [link.local],
@@ -189,7 +189,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     )
 
 
-def _opened(address: Address, sensor: Sensor | None) -> Transport:
+def _open(address: Address, sensor: Sensor | None) -> Transport:
     """The open transport of a SOURCE with a scheme, which the package or a plugin knows."""
     if address.scheme in SCHEMES:
         module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")
@@ -210,7 +210,7 @@ def _opened(address: Address, sensor: Sensor | None) -> Transport:
     return plugged
 
 
-def _bracketed(host: str) -> str:
+def _bracket(host: str) -> str:
     if ":" in host:
         return f"[{host}]"
     return host

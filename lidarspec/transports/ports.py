@@ -67,7 +67,7 @@ def serial_ports() -> list[SerialPort]:
         path = port.device
         found.append(
             SerialPort(
-                path, f"{description}{maker}".strip(), lasting(path), allowed(path), users(path)
+                path, f"{description}{maker}".strip(), lasting(path), is_allowed(path), users(path)
             )
         )
     return found
@@ -81,7 +81,7 @@ def lasting(port: str) -> str:
     )
 
 
-def allowed(port: str) -> bool:
+def is_allowed(port: str) -> bool:
     """Whether this user may open a port; a name that is no file is taken for one that he may."""
     effective = os.access in os.supports_effective_ids
     return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK, effective_ids=effective)
@@ -144,7 +144,7 @@ def _targets(folder: Path) -> Iterator[str]:
             yield os.readlink(folder / name)
 
 
-def received() -> dict[str, int]:
+def count_received() -> dict[str, int]:
     """Packets that each network interface has received so far; empty where the system does not
     tell.
     """

@@ -141,10 +141,10 @@ class SerialTransport(StreamTransport):
         except GONE as error:
             with contextlib.suppress(*GONE):
                 port.close()
-            raise self._refused(error) from None
+            raise self._refusal(error) from None
         return port
 
-    def _refused(self, error: Exception) -> SourceError:
+    def _refusal(self, error: Exception) -> SourceError:
         """Why the port does not open, and what to type."""
         number = error.errno if isinstance(error, OSError) else None
         source = f"serial://{self.label}{sensor_option(self._sensor)}"

@@ -44,7 +44,7 @@ class TcpTransport(StreamTransport):
     def __init__(self, label: str, host: str, port: int, *, sensor: Sensor | None = None) -> None:
         super().__init__(label, sensor)
         self._address = (host, port)
-        self._socket = self._connected(PATIENCE)
+        self._socket = self._connect(PATIENCE)
 
     def _receive(self, timeout: float) -> bytes:
         if not wait_readable(self._socket.fileno(), timeout):
@@ -62,7 +62,7 @@ class TcpTransport(StreamTransport):
 
     def reopen(self) -> None:
         self._socket.close()
-        self._socket = self._connected(AGAIN)
+        self._socket = self._connect(AGAIN)
 
     def peer(self) -> str | None:
         return self._address[0]
@@ -71,18 +71,18 @@ class TcpTransport(StreamTransport):
         self.closed = True
         self._socket.close()
 
-    def _connected(self, patience: float) -> socket.socket:
+    def _connect(self, patience: float) -> socket.socket:
         try:
             found = socket.create_connection(self._address, patience)
         except OSError as error:
-            raise self._refused(error) from None
+            raise self._refusal(error) from None
         found.settimeout(PATIENCE)
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with contextlib.suppress(OSError):
             found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         return found
 
-    def _refused(self, error: OSError) -> SourceError:
+    def _refusal(self, error: OSError) -> SourceError:
         host, port = self._address
         doctor = f"lidarspec doctor {quote(self.label)}{sensor_option(self._sensor)}"
         if isinstance(error, socket.gaierror):

@@ -118,7 +118,7 @@ def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: P
     assert found["desk"].file == str(user)
     project = folder / "lidarspec.toml"
     with pytest.warns(UserWarning, match=f"front: the device of {user}, not that of {project}"):
-        assert settings.named("front") == found["front"]
+        assert settings.find_device("front") == found["front"]
     said = ran("stats", "front", "-s", SENSOR, "-n", "1").stderr
     assert said.count(f"front: the device of {user}, not that of {project}") == 1
     (folder / "deep" / "lidarspec.toml").write_text("", encoding="utf-8")
@@ -158,7 +158,7 @@ def test_a_file_that_is_not_the_users_is_passed_over_and_said_once(
         place.chmod(0o777)
         reason = f"{place} is open to others: chmod 775 makes it yours"
     with pytest.warns(UserWarning, match=f"{file} is not read: {reason}"):
-        device = settings.named("front")
+        device = settings.find_device("front")
     assert device is not None
     assert device.sensor == SENSOR  # that of the folder above, which is the user's
     assert ran("stats", "front").stderr.count(f"{file} is not read: {reason}") == 1
@@ -270,12 +270,12 @@ def test_paths_that_begin_with_a_dot_are_from_the_files_folder(folder: Path) -> 
 
 
 def test_a_path_is_no_name(folder: Path) -> None:
-    assert settings.named("./front") is None
-    assert settings.named(Path("front")) is None
-    assert settings.named("udp://") is None
-    assert settings.named("-") is None
+    assert settings.find_device("./front") is None
+    assert settings.find_device(Path("front")) is None
+    assert settings.find_device("udp://") is None
+    assert settings.find_device("-") is None
     (folder / "deep" / "other").write_bytes(b"")
-    assert settings.named("other") is None
+    assert settings.find_device("other") is None
 
 
 def test_a_word_that_is_nothing_gets_a_suggestion(folder: Path) -> None:

@@ -45,7 +45,7 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation
 from lidarspec.testing.subject import Subject
 from lidarspec.testing.vectors import vectors_hold
-from lidarspec.transports.hexadecimal import unhexed
+from lidarspec.transports.hexadecimal import parse_hex
 from lidarspec.transports.open_url import is_port, live_address
 from tests import made_captures as made
 from tests.calibration_files import write_velodyne_xml
@@ -169,7 +169,7 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
     found.append(
         Target(
             "hex",
-            lambda data: unhexed(data.decode("latin-1")),
+            lambda data: parse_hex(data.decode("latin-1")),
             lambda: printed,
             (ValueError,),
             lambda: text,

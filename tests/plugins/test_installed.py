@@ -24,7 +24,7 @@ import pytest
 from lidarspec import Sensor, UsageError
 from lidarspec.entry_points import EntryPoint, entry_points
 from lidarspec.errors import UnknownSensor
-from lidarspec.plugins import HookedPoints, Registry, named_owners, tried
+from lidarspec.plugins import HookedPoints, Registry, named_owners, try_plugins
 from lidarspec.spec import hookimpl
 from lidarspec.trust import own_settings
 from tests.shapes import SHAPES
@@ -584,7 +584,7 @@ def test_each_plugin_is_tried_in_a_process_of_its_own_if_anything_is_wrong(
     )  # not here too
     found = {
         plugin.distribution.removeprefix("odd_"): (plugin.error, plugin.remark)
-        for plugin in tried()
+        for plugin in try_plugins()
     }
     assert found == {name: (error, remark) for name, (_, error, remark) in plugins.items()}
 
@@ -609,7 +609,7 @@ def test_plugins_with_which_nothing_is_wrong_are_tried_in_one_process(
         "run",
         lambda command, **more: [started.append(command), run(command, **more)][1],
     )
-    assert {plugin.distribution: (plugin.error, plugin.remark) for plugin in tried()} == {
+    assert {plugin.distribution: (plugin.error, plugin.remark) for plugin in try_plugins()} == {
         "sound_one": ("", ""),
         "sound_other": ("", ""),
     }

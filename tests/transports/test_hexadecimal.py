@@ -16,7 +16,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import WireError
 from lidarspec.transports import hexadecimal
-from lidarspec.transports.hexadecimal import HexText, unhexed
+from lidarspec.transports.hexadecimal import HexText, parse_hex
 from lidarspec.transports.open_url import transport
 from tests.cli.running import ran
 
@@ -37,7 +37,7 @@ from tests.cli.running import ran
     ],
 )
 def test_bytes_are_read_as_people_print_them(text: str, tmp_path: Path) -> None:
-    assert unhexed(text) == b"\x8b\x13\x5a"
+    assert parse_hex(text) == b"\x8b\x13\x5a"
     (tmp_path / "a.hex").write_text(text, encoding="ascii")
     with contextlib.closing(transport(tmp_path / "a.hex")) as opened:
         assert b"".join(chunk.data for chunk in opened.chunks()) == b"\x8b\x13\x5a"
@@ -57,13 +57,13 @@ def test_a_line_without_end_is_read_in_pieces(
     )
     with contextlib.closing(transport(tmp_path / "a.hex")) as opened:
         found = [chunk.data for chunk in opened.chunks()]
-    assert b"".join(found) == unhexed(line) * 2 + unhexed(form) * (block // len(form))
+    assert b"".join(found) == parse_hex(line) * 2 + parse_hex(form) * (block // len(form))
     assert max(map(len, found)) <= block
 
 
 def test_a_single_digit_is_a_byte_where_it_says_so_alone() -> None:
-    assert unhexed("0xa, 0x5") == b"\x0a\x05"
-    assert unhexed("") == b""
+    assert parse_hex("0xa, 0x5") == b"\x0a\x05"
+    assert parse_hex("") == b""
     for text, reason in (
         ("a 5", "'a' makes no whole bytes"),
         ("0x", "makes no whole bytes"),
@@ -71,7 +71,7 @@ def test_a_single_digit_is_a_byte_where_it_says_so_alone() -> None:
         ("a5|", "'|'"),
     ):
         with pytest.raises(ValueError, match=reason.replace("|", r"\|")):
-            unhexed(text)
+            parse_hex(text)
 
 
 def test_the_line_of_a_file_that_is_no_hexadecimal_text_is_named(tmp_path: Path) -> None:
@@ -107,9 +107,9 @@ def test_dumps_are_read_as_their_tools_print_them(command: str, tmp_path: Path) 
     done = subprocess.run(
         [program, *options, "it.bin"], cwd=tmp_path, capture_output=True, text=True, check=True
     )
-    assert unhexed(done.stdout) == EVERY
+    assert parse_hex(done.stdout) == EVERY
     assert (
-        unhexed(done.stdout * 2) == EVERY * 2 or command == "xxd -p"
+        parse_hex(done.stdout * 2) == EVERY * 2 or command == "xxd -p"
     )  # a dump begins again where its offset does
 
 
@@ -127,7 +127,7 @@ def test_frames_are_read_as_analysers_and_terminals_print_them() -> None:
         "\t0x0010:  642c                                     d,\n"
     )
     for text in (wireshark, older, tcpdump):
-        assert unhexed(text) == b"T,\x10\x0eT,A ....ab cd,", text
+        assert parse_hex(text) == b"T,\x10\x0eT,A ....ab cd,", text
 
 
 CAN = b"\x11\x22\x33\x44\x55\x66\x77\x88"
@@ -196,7 +196,7 @@ def test_tables_of_logic_analysers_are_read_with_their_times(table: str, tmp_pat
     ],
 )
 def test_arrays_and_strings_of_programs_are_read(text: str) -> None:
-    assert unhexed(text) == b"\x8b\x13\x5a"
+    assert parse_hex(text) == b"\x8b\x13\x5a"
 
 
 REFUSED = {
@@ -224,7 +224,7 @@ REFUSED = {
 @pytest.mark.parametrize("text", REFUSED)
 def test_what_can_be_read_in_two_ways_is_refused_by_what_it_may_be(text: str) -> None:
     with pytest.raises(ValueError, match=re.escape(REFUSED[text])):
-        unhexed(text)
+        parse_hex(text)
 
 
 def test_the_command_line_takes_text_in_every_place(tmp_path: Path) -> None:

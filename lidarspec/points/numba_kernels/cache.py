@@ -24,7 +24,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from lidarspec.trust import shared
+from lidarspec.trust import describe_sharing
 
 # mypy: disable-error-code="no-untyped-call"
 
@@ -122,7 +122,7 @@ def _own(folder: Path) -> Path:
     Raises:
         OSError: where it is missing, or not its user's alone.
     """
-    if reason := shared(folder.stat(), _OTHERS):
+    if reason := describe_sharing(folder.stat(), _OTHERS):
         raise PermissionError(f"{folder} {reason}")
     return folder
 
@@ -160,7 +160,7 @@ def _read(path: Path) -> bytes:
     """
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _PLAINLY)) as file:
         status = os.fstat(file.fileno())
-        if shared(status, _OTHERS) or not stat.S_ISREG(status.st_mode):
+        if describe_sharing(status, _OTHERS) or not stat.S_ISREG(status.st_mode):
             raise PermissionError(f"{path} is not its user's alone")
         return file.read()
 

@@ -15,7 +15,7 @@ from typing import Any
 from lidarspec.cli.options import configure_sensor
 from lidarspec.detect.identification import detect, find_declared_sensor
 from lidarspec.device.device import Device
-from lidarspec.device.settings import named
+from lidarspec.device.settings import find_device
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
@@ -283,7 +283,7 @@ class Settings:
     def mount(self) -> Mount | None:
         """How the sensor is mounted: by the parameters, or else as `lidarspec.toml` says."""
         given = Mount(**{field.name: self[f"mount.{field.name}"] for field in fields(Mount)})
-        device = named(self["source"])
+        device = find_device(self["source"])
         return given if given != Mount() else None if device is None else device.mount
 
     def device(self, record: Callable[[Transport], Log]) -> Device:
