@@ -30,7 +30,8 @@ ALLOWED = {
         "spec.bits",
         "spec.checksums",
     ),
-    *("spec.syntax", "spec.syntax.classes", "spec.syntax.meaning", "spec.syntax.refusals"),
+    *("spec.syntax", "spec.syntax.meaning", "spec.syntax.refusals", "spec.syntax.replacements"),
+    "spec.syntax.structs",
     *(
         "spec.description",
         "spec.fields",

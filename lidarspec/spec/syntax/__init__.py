@@ -2,18 +2,24 @@
 fit for the engine, and read off.
 
 In: an author's struct. Out: `prepare`, a copy of it for the engine; `check_struct`, what speaks
-against it; `frame_tree`, the nodes that
-it means. Modules in reading order:
+against it; `frame_tree`, the nodes that it means. Modules in reading order:
 
-* `classes`: the few classes that stand in the places of construct's, and what one can ask of a
-  construct.
+* `replacements`: the classes that replace construct's, each with its reason, and parts of our own.
+* `structs`: a struct prepared, the properties of a construct, random values for it.
 * `refusals`: what no frame can be described by, with the reason.
 * `meaning`: a struct read off as nodes.
 """
 
 from __future__ import annotations
 
-from lidarspec.spec.syntax.classes import (
+from lidarspec.spec.syntax.meaning import (
+    bytes_of as bytes_of,
+    frame_tree as frame_tree,
+    seen as seen,
+    unnamed as unnamed,
+)
+from lidarspec.spec.syntax.refusals import check_struct as check_struct
+from lidarspec.spec.syntax.replacements import (
     Describing as Describing,
     Fault as Fault,
     MarkedStruct as MarkedStruct,
@@ -23,8 +29,12 @@ from lidarspec.spec.syntax.classes import (
     Sealing as Sealing,
     Sizing as Sizing,
     WireNaN as WireNaN,
-    bit_width as bit_width,
     bounded as bounded,
+    member as member,
+    verifying as verifying,
+)
+from lidarspec.spec.syntax.structs import (
+    bit_width as bit_width,
     clean as clean,
     field_path as field_path,
     fixed_size as fixed_size,
@@ -32,17 +42,8 @@ from lidarspec.spec.syntax.classes import (
     is_expression as is_expression,
     is_struct as is_struct,
     leaves as leaves,
-    member as member,
     prepare as prepare,
     random_value as random_value,
     seals as seals,
     unwrap as unwrap,
-    verifying as verifying,
 )
-from lidarspec.spec.syntax.meaning import (
-    bytes_of as bytes_of,
-    frame_tree as frame_tree,
-    seen as seen,
-    unnamed as unnamed,
-)
-from lidarspec.spec.syntax.refusals import check_struct as check_struct

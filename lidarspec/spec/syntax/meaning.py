@@ -36,7 +36,7 @@ from construct.expr import BinExpr, ExprMixin, UniExpr
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, probe
-from lidarspec.spec.syntax.classes import (
+from lidarspec.spec.syntax.replacements import (
     Bounded,
     Counting,
     Describing,
@@ -45,6 +45,8 @@ from lidarspec.spec.syntax.classes import (
     Partition,
     Sealing,
     Sizing,
+)
+from lidarspec.spec.syntax.structs import (
     is_greedy,
     leaves,
     unwrap,

@@ -11,12 +11,14 @@ from construct import Array, Const, Construct, Container, Struct
 
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
-from lidarspec.spec.syntax.classes import (
-    GREEDY,
+from lidarspec.spec.syntax.replacements import (
     Bounded,
     Describing,
     HeldCheck,
     Partition,
+)
+from lidarspec.spec.syntax.structs import (
+    GREEDY,
     children,
     fixed_size,
     unwrap,

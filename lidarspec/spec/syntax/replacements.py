@@ -1,0 +1,520 @@
+"""The classes of a prepared struct that are not construct's: replacements, and parts of our own.
+
+`prepare` puts a replacement in the place of a construct class that loses bytes, does not say where
+a fault is, or cannot be read unchecked. Frames with a layout are read without these classes. They
+matter for frames without a layout, which construct parses and builds one at a time, and for the
+examples of frames with parts. `tests/frames/test_plain.py` fails if a replacement is missing.
+
+The other classes are parts that construct does not have: units, checksums, sizes, fillers and
+chains of parts. `lidarspec.spec.fields` gives the names and arguments that authors write.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import operator
+import struct
+import sys
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import construct
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Construct,
+    Container,
+    FormatField,
+    Struct,
+    Subconstruct,
+)
+
+from lidarspec.errors import SpecError
+from lidarspec.spec import tree
+from lidarspec.spec.checksums import Checksum
+
+_MISSING = object()
+
+#: what construct raises where bytes or values do not fit a struct.
+Fault = construct.ConstructError
+
+
+class Mismatch(construct.ConstructError):  # type: ignore[misc]
+    """A value on the wire that is not what the spec asks for; made a `WireError` by the engine."""
+
+    def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
+        super().__init__(f"{reason}: expected {expected}, got {got}", path=path)
+        self.offset = offset
+        self.expected = expected
+        self.got = got
+        self.reason = reason
+
+
+class WireNaN(float):
+    """A NaN that keeps its bits, so that a signalling NaN is built as it was parsed."""
+
+    raw: bytes
+
+    def __new__(cls, raw: bytes) -> WireNaN:
+        value = super().__new__(cls, math.nan)
+        value.raw = raw
+        return value
+
+    def __reduce__(self) -> tuple[type[WireNaN], tuple[bytes]]:
+        return WireNaN, (self.raw,)
+
+
+def verifying(context: Any) -> bool:
+    """Return whether constants, lengths, checksums and values are checked in this parse."""
+    return bool(context._params.get("_verify", True))
+
+
+def bounded(number: int, limit: int, what: str, path: str) -> int:
+    """A count or a length that a frame can have; RangeError for another one."""
+    if not 0 <= number <= limit:
+        raise construct.RangeError(f"invalid {what} {number}", path=path)
+    return number
+
+
+def member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
+    """The member of a nested mapping under a dotted name."""
+    for part in dotted.split("."):
+        if default is not _MISSING and (not isinstance(obj, Mapping) or part not in obj):
+            return default
+        obj = obj[part]
+    return obj
+
+
+class MarkedStruct(Struct):  # type: ignore[misc]
+    """A Struct whose parsed container holds the (start, end) of each member under ``_marks``.
+
+    construct's own does not keep them. `Checksummed` needs them to find its bytes, `SizeOf` and
+    `Filler` to measure, and `explain` to list the fields of a frame without a layout. A missing
+    value is reported with the path of its field.
+    """
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        obj = Container()
+        inner = self._inner(stream, context, is_parsing=True)
+        marks = inner._marks
+        for con in self.subcons:
+            start = stream.tell()
+            value = con._parsereport(stream, inner, path)
+            end = stream.tell()
+            if con.name:
+                obj[con.name] = inner[con.name] = value
+                marks[con.name] = (start, end)
+        obj["_marks"] = marks
+        for sizing, place, spot, value in inner._sizings if verifying(context) else ():
+            expected = sizing.value(obj)
+            if value != expected:
+                raise Mismatch(place, spot, expected, value, "length")
+        return obj
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        obj = {} if obj is None else obj
+        if not isinstance(obj, dict):
+            raise Mismatch(path, 0, "a mapping of its fields", repr(obj), "value")
+        for con in self.subcons:
+            if not con.flagbuildnone and con.name not in obj:
+                raise Mismatch(f"{path} -> {con.name}", 0, "a value", "none", "missing")
+        inner = self._inner(stream, context, is_parsing=False)
+        inner.update({name: value for name, value in obj.items() if name != "_marks"})
+        marks = inner._marks
+        for con in self.subcons:
+            start = stream.tell()
+            value = con._build(obj.get(con.name), stream, inner, path)
+            if con.name:
+                inner[con.name] = value
+                marks[con.name] = (start, stream.tell())
+        for sizing, place, _, _ in inner._sizings:
+            context._params["_sizes"][place] = sizing.value(inner)
+        return inner
+
+    def _inner(self, stream: Any, context: Any, *, is_parsing: bool) -> Container:
+        """The context of the members' expressions.
+
+        `_marks` holds (start, end) by name, `_sizings` (sizing, path, offset, value) of each field
+        that states a length.
+        """
+        inner = Container(
+            _=context,
+            _params=context._params,
+            _root=None,
+            _parsing=is_parsing,
+            _building=not is_parsing,
+            _sizing=False,
+        )
+        inner._subcons = self._subcons
+        inner._io = stream
+        inner._index = context.get("_index", None)
+        inner._root = context.get("_root", None) or inner
+        inner._marks = {}
+        inner._sizings = []
+        return inner
+
+
+class IndexedArray(Array):  # type: ignore[misc]
+    """An Array with the index in the path of an error, and with at most `limit` elements.
+
+    construct's own names no element, and a hostile count of elements without a byte keeps it busy
+    for minutes. All arrays of a frame together have at most `limit` elements without a byte, since
+    nested ones would multiply.
+
+    Attributes:
+        limit: the longest frame, in bytes; within a bit block in bits.
+        in_bits: whether it stands within a bit block.
+    """
+
+    limit: int
+    in_bits: bool
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        count = bounded(construct.evaluate(self.count, context), self.limit, "count", path)
+        found = construct.ListContainer()
+        for index in range(count):
+            context._index = index
+            start = stream.tell()
+            place = f"{path}[{index}]"
+            element = self.subcon._parsereport(stream, context, place)
+            found.append(element)
+            if stream.tell() == start and not self.in_bits:
+                context._params["_empty"] = bounded(
+                    context._params.get("_empty", 0) + 1, self.limit, "count", path
+                )
+        return found
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        count = construct.evaluate(self.count, context)
+        if not isinstance(obj, list | tuple | bytes):
+            raise Mismatch(path, 0, "a list of its elements", repr(obj), "value")
+        if len(obj) != count:
+            raise construct.RangeError(f"expected {count} elements, found {len(obj)}", path=path)
+        return _built(self, obj, stream, context, path)
+
+
+class FullRange(construct.GreedyRange):  # type: ignore[misc]
+    """A GreedyRange that uses all bytes of the part that bounds it.
+
+    construct's own drops an element that fails and all bytes after it, and reports no error.
+    """
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        found = construct.ListContainer()
+        while stream.read(1):
+            stream.seek(-1, io.SEEK_CUR)
+            context._index = len(found)
+            start = stream.tell()
+            place = f"{path}[{len(found)}]"
+            found.append(self.subcon._parsereport(stream, context, place))
+            if stream.tell() == start:
+                raise construct.RangeError("an element without a byte never ends", path=place)
+        return found
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        if not isinstance(obj, list | tuple):
+            raise Mismatch(path, 0, "a list of its elements", repr(obj), "value")
+        return _built(self, obj, stream, context, path)
+
+
+def _built(con: Subconstruct, elements: Iterable[Any], stream: Any, context: Any, path: str) -> Any:
+    """Build the elements of an array, with the index in an error's path."""
+    built = construct.ListContainer()
+    for index, element in enumerate(elements):
+        context._index = index
+        built.append(con.subcon._build(element, stream, context, f"{path}[{index}]"))
+    return built
+
+
+class CheckedConst(Const):  # type: ignore[misc]
+    """A Const that can be read unchecked, and reports its offset and the value found.
+
+    ``parse(verify=False)`` and `explain` read frames with wrong constants, and a `WireError` has
+    the offset, the expected value and the actual one. construct's own offers neither.
+    """
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        obj = self.subcon._parsereport(stream, context, path)
+        if obj != self.value and verifying(context):
+            raise Mismatch(
+                path, start, tree.format_hex(self.value), tree.format_hex(obj), "constant"
+            )
+        return obj
+
+
+class Limited(Subconstruct):  # type: ignore[misc]
+    """A number that accepts only some raw values.
+
+    It represents OneOf, NoneOf and Mapping of construct.
+    """
+
+    def __init__(self, subcon: Construct, allowed: tuple[int, ...]) -> None:
+        super().__init__(subcon)
+        self.allowed = allowed
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        obj = self.subcon._parsereport(stream, context, path)
+        if verifying(context):
+            return self._held(obj, start, path)
+        return obj
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        return self._held(self.subcon._build(obj, stream, context, path), 0, path)
+
+    def _held(self, obj: Any, start: int, path: str) -> Any:
+        if int(obj) not in self.allowed:
+            raise Mismatch(path, start, tree.listed(self.allowed), int(obj), "value")
+        return obj
+
+
+class HeldCheck(construct.Check):  # type: ignore[misc]
+    """A Check that can be read unchecked, for ``parse(verify=False)`` and `explain`."""
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        if verifying(context):
+            return super()._parse(stream, context, path)
+        return None
+
+
+class CountedBytes(Bytes):  # type: ignore[misc]
+    """Bytes that tell an invalid length from a frame that has not arrived completely.
+
+    For a length that no frame has, construct's own reports the end of the stream. The candidate
+    would wait for more bytes, and block the output until the longest frame has arrived.
+    """
+
+    limit: int
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        length = bounded(
+            operator.index(construct.evaluate(self.length, context)), self.limit, "length", path
+        )
+        return construct.stream_read(stream, length, path)
+
+
+class ExactFloat(FormatField):  # type: ignore[misc]
+    """A float field that keeps the bits of a NaN.
+
+    construct's own builds a signalling NaN as a quiet one.
+    """
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        raw = construct.stream_read(stream, self.length, path)
+        value = struct.unpack(self.fmtstr, raw)[0]
+        if math.isnan(value):
+            return WireNaN(raw)
+        return value
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        if isinstance(obj, WireNaN) and len(obj.raw) == self.length:
+            construct.stream_write(stream, obj.raw, self.length, path)
+            return obj
+        return super()._build(obj, stream, context, path)
+
+
+class NamedEnum(construct.Enum):  # type: ignore[misc]
+    """An Enum that gives expressions the name of a number, in building as in parsing.
+
+    With construct's own, a Switch on a name finds its case in parsing, but not in building from
+    the number, and builds other bytes.
+    """
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        raw = self._encode(obj, context, path)
+        self.subcon._build(raw, stream, context, path)
+        return self._decode(raw, context, path)
+
+
+class Describing(Subconstruct):  # type: ignore[misc]
+    """A part that only says something of the field below it: parses and builds what that does."""
+
+    def described(self, info: tree.FieldInfo) -> tree.FieldInfo:
+        """What is known of the field, with what this part says of it."""
+        raise NotImplementedError
+
+
+class Sealing(Subconstruct):  # type: ignore[misc]
+    """A struct with a checksum.
+
+    Attributes:
+        fields: names of the fields that hold it, low bits first.
+        algorithm: of the checksum, None where a hook has to supply it.
+        over: names of the fields that it covers, in a row; None: all bytes that hold no bit of
+            `fields`.
+        absent: values that mean "not filled".
+    """
+
+    fields: tuple[str, ...]
+    algorithm: Checksum | None
+    over: tuple[str, ...] | None
+    absent: frozenset[int]
+
+
+class Sizing(Subconstruct):  # type: ignore[misc]
+    """A number that says how many bytes a part has: made of it, and held to it.
+
+    Attributes:
+        of: the names that lead to the part from the struct that it stands in, which is itself what
+            no names lead to; "_" leads one struct out.
+        plus: what is added.
+        since: a member before the part, from which on is measured; "" for the part alone.
+    """
+
+    def __init__(
+        self, subcon: Construct, of: tuple[str, ...], plus: int = 0, since: str = ""
+    ) -> None:
+        super().__init__(subcon)
+        self.of = of
+        self.plus = plus
+        self.since = since
+        self.flagbuildnone = True
+
+    @property
+    def out(self) -> int:
+        """How many structs further out the one is that has the part."""
+        return self.of.count("_")
+
+    def value(self, obj: Any) -> int:
+        """What it has to say, of the struct that has the part, parsed or built."""
+        *parents, name = self.of[self.out :] or ("",)
+        try:
+            marks = (member(obj, ".".join(parents)) if parents else obj)["_marks"]
+            if name:
+                start, end = marks[name]
+            else:
+                start = min(marks.values())[0]
+                end = max(end for _, end in marks.values())
+            start = marks[self.since][0] if self.since else start
+        except (KeyError, TypeError):
+            raise SpecError(
+                f"SizeOf measures {'.'.join(self.of)!r}, and there is no such part"
+            ) from None
+        return int(end - start + self.plus)
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        value = self.subcon._parsereport(stream, context, path)
+        self._enter(context, (path, start, value))
+        return value
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        sizes = context._params.setdefault("_sizes", {})
+        self._enter(context, (path, 0, obj))
+        return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
+
+    def _enter(self, context: Any, said: tuple[str, int, Any]) -> None:
+        """Register the value with the struct that contains the part.
+
+        A bit block that is probed on its own has no such struct.
+        """
+        for _ in range(self.out):
+            context = context.get("_", {})
+        context.get("_sizings", []).append((self, *said))
+
+
+class Counting(Subconstruct):  # type: ignore[misc]
+    """The number of elements of a later array, `of`.
+
+    It is built from the length of the array; the value given is ignored.
+    """
+
+    def __init__(self, subcon: Construct, of: str) -> None:
+        super().__init__(subcon)
+        self.of = of
+        self.flagbuildnone = True
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        array = context.get(self.of)
+        return self.subcon._build(
+            len(array) if isinstance(array, list | tuple | bytes) else obj, stream, context, path
+        )
+
+
+class Bounded(Subconstruct):  # type: ignore[misc]
+    """A part that ends after `length` bytes of a frame that comes, and is as long as its values are
+    in one that is made.
+    """
+
+    def __init__(self, length: Any, subcon: Construct) -> None:
+        super().__init__(subcon)
+        self.length = length
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        length = bounded(construct.evaluate(self.length, context), sys.maxsize, "length", path)
+        stream.seek(0)
+        within = io.BytesIO(construct.stream_read(stream, start + length, path))
+        within.seek(start)
+        value = self.subcon._parsereport(within, context, path)
+        stream.seek(within.tell())
+        return value
+
+
+class Filler(CountedBytes):
+    """The bytes behind members (from one to another, `of`), up to a length (`to`) or to a multiple
+    of one (`modulus`).
+
+    They are those of a pattern unless given.
+    """
+
+    def __init__(
+        self, of: tuple[str, str], to: Any = None, modulus: Any = None, pattern: bytes = b"\0"
+    ) -> None:
+        super().__init__(self._missing)
+        self.of = of
+        self.to = to
+        self.modulus = modulus
+        self.pattern = pattern
+        self.flagbuildnone = True
+
+    def _missing(self, context: Any) -> int:
+        start = context._marks[self.of[0]][0]
+        end = context._marks[self.of[1]][1]
+        number = construct.evaluate(self.modulus if self.to is None else self.to, context)
+        return int((start - end) % number if self.to is None else number - (end - start))
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        length = bounded(self._missing(context), self.limit, "length", path)
+        return super()._build(self.pattern * length if obj is None else obj, stream, context, path)
+
+
+class Pieces(construct.ListContainer):  # type: ignore[misc]
+    """Parts that were parsed or built: kind, first byte and the one after the last of each as
+    `spans`; `size`: the bytes of all.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spans: list[tuple[str, int, int]] = []
+
+    @property
+    def size(self) -> int:
+        """The bytes of all parts."""
+        return sum(end - start for _, start, end in self.spans)
+
+    def __getitem__(self, key: Any) -> Any:
+        if key == "size":
+            return self.size
+        return super().__getitem__(key)
+
+
+class Partition(Construct):  # type: ignore[misc]
+    """Structs one after another, each of a size of its own.
+
+    Attributes:
+        cases: what a part can be, by the name of its kind.
+        count, size, within: how many there are, the bytes of the first of a chain, or those of all.
+        following: of a part's own fields, the bytes of the next one.
+        limit: the longest frame, in bytes.
+    """
+
+    cases: dict[str, Construct]
+    count: Any
+    size: Any
+    within: Any
+    following: Any
+    limit: int = sys.maxsize

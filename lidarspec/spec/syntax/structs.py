@@ -1,0 +1,557 @@
+"""Prepare an author's struct, ask a construct for its properties, and draw values for it.
+
+`prepare` copies a struct with some of construct's classes replaced (`replacements` gives the
+reasons), and with the lengths, counts and padding that construct hides as members.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import construct
+from construct import (
+    Array,
+    BitsInteger,
+    Bytes,
+    BytesInteger,
+    Const,
+    Construct,
+    Container,
+    FormatField,
+    Struct,
+    Subconstruct,
+)
+from construct.expr import ExprMixin
+
+from lidarspec.spec.syntax.replacements import (
+    Bounded,
+    CheckedConst,
+    CountedBytes,
+    Counting,
+    ExactFloat,
+    Fault,
+    Filler,
+    FullRange,
+    HeldCheck,
+    IndexedArray,
+    Limited,
+    MarkedStruct,
+    NamedEnum,
+    Partition,
+    Pieces,
+    Sealing,
+    Sizing,
+    bounded,
+)
+
+if TYPE_CHECKING:
+    import random  # finding a sensor does without it
+
+    #: field path -> what draws its value in place of chance
+    Drawn = Mapping[str, Callable[[random.Random], Any]]
+
+#: construct's classes -> their replacements.
+_REPLACEMENTS: dict[type, type] = {
+    Struct: MarkedStruct,
+    Array: IndexedArray,
+    Const: CheckedConst,
+    construct.Enum: NamedEnum,
+    construct.GreedyRange: FullRange,
+}
+
+#: attributes of constructs that hold others; "cases" does by key.
+_INNER = ("subcon", "thensubcon", "elsesubcon", "default")
+
+
+def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) -> Construct:
+    """Return a copy of an author's struct with the replacements for construct's classes.
+
+    Args:
+        limit: the longest frame, in bytes; within a bit block in bits.
+        in_bits: whether it stands within a bit block.
+    """
+    if isinstance(con, FormatField):
+        if con.fmtstr[-1] in "efd":
+            return ExactFloat(con.fmtstr[0], con.fmtstr[-1])
+        return con
+    if isinstance(
+        con, construct.Hex | construct.HexDump
+    ):  # how a value is printed; it is the value below it
+        return prepare(con.subcon, limit, in_bits=in_bits)
+    if isinstance(con, construct.Check):
+        return HeldCheck(con.func)
+    if isinstance(con, construct.Mapping) and {
+        *map(type, con.encmapping),
+        *map(type, con.decmapping),
+    } == {str, int}:
+        return Limited(
+            NamedEnum(prepare(con.subcon, limit, in_bits=in_bits), **con.encmapping),
+            tuple(sorted(con.decmapping)),
+        )
+    if isinstance(con, construct.ExprValidator) and (allowed := _allowed(con)) is not None:
+        return Limited(prepare(con.subcon, limit, in_bits=in_bits), allowed)
+    if isinstance(con, Filler):
+        con.limit = limit
+        return con
+    if isinstance(con, Bytes):
+        counted = CountedBytes(con.length)
+        counted.limit = limit
+        return counted
+    if isinstance(con, Struct):
+        if in_bits:
+            members = con.subcons
+        else:
+            members = [member for child in con.subcons for member in _spelled_out(child)]
+        return MarkedStruct(*(prepare(child, limit, in_bits=in_bits) for child in members))
+    if isinstance(con, construct.Renamed):
+        inner = con.subcon
+        while isinstance(
+            inner, construct.Renamed
+        ):  # ("name" / con) * "docs" wraps twice, and the path would name it twice
+            inner = inner.subcon
+        return construct.Renamed(
+            prepare(inner, limit, in_bits=in_bits), newname=con.name, newdocs=con.docs
+        )
+    if not isinstance(con, Subconstruct | construct.IfThenElse | construct.Switch | Partition):
+        return con
+    same = copy.copy(con)
+    same.__class__ = next(
+        (own for kind, own in _REPLACEMENTS.items() if isinstance(con, kind)), type(con)
+    )
+    is_block = isinstance(con, construct.Transformed | construct.Restreamed)
+    for name in vars(con).keys() & _INNER:
+        setattr(
+            same,
+            name,
+            prepare(
+                getattr(con, name), 8 * limit if is_block else limit, in_bits=in_bits or is_block
+            ),
+        )
+    if isinstance(con, construct.Switch | Partition):
+        same.cases = {key: prepare(case, limit, in_bits=in_bits) for key, case in con.cases.items()}
+    if isinstance(same, IndexedArray):
+        same.limit = limit
+        same.in_bits = in_bits
+    if isinstance(same, Partition):
+        same.limit = limit
+    return same
+
+
+def _spelled_out(con: Construct) -> list[Construct]:
+    """A member of a struct; of those that construct prefixes, pads or aligns, what it does not
+    show: the length or count, the padding.
+    """
+    name = con.name
+    inner = con
+    docs = con.docs
+    while isinstance(inner, construct.Renamed):
+        inner = inner.subcon
+
+    def named(ending: str, part: Construct, what: str) -> Construct:
+        return construct.Renamed(part, newname=name + ending, newdocs=f"{what} {name}")
+
+    if name and isinstance(inner, construct.IfThenElse) and inner.elsesubcon is construct.Pass:
+        members = _spelled_out(construct.Renamed(inner.thensubcon, newname=name, newdocs=docs))
+        optional = (
+            construct.Renamed(
+                construct.If(inner.condfunc, one.subcon), newname=one.name, newdocs=one.docs
+            )
+            for one in members
+        )
+        if len(members) == 1:
+            return [con]
+        return list(optional)
+    if name and isinstance(inner, construct.Prefixed):
+        if inner.includelength:
+            plus = inner.lengthfield.sizeof()
+        else:
+            plus = 0
+        length = construct.this[f"{name}_size"]
+        if is_greedy(inner.subcon):
+            content = Bounded(length - plus if plus else length, inner.subcon)
+        else:
+            content = inner.subcon
+        members = _spelled_out(construct.Renamed(content, newname=name, newdocs=docs))
+        return [
+            named(
+                "_size",
+                Sizing(inner.lengthfield, (members[-1].name,), plus, members[0].name),
+                "bytes of",
+            ),
+            *members,
+        ]
+    if (
+        name
+        and isinstance(inner, construct.FocusedSeq)
+        and [part.name for part in inner.subcons] == ["count", "items"]
+    ):  # PrefixedArray
+        count, items = (part.subcon for part in inner.subcons)
+        array = Array(construct.this[f"{name}_count"], items.subcon)
+        return [
+            named("_count", Counting(count.subcon, name), "number of"),
+            construct.Renamed(array, newname=name, newdocs=docs),
+        ]
+    if name and (
+        isinstance(inner, construct.Aligned)
+        or (isinstance(inner, construct.FixedSized) and not is_greedy(inner.subcon))
+    ):
+        members = _spelled_out(construct.Renamed(inner.subcon, newname=name, newdocs=docs))
+        span = (members[0].name, members[-1].name)
+        if isinstance(inner, construct.Aligned):
+            return [
+                *members,
+                named(
+                    "_padding",
+                    Filler(span, modulus=inner.modulus, pattern=inner.pattern),
+                    "padding of",
+                ),
+            ]
+        is_full = isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon)
+        if is_full:
+            return members
+        return [*members, named("_padding", Filler(span, to=inner.length), "padding of")]
+    return [con]
+
+
+class _Compared:
+    """What stands for a value that a validator is given, and remembers what it is compared with."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self) -> None:
+        self.values: list[Any] = []
+
+    def __eq__(self, other: object) -> bool:
+        self.values.append(other)
+        return False
+
+
+def _allowed(con: construct.Validator) -> tuple[int, ...] | None:
+    """The raw values that a validator lets pass: those that it compares with, or of 16 bits all
+    that pass; None where neither is known.
+    """
+    field = unwrap(con)
+    subcon = con.subcon
+    while isinstance(subcon, Subconstruct) and not isinstance(subcon, construct.Enum):
+        subcon = subcon.subcon
+    if (
+        not isinstance(field, FormatField | BytesInteger | BitsInteger)
+        or getattr(field, "fmtstr", "B")[-1] in "efd?"
+    ):
+        return None
+    width = bit_width(field)
+    if isinstance(field, FormatField):
+        signed = field.fmtstr[-1].islower()
+    else:
+        signed = field.signed
+    low, high = (-(1 << (width - 1)), (1 << (width - 1)) - 1) if signed else (0, (1 << width) - 1)
+    with contextlib.suppress(
+        Exception
+    ):  # the author's function may raise anything at what is no number
+        passes = con._validate(compared := _Compared(), None, "")
+        if compared.values and not passes and all(type(value) is int for value in compared.values):
+            return tuple(
+                value
+                for value in sorted({*compared.values})
+                if low <= value <= high and con._validate(value, None, "")
+            )
+    with contextlib.suppress(Exception):  # or at numbers that it does not expect
+        if width <= 16:
+            seen = (
+                (lambda raw: subcon._decode(raw, None, None))
+                if isinstance(subcon, construct.Enum)
+                else int
+            )
+            return tuple(raw for raw in range(low, high + 1) if con._validate(seen(raw), None, ""))
+    return None
+
+
+#: what takes all bytes that there are.
+GREEDY = (construct.GreedyRange, type(construct.GreedyBytes))
+
+
+def is_greedy(con: Construct, kinds: tuple[type, ...] = (*GREEDY, construct.NullStripped)) -> bool:
+    """Whether a part takes all bytes that it is given, by ending in one of some kinds that do."""
+    if isinstance(con, kinds):
+        return True
+    if isinstance(
+        con,
+        Array
+        | construct.NullTerminated
+        | construct.NullStripped
+        | construct.FixedSized
+        | construct.Prefixed
+        | Bounded,
+    ):
+        return False
+    return any(
+        is_greedy(child, kinds)
+        for child in (children(con)[-1:] if isinstance(con, Struct) else children(con))
+    )
+
+
+def unwrap(con: Construct, *, bits: bool = True) -> Construct:
+    """The construct below names, units and checksums, and below bit transformations unless `bits`
+    is False.
+    """
+    while isinstance(con, Subconstruct) and not isinstance(con, Array | Const):
+        if isinstance(con, construct.Transformed | construct.Restreamed) and not bits:
+            return con
+        con = con.subcon
+    return con
+
+
+def is_struct(con: Construct) -> bool:
+    """Whether it is a Struct, sealed or not."""
+    return isinstance(unwrap(con, bits=False), Struct)
+
+
+def has_member(con: Construct, dotted: str) -> bool:
+    """Whether a struct has a member under a dotted name."""
+    inner: Any = unwrap(con)
+    for part in dotted.split("."):
+        if not isinstance(inner, Struct) or part not in inner._subcons:
+            return False
+        inner = unwrap(inner._subcons[part])
+    return True
+
+
+def bit_width(con: Construct) -> int:
+    """The number of bits of a field of fixed size."""
+    inner = unwrap(con)
+    if isinstance(inner, BitsInteger):
+        return int(inner.length)
+    if isinstance(inner, FormatField | BytesInteger | Bytes):
+        return 8 * int(inner.length)
+    return 8 * int(inner.sizeof())
+
+
+def fixed_size(con: Construct) -> int:
+    """The number of bytes of a struct of fixed size; 0 where it depends on what is parsed."""
+    try:
+        return int(con.sizeof())
+    except Exception:  # construct lets a KeyError through where a condition asks for a field
+        return 0
+
+
+def clean(parsed: Any) -> Any:
+    """The parsed object without construct's and our own private entries."""
+    if isinstance(parsed, dict):
+        return Container(
+            {name: clean(value) for name, value in parsed.items() if not name.startswith("_")}
+        )
+    if isinstance(parsed, list):
+        return construct.ListContainer(clean(value) for value in parsed)
+    return parsed
+
+
+def field_path(path: str | None) -> str:
+    """construct's "(parsing) -> points[1] -> intensity" as "points[1].intensity"; a text on a part
+    without name makes a "None".
+    """
+    names = re.sub(r" -> None(?=$| ->|\[)", "", path or "").split(" -> ")[1:]
+    return ".".join(names)
+
+
+def children(con: Construct) -> list[Construct]:
+    """The constructs directly below one, branches included."""
+    if isinstance(con, Struct):
+        return list(con.subcons)
+    found = [getattr(con, name) for name in _INNER if name in vars(con)]
+    return found + (list(con.cases.values()) if "cases" in vars(con) else [])
+
+
+def seals(con: Construct) -> Iterator[Sealing]:
+    """The sealed structs of a struct, outer ones first."""
+    if isinstance(con, Sealing):
+        yield con
+    for child in children(con):
+        yield from seals(child)
+
+
+def leaves(
+    parsed: Any, keys: tuple[str | int, ...] = ()
+) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    """The values of a parsed object with where they stand in it, private entries left out."""
+    if isinstance(parsed, dict):
+        for name, value in parsed.items():
+            if not name.startswith("_"):
+                yield from leaves(value, (*keys, name))
+    elif isinstance(parsed, list):
+        for index, value in enumerate(parsed):
+            yield from leaves(value, (*keys, index))
+    else:
+        yield keys, int(parsed) if isinstance(parsed, construct.EnumIntegerString) else parsed
+
+
+def is_expression(value: object) -> bool:
+    """Whether a value is an expression or a part of a struct, where a number is wanted."""
+    return isinstance(value, ExprMixin | Construct)
+
+
+#: the highest of the low numbers that are drawn half of the time: as a count or a choice, a number
+#: of any size hardly ever fits.
+MANY = (1, 6, 40)
+
+#: how often a part is drawn that does not fit.
+DRAWS = 100
+
+
+def random_value(
+    con: Construct, source: random.Random, drawn: Drawn, scope: Any = None, path: str = ""
+) -> Any:
+    """Return a random value that a construct can build.
+
+    Examples of frames with `Parts`, and of frames without a layout, are built from such values:
+    random bytes are hardly ever a valid chain of parts or a text with its terminator. Examples of
+    all other frames are random bytes in a layout.
+
+    Args:
+        drawn: field path -> what draws its value in place of chance.
+        scope: what its expressions see.
+    """
+    if path in drawn:
+        return drawn[path](source)
+    if isinstance(con, Const):
+        return con.parse(
+            con.build(con.value), _verify=False
+        )  # a name of an Enum with its number, as other expressions see it
+    if isinstance(con, construct.Rebuild):
+        with contextlib.suppress(
+            Exception
+        ):  # it may ask for what comes after it, and is evaluated again when the frame is built
+            return con.func(scope)
+    if isinstance(con, Struct):
+        values = Container(_=scope)
+        values._root = values if scope is None else scope._root
+        for child in con.subcons:
+            if child.name is not None:
+                values[child.name] = random_value(
+                    child, source, drawn, values, f"{path}.{child.name}" if path else child.name
+                )
+        return values
+    if isinstance(con, construct.GreedyRange):
+        return [
+            random_value(con.subcon, source, drawn, scope, path)
+            for _ in range(source.randint(0, 4))
+        ]
+    if isinstance(con, Partition):
+        return _random_parts(con, source, drawn, scope, path)
+    if isinstance(con, Array):
+        count = bounded(construct.evaluate(con.count, scope), con.limit, "count", path)
+        bounded(count * _elements(con.subcon, scope), con.limit, "count", path)
+        return [random_value(con.subcon, source, drawn, scope, path) for _ in range(count)]
+    if isinstance(con, construct.IfThenElse):
+        return random_value(
+            con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon,
+            source,
+            drawn,
+            scope,
+            path,
+        )
+    if isinstance(con, construct.Switch):
+        return random_value(
+            con.cases.get(construct.evaluate(con.keyfunc, scope), con.default),
+            source,
+            drawn,
+            scope,
+            path,
+        )
+    if isinstance(con, Limited):
+        raw = source.choice(con.allowed)
+        if isinstance(con.subcon, construct.Enum):
+            return con.subcon._decode(raw, None, None)
+        return raw
+    if isinstance(con, construct.Enum):
+        if not isinstance(unwrap(con), Const) and source.random() < 0.5:
+            named = list(con.ksymapping)
+        else:
+            named = []
+        return con._decode(
+            source.choice(named) if named else random_value(con.subcon, source, drawn, scope, path),
+            None,
+            None,
+        )
+    if isinstance(con, construct.NullTerminated) or not isinstance(con, Subconstruct):
+        return _random_leaf(con, source, scope)
+    if isinstance(con, construct.Adapter):
+        return clean(
+            con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path)))
+        )
+    return random_value(con.subcon, source, drawn, scope, path)
+
+
+def _elements(con: Construct, scope: Any) -> int:
+    """How many an element of an array has itself, where it is an array too; as far as that is known
+    before there is one.
+    """
+    with contextlib.suppress(
+        Exception
+    ):  # whatever an expression raises that asks for what is not there yet
+        if isinstance(con, Array):
+            return int(construct.evaluate(con.count, scope)) * _elements(con.subcon, scope)
+        return 1
+    return 1
+
+
+def _random_parts(
+    con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str
+) -> Pieces:
+    """Some parts, with how long each is, which what stands behind them may ask for."""
+    found = Pieces()
+    around = Container(
+        {**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False}
+    )
+    for _ in range(source.randint(0, 4)):
+        name = source.choice(list(con.cases))
+        stream = io.BytesIO()
+        found.append(_random_part(con.cases[name], source, drawn, scope, path))
+        con.cases[name]._build(found[-1], stream, around, path)
+        found.spans.append((name, 0, stream.tell()))
+    return found
+
+
+def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:
+    """One part; drawn again by itself where it is too long, since frames of many counts would else
+    have no part at all.
+    """
+    for _ in range(DRAWS):
+        with contextlib.suppress(Fault):
+            return random_value(con, source, drawn, scope, path)
+    return random_value(con, source, drawn, scope, path)
+
+
+def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
+    if con is construct.Pass or isinstance(con, construct.Check | Filler):
+        # whether a Check holds, and how much there is to fill, is seen when the frame is built
+        return None
+    if isinstance(con, construct.NullTerminated):
+        return str(source.randrange(10 ** source.randint(1, 4))).encode()
+    if isinstance(con, construct.Computed):
+        return construct.evaluate(con.func, scope)
+    if con is construct.GreedyBytes:
+        return source.randbytes(source.randint(0, 4))
+    if isinstance(con, Bytes):
+        return source.randbytes(
+            bounded(construct.evaluate(con.length, scope), con.limit, "length", "")
+        )
+    if (
+        isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5
+    ):  # it may be a count
+        return con.parse(
+            con.build(source.randint(0, min(source.choice(MANY), (1 << (bit_width(con) - 1)) - 1)))
+        )
+    if con in (construct.VarInt, construct.ZigZag):
+        return source.randint(0, source.choice(MANY))
+    if isinstance(con, BitsInteger):
+        value = source.getrandbits(con.length)
+        if con.signed and value >> (con.length - 1):
+            return value - (1 << con.length)
+        return value
+    return con.parse(source.randbytes(con.sizeof()))
