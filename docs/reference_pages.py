@@ -16,6 +16,10 @@ from lidarspec.exports import export, select_frame
 from lidarspec.exports.reference import page
 
 FOLDER = Path(__file__).parent / "reference" / "sensors"
+INTRODUCTION = """\
+Each sensor has a page with its packets, generated from its spec. It was verified with captures of a
+real unit (`capture`), with bytes that the vendor or others printed (`vectors`), or from documents
+alone (`manual`). `lidarspec sensors` prints this list."""
 
 
 def make_sensor_files(sensor: ls.Sensor) -> dict[str, str]:
@@ -32,8 +36,7 @@ def make_sensor_files(sensor: ls.Sensor) -> dict[str, str]:
 
 def make_index(sensors: list[ls.Sensor]) -> str:
     """Return a page with a link to the page of each sensor."""
-    lines = ["# Sensors", "", "One page each, generated from the spec by `make docs`.", ""]
-    lines += ["| sensor | id | proven |", "|---|---|---|"]
+    lines = ["# Sensors", "", INTRODUCTION, "", "| sensor | id | verified |", "|---|---|---|"]
     for sensor in sensors:
         name = f"{sensor.vendor} {sensor.model}"
         lines.append(f"| [{name}]({sensor.id}.md) | `{sensor.id}` | {sensor.status} |")

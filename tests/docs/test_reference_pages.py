@@ -48,6 +48,13 @@ def test_the_index_links_every_page() -> None:
     assert all(f"({sensor.id}.md)" in index for sensor in sensors)
 
 
+def test_the_navigation_lists_the_pages_of_each_vendor() -> None:
+    sensors = [ls.sensor(name) for name in ("velodyne-vlp16", "ldrobot-ld06", "ldrobot-stl27l")]
+    entries = load_script("sensor_navigation").make_entries(sensors)
+    assert [list(entry) for entry in entries] == [["All sensors"], ["LDROBOT"], ["Velodyne"]]
+    assert {"STL-27L": "reference/sensors/ldrobot-stl27l.md"} in entries[1]["LDROBOT"]
+
+
 def test_files_of_sensors_that_are_gone_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
