@@ -13,5 +13,6 @@ other types. Modules in reading order:
 * `masked_sector`: gaps where a rotating sensor is set to send nothing, which are no loss.
 * `reorder`: packets put back in order, duplicates left out.
 * `imu`: the samples of an IMU.
+* `packet_type`: how the packets of one frame type are timed, and how losses are found.
 * `stream`: from frames to packets, batch by batch.
 """

@@ -9,39 +9,34 @@ by their clock (`clock_order`), else by arrival (`arrival_order`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.errors import PluginError, SpecError, UnknownFrame
+from lidarspec.errors import PluginError, SpecError
 from lidarspec.expressions.columns import Batch
 from lidarspec.frames.arrays import alike, repeated
 from lidarspec.frames.frame_table import Table
-from lidarspec.frames.schema import Schema
-from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.results import Counters, Frames, Numbers
+from lidarspec.framing.results import Counters, Frames, Numbers, array_of
 from lidarspec.packets.arrival_order import ArrivalOrder
 from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.clocks import (
     ClockReference,
     Epoch,
     Unwrapper,
-    clock_parts,
-    clock_terms,
     clocked,
     held,
-    paths,
 )
 from lidarspec.packets.counter_order import CounterOrder
 from lidarspec.packets.imu import ImuSamples, Waiting, joined
 from lidarspec.packets.masked_sector import MaskedGaps
+from lidarspec.packets.packet_type import find_clock, packet_type
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.timing import Clock
 
 Integers = NDArray[np.int64]
 #: frames of another type, and the number of packets before each, (k,).
@@ -73,49 +68,29 @@ class PacketStream:
         state: Mapping[str, bytes] | None = None,
         reference: ClockReference | None = None,
     ) -> None:
-        if frame not in sensor.frames:
-            raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-        self.sensor = sensor
-        self.frame = frame
+        self._type = packet_type(sensor, frame)
         self.stats = stats
         self._backend = backend
-        self._codec = self._codec_of(frame)
-        self._others = [
-            name for name, other in sensor.incoming.items() if not other.data and name != frame
-        ]
         self._state: dict[str, bytes] = dict(state or {})
         self._tables: dict[str, tuple[bytes, Table]] = {}
         self._skipped = 0  # bytes since the last packet
 
-        is_data = sensor.frames[frame].data
-        clock = _clock_of(sensor, frame, self._codec.schema)
-        self._timer = sensor  # with the clock of these packets
-        if clock is not None and clock is not sensor.clock:
-            self._timer = replace(sensor, clock=clock)
+        clock = self._type.clock
         self._clock = Unwrapper(clock.wraps_at) if clock else None
         self._time: int | None = None  # of the last packet with parts that have the clock
         self._turn = repeated(0, 0)  # completes the times of the packets at hand
         self._epoch: Epoch | None = None
-        if is_data and clock is not None and clock.told is not None:
-            self._epoch = Epoch(self._timer, clock, reference)
+        if clock is not None and clock.told is not None and sensor.frames[frame].data:
+            self._epoch = Epoch(self._type.timed_sensor, clock, reference)
 
-        if is_data and clock is not None:
-            data_clock = sensor.clock
-        else:
-            data_clock = None
-        is_in_parts = (
-            data_clock is not None
-            and clock_parts(paths(data_clock), self._codec.schema) is not None
-        )
         self._counter_order: CounterOrder | None = None
         self._clock_order: ClockOrder | None = None
-        if is_data and _has_counter(sensor, frame):
-            self._counter_order = CounterOrder(sensor, stats, data_clock)
-        elif data_clock is not None and not is_in_parts and sensor.datagrams:
-            self._clock_order = ClockOrder(stats, data_clock, MaskedGaps(sensor))
-        # a frame without the parts that have the clock does not show how much time has passed
-        frame_clock = None if is_in_parts else data_clock
-        self._arrival_order = ArrivalOrder(stats, frame_clock, self._step_ns(frame_clock))
+        loss_clock = self._type.loss_clock
+        if self._type.is_counted:
+            self._counter_order = CounterOrder(sensor, stats, self._type.counter_clock)
+        elif loss_clock is not None and self._type.is_ordered_by_clock:
+            self._clock_order = ClockOrder(stats, loss_clock, MaskedGaps(sensor))
+        self._arrival_order = ArrivalOrder(stats, loss_clock, self._type.loss_clock_step_ns)
 
     def add(self, found: Sequence[Frames], *, whole: bool = False) -> Packets:
         """Return the packets among some frames.
@@ -124,30 +99,32 @@ class PacketStream:
             whole: the frames are a whole input: packets before the first frame of another type see
                 that one as state.
         """
-        parts = [OwnFrames.of(frames, self.frame) for frames in found if len(frames)]
-        table = self._table(parts)
-        skipped = _all_or_joined([self._bytes_skipped(part) for part in parts])
+        parts = [OwnFrames.of(frames, self._type.frame) for frames in found if len(frames)]
+        columns = _joined([self._read(part) for part in parts])
+        if columns is None:
+            columns = self._no_columns()
+        table = columns.table
         state: dict[str, StateOf] = {}
-        if self._others:
+        if self._type.others:
             state = self._states(parts, len(table), whole=whole)
-        host = _times([part.frames.at for part in parts])
+        host = _host_times(columns.at)
         breaks = np.zeros(len(table), np.bool_)
-        if alike(skipped) != 0:
-            breaks = skipped > 0
+        if alike(columns.skipped) != 0:
+            breaks = columns.skipped > 0
         time = None
         index: Index = range(0)
         order: Integers | None = None
         if len(table):
-            batch = Batch(table, breaks, state, self.sensor.state)
+            batch = Batch(table, breaks, state, self._type.sensor.state)
             with np.errstate(all="ignore"):
                 if self._clock is not None:
                     time = self._guarded("clock", self._times, None, batch, host, whole)
-                index, breaks, order = self._judge(batch, time, skipped)
+                index, breaks, order = self._judge(batch, time, columns.skipped)
         return Packets(
-            self.sensor,
-            self.frame,
+            self._type.sensor,
+            self._type.frame,
             table,
-            offset=_offsets(parts),
+            offset=columns.offset,
             time_ns=host if time is None else self._complete(time),
             host_ns=host,
             index=index,
@@ -164,13 +141,6 @@ class PacketStream:
         for judge in (self._counter_order, self._clock_order, self._arrival_order):
             if judge is not None:
                 judge.forget()
-
-    def _step_ns(self, clock: Clock | None) -> float:
-        """Return the step of a clock, ns; 0 if it has no fields."""
-        if clock is None:
-            return 0
-        terms = clock_terms(paths(clock), self._codec.schema, self.sensor.id)
-        return float(min((step for _, step, _, _ in terms), default=0))
 
     def _judge(
         self, batch: Batch, time: Integers | None, skipped: Integers
@@ -205,7 +175,7 @@ class PacketStream:
     def _times(self, batch: Batch, host: Integers, whole: bool) -> Integers:
         """Return the times of packets by their clock, (n,) ns."""
         assert self._clock is not None
-        which, readings = clocked(self._timer, batch)
+        which, readings = clocked(self._type.timed_sensor, batch)
         if which is None:
             times = self._clock.push(readings, host)
             if self._epoch is not None:
@@ -252,22 +222,27 @@ class PacketStream:
             self._skipped -= int(own_sums[-1])
         return np.diff(own_sums, prepend=0)
 
-    def _table(self, parts: Sequence[OwnFrames]) -> Table:
-        tables = [self._codec.gather(part.frames) for part in parts if len(part.frames)]
-        if tables:
-            return joined_tables(tables)
-        return self._codec.table([])
+    def _read(self, part: OwnFrames) -> _Columns:
+        """Return what a piece of input says of its packets."""
+        frames = part.frames
+        skipped = self._bytes_skipped(part)
+        return _Columns(self._type.codec.gather(frames), frames.places, frames.at, skipped)
+
+    def _no_columns(self) -> _Columns:
+        """Return what an input without packets says of them."""
+        nothing = repeated(0, 0)
+        return _Columns(self._type.codec.table([]), range(0), nothing, nothing)
 
     def _states(
         self, parts: Sequence[OwnFrames], number: int, *, whole: bool
     ) -> dict[str, StateOf]:
         """Return the frames of each other type, and which was the last before each packet."""
         if not self._state and not any(part.has_others for part in parts):
-            return dict.fromkeys(self._others, (None, repeated(-1, number)))
+            return dict.fromkeys(self._type.others, (None, repeated(-1, number)))
         seen = self._others_in(parts)
         return {
             name: self._state_of(name, seen.get(name, []), number=number, whole=whole)
-            for name in self._others
+            for name in self._type.others
         }
 
     def _others_in(self, parts: Sequence[OwnFrames]) -> dict[str, list[Earlier]]:
@@ -283,22 +258,19 @@ class PacketStream:
                 before = number + others - np.arange(len(others))
                 for kind in np.unique(kinds).tolist():
                     name = part.piece.names[kind]
-                    if name in self._others:
+                    if name in self._type.others:
                         which = kinds == kind
                         frames = part.piece.only(others[which])
                         seen.setdefault(name, []).append((frames, before[which]))
             number += len(part.frames)
         return seen
 
-    def _codec_of(self, name: str) -> Codec:
-        return codec(self.sensor.frames[name])
-
     def _last(self, name: str) -> Table:
         """Return the last frame of another type, as a table."""
         data = self._state[name]
         cached = self._tables.get(name)
         if cached is None or cached[0] is not data:
-            cached = (data, self._codec_of(name).table([data]))
+            cached = (data, codec(self._type.sensor.frames[name]).table([data]))
             self._tables[name] = cached
         return cached[1]
 
@@ -308,7 +280,8 @@ class PacketStream:
             if name in self._state:
                 return self._last(name), repeated(0, number)
             return None, repeated(-1, number)
-        tables: list[Table] = [self._codec_of(name).gather(frames) for frames, _ in seen]
+        engine = codec(self._type.sensor.frames[name])
+        tables: list[Table] = [engine.gather(frames) for frames, _ in seen]
         before = np.concatenate([places for _, places in seen])
         if name in self._state:
             tables = [self._last(name), *tables]
@@ -344,10 +317,8 @@ class ImuStream:
         self._names = [name for name in sensor.imu_frames if not sensor.frames[name].data]
         self._streams = dict[str, PacketStream]()
         self._make_stream = partial(PacketStream, sensor, stats=stats, backend=backend, state=state)
-        has_clock = {
-            _clock_of(sensor, name, codec(sensor.frames[name]).schema) is not None
-            for name in (*self._names, *sensor.data_frames)
-        }
+        names = (*self._names, *sensor.data_frames)
+        has_clock = {find_clock(sensor, name) is not None for name in names}
         self.waiting = Waiting() if sensor.imu_frames and len(has_clock) == 1 else None
 
     def add(
@@ -446,92 +417,63 @@ def data_frame(sensor: SensorDescription, found: Sequence[Frames]) -> str | None
     return None
 
 
-def _clock_of(sensor: SensorDescription, frame: str, schema: Schema) -> Clock | None:
-    """Return the clock of frames of a type, if any.
+class _Columns(NamedTuple):
+    """What the frames of one type say of their packets, (n,) each.
 
-    Data frames use the clock of the sensor, as do frames of an IMU that have its fields.
+    Attributes:
+        table: the raw columns.
+        offset: of each in the input; a range if they have one size and follow one another.
+        at: arrival times, ns; -1 if unknown.
+        skipped: bytes in no frame before each.
     """
-    declared = sensor.frames[frame]
-    shared = sensor.clock
-    if declared.clock is not None or shared is None:
-        return declared.clock
-    if declared.data:
-        if all(_has_field(sensor, frame, path) for path in paths(shared)):
-            return shared
-        return None
-    if declared.imu is None or not paths(shared):
-        return None
-    if all(path in schema.fields for path in paths(shared)):
-        return shared
-    return None
+
+    table: Table
+    offset: Numbers
+    at: Integers
+    skipped: Integers
 
 
-def _has_counter(sensor: SensorDescription, frame: str) -> bool:
-    return sensor.sequence is not None and _has_field(sensor, frame, sensor.sequence.field)
+def _joined(parts: Sequence[_Columns]) -> _Columns | None:
+    """Return the columns of all packets, in this order; None if there are none."""
+    parts = [part for part in parts if len(part.table)]
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    return _Columns(
+        joined_tables([part.table for part in parts]),
+        _join_offsets([part.offset for part in parts]),
+        _join_values([part.at for part in parts]),
+        _join_values([part.skipped for part in parts]),
+    )
 
 
-def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
-    """Return whether packets of this type have a field, or should, since no data frame has it."""
-    schemas = {name: codec(sensor.frames[name]).schema for name in sensor.data_frames}
-    having = [
-        name
-        for name, schema in schemas.items()
-        if path in schema.fields or schema.within(path) is not None
-    ]
-    return frame in having or not having
+def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
+    """Return offsets joined; as a range, if they are in equal steps."""
+    first = parts[0]
+    if not isinstance(first, range):
+        return np.concatenate([array_of(part) for part in parts])
+    stop = first.stop
+    for part in parts[1:]:
+        if not isinstance(part, range) or part.step != first.step or part.start != stop:
+            return np.concatenate([array_of(part) for part in parts])
+        stop = part.stop
+    return range(first.start, stop, first.step)
 
 
-def _offsets(parts: Sequence[OwnFrames]) -> Numbers:
-    """Return the offsets of frames in the input.
-
-    They are a range if all frames have one size and follow one another.
-    """
-    places = _join_ranges(parts)
-    if places is None:
-        return _joined([part.frames.offsets for part in parts], np.int64)
-    return places
-
-
-def _join_ranges(parts: Sequence[OwnFrames]) -> range | None:
-    """Return the offsets of frames as one range; None if they are not in equal steps."""
-    joined: range | None = None
-    for part in parts:
-        places = part.frames.places
-        if not isinstance(places, range):
-            return None
-        if joined is None:
-            joined = places
-        elif joined.stop == places.start and joined.step == places.step:
-            joined = range(joined.start, places.stop, joined.step)
-        else:
-            return None
-    return joined
-
-
-def _times(parts: Sequence[Integers]) -> Integers:
-    """Return arrival times, 0 if unknown."""
-    times = _all_or_joined(parts)
-    only = alike(times)
-    if only is not None:
-        return repeated(max(only, 0), len(times))
-    if len(times) and int(times.min()) < 0:
-        return np.maximum(times, 0)
-    return times
-
-
-def _all_or_joined(parts: Sequence[Integers]) -> Integers:
+def _join_values(parts: Sequence[Integers]) -> Integers:
     """Return arrays joined; as one `repeated` value, if all of them are of it."""
-    values = {alike(part) for part in parts if len(part)}
+    values = {alike(part) for part in parts}
     if len(values) == 1:
         only = values.pop()
         if only is not None:
             return repeated(only, sum(map(len, parts)))
-    return _joined(parts, np.int64)
+    return np.concatenate(parts)
 
 
-def _joined(parts: Sequence[NDArray[Any]], dtype: Any) -> NDArray[Any]:
-    if len(parts) == 1:
-        return parts[0]
-    if parts:
-        return np.concatenate(parts)
-    return np.empty(0, dtype)
+def _host_times(at: Integers) -> Integers:
+    """Return arrival times, 0 if unknown."""
+    only = alike(at)
+    if only is not None:
+        return repeated(max(only, 0), len(at))
+    if len(at) and int(at.min()) < 0:
+        return np.maximum(at, 0)
+    return at

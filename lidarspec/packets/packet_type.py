@@ -1,0 +1,129 @@
+"""Work out how the packets of one frame type are timed, and how losses among them are found.
+
+Both follow from the declaration of the sensor, so this is done once for each frame type and not for
+each stream.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+from lidarspec.errors import UnknownFrame
+from lidarspec.framing.frame_codec import Codec
+from lidarspec.framing.frame_engine import codec
+from lidarspec.packets.clocks import clock_parts, clock_terms, paths
+from lidarspec.spec.sensor import SensorDescription
+from lidarspec.spec.timing import Clock
+
+
+@dataclass(frozen=True, eq=False)
+class PacketType:
+    """The packets of one frame type of a sensor.
+
+    Attributes:
+        sensor, frame: the sensor, and the name of the frame type.
+        codec: the engine of the frame type.
+        others: the names of the frame types that packets take state from.
+        clock: the clock of these packets; None if they have none.
+        timed_sensor: the sensor with this clock.
+        loss_clock: the clock that shows losses; None if there is none, or if it is in the parts of
+            a frame: a frame without parts does not show how much time has passed.
+        loss_clock_step_ns: its step; 0 if a function computes it.
+        counter_clock: the clock that is compared with the counter; None if there is none.
+        is_counted: whether the packets have a counter.
+        is_ordered_by_clock: whether their clock shows the order in which they were sent: that of
+            datagrams without a counter.
+    """
+
+    sensor: SensorDescription
+    frame: str
+    codec: Codec
+    others: tuple[str, ...]
+    clock: Clock | None
+    timed_sensor: SensorDescription
+    loss_clock: Clock | None
+    loss_clock_step_ns: float
+    counter_clock: Clock | None
+    is_counted: bool
+    is_ordered_by_clock: bool
+
+    def __reduce__(self) -> Any:
+        return packet_type, (self.sensor, self.frame)
+
+
+@lru_cache(maxsize=256)
+def packet_type(sensor: SensorDescription, frame: str) -> PacketType:
+    """Return the packets of a frame type, always the same object.
+
+    Raises:
+        UnknownFrame: if the sensor has no such type.
+    """
+    if frame not in sensor.frames:
+        raise UnknownFrame(frame, sensor.frames, place=sensor.id)
+    own_codec = codec(sensor.frames[frame])
+    is_data = sensor.frames[frame].data
+    clock = find_clock(sensor, frame)
+    timed_sensor = sensor
+    if clock is not None and clock is not sensor.clock:
+        timed_sensor = replace(sensor, clock=clock)
+    counter_clock = None
+    if is_data and clock is not None:
+        counter_clock = sensor.clock
+    loss_clock = counter_clock
+    step_ns = 0.0
+    if loss_clock is not None:
+        fields = paths(loss_clock)
+        if clock_parts(fields, own_codec.schema) is not None:
+            loss_clock = None
+        else:
+            terms = clock_terms(fields, own_codec.schema, sensor.id)
+            step_ns = float(min((step for _, step, _, _ in terms), default=0))
+    counter = sensor.sequence
+    is_counted = is_data and counter is not None and _has_field(sensor, frame, counter.field)
+    return PacketType(
+        sensor,
+        frame,
+        own_codec,
+        tuple(name for name, other in sensor.incoming.items() if not other.data and name != frame),
+        clock,
+        timed_sensor,
+        loss_clock,
+        step_ns,
+        counter_clock,
+        is_counted,
+        not is_counted and loss_clock is not None and sensor.datagrams,
+    )
+
+
+def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
+    """Return the clock of the frames of a type, if any.
+
+    Data frames use the clock of the sensor, as do frames of an IMU that have its fields.
+    """
+    declared = sensor.frames[frame]
+    shared = sensor.clock
+    if declared.clock is not None or shared is None:
+        return declared.clock
+    if declared.data:
+        if all(_has_field(sensor, frame, path) for path in paths(shared)):
+            return shared
+        return None
+    if declared.imu is None or not paths(shared):
+        return None
+    schema = codec(declared).schema
+    if all(path in schema.fields for path in paths(shared)):
+        return shared
+    return None
+
+
+def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
+    """Return whether packets of this type have a field, or should, since no data frame has it."""
+    schemas = {name: codec(sensor.frames[name]).schema for name in sensor.data_frames}
+    having = [
+        name
+        for name, schema in schemas.items()
+        if path in schema.fields or schema.within(path) is not None
+    ]
+    return frame in having or not having
