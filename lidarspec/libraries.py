@@ -6,6 +6,7 @@ with `EXTRAS` first, because an old version may import and then fail on a missin
 
 from __future__ import annotations
 
+import functools
 import importlib
 import re
 from typing import Any, NamedTuple
@@ -96,6 +97,7 @@ def find_requirement(module: str, extra: str) -> Requirement | None:
     return None
 
 
+@functools.cache  # reading the version takes most of a millisecond
 def check_version(requirement: Requirement, extra: str) -> None:
     """Raise an exception if the installed version of a library is too old.
 

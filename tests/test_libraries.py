@@ -11,7 +11,7 @@ import pytest
 
 from lidarspec.errors import LibraryError, UsageError, suggestion
 from lidarspec.formats import write
-from lidarspec.libraries import EXTRAS, import_library, release_numbers
+from lidarspec.libraries import EXTRAS, check_version, import_library, release_numbers
 
 ROOT = Path(__file__).parents[1]
 #: extras that install plugins or tools, and no library that lidarspec imports.
@@ -65,6 +65,7 @@ def test_an_old_library_is_named_with_both_versions(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     versions = {"rosbags": "0.9.23"}
+    check_version.cache_clear()
     monkeypatch.setattr(importlib.metadata, "version", versions.__getitem__)
     with pytest.raises(LibraryError) as caught:
         write(tmp_path / "scan.bag", [])
