@@ -206,7 +206,7 @@ class Sensor(SensorDescription):
         name = frame or data_frame(self, frames) or self.data_frame
         stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
         packets = stream.add(frames, whole=True)
-        if frame is not None:
+        if frame is not None or not self.imu_frames:
             return packets, None
         imu = ImuStream(self, decoder.stats, backend=decoder.backend)
         imu.add(frames, packets, whole=True)

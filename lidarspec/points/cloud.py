@@ -497,10 +497,3 @@ class _LazyColumn:
 
 for _name in (*COLUMNS, "valid"):
     setattr(LazyCloud, _name, _LazyColumn(_name))
-
-
-def source_of(cloud: PointCloud) -> ColumnSource:
-    """Return the source of the columns of a cloud."""
-    if isinstance(cloud, LazyCloud):
-        return cloud.lazy.source
-    return CloudColumns(cloud)

@@ -9,6 +9,7 @@ written once.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -281,6 +282,7 @@ def axes_of(sensor: SensorDescription) -> tuple[str, str, str]:
     return wanted or REP_103
 
 
+@lru_cache(maxsize=256)
 def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
     """Return the (3, 3) matrix from REP-103 to the configured axes.
 

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
-from lidarspec.expressions.columns import Batch, Carry, Column, Fields
+from lidarspec.expressions.columns import Batch, Carry, Column
 from lidarspec.expressions.graph import Node
 from lidarspec.frames.frame_table import Group, Rows, ascends
 from lidarspec.points.batch_columns import BatchColumns
-from lidarspec.points.cloud import LazyCloud
 from lidarspec.points.conventions import Grids, grid_of
 from lidarspec.points.plain import Evaluated, PacketBatch, evaluate_plainly, stamp_of
 from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
@@ -91,9 +90,9 @@ def _evaluate_by_plans(
     ready = len(packets)
     if not final:
         ready = min((column.ready for column in remembered.values()), default=ready)
-    cloud = _cloud_of(packets, shares, batch, ready, stamp_of(packets, epoch))
+    source = _source_of(packets, shares, batch, ready, stamp_of(packets, epoch))
     counts = _counts(shares, len(packets))[:ready]
-    return Evaluated(cloud, ready, batch.carried(ready), counts, Fields(batch), plans[0].axes)
+    return Evaluated(source, ready, counts, plans[0].axes, batch)
 
 
 def _share(
@@ -149,10 +148,10 @@ def _are_moderate(values: NDArray[Any]) -> bool:
     return not (odd.any() and sizes[odd].any())
 
 
-def _cloud_of(
+def _source_of(
     packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int
-) -> LazyCloud:
-    """Return the cloud of the first `ready` packets."""
+) -> BatchColumns:
+    """Return the columns of the points of the first `ready` packets."""
     plan = shares[0].plan
     grids = None
     size = ready * plan.width
@@ -169,13 +168,12 @@ def _cloud_of(
         for share in shares:
             share.first = np.where(share.group.where < ready, starts[share.group.where], -1)
     nominal = batch.nominal or plan.nominal
-    source = BatchColumns(packets, shares, size, stamp_ns, grids=grids, nominal=nominal)
-    return LazyCloud.of(source, stamp_ns)
+    return BatchColumns(packets, shares, size, stamp_ns, grids=grids, nominal=nominal)
 
 
 def _counts(shares: list[Share], number: int) -> NDArray[Any]:
     """Return 1 for each point, with the axes of the arrays, and 0 in their padding."""
-    if all(share.plan.shape == shares[0].plan.shape for share in shares):
+    if len(shares) == 1 or len({share.plan.shape for share in shares}) == 1:
         return np.broadcast_to(np.intp(1), (number, *shares[0].plan.shape))
     shape = tuple(
         max(lengths) for lengths in zip(*(share.plan.shape for share in shares), strict=True)
@@ -204,5 +202,5 @@ def guarded(
     except SpecError as error:
         packets.stats.error(PluginError.of(error, f"points of {packets.frame}"), len(packets))
         return None
-    packets.stats.nominal |= bool(points.cloud.nominal)
+    packets.stats.nominal |= bool(points.source.nominal)
     return points

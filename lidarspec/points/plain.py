@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,6 +24,7 @@ from lidarspec.frames.frame_table import Table
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud, organised
+from lidarspec.points.column_sources import ColumnSource
 from lidarspec.points.conventions import Kind
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.sensor import SensorDescription
@@ -63,21 +65,34 @@ class Evaluated:
     """The points of the first `ready` packets of a batch.
 
     Attributes:
-        cloud: they, flat, in stream order.
+        source: their columns, flat, in stream order.
         ready: how many packets they are of; the others wait for what follows.
-        carry: what the evaluation of the next batch needs, which starts with packet `ready`.
         counts: (ready, ...) points of each packet, with an axis for each array level, padding left
             out.
-        fields: the columns of the batch, for the splitting into scans.
         axes: names of the axes of `counts` after the first.
+        batch: all packets of the batch.
     """
 
-    cloud: PointCloud
+    source: ColumnSource
     ready: int
-    carry: Carry
     counts: NDArray[np.intp]
-    fields: Fields
     axes: tuple[str | None, ...]
+    batch: Batch
+
+    @cached_property
+    def cloud(self) -> LazyCloud:
+        """A cloud of the points."""
+        return LazyCloud.of(self.source, self.source.base)
+
+    @property
+    def carry(self) -> Carry:
+        """The values that the next batch needs, which starts with packet `ready`."""
+        return self.batch.carried(self.ready)
+
+    @property
+    def fields(self) -> Fields:
+        """The fields of all packets of the batch."""
+        return Fields(self.batch)
 
 
 def evaluate_plainly(
@@ -165,11 +180,11 @@ def _flattened(
         shape=organised(len(every["time"]), conventions.grid_of(shape[1:], axes)),
         nominal=np.bool_(batch.nominal or result.nominal),
     )
+    grids = None
     if mask is not None:
-        cloud = LazyCloud.of(CloudColumns(cloud, _grids(inside, axes)), stamp_ns)
-    return Evaluated(
-        cloud, ready, batch.carried(ready), inside[:ready].astype(np.intp), Fields(batch), axes
-    )
+        grids = _grids(inside, axes)
+    counts = inside[:ready].astype(np.intp)
+    return Evaluated(CloudColumns(cloud, grids), ready, counts, axes, batch)
 
 
 def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:

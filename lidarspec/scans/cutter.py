@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from lidarspec.packets.masked_sector import Sector
 from lidarspec.packets.packets import Packets
-from lidarspec.points.cloud import source_of
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.completeness import OpenScan, PacketCounts
 from lidarspec.scans.ends import End, EndFinder, first_points
@@ -84,7 +83,7 @@ class Cutter:
             first = first_points(points)
         sizes = None
         if self._limits.has_point_limit:
-            sizes = np.diff(first, append=source_of(points.cloud).size)
+            sizes = np.diff(first, append=points.source.size)
         counts = PacketCounts.of(packets, number, sizes, self._last_index)
         cuts = list[Cut]()
         start = 0

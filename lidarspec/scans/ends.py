@@ -105,7 +105,8 @@ class EndFinder:
         """Return the ends at which a column or a field passes an angle."""
         rows: Indices | None = None
         if rule.name in COLUMNS:
-            values = np.asarray(getattr(points.cloud, rule.name), np.float64)
+            columns = points.source.columns((rule.name,), 0, points.source.size)
+            values = np.asarray(columns[rule.name], np.float64)
             full = 2 * np.pi
             ends, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
         else:

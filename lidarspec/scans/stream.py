@@ -17,7 +17,7 @@ from lidarspec.packets.imu import ImuSamples, Waiting
 from lidarspec.packets.masked_sector import AngleReader
 from lidarspec.packets.packets import Packets, joined
 from lidarspec.packets.reorder import Reorder
-from lidarspec.points.cloud import LazyCloud, PointCloud, source_of
+from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.column_sources import Stretch, Stretches
 from lidarspec.points.evaluate import guarded
 from lidarspec.points.mount import Mount
@@ -187,7 +187,7 @@ class ScanStream:
             scans += self._close(start, whole=cut.whole, complete=cut.complete)
             self._start = start
             first = cut.point
-        self._keep(PointRun(packets, points, first, source_of(points.cloud).size, parts_before))
+        self._keep(PointRun(packets, points, first, points.source.size, parts_before))
         return scans
 
     def _keep(self, run: PointRun) -> None:
@@ -216,7 +216,7 @@ class ScanStream:
         if is_foreign or not runs:
             return []
         assert start is not None  # since there are points
-        parts = [Stretch(source_of(run.points.cloud), run.start, run.stop) for run in runs]
+        parts = [Stretch(run.points.source, run.start, run.stop) for run in runs]
         cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), start.time_ns)
         samples: ImuSamples | None = None
         if self._imu is not None:
@@ -246,7 +246,7 @@ def _read_starts(
     packets: Packets, points: Evaluated, indices: Sequence[int]
 ) -> list[ScanStart | None]:
     """Return the starts of scans at some points, in order; None for indices past the end."""
-    source = source_of(points.cloud)
+    source = points.source
     known = [index for index in indices if index < source.size]
     starts: list[ScanStart | None] = [None] * len(indices)
     if known:

@@ -104,7 +104,7 @@ class Crc(Checksum):
         )
         return f"CRC-{self.width}{''.join(values)}{order}"
 
-    @property
+    @cached_property
     def start(self) -> int:
         """The register before the first byte, in wire order."""
         start = reflect(self.init, self.width)

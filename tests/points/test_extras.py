@@ -25,6 +25,7 @@ import lidarspec
 from lidarspec import PointCloud, Sensor, SpecError, simulate
 from lidarspec.errors import UnknownName
 from lidarspec.packets.packets import Packets
+from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.cloud import LazyCloud
 from lidarspec.points.evaluate import evaluate
 from lidarspec.points.mount import Mount
@@ -57,8 +58,9 @@ def packets(number: int = 40, backend: str = "numpy") -> Packets:
 @EVERY_BACKEND
 def test_columns_have_the_values_types_and_units_of_the_plain_evaluation(backend: str) -> None:
     read = packets(backend=backend)
-    found, plain = evaluate(read).cloud, evaluate_plainly(read).cloud
-    assert isinstance(found, LazyCloud) == (backend != "construct")
+    evaluated = evaluate(read)
+    found, plain = evaluated.cloud, evaluate_plainly(read).cloud
+    assert isinstance(evaluated.source, BatchColumns) == (backend != "construct")
     assert list(found.extra) == list(plain.extra) == list(KINDS)
     for cloud in (found, plain):
         assert {
