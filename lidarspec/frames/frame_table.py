@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -79,6 +80,18 @@ class Group:
     where: NDArray[np.intp]
     rows: Bytes2D
 
+    @cached_property
+    def is_in_order(self) -> bool:
+        """Whether the frames are in stream order."""
+        return ascends(self.where)
+
+    @cached_property
+    def stream_order(self) -> NDArray[np.intp] | slice:
+        """An index that puts the frames into stream order, if the table has no others."""
+        if self.is_in_order:
+            return slice(None)
+        return np.argsort(self.where)
+
 
 class Rows:
     """A `Table` of frames whose layout is compiled."""
@@ -87,7 +100,6 @@ class Rows:
         self.schema = schema
         self.groups = [group for group in groups if len(group.where)]
         self._length = sum(len(group.where) for group in self.groups)
-        self._stream_order: NDArray[np.intp] | slice | None = None
         self._walks: dict[str, list[tuple[Group, NDArray[np.uint8], Walked]]] = {}
 
     def __len__(self) -> int:
@@ -96,32 +108,36 @@ class Rows:
     def raw(self, path: str) -> NDArray[Any]:
         info = self.schema.fields[path]
         assert info.dtype is not None
-        if "[" in path:
-            around = self.schema.fields[without_indices(path)[0]].axes
-        else:
-            around = info.axes
         if len(self.groups) == 1:
-            only = self.groups[0].layout.leaves.get(path)
-        else:
-            only = None
-        # The general path handles empty arrays: an array in an empty one has length 0, whatever
-        # its declared length.
-        if only is not None and 0 not in only.shape:
-            values = _load_leaf(only, around, self.groups[0].rows)
-            if self._stream_order is None:
-                self._stream_order = _stream_order(self.groups[0].where)
-            if not isinstance(self._stream_order, slice):
-                values = values[self._stream_order]
-            return values.astype(info.dtype, copy=False)
+            group = self.groups[0]
+            leaf = group.layout.leaves.get(path)
+            # The general path handles empty arrays: an array in an empty one has length 0,
+            # whatever its declared length.
+            if leaf is not None and 0 not in leaf.shape:
+                values = self._load(leaf, path, group)[group.stream_order]
+                return values.astype(info.dtype, copy=False)
         lengths = [self.length(axis) for axis in info.axes]
         column = np.zeros((len(self), *lengths), info.dtype)
         for group in self.groups:
             leaf = group.layout.leaves.get(path)
             if leaf is not None and 0 not in leaf.shape:
-                values = _load_leaf(leaf, around, group.rows)
+                values = self._load(leaf, path, group)
                 corner: Any = (group.where, *(slice(0, length) for length in values.shape[1:]))
                 column[corner] = values
         return column
+
+    def _load(self, leaf: Leaf, path: str, group: Group) -> NDArray[Any]:
+        """Return the raw values of a field in the frames of a group.
+
+        An index in the path removes the axis of which it selects one element.
+        """
+        values = leaf.load(group.rows)
+        if "[" not in path:
+            return values
+        axes = self.schema.fields[without_indices(path)[0]].axes
+        lengths = zip(axes, leaf.shape, strict=False)
+        kept = [length for axis, length in lengths if axis in leaf.info.axes]
+        return values.reshape(len(values), *kept)
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
         if not self.schema.fields[path].optional:
@@ -171,7 +187,7 @@ class Rows:
             and ascends(which)
         ):
             only = self.groups[0]
-            if ascends(only.where):
+            if only.is_in_order:
                 return Rows(
                     self.schema,
                     [Group(only.layout, counted(len(which)), only.rows[which[0] : which[-1] + 1])],
@@ -228,7 +244,7 @@ class Rows:
         if (
             len(alone) == len(tables)
             and len({id(group.layout) for group in alone}) == 1
-            and all(ascends(group.where) for group in alone)
+            and all(group.is_in_order for group in alone)
         ):
             rows = _stack_rows([group.rows for group in alone])
             return Rows(tables[0].schema, [Group(alone[0].layout, counted(len(rows)), rows)])
@@ -241,25 +257,6 @@ class Rows:
                 )
             start += len(table)
         return Rows(tables[0].schema, [_merge_groups(groups) for groups in found.values()])
-
-
-def _load_leaf(leaf: Leaf, around: Sequence[str], rows: Bytes2D) -> NDArray[Any]:
-    """Return raw values without the axes that an index of the path selects one element of.
-
-    Args:
-        around: the axes of the field without these indices.
-    """
-    values = leaf.load(rows)
-    if len(around) == len(leaf.info.axes):
-        return values
-    return values.reshape(
-        len(rows),
-        *(
-            length
-            for axis, length in zip(around, leaf.shape, strict=False)
-            if axis in leaf.info.axes
-        ),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,13 +345,6 @@ def _stack_rows(parts: list[Bytes2D]) -> Bytes2D:
 
 def _address(array: NDArray[Any]) -> int:
     return int(array.__array_interface__["data"][0])
-
-
-def _stream_order(where: NDArray[np.intp]) -> NDArray[np.intp] | slice:
-    """Return an index that puts the rows of a single group into stream order."""
-    if ascends(where):
-        return slice(None)
-    return np.argsort(where)
 
 
 def ascends(where: NDArray[np.intp]) -> bool:

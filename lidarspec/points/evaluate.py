@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.expressions.columns import Batch, Carry, Column
 from lidarspec.expressions.graph import Node
-from lidarspec.frames.frame_table import Group, Rows, ascends
+from lidarspec.frames.frame_table import Group, Rows
 from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.conventions import Grids, grid_of
 from lidarspec.points.plain import Evaluated, PacketBatch, evaluate_plainly, stamp_of
@@ -99,7 +99,7 @@ def _share(
     plan: Plan, batch: Batch, group: Group, whole: PlainValues, remembered: Mapping[int, Column]
 ) -> Share:
     """Return the share of a group; values that use other packets are those of the whole batch."""
-    is_whole = len(group.where) == len(batch) and ascends(group.where)
+    is_whole = len(group.where) == len(batch) and group.is_in_order
     if is_whole:
         return Share(plan, group, whole, batch)
     return Share.part(plan, batch, group, remembered)
@@ -155,7 +155,7 @@ def _source_of(
     plan = shares[0].plan
     grids = None
     size = ready * plan.width
-    if len(shares) > 1 or not ascends(shares[0].group.where):
+    if len(shares) > 1 or not shares[0].group.is_in_order:
         widths = np.zeros(len(packets), np.intp)
         which = np.zeros(len(packets), np.intp)
         for number, share in enumerate(shares):
