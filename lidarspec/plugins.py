@@ -479,6 +479,8 @@ class Registry:
                 all.
             UsageError: where several distributions claim the name, and none owns it.
         """
+        if name in self._ready:
+            return self._ready[name]
         found = self._find(name)
         if found is None:
             self._load_all()
