@@ -88,6 +88,10 @@ CONTAINERS = {
     rb"\s*(?:\[\s*)?\{\s*\"[^\"]*\"\s*:": ("JSON", ""),
     rb"(?i)\s*<(?:\?xml|!doctype|html)": ("an XML or HTML page", ""),
 }
+_REFUSED = CONTAINERS | {
+    beginning: (f"compressed by {packing.name} again and again", packing.command)
+    for beginning, packing in PACKINGS.items()
+}
 
 
 class Damage(NamedTuple):
@@ -285,11 +289,7 @@ def refuse_container(path: str, start: bytes) -> None:
     Raises:
         SourceError: where it begins as a file of another kind, which is named.
     """
-    packed = {
-        beginning: (f"compressed by {packing.name} again and again", packing.command)
-        for beginning, packing in PACKINGS.items()
-    }
-    for beginning, (what, command) in (CONTAINERS | packed).items():
+    for beginning, (what, command) in _REFUSED.items():
         if re.match(beginning, start, re.DOTALL):
             error = SourceError(
                 f"{path} is {what}, and is not read: this takes captures, recordings and bytes as a"

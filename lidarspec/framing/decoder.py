@@ -109,16 +109,11 @@ class Decoder:
         self._need = 0
         self._gap = 0
         self._fillers = bytes(sensor.fillers)
+        self._assembly: Assembly | None = None
         link = sensor.links.get("data")
-        longest = max(frame.max_length for frame in sensor.incoming.values())
-        if isinstance(link, Udp) and not stream:
-            rule = link.assembled
-        else:
-            rule = None
-        if rule is None:
-            self._assembly = None
-        else:
-            self._assembly = Assembly(rule, longest, self.stats)
+        if isinstance(link, Udp) and link.assembled is not None and not stream:
+            longest = max(frame.max_length for frame in sensor.incoming.values())
+            self._assembly = Assembly(link.assembled, longest, self.stats)
         self._least = max(LEAST, 2 * self.framing.reach)
         self._size = max(PIECE, self._least)
 
