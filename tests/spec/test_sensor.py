@@ -1,4 +1,4 @@
-"""The options of a sensor are of the declared types, and no others."""
+"""A sensor is immutable, and its options are of the declared types, and no others."""
 
 from __future__ import annotations
 
@@ -27,6 +27,12 @@ def configure(
     plain=None,  # type: ignore[no-untyped-def]
 ) -> ls.Sensor:
     return sensor
+
+
+@pytest.mark.parametrize("name", ["beams", "note"])
+def test_no_attribute_of_a_sensor_can_be_set(name: str) -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(SHAPES["shape-count"], name, 3)
 
 
 @pytest.mark.parametrize(
