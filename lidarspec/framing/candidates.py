@@ -112,6 +112,7 @@ class Framing:
             codec.frame.max_length * codec.frame.confirm for codec in self.codecs
         )
         self._weak = {kind for kind, codec in enumerate(self.codecs) if codec.frame.confirm > 1}
+        self.has_weak_types = bool(self._weak)
         self._active: dict[str | None, list[int]] = {}
 
     def active(self, mode: SearchState) -> list[int]:

@@ -115,7 +115,11 @@ class Decoder:
             longest = max(frame.max_length for frame in sensor.incoming.values())
             self._assembly = Assembly(link.assembled, longest, self.stats)
         self._least = max(LEAST, 2 * self.framing.reach)
-        self._size = max(PIECE, self._least)
+        # Weak frames take long to find, but not as regular rows, which follow the first piece.
+        if self.framing.has_weak_types:
+            self._size = self._least
+        else:
+            self._size = max(PIECE, self._least)
 
     def __repr__(self) -> str:
         return (
