@@ -69,13 +69,7 @@ class Compiler:
         """Add an output column of the integers of a field, as they were sent."""
         assert leaf.info.dtype is not None
         kind = f"{leaf.info.dtype.kind}{leaf.info.dtype.itemsize}"
-
-        def run(execution: Run, out: NDArray[Any]) -> None:
-            rows = execution.part(execution.rows)
-            np.copyto(out.reshape(-1, *leaf.shape), leaf.load(rows))
-
-        text = f"{leaf.info.path} as it was sent"
-        self.program.outputs[name] = self.program.step(text, kind, run)
+        self.program.outputs[name] = self._raw(leaf, kind)
 
     def _once(self, name: Any, make: Callable[[], int]) -> int:
         """Return the register of this name; make it if there is none."""
@@ -110,7 +104,7 @@ class Compiler:
         name = node.function.__name__
         if node.function in (np.cos, np.sin):
             return self._direction(node.function, node.args[0])
-        is_offset = node.function is np.add and any(not isinstance(arg, Node) for arg in node.args)
+        is_offset = node.function is np.add and any(map(_is_known, node.args))
         if node.function is np.multiply or is_offset:
             first, second = (self._factor(arg) for arg in node.args)
             return self.program.call(name, "single", node.function, first, second)
@@ -214,8 +208,8 @@ class Compiler:
             return None
         seen = window(leaf)
         is_long = seen is None or (self._is_exact and seen.size > 1)
-        if node is source and leaf.wire is not None and (is_long or not leaf.info.scaled):
-            return self._loaded(leaf, leaf.wire, kind)
+        if node is source and (is_long or not leaf.info.scaled):
+            return self._loaded(leaf, kind)
         if seen is None or (is_long and node.function in _FASTER_THAN_TABLE):
             return None
         index = Read(
@@ -241,15 +235,16 @@ class Compiler:
             self._tables[name] = np.ascontiguousarray(values, TYPES[kind])
         return self._tables[name]
 
-    def _loaded(self, leaf: Leaf, wire: np.dtype[Any], kind: str) -> int | None:
-        """Load a field of whole bytes in its unit; None if it requires float64 first."""
+    def _loaded(self, leaf: Leaf, kind: str) -> int | None:
+        """Load a field in its unit; None if it requires float64 first."""
         info = leaf.info
-        if kind == "single" and (wire.itemsize > 4 or (info.scaled and self._is_exact)):
+        assert info.dtype is not None
+        if kind == "single" and (info.dtype.itemsize > 4 or (info.scaled and self._is_exact)):
             return None
         if kind == "single" and info.offset:
             return None
 
-        register = self._load(leaf, wire, leaf.offset, kind)
+        register = self._raw(leaf, kind)
         if not info.scaled:
             return register
         raw = Read(register)
@@ -260,6 +255,17 @@ class Compiler:
                 np.add(out, out.dtype.type(info.offset), out=out)
 
         return self.program.step(f"{info.path} in its unit", kind, scale, raw)
+
+    def _raw(self, leaf: Leaf, kind: str) -> int:
+        """Load the raw values of a field."""
+        if leaf.wire is not None:
+            return self._load(leaf, leaf.wire, leaf.offset, kind)
+
+        def run(execution: Run, out: NDArray[Any]) -> None:
+            rows = execution.part(execution.rows)
+            np.copyto(out.reshape(-1, *leaf.shape), leaf.load(rows), casting="unsafe")
+
+        return self.program.step(f"{leaf.info.path}: some bits", kind, run)
 
     def _load(self, leaf: Leaf, dtype: np.dtype[Any], offset: int, kind: str) -> int:
         """Load some bytes of every element of a field."""
@@ -376,6 +382,11 @@ class Compiler:
             out.reshape(-1, *shape)[...] = deep(execution.part(execution.values(value)), depth)
 
         return self.program.step("computed plainly before", kind, run)
+
+
+def _is_known(value: Any) -> bool:
+    """Return whether a value is a number, an array, or rows of a table."""
+    return not isinstance(value, Node) or value.kind == "rows"
 
 
 def _constant(value: Any) -> Callable[[Run], Any]:
