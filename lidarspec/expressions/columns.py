@@ -337,16 +337,12 @@ class Column(NDArrayOperatorsMixin):
         ]
         row, known = (RowOfValues(column) for column in both)
         slot = len(self.batch.left)
-        carried = self.batch.carry.get(slot, np.empty(0))
+        carried = self.batch.carry.get(slot, np.full(1, np.nan))
         numbers = np.concatenate([carried, row.values])
-        indices = np.where(
-            np.concatenate([np.ones(len(carried)), known.values]) > 0, np.arange(len(numbers)), -1
-        )
-        if len(indices):
-            indices = np.maximum.accumulate(indices)
-        latest = np.where(indices >= 0, numbers[indices], np.nan)
-        self.batch.left.append(lambda upto: latest[: len(carried) + row.starts[upto]][-1:])
-        return Column(row.spread(latest[len(carried) :]), axes, self.batch, ready=ready)
+        starts = np.concatenate([[0], 1 + np.flatnonzero(known.values > 0)])
+        latest = np.repeat(numbers[starts], np.diff(starts, append=len(numbers)))
+        self.batch.left.append(lambda upto: latest[: 1 + row.starts[upto]][-1:])
+        return Column(row.spread(latest[1:]), axes, self.batch, ready=ready)
 
 
 class RowOfValues:
