@@ -163,8 +163,9 @@ def is_available() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
+@functools.cache
 def require() -> None:
-    """Import Numba.
+    """Import Numba; reading its version takes as long as decoding a hundred packets.
 
     Raises:
         LibraryError: if it is missing, too old, or does not work here.
