@@ -19,12 +19,13 @@ COUNTED = 1 << 17
 KEPT = 1 << 24
 
 
-def repeated(value: int, count: int) -> NDArray[np.int64]:
-    """Return `count` times one value, (count,), read-only.
+def repeated(value: int, *shape: int) -> NDArray[np.int64]:
+    """Return an array of this shape that holds one value everywhere, read-only.
 
     It equals the result of `np.broadcast_to`, at a tenth of its cost.
     """
-    return np.ndarray((count,), np.int64, value.to_bytes(8, sys.byteorder, signed=True), 0, (0,))
+    memory = value.to_bytes(8, sys.byteorder, signed=True)
+    return np.ndarray(shape, np.int64, memory, 0, (0,) * len(shape))
 
 
 def some(

@@ -73,8 +73,12 @@ class BatchColumns(ColumnSource):
         self._shares = shares
         self._plan = shares[0].plan
         self._turn = vendor_turn(packets.sensor)
-        self._is_level = self._turn is None and all(share.plan.level for share in shares)
-        self._main_columns = self._plan.expressions.keys() & COMPILED_TOGETHER
+        self.is_level = self._turn is None and all(share.plan.level for share in shares)
+        self._main_columns = [
+            name
+            for name in COMPILED_TOGETHER
+            if name in self._plan.expressions and not (name == "z" and self.is_level)
+        ]
         # Packets of one layout in order have all their points one after another.
         self._is_regular = len(shares) == 1 and shares[0].first is None
         self.extra = self._plan.extra
@@ -90,6 +94,9 @@ class BatchColumns(ColumnSource):
         self._blocks: list[Block] = []
 
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
+        if any(name in self._main_columns for name in names):
+            others = [name for name in names if name not in self._main_columns]
+            names = [*self._main_columns, *others]
         missing = [name for name in names if name not in self._computed]
         is_whole = not self._is_regular or self.size <= BLOCK_POINTS or stop - start == self.size
         if is_whole or not missing:
@@ -132,23 +139,16 @@ class BatchColumns(ColumnSource):
         return block
 
     def _compute(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Compute columns of the points from `start` to `stop`, and those that go with them."""
-        main: list[str] = []
-        if not self._main_columns.isdisjoint(names):
-            main = [name for name in COMPILED_TOGETHER if name in self._plan.expressions]
-            if self._is_level:
-                main.remove("z")
+        """Compute columns of the points from `start` to `stop`, all main ones or none."""
+        main = [name for name in names if name in self._main_columns]
         sent = [name for name in names if all(name in share.plan.sent for share in self._shares)]
         if len(sent) + len(main) == 1 or self._turn is not None:
             sent = []
         columns: dict[str, NDArray[Any]] = {}
         if main or sent:
             columns = self._filled((*main, *sent), start, stop)
-        if main:
-            if self._is_level:
-                columns["z"] = columns["x"] - columns["x"]  # 0, or nan like x
-            if self._turn is not None:
-                columns |= _turned(columns, self._turn)
+        if main and self._turn is not None:
+            columns |= _turned(columns, self._turn)
         for name in names:
             if name not in columns:
                 columns |= self._compute_single(name, start, stop)
@@ -156,6 +156,8 @@ class BatchColumns(ColumnSource):
 
     def _compute_single(self, name: str, start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Compute a column by itself; nothing if the sensor does not have it."""
+        if name == "z":  # of a level source, else it is one of the main columns
+            return {}
         if name == "time":
             first, last = self._packet_range(start, stop)
             times = [self._times(share, first, last) for share in self._shares]

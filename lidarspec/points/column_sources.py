@@ -28,6 +28,7 @@ class ColumnSource:
         grids: the organisation of the points of each packet, if packets have several shapes.
         nominal: whether a default calibration stood in for the sensor's own.
         extra: the type and unit of the columns under names of the sensor's own, by name.
+        is_level: whether all points lie in the horizontal plane through the sensor.
     """
 
     size: int
@@ -36,12 +37,14 @@ class ColumnSource:
     grids: Grids | None = None
     nominal: bool = False
     extra: Mapping[str, Kind] = {}
+    is_level: bool = False
 
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return columns of the points from `start` to `stop`, (stop - start,) each.
 
         Columns that the sensor does not have are missing. Others that were computed together with
-        the requested ones may be included. A source may leave out "valid", which follows from x.
+        the requested ones may be included. A source may leave out "valid", which follows from x,
+        and leaves out "z" if it is level.
 
         Args:
             names: of columns of `PointCloud`, or of columns in `extra`.
@@ -85,17 +88,28 @@ class LazyColumns:
         if not missing:
             return
         found = self.source.columns(missing, 0, self.source.size)
-        if "valid" in missing and "valid" not in found:
-            x = self.read("x")
-            assert x is not None  # since every cloud has it
-            found["valid"] = ~np.isnan(x)  # x is nan unless a point is valid
         self.computed = dict.fromkeys(missing) | found | self.computed
+        if "z" in missing and self.source.is_level:
+            self.computed["z"] = level_z(self._x())
+        if "valid" in missing and "valid" not in found:
+            self.computed["valid"] = ~np.isnan(self._x())  # x is nan unless a point is valid
 
     def read(self, name: str) -> NDArray[Any] | None:
         """Return a column, None if the sensor lacks it."""
         if name not in self.computed:
             self.load(name)
         return self.computed[name]
+
+    def _x(self) -> NDArray[Any]:
+        x = self.read("x")
+        assert x is not None  # since every cloud has it
+        return x
+
+
+def level_z(x: NDArray[Any]) -> NDArray[Any]:
+    """Return the z of points in the horizontal plane: 0, or nan like x."""
+    z: NDArray[Any] = x - x
+    return z
 
 
 class Stretch(NamedTuple):
@@ -127,6 +141,7 @@ class Stretches(ColumnSource):
         if len(grids) == 1:
             self.grid = grids.pop()
         self.nominal = any(part.source.nominal for part in parts)
+        self.is_level = all(part.source.is_level for part in parts)
         self.extra = {
             name: kind
             for name, kind in parts[0].source.extra.items()
@@ -149,6 +164,8 @@ class Stretches(ColumnSource):
         piece = part.source.columns(names, part.start, part.stop)
         if "time" in piece:
             piece["time"] = piece["time"] + part.source.seconds_after(self.base)
+        if "z" in names and part.source.is_level and not self.is_level:
+            piece["z"] = level_z(part.source.columns(("x",), part.start, part.stop)["x"])
         return piece
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
