@@ -26,9 +26,12 @@ from lidarspec.errors import UsageError
 from lidarspec.frames.frame_table import Rows
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points import batch_columns
-from lidarspec.points.cloud import COLUMNS
+from lidarspec.points.cloud import COLUMNS, CloudColumns, LazyCloud
+from lidarspec.points.column_sources import Stretch, Stretches
+from lidarspec.points.plain import evaluate_plainly
 from lidarspec.scans.stream import ScanStream, scans_of
 from lidarspec.spec import OnChange, OnWrap, Udp
+from tests.agreement import assert_same_points
 from tests.broken import points_fail, sound
 from tests.by_construct import reader
 from tests.points.backends import BACKENDS, COMPILED
@@ -109,6 +112,18 @@ def test_the_vendors_axes_hold_for_scans_too() -> None:
     sensor = ls.sensor("hesai-xt32").configure(frame="vendor")
     packets = sensor.decode(simulate(sensor, 400))
     assert_cut_from(list(scans_of(sensor, batches(packets, 123))), packets.points())
+
+
+def test_scans_of_batches_that_are_evaluated_in_different_ways_have_all_columns() -> None:
+    """`z` of a level sensor follows from x, unless it was computed with the others."""
+    packets = packets_of("ldrobot-stl27l", 20, "numpy")
+    planned = packets.points()
+    plain = evaluate_plainly(packets).cloud
+    assert isinstance(planned, LazyCloud)
+    parts = [Stretch(planned.lazy.source, 0, 100), Stretch(CloudColumns(plain), 100, len(plain))]
+    cloud = LazyCloud.of(Stretches(parts), plain.stamp_ns)
+    np.testing.assert_array_equal(cloud.z, plain.z)
+    assert_same_points(cloud, plain, ulps=4)
 
 
 def test_large_scans_are_computed_without_the_rest_of_their_batch() -> None:

@@ -163,9 +163,9 @@ def is_available() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
-@functools.cache
+@functools.cache  # reading the version takes as long as decoding a hundred packets
 def require() -> None:
-    """Import Numba; reading its version takes as long as decoding a hundred packets.
+    """Import Numba.
 
     Raises:
         LibraryError: if it is missing, too old, or does not work here.

@@ -5,8 +5,8 @@ is a table by its raw value (`points.windows`). Values that are not full (one fo
 are evaluated plainly for the whole batch and broadcast. Everything else is the NumPy function of
 the expression.
 
-Columns that are not exact may be computed in another order: products, cosines and sines are
-float32, and the terms of a sum that are not full are added before they are broadcast.
+Columns that are not exact may be computed in another order: products, offsets, cosines and sines
+are float32, and the terms of a sum that are not full are added before they are broadcast.
 """
 
 from __future__ import annotations
