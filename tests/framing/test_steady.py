@@ -14,9 +14,11 @@ from construct import Bytes, Const, Struct
 from lidarspec.frames.row_checksums import FEW, SHORT, registers
 from lidarspec.framing.results import Frames
 from lidarspec.framing.steady import SMALL_PIECE_BYTES
+from lidarspec.simulation.simulator import opening, simulate
 from lidarspec.spec import Checksummed, Frame, Xor
 from lidarspec.testing.subject import Subject
 from tests.engine.streams import Books, damaged
+from tests.representatives import load_sensor
 from tests.shapes import SHAPES
 
 TWINS = SHAPES["shape-twins"]
@@ -89,6 +91,14 @@ def test_clean_frames_are_found_so() -> None:
     found = [frames for piece in as_it_comes(data, 18, 1) for frames in decoder.frames(piece)]
     assert sum(is_steady(frames) for frames in found) > 5
     assert sum(map(len, found)) == 40
+
+
+def test_weak_frames_are_searched_for_in_the_first_bytes_alone() -> None:
+    sensor = load_sensor("slamtec-rplidar-a1").configure(answer="node")
+    data = opening(sensor) + b"".join(simulate(sensor, 20_000))
+    found = sensor.decoder().frames(data)
+    steady = sum(frames.total for frames in found if is_steady(frames))
+    assert steady > len(data) - 10_000
 
 
 @pytest.mark.parametrize("faults", [0, 2, 40])
