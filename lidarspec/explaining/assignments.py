@@ -21,7 +21,7 @@ from lidarspec.frames.schema import Schema
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Octets, Range
 from lidarspec.spec.fields import factor, split_unit
-from lidarspec.spec.tree import FieldInfo, evaluated
+from lidarspec.spec.tree import FieldInfo, evaluate
 from lidarspec.transports.hexadecimal import parse_hex
 
 _STEP = r"\w+(?:\[(?:\d+|\*)\])*"
@@ -131,7 +131,7 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
     if isinstance(declared, int):
         return declared
     try:
-        return int(evaluated(declared, functools.partial(given_value, given, table.fields)))  # type: ignore[arg-type]
+        return int(evaluate(declared, functools.partial(given_value, given, table.fields)))  # type: ignore[arg-type]
     except Exception:
         target: Any = given
         for name in path.removesuffix("[]").split("."):

@@ -18,7 +18,7 @@ from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
 from lidarspec.frames.wire_table import bit_text, format_hex
 from lidarspec.spec import Frame
-from lidarspec.spec.tree import UNNAMED, FieldInfo, exact, listed
+from lidarspec.spec.tree import UNNAMED, FieldInfo, exact, format_values
 
 #: most decimals that steps are told apart by, and those that may be added to show one in full.
 MAX_DIGITS = 12
@@ -152,7 +152,7 @@ class FrameRows:
             shown = format_hex(each.raw, info.bits)
             return f"wrong: {shown}, expected {format_hex(info.const, info.bits)}"
         if info.allowed is not None and each.raw not in info.allowed:
-            return f"wrong: {each.raw}, expected {listed(info.allowed)}"
+            return f"wrong: {each.raw}, expected {format_values(info.allowed)}"
         if info.held and self._fault is not None and self._fault.path == each.path:
             return f"wrong: {each.raw}, expected {self._fault.expected}"
         return ""

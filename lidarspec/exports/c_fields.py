@@ -227,7 +227,7 @@ class CLayout:
         """
         if tree.width(value) > tree.MOST_BITS:
             raise Refused("a formula that may pass what a 64-bit integer holds")
-        return tree.written(
+        return tree.write(
             value,
             lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})",
             _OPERATIONS,

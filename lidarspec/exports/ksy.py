@@ -113,7 +113,7 @@ _OPERATIONS = {
 
 def number(formula: tree.Formula, scope: Scope) -> str:
     """A formula as an integer."""
-    return tree.written(formula, functools.partial(format_reference, scope), _OPERATIONS)
+    return tree.write(formula, functools.partial(format_reference, scope), _OPERATIONS)
 
 
 def truth(formula: tree.Formula, scope: Scope) -> str:
@@ -415,7 +415,7 @@ class _Types:
         if node.count is not None:
             more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
         elif node.size is not None and kind.following is not None:
-            ends = tree.written(kind.following, lambda ref: f"_.{ref.path}", _OPERATIONS)
+            ends = tree.write(kind.following, lambda ref: f"_.{ref.path}", _OPERATIONS)
             if "if" in more:
                 condition = f"({more['if']}) and {number(node.size, scope)} != 0"
             else:

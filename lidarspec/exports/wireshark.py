@@ -76,7 +76,7 @@ def _function(value: tree.Formula, missing: str = "") -> Code:
     """
     return Code(
         "function(v) return"
-        f" {tree.written(value, lambda ref: f'(v[{quote_lua(ref.path)}]{missing})', _OPERATIONS)} end"
+        f" {tree.write(value, lambda ref: f'(v[{quote_lua(ref.path)}]{missing})', _OPERATIONS)} end"
     )
 
 

@@ -161,7 +161,7 @@ class Column(NDArrayOperatorsMixin):
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
             return getattr(ufunc, method)(*(np.asarray(value) for value in inputs), **kwargs)
-        return self.applied(
+        return self.apply_function(
             (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
         )
 
@@ -169,11 +169,11 @@ class Column(NDArrayOperatorsMixin):
         self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any
     ) -> Any:
         if function in ELEMENTWISE:
-            return self.applied(lambda *arrays: function(*arrays, **kwargs), *args)
+            return self.apply_function(lambda *arrays: function(*arrays, **kwargs), *args)
         plain = [np.asarray(value) if isinstance(value, Column) else value for value in args]
         return function(*plain, **kwargs)
 
-    def applied(self, function: Callable[..., Any], *values: Any) -> Column:
+    def apply_function(self, function: Callable[..., Any], *values: Any) -> Column:
         """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as
         in NumPy.
         """

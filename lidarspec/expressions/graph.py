@@ -130,7 +130,7 @@ class Node:
             return self.function(*args)
         first = args[self._first]
         if isinstance(first, Column):
-            return first.applied(self.function, *args)
+            return first.apply_function(self.function, *args)
         arrays = [
             known if not is_node else arg.reshape(*arg.shape, *known) if known else arg
             for arg, (is_node, known) in zip(args, self._operands, strict=True)
@@ -187,7 +187,7 @@ class Traced(NDArrayOperatorsMixin):
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
             raise Untraceable(f"np.{ufunc.__name__}.{method} takes several values together")
-        return self.applied(
+        return self.apply_function(
             (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
         )
 
@@ -196,11 +196,11 @@ class Traced(NDArrayOperatorsMixin):
     ) -> Traced:
         if function not in ELEMENTWISE:
             raise Untraceable(f"np.{function.__name__} is not elementwise")
-        return self.applied(
+        return self.apply_function(
             (lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args
         )
 
-    def applied(self, function: Callable[..., Any], *values: Any) -> Traced:
+    def apply_function(self, function: Callable[..., Any], *values: Any) -> Traced:
         """What a function of arrays makes of the values, noted down."""
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
         arrays, _, _ = aligned(
@@ -213,7 +213,9 @@ class Traced(NDArrayOperatorsMixin):
             value if isinstance(value, Traced | int | float) else array
             for value, array in zip(values, arrays, strict=True)
         )
-        return self._tape.add("call", function, args, self.node.sample.applied(function, *samples))
+        return self._tape.add(
+            "call", function, args, self.node.sample.apply_function(function, *samples)
+        )
 
     @property
     def index(self) -> Along:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.layout import Condition, Layout, set_bits
 from lidarspec.frames.layout_tree import TooLong, Unknown, Unlike, Walk
 from lidarspec.frames.wire_fields import Examined, WireField
-from lidarspec.spec.tree import format_hex, listed
+from lidarspec.spec.tree import format_hex, format_values
 
 #: kinds of faults.
 CONSTANT = "constant"
@@ -137,7 +137,7 @@ def _fault_of_field(each: WireField) -> Fault | None:
         got = format_hex(each.raw)
         return Fault(CONSTANT, each.path, each.first_byte, expected, got, each.end)
     if info.allowed is not None and each.raw not in info.allowed:
-        expected = listed(info.allowed)
+        expected = format_values(info.allowed)
         return Fault(VALUE, each.path, each.first_byte, expected, int(each.raw), each.end)
     return None
 

@@ -40,9 +40,9 @@ from lidarspec.spec.tree import (
     Select,
     Struct,
     When,
-    evaluated,
+    evaluate,
     format_hex,
-    listed,
+    format_values,
     nodes,
 )
 
@@ -168,8 +168,8 @@ class _Encoder:
         if info.const is not None:
             return info.const
         if info.rebuilt is not None and not info.held:
-            return evaluated(info.rebuilt, self.read)
-        return evaluated(info.default, self.read)
+            return evaluate(info.rebuilt, self.read)
+        return evaluate(info.default, self.read)
 
     def _encode_parts(self, node: Parts) -> list[bytes]:
         """Return the bytes of parts, and fill in the fields that count or measure them."""
@@ -343,7 +343,7 @@ class _Encoder:
         if not low <= raw <= high:
             raise OutOfRange(shown, raw, low, high, place=self._place)
         if info.allowed is not None and raw not in info.allowed:
-            raise self._wrong(shown, listed(info.allowed), raw)
+            raise self._wrong(shown, format_values(info.allowed), raw)
         return raw
 
     def _store(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
@@ -496,7 +496,7 @@ def _find_count(
     def length_for(value: int) -> Any:
         holder[field] = value
         try:
-            return evaluated(count, read)
+            return evaluate(count, read)
         except Exception:  # an expression of the struct, that may divide by what is tried
             return -1
 

@@ -340,7 +340,7 @@ class Walk:
                     elements = (whole_bytes(size, order, signed=node.kind == "int"),)
                 self._add(Leaf(info, self.cursor, shape, strides, size, wire, elements))
                 if info.const is not None:
-                    self._constant(node.encoded(info.const))
+                    self._constant(node.encode(info.const))
             case tree.Blob():
                 size = self._count(node.size, path)
                 if node.name:
@@ -421,7 +421,7 @@ class Walk:
         for leaf in found:
             (low, high), rebuilt = leaf.info.limits, leaf.info.rebuilt
             if rebuilt is not None:
-                value = operator.index(tree.evaluated(rebuilt, self._read_known))
+                value = operator.index(tree.evaluate(rebuilt, self._read_known))
                 if not low <= value <= high:
                     raise TooLong(leaf.info.path, value)
                 leaf.store(
@@ -443,7 +443,7 @@ class Walk:
                 with contextlib.suppress(
                     Exception
                 ):  # of the others: construct evaluates them when a frame is built
-                    yield leaf, operator.index(tree.evaluated(leaf.info.rebuilt, self._read_known))
+                    yield leaf, operator.index(tree.evaluate(leaf.info.rebuilt, self._read_known))
 
     def _read_known(self, path: str) -> int | None:
         part = self.parts[path]
@@ -452,7 +452,7 @@ class Walk:
         return self.read(path)
 
     def _value(self, formula: tree.Formula) -> Any:
-        return tree.evaluated(formula, self.read)
+        return tree.evaluate(formula, self.read)
 
     def _count(self, formula: tree.Formula, path: str) -> int:
         count = operator.index(self._value(formula))
@@ -666,7 +666,7 @@ def _rises(formula: tree.Formula) -> bool:
 
 def _with_value(formula: tree.Formula, value: int) -> int:
     """A formula of one field, where that has this value."""
-    return int(tree.evaluated(formula, lambda _: value))
+    return int(tree.evaluate(formula, lambda _: value))
 
 
 class _Places:

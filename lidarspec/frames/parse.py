@@ -29,7 +29,7 @@ from lidarspec.frames.wire_fields import Examined, examine
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.syntax import WireNaN, seen, unnamed
+from lidarspec.spec.syntax import WireNaN, to_seen, to_unnamed
 from lidarspec.spec.tree import (
     Blob,
     Block,
@@ -438,10 +438,10 @@ class _LabelCache(dict[int, Any]):
     """
 
     def __init__(self, info: FieldInfo) -> None:
-        super().__init__({raw: seen(info, raw) for raw in info.labels})
+        super().__init__({raw: to_seen(info, raw) for raw in info.labels})
 
     def __missing__(self, raw: int) -> Any:
-        return unnamed(raw)
+        return to_unnamed(raw)
 
 
 def _look_up_labels(names: _LabelCache, numbers: Reader, frame: bytes) -> Sequence[Any]:

@@ -412,7 +412,7 @@ class _Walk:
             return leaf.scalar(part)
 
         try:
-            return min(int(tree.evaluated(formula, read)), self._region.limit + 1)
+            return min(int(tree.evaluate(formula, read)), self._region.limit + 1)
         except Exception as error:
             self._errors.append(PluginError.of(error, "struct"))
             return -1

@@ -302,7 +302,7 @@ def phrase(formula: tree.Formula) -> str:
     if isinstance(formula, tree.Untraced):
         text = formula.text
     else:
-        text = tree.written(formula, lambda ref: ref.path, {})
+        text = tree.write(formula, lambda ref: ref.path, {})
     if _is_enclosed(text):
         return text[1:-1]
     return text
@@ -350,7 +350,9 @@ def meaning(info: tree.FieldInfo) -> str:
     else:
         const = ""
     const = const or (
-        f"only {tree.listed(info.allowed)}" if info.allowed is not None and not info.labels else ""
+        f"only {tree.format_values(info.allowed)}"
+        if info.allowed is not None and not info.labels
+        else ""
     )
     if info.rebuilt is not None:
         follows = phrase(info.rebuilt)

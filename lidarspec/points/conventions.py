@@ -65,7 +65,7 @@ def returned_range(measured: Any) -> Any:
     A traced value gets a single step that compilers know.
     """
     if isinstance(measured, Traced):
-        return measured.applied(returned_range, measured)
+        return measured.apply_function(returned_range, measured)
     return np.where((measured > 0) & (measured < np.inf), measured, np.nan)
 
 

@@ -50,7 +50,7 @@ class Mount:
         )
         return np.asarray(about_z @ about_y @ about_x)
 
-    def applied(self, cloud: PointCloud) -> PointCloud:
+    def apply(self, cloud: PointCloud) -> PointCloud:
         """Return a cloud, given in the sensor's axes, in those of the carrier.
 
         Returns:

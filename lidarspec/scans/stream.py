@@ -222,7 +222,7 @@ class ScanStream:
         if self._imu is not None:
             samples = self._imu.until(end_ns)
         if self._mount is not None:
-            cloud = self._mount.applied(cloud)
+            cloud = self._mount.apply(cloud)
             if samples is not None:
                 samples = samples.turned(self._mount.rotation)
         rate_hz = np.nan

@@ -169,7 +169,7 @@ class Scaled(layer.Describing):
         self.unit = unit
         self.offset = offset
 
-    def described(self, info: FieldInfo) -> FieldInfo:
+    def describe(self, info: FieldInfo) -> FieldInfo:
         return replace(info, scale=self.scale, offset=self.offset, unit=self.unit, measured=True)
 
 
@@ -266,7 +266,7 @@ class Checksummed(layer.Sealing):
         given = [layer.member(obj, name, None) for name in self.fields]
         blank = obj
         for name, value in zip(self.fields, given, strict=True):
-            blank = _replaced(blank, name, self._zero(name) if value is None else value)
+            blank = _replace(blank, name, self._zero(name) if value is None else value)
         con = self._marked
         trial = io.BytesIO()
         con._build(blank, trial, context, path)
@@ -275,11 +275,9 @@ class Checksummed(layer.Sealing):
             {**context, "_params": Container(_verify=False)}
         )  # what was just built is parsed back
         parsed = con._parsereport(io.BytesIO(data), unverified, path)
-        if None not in given and self._stored(parsed) in self.absent:
+        if None not in given and self._load_stored(parsed) in self.absent:
             return con._build(blank, stream, context, path)
-        return con._build(
-            self._filled(blank, self._computed(data, parsed, 0)), stream, context, path
-        )
+        return con._build(self._fill(blank, self._compute(data, parsed, 0)), stream, context, path)
 
     @property
     def _marked(self) -> Construct:
@@ -294,9 +292,9 @@ class Checksummed(layer.Sealing):
         """The checksum that stands in one parsed struct and the one that should, for its bytes,
         which began at `base`.
         """
-        return self._stored(obj), self._computed(data, obj, base)
+        return self._load_stored(obj), self._compute(data, obj, base)
 
-    def covered(self, obj: Any, size: int, base: int = 0) -> list[tuple[int, int]]:
+    def find_covered(self, obj: Any, size: int, base: int = 0) -> list[tuple[int, int]]:
         """The byte ranges (start, end) within the struct that the checksum covers, for one parsed
         frame.
         """
@@ -307,7 +305,7 @@ class Checksummed(layer.Sealing):
         edges = [0, *(edge - base for span in held for edge in span), size]
         return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
 
-    def _computed(self, data: bytes, obj: Any, base: int) -> int:
+    def _compute(self, data: bytes, obj: Any, base: int) -> int:
         if self.algorithm is None:
             raise layer.Mismatch(
                 "",
@@ -316,9 +314,11 @@ class Checksummed(layer.Sealing):
                 "none; a lidarspec_checksum hook has to supply it",
                 "checksum",
             )
-        return self.algorithm(b"".join(data[a:b] for a, b in self.covered(obj, len(data), base)))
+        return self.algorithm(
+            b"".join(data[a:b] for a, b in self.find_covered(obj, len(data), base))
+        )
 
-    def _stored(self, obj: Any) -> int:
+    def _load_stored(self, obj: Any) -> int:
         value = shift = 0
         for name in self.fields:
             part = layer.member(obj, name)
@@ -328,7 +328,7 @@ class Checksummed(layer.Sealing):
             shift += layer.bit_width(self._field(name))
         return value
 
-    def _filled(self, obj: Any, value: int) -> Any:
+    def _fill(self, obj: Any, value: int) -> Any:
         for name in self.fields:
             con = self._field(name)
             width = layer.bit_width(con)
@@ -336,7 +336,7 @@ class Checksummed(layer.Sealing):
             if isinstance(self._zero(name), bytes):
                 assert self.algorithm is not None
                 part = int(part).to_bytes(width // 8, self.algorithm.order)
-            obj = _replaced(obj, name, part)
+            obj = _replace(obj, name, part)
             value >>= width
         return obj
 
@@ -459,7 +459,9 @@ class Parts(layer.Partition):
         """
         rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))
         known = (
-            None if rule is None else layer.bounded(evaluate(rule, context), self.limit, what, path)
+            None
+            if rule is None
+            else layer.check_bound(evaluate(rule, context), self.limit, what, path)
             for rule, what in rules
         )
         count, size, within = known
@@ -472,11 +474,11 @@ class Parts(layer.Partition):
             if within is not None:
                 if found.size < within:
                     return -1
-                return layer.bounded(found.size, within, "length of parts", path) - within
+                return layer.check_bound(found.size, within, "length of parts", path) - within
             assert size is not None
             if not found:
                 return size
-            return layer.bounded(
+            return layer.check_bound(
                 evaluate(self.following, Container({**found[-1], "_": context})),
                 self.limit,
                 "length",
@@ -545,8 +547,8 @@ class Parts(layer.Partition):
         raise faults[0]
 
 
-def _replaced(obj: Any, name: str, value: object) -> Any:
+def _replace(obj: Any, name: str, value: object) -> Any:
     head, _, rest = name.partition(".")
     copy = Container(obj)
-    copy[head] = _replaced(copy.get(head, {}), rest, value) if rest else value
+    copy[head] = _replace(copy.get(head, {}), rest, value) if rest else value
     return copy

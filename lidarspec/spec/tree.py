@@ -199,7 +199,7 @@ def format_hex(value: object) -> str:
     return repr(value)
 
 
-def listed(values: Sequence[int]) -> str:
+def format_values(values: Sequence[int]) -> str:
     """Return raw values as text, e.g. "1, 3, 5 to 7"."""
     formats = {0: "{0}", 1: "{0}, {1}"}
     return ", ".join(
@@ -278,7 +278,7 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-def calculated(symbol: str, *args: Formula) -> Formula:
+def calculate(symbol: str, *args: Formula) -> Formula:
     """Return an operation as a formula.
 
     A sum, difference or product of numbers is computed at once.
@@ -288,7 +288,7 @@ def calculated(symbol: str, *args: Formula) -> Formula:
     return Op(symbol, args)
 
 
-def evaluated(formula: Formula, read: Read) -> Any:
+def evaluate(formula: Formula, read: Read) -> Any:
     """Return the value of a formula.
 
     Args:
@@ -301,11 +301,11 @@ def evaluated(formula: Formula, read: Read) -> Any:
     match formula:
         case Ref():
             return read(formula.path)
-        case Op("*", (condition, _)) if _is_condition(condition) and not evaluated(condition, read):
+        case Op("*", (condition, _)) if _is_condition(condition) and not evaluate(condition, read):
             # The size of an alternative that is not present: its fields cannot be read.
             return 0
         case Op():
-            return _OPERATIONS[formula.symbol](*(evaluated(arg, read) for arg in formula.args))
+            return _OPERATIONS[formula.symbol](*(evaluate(arg, read) for arg in formula.args))
         case Untraced():
             raise ValueError(formula.reason)
     return formula
@@ -348,7 +348,7 @@ def _is_condition(formula: Formula) -> bool:
     )
 
 
-def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
+def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str, str]) -> str:
     """Return a formula as an expression of another language.
 
     Args:
@@ -363,12 +363,12 @@ def written(formula: Formula, named: Callable[[Ref], str], operations: Mapping[s
         case Ref():
             return named(formula)
         case Op("-", (operand,)):
-            return f"(-{written(operand, named, operations)})"
+            return f"(-{write(operand, named, operations)})"
         case Op(symbol, args):
             text = operations.get(
                 symbol, "(not {})" if symbol == "not" else f"({{}} {symbol} {{}})"
             )
-            return text.format(*(written(arg, named, operations) for arg in args))
+            return text.format(*(write(arg, named, operations) for arg in args))
         case Untraced():
             raise ValueError(formula.reason)
     if formula < 0:
@@ -448,7 +448,7 @@ def width(formula: Formula) -> int:
     return max(args)
 
 
-def moved(formula: Formula, axis: str) -> Formula:
+def move_to_part(formula: Formula, axis: str) -> Formula:
     """Return a formula of a part with paths from the top of the outer frame.
 
     Args:
@@ -458,7 +458,7 @@ def moved(formula: Formula, axis: str) -> Formula:
         case Ref(path):
             return replace(formula, path=path[2:] if path.startswith("_.") else f"{axis}.{path}")
         case Op(symbol, args):
-            return Op(symbol, tuple(moved(arg, axis) for arg in args))
+            return Op(symbol, tuple(move_to_part(arg, axis) for arg in args))
     return formula
 
 
@@ -483,7 +483,7 @@ class Number:
         """The name of the field."""
         return self.info.name
 
-    def encoded(self, value: float) -> bytes:
+    def encode(self, value: float) -> bytes:
         """Return the bytes of a raw value on the wire."""
         if self.kind == "float":
             order = "<" if self.order == "little" else ">"
@@ -664,7 +664,7 @@ class Parts:
         """Return the size of the part after one of this kind, with paths from the frame."""
         if kind.following is None:
             return None
-        return moved(kind.following, self.axis)
+        return move_to_part(kind.following, self.axis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -813,30 +813,30 @@ def size(node: Node) -> Formula | None:
         case Number() | Block() | Blob() | Opaque():
             return node.size
         case Repeat():
-            return joined("*", node.count, size(node.element))
+            return combine("*", node.count, size(node.element))
         case Parts():
             return Ref(node.total.path, node.total)
         case When():
             return _sum_alternatives(
                 [
-                    (calculated("!=", node.condition, 0), size(node.then)),
-                    (calculated("==", node.condition, 0), size(node.otherwise)),
+                    (calculate("!=", node.condition, 0), size(node.then)),
+                    (calculate("==", node.condition, 0), size(node.otherwise)),
                 ]
             )
         case Select():
             cases = [
-                (calculated("==", node.key, value), size(case))
+                (calculate("==", node.key, value), size(case))
                 for value, case in node.cases
                 if not isinstance(case, Never)
             ]
-            others = [calculated("!=", node.key, value) for value, _ in node.cases]
+            others = [calculate("!=", node.key, value) for value, _ in node.cases]
             if isinstance(node.default, Never):
                 return _sum_alternatives(cases)
             return _sum_alternatives(
                 [
                     *cases,
                     (
-                        functools.reduce(functools.partial(calculated, "*"), others),
+                        functools.reduce(functools.partial(calculate, "*"), others),
                         size(node.default),
                     ),
                 ]
@@ -848,11 +848,11 @@ def total(sizes: Iterable[Formula | None]) -> Formula | None:
     """Return the sum of sizes, None if one of them is None."""
     found: Formula | None = 0
     for each in sizes:
-        found = joined("+", found, each)
+        found = combine("+", found, each)
     return found
 
 
-def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula | None:
+def combine(symbol: str, one: Formula | None, other: Formula | None) -> Formula | None:
     """Return a sum, difference or product in its simplest form, None if an operand is None."""
     if one is None or other is None:
         return None
@@ -868,8 +868,8 @@ def joined(symbol: str, one: Formula | None, other: Formula | None) -> Formula |
     match symbol, one, other:
         case "+" | "-", Op("+" | "-" as inner, (first, int() as known)), int():
             number = (known if inner == "+" else -known) + (other if symbol == "+" else -other)
-            return joined("+" if number >= 0 else "-", first, abs(number))
-    return calculated(symbol, one, other)
+            return combine("+" if number >= 0 else "-", first, abs(number))
+    return calculate(symbol, one, other)
 
 
 def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formula | None:
@@ -881,7 +881,7 @@ def _sum_alternatives(cases: Sequence[tuple[Formula, Formula | None]]) -> Formul
     first = cases[0][1] if cases else 0
     if all(each == first for _, each in cases):
         return first
-    return total(joined("*", holds, each) for holds, each in cases)
+    return total(combine("*", holds, each) for holds, each in cases)
 
 
 def infos(node: Node) -> tuple[FieldInfo, ...]:
@@ -1026,7 +1026,7 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
     if wrong is not None:
         raise Untraceable(f"an expression with {wrong!r}")
     return Symbol(
-        calculated(symbol, *(int(part) if isinstance(part, bool) else part for part in pair))
+        calculate(symbol, *(int(part) if isinstance(part, bool) else part for part in pair))
     )
 
 

@@ -54,7 +54,7 @@ class Along(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if method != "__call__" or kwargs.get("out") is not None:
             return getattr(ufunc, method)(*map(np.asarray, inputs), **kwargs)
-        return self.applied(
+        return self.apply_function(
             (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
         )
 
@@ -62,21 +62,21 @@ class Along(NDArrayOperatorsMixin):
         self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any
     ) -> Any:
         if function in ELEMENTWISE:
-            return self.applied(
+            return self.apply_function(
                 (lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args
             )
         return function(
             *(np.asarray(value) if isinstance(value, Along) else value for value in args), **kwargs
         )
 
-    def applied(self, function: Callable[..., Any], *values: Any) -> Any:
+    def apply_function(self, function: Callable[..., Any], *values: Any) -> Any:
         """Return `function` of values that are aligned by the arrays that they are along.
 
         If a column is among the values, the column applies the function.
         """
         for value in values:
-            if hasattr(value, "applied") and not isinstance(value, Along):
-                return value.applied(function, *values)
+            if hasattr(value, "apply_function") and not isinstance(value, Along):
+                return value.apply_function(function, *values)
         axes: dict[str, str] = {}
         for name in (name for value in values if isinstance(value, Along) for name in value.axes):
             axes.setdefault(name.rpartition(".")[2], name)
@@ -190,7 +190,7 @@ def following(a: Array, step: int = 1) -> Array:
         float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at
         the end.
     """
-    return _shifted(a, step)
+    return _shift(a, step)
 
 
 def previous(a: Array, step: int = 1) -> Array:
@@ -202,7 +202,7 @@ def previous(a: Array, step: int = 1) -> Array:
         float64, the shape of `a`; nan across a loss (a jump of the sequence, skipped bytes) and at
         the beginning.
     """
-    return _shifted(a, -step)
+    return _shift(a, -step)
 
 
 def last(a: Array, where: Array | None = None) -> Array:
@@ -257,7 +257,7 @@ def between_blocks(
 
 def stack(*columns: Array) -> Array:
     """Return columns side by side on a new innermost axis: k of shape (n, b) give (n, b, k)."""
-    return _applied(side_by_side, *columns)
+    return _apply(side_by_side, *columns)
 
 
 def side_by_side(*arrays: Any) -> Any:
@@ -291,7 +291,7 @@ def take(table: Array, index: Array) -> Array:
     """
     entries = np.asarray(table, np.float64)
     if entries.ndim == 1:
-        return _applied(LookUp(entries), index)
+        return _apply(LookUp(entries), index)
     rows = np.concatenate([entries, np.full((1, entries.shape[1]), np.nan)])
     if hasattr(index, "gathered"):
         return index.gathered(rows)
@@ -337,7 +337,7 @@ def _refuse_folded(turn: Array, full: float) -> None:
         )
 
 
-def _shifted(a: Array, step: int) -> Array:
+def _shift(a: Array, step: int) -> Array:
     if hasattr(a, "shifted"):
         return a.shifted(step)
     values = np.asarray(a, np.float64)
@@ -349,9 +349,9 @@ def _shifted(a: Array, step: int) -> Array:
     return flat.reshape(values.shape)
 
 
-def _applied(function: Callable[..., Any], *values: Array) -> Array:
+def _apply(function: Callable[..., Any], *values: Array) -> Array:
     """`function` of arrays; where one of them is a column, the column's way of applying it."""
     for value in values:
-        if hasattr(value, "applied"):
-            return value.applied(function, *values)
+        if hasattr(value, "apply_function"):
+            return value.apply_function(function, *values)
     return function(*(np.asarray(value) for value in values))

@@ -379,7 +379,7 @@ def test_a_mount_turns_and_moves(mount: Mount, expected: tuple[float, float, flo
         name: np.array([value], np.float32)
         for name, value in {"x": 1, "y": 2, "z": 3, **polar}.items()
     }
-    found = mount.applied(ls.PointCloud(**columns, **one))
+    found = mount.apply(ls.PointCloud(**columns, **one))
     np.testing.assert_allclose(found.xyz[0], expected, atol=1e-5)
     beam = np.array(expected) - (mount.x, mount.y, mount.z)
     assert found.azimuth[0] == pytest.approx(np.arctan2(beam[1], beam[0]), abs=1e-6)
@@ -395,7 +395,7 @@ def test_no_return_stays_none_and_keeps_its_direction() -> None:
         x=nothing, y=nothing, z=nothing, range=np.full(1, np.inf, np.float32),
         azimuth=zero, elevation=zero, time=np.zeros(1), valid=np.zeros(1, np.bool_),
     )  # fmt: skip
-    found = Mount(x=3, yaw_deg=180).applied(cloud)
+    found = Mount(x=3, yaw_deg=180).apply(cloud)
     assert np.isnan(found.xyz).all()
     assert np.isinf(found.range[0])
     assert found.azimuth[0] == pytest.approx(-np.pi)

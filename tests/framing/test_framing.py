@@ -92,13 +92,13 @@ def test_each_datagram_is_judged_by_its_own_bytes_alone(sensor: Sensor) -> None:
 
 def test_a_new_header_is_gone_through_once(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = list[tree.Formula]()
-    evaluated = tree.evaluated
+    evaluated = tree.evaluate
 
     def counting(formula: tree.Formula, read: tree.Read) -> Any:
         asked.append(formula)
         return evaluated(formula, read)
 
-    monkeypatch.setattr(tree, "evaluated", counting)
+    monkeypatch.setattr(tree, "evaluate", counting)
     counts = Struct(
         "sync" / Const(b"\x5a\xa5"),
         "n" / Int8ub,

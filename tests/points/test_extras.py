@@ -124,7 +124,7 @@ def test_masks_slices_scans_mounts_and_pickles_carry_them() -> None:
     assert_carried(cloud[7:200][3:9], reader, slice(10, 16))
     assert_carried(cloud[::2][1:9], reader[::2], slice(1, 9))
     assert_carried(pickle.loads(pickle.dumps(cloud)), reader, slice(None))
-    assert_carried(Mount(yaw_deg=90.0).applied(cloud), reader, slice(None))
+    assert_carried(Mount(yaw_deg=90.0).apply(cloud), reader, slice(None))
     data = simulate(SENSOR, 60)
     scans, all_of_it = list(SENSOR.scans(data)), SENSOR.decode(data).points()
     assert len(scans) > 3

@@ -102,7 +102,7 @@ def test_a_field_that_is_asked_for_has_its_share_of_the_beams() -> None:
 
 def test_a_sensor_upside_down_is_planar_and_mirrored() -> None:
     scans = simulated("ldrobot-stl27l")
-    over = [replace(scan, points=Mount(inverted=True).applied(scan.points)) for scan in scans]
+    over = [replace(scan, points=Mount(inverted=True).apply(scan.points)) for scan in scans]
     (one, *_), (other, *_) = (
         planar(Planes(360, (-math.pi / 2, math.pi / 2)), scans),
         planar(Planes(360, (-math.pi / 2, math.pi / 2)), over),

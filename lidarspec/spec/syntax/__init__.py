@@ -15,8 +15,8 @@ from __future__ import annotations
 from lidarspec.spec.syntax.meaning import (
     bytes_of as bytes_of,
     frame_tree as frame_tree,
-    seen as seen,
-    unnamed as unnamed,
+    to_seen as to_seen,
+    to_unnamed as to_unnamed,
 )
 from lidarspec.spec.syntax.refusals import check_struct as check_struct
 from lidarspec.spec.syntax.replacements import (
@@ -29,7 +29,7 @@ from lidarspec.spec.syntax.replacements import (
     Sealing as Sealing,
     Sizing as Sizing,
     WireNaN as WireNaN,
-    bounded as bounded,
+    check_bound as check_bound,
     member as member,
     verifying as verifying,
 )

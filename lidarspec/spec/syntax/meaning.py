@@ -76,16 +76,16 @@ def _twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
     return root, builder
 
 
-def _traced(expression: Any, scope: tree.Scope) -> Any:
+def _trace(expression: Any, scope: tree.Scope) -> Any:
     """Return the value of an expression whose fields are symbols.
 
     Expressions of construct are walked here instead of called, since calling ``~`` evaluates
     ``not value``, and the truth of a symbol is not known.
     """
     if isinstance(expression, BinExpr):
-        return expression.op(_traced(expression.lhs, scope), _traced(expression.rhs, scope))
+        return expression.op(_trace(expression.lhs, scope), _trace(expression.rhs, scope))
     if isinstance(expression, UniExpr):
-        operand = _traced(expression.operand, scope)
+        operand = _trace(expression.operand, scope)
         if expression.op is operator.not_ and isinstance(operand, tree.Symbol):
             return tree.Symbol(tree.Op("not", (operand.formula,)))
         return expression.op(operand)
@@ -94,7 +94,7 @@ def _traced(expression: Any, scope: tree.Scope) -> Any:
     return expression
 
 
-def _spelled(expression: Any, path: str) -> str:
+def _spell(expression: Any, path: str) -> str:
     """An expression of the part at `path` as its author wrote it, with fields by their whole paths;
     "?" for a function.
     """
@@ -123,7 +123,7 @@ def _whole_path(path: str, way: re.Match[str]) -> str:
     return ".".join(names)
 
 
-def seen(info: tree.FieldInfo, raw: int) -> Any:
+def to_seen(info: tree.FieldInfo, raw: int) -> Any:
     """A raw value as the expressions of a struct see it: where construct's Enum has a name for it,
     that name.
     """
@@ -132,7 +132,7 @@ def seen(info: tree.FieldInfo, raw: int) -> Any:
     return raw
 
 
-def unnamed(raw: int) -> Any:
+def to_unnamed(raw: int) -> Any:
     """A raw value that construct's Enum has no name for."""
     return construct.EnumInteger(raw)
 
@@ -195,7 +195,7 @@ class _Builder:
         if is_block:
             return self.node(inner.subcon, place)
         if isinstance(inner, Sealing):
-            return self._sealed(inner, place)
+            return self._seal(inner, place)
         if isinstance(inner, Struct):
             return self._struct(inner, place)
         if isinstance(inner, Array):
@@ -241,7 +241,7 @@ class _Builder:
                 if con.docs:
                     place = place.inside(docs=con.docs)
             elif isinstance(con, Describing):
-                place = replace(place, info=con.described(place.info))
+                place = replace(place, info=con.describe(place.info))
             elif isinstance(con, construct.Enum):
                 place = place.inside(
                     labels={int(value): str(name) for value, name in con.ksymapping.items()}
@@ -290,7 +290,7 @@ class _Builder:
         )
         scope.asked.clear()
         try:
-            value = _traced(expression, scope)
+            value = _trace(expression, scope)
             if not isinstance(expression, ExprMixin) and any(
                 ref.info.optional for ref in scope.asked
             ):
@@ -308,7 +308,7 @@ class _Builder:
         except Exception as error:
             reason = f"a Python function of other fields ({type(error).__name__}: {error})"
         path = place.info.path
-        return tree.Untraced(f"{path}: {reason}", _spelled(expression, path))
+        return tree.Untraced(f"{path}: {reason}", _spell(expression, path))
 
     def _select(self, con: construct.Switch, place: _Context) -> tree.Select:
         key = self._formula(con.keyfunc, place, is_key=True)
@@ -327,7 +327,7 @@ class _Builder:
             else:
                 reason = f"a case for {odd[0]!r}, which is no integer"
             path = place.info.path
-            key = tree.Untraced(f"{path}: {reason}", _spelled(con.keyfunc, path))
+            key = tree.Untraced(f"{path}: {reason}", _spell(con.keyfunc, path))
         if isinstance(key, tree.Untraced):
             values = {case: case for case in con.cases}
         cases = tuple(
@@ -371,7 +371,7 @@ class _Builder:
                 )
             elif place.room is not None and child is con.subcons[-1]:
                 inside = replace(
-                    inside, room=tree.joined("-", place.room, tree.total(map(tree.size, members)))
+                    inside, room=tree.combine("-", place.room, tree.total(map(tree.size, members)))
                 )
             members.append(self.node(child, inside))
         self.scopes[info.path] = scope
@@ -392,10 +392,10 @@ class _Builder:
         """The bytes behind a part of this size."""
         number = self._formula(con.modulus if con.to is None else con.to, place)
         if con.to is not None:
-            return tree.joined("-", number, size)
+            return tree.combine("-", number, size)
         if size is None:
             return size
-        return tree.calculated("%", tree.calculated("-", size), number)
+        return tree.calculate("%", tree.calculate("-", size), number)
 
     def _measuring(self, con: Sizing, place: _Context) -> tree.Formula | None:
         """Return the formula for the size of a part, None in the first pass.
@@ -434,7 +434,7 @@ class _Builder:
                 " within=...) for them"
             )
             return tree.Opaque(place.name, place.info, "GreedyRange", reason, (element,))
-        return tree.Repeat(place.name, axis, tree.calculated("//", place.room, size), element)  # type: ignore[arg-type]
+        return tree.Repeat(place.name, axis, tree.calculate("//", place.room, size), element)  # type: ignore[arg-type]
 
     def _parts(self, con: Partition, place: _Context) -> tree.Parts:
         info = place.info
@@ -525,7 +525,7 @@ class _Builder:
             f"{reason.partition(': ')[2]}: plausible=lambda f: ... is judged in bulk",
         )
 
-    def _sealed(self, con: Sealing, place: _Context) -> tree.Node:
+    def _seal(self, con: Sealing, place: _Context) -> tree.Node:
         body = self.node(con.subcon, place)
         if not isinstance(body, tree.Struct | tree.Sealed):
             return tree.Opaque(
@@ -550,7 +550,7 @@ class _Builder:
 
     def _leaf(self, con: Construct, place: _Context) -> tree.Node:
         name = place.name
-        info = _typed(con, place.info)
+        info = _add_type(con, place.info)
         if name and place.scope is not None:
             place.scope.add(name, tree.Ref(info.path, info))
         if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
@@ -587,7 +587,7 @@ class _Builder:
         inside = self.node(con, replace(place, in_bits=True))
         try:
             size = int(con.sizeof())
-            fields = _probed(con, size)
+            fields = _probe(con, size)
         except (construct.ConstructError, LookupError):
             fields = None
         if fields is None:
@@ -736,7 +736,7 @@ def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:
     return np.dtype(f"{'i' if signed else 'u'}{size}")
 
 
-def _typed(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
+def _add_type(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
     """What is known of a field, with the type of its values."""
     if isinstance(con, FormatField):
         code = con.fmtstr[-1]
@@ -814,7 +814,7 @@ def _is_odd(con: BytesInteger) -> bool:
 
 
 @functools.lru_cache(maxsize=4096)
-def _probed(con: Construct, size: int) -> list[BitField] | None:
+def _probe(con: Construct, size: int) -> list[BitField] | None:
     """The bit fields of a block; None where construct decides on its bits, or values are no plain
     integers.
     """
@@ -840,7 +840,7 @@ def _is_even(con: Construct) -> bool:
 def bytes_of(con: Construct, names: Iterable[str]) -> list[int]:
     """The offsets of the bytes of a block that hold any bit of one of its fields."""
     keys = tuple(names)
-    for field in _probed(con, con.sizeof()) or ():
+    for field in _probe(con, con.sizeof()) or ():
         if field.keys == keys:
             return [segment.byte for segment in field.segments]
     raise KeyError(".".join(keys))

@@ -236,7 +236,7 @@ def _check_measures(
             path = str(con.name)
         measure = (1, 0, "")
     if isinstance(con, Describing):
-        said = con.described(tree.FieldInfo(""))
+        said = con.describe(tree.FieldInfo(""))
         measure = (said.scale, said.offset, said.unit)
     is_number = isinstance(
         con, construct.FormatField | construct.BytesInteger | construct.BitsInteger

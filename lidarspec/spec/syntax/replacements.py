@@ -71,7 +71,7 @@ def verifying(context: Any) -> bool:
     return bool(context._params.get("_verify", True))
 
 
-def bounded(number: int, limit: int, what: str, path: str) -> int:
+def check_bound(number: int, limit: int, what: str, path: str) -> int:
     """A count or a length that a frame can have; RangeError for another one."""
     if not 0 <= number <= limit:
         raise construct.RangeError(f"invalid {what} {number}", path=path)
@@ -172,7 +172,7 @@ class IndexedArray(Array):  # type: ignore[misc]
     in_bits: bool
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        count = bounded(construct.evaluate(self.count, context), self.limit, "count", path)
+        count = check_bound(construct.evaluate(self.count, context), self.limit, "count", path)
         found = construct.ListContainer()
         for index in range(count):
             context._index = index
@@ -181,7 +181,7 @@ class IndexedArray(Array):  # type: ignore[misc]
             element = self.subcon._parsereport(stream, context, place)
             found.append(element)
             if stream.tell() == start and not self.in_bits:
-                context._params["_empty"] = bounded(
+                context._params["_empty"] = check_bound(
                     context._params.get("_empty", 0) + 1, self.limit, "count", path
                 )
         return found
@@ -259,15 +259,15 @@ class Limited(Subconstruct):  # type: ignore[misc]
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
         if verifying(context):
-            return self._held(obj, start, path)
+            return self._hold(obj, start, path)
         return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        return self._held(self.subcon._build(obj, stream, context, path), 0, path)
+        return self._hold(self.subcon._build(obj, stream, context, path), 0, path)
 
-    def _held(self, obj: Any, start: int, path: str) -> Any:
+    def _hold(self, obj: Any, start: int, path: str) -> Any:
         if int(obj) not in self.allowed:
-            raise Mismatch(path, start, tree.listed(self.allowed), int(obj), "value")
+            raise Mismatch(path, start, tree.format_values(self.allowed), int(obj), "value")
         return obj
 
 
@@ -290,7 +290,7 @@ class CountedBytes(Bytes):  # type: ignore[misc]
     limit: int
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        length = bounded(
+        length = check_bound(
             operator.index(construct.evaluate(self.length, context)), self.limit, "length", path
         )
         return construct.stream_read(stream, length, path)
@@ -332,7 +332,7 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
 class Describing(Subconstruct):  # type: ignore[misc]
     """A part that only says something of the field below it: parses and builds what that does."""
 
-    def described(self, info: tree.FieldInfo) -> tree.FieldInfo:
+    def describe(self, info: tree.FieldInfo) -> tree.FieldInfo:
         """What is known of the field, with what this part says of it."""
         raise NotImplementedError
 
@@ -445,7 +445,7 @@ class Bounded(Subconstruct):  # type: ignore[misc]
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
-        length = bounded(construct.evaluate(self.length, context), sys.maxsize, "length", path)
+        length = check_bound(construct.evaluate(self.length, context), sys.maxsize, "length", path)
         stream.seek(0)
         within = io.BytesIO(construct.stream_read(stream, start + length, path))
         within.seek(start)
@@ -478,7 +478,7 @@ class Filler(CountedBytes):
         return int((start - end) % number if self.to is None else number - (end - start))
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        length = bounded(self._missing(context), self.limit, "length", path)
+        length = check_bound(self._missing(context), self.limit, "length", path)
         return super()._build(self.pattern * length if obj is None else obj, stream, context, path)
 
 

@@ -47,7 +47,7 @@ from lidarspec.spec.syntax.replacements import (
     Pieces,
     Sealing,
     Sizing,
-    bounded,
+    check_bound,
 )
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
             NamedEnum(prepare(con.subcon, limit, in_bits=in_bits), **con.encmapping),
             tuple(sorted(con.decmapping)),
         )
-    if isinstance(con, construct.ExprValidator) and (allowed := _allowed(con)) is not None:
+    if isinstance(con, construct.ExprValidator) and (allowed := _find_allowed(con)) is not None:
         return Limited(prepare(con.subcon, limit, in_bits=in_bits), allowed)
     if isinstance(con, Filler):
         con.limit = limit
@@ -153,7 +153,7 @@ def _spelled_out(con: Construct) -> list[Construct]:
     while isinstance(inner, construct.Renamed):
         inner = inner.subcon
 
-    def named(ending: str, part: Construct, what: str) -> Construct:
+    def rename_ending(ending: str, part: Construct, what: str) -> Construct:
         return construct.Renamed(part, newname=name + ending, newdocs=f"{what} {name}")
 
     if name and isinstance(inner, construct.IfThenElse) and inner.elsesubcon is construct.Pass:
@@ -179,7 +179,7 @@ def _spelled_out(con: Construct) -> list[Construct]:
             content = inner.subcon
         members = _spelled_out(construct.Renamed(content, newname=name, newdocs=docs))
         return [
-            named(
+            rename_ending(
                 "_size",
                 Sizing(inner.lengthfield, (members[-1].name,), plus, members[0].name),
                 "bytes of",
@@ -194,7 +194,7 @@ def _spelled_out(con: Construct) -> list[Construct]:
         count, items = (part.subcon for part in inner.subcons)
         array = Array(construct.this[f"{name}_count"], items.subcon)
         return [
-            named("_count", Counting(count.subcon, name), "number of"),
+            rename_ending("_count", Counting(count.subcon, name), "number of"),
             construct.Renamed(array, newname=name, newdocs=docs),
         ]
     if name and (
@@ -206,7 +206,7 @@ def _spelled_out(con: Construct) -> list[Construct]:
         if isinstance(inner, construct.Aligned):
             return [
                 *members,
-                named(
+                rename_ending(
                     "_padding",
                     Filler(span, modulus=inner.modulus, pattern=inner.pattern),
                     "padding of",
@@ -215,7 +215,7 @@ def _spelled_out(con: Construct) -> list[Construct]:
         is_full = isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon)
         if is_full:
             return members
-        return [*members, named("_padding", Filler(span, to=inner.length), "padding of")]
+        return [*members, rename_ending("_padding", Filler(span, to=inner.length), "padding of")]
     return [con]
 
 
@@ -232,7 +232,7 @@ class _Compared:
         return False
 
 
-def _allowed(con: construct.Validator) -> tuple[int, ...] | None:
+def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
     """The raw values that a validator lets pass: those that it compares with, or of 16 bits all
     that pass; None where neither is known.
     """
@@ -444,8 +444,8 @@ def random_value(
     if isinstance(con, Partition):
         return _random_parts(con, source, drawn, scope, path)
     if isinstance(con, Array):
-        count = bounded(construct.evaluate(con.count, scope), con.limit, "count", path)
-        bounded(count * _elements(con.subcon, scope), con.limit, "count", path)
+        count = check_bound(construct.evaluate(con.count, scope), con.limit, "count", path)
+        check_bound(count * _elements(con.subcon, scope), con.limit, "count", path)
         return [random_value(con.subcon, source, drawn, scope, path) for _ in range(count)]
     if isinstance(con, construct.IfThenElse):
         return random_value(
@@ -539,7 +539,7 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
         return source.randbytes(source.randint(0, 4))
     if isinstance(con, Bytes):
         return source.randbytes(
-            bounded(construct.evaluate(con.length, scope), con.limit, "length", "")
+            check_bound(construct.evaluate(con.length, scope), con.limit, "length", "")
         )
     if (
         isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5
