@@ -104,12 +104,12 @@ class FieldInfo:
     optional: bool = False
     measured: bool = False
 
-    @property
+    @functools.cached_property
     def name(self) -> str:
         """The last part of the path."""
         return self.path.rpartition(".")[2]
 
-    @property
+    @functools.cached_property
     def scaled(self) -> bool:
         """Whether physical values differ from raw values."""
         return self.scale != 1 or self.offset != 0
@@ -157,7 +157,7 @@ class FieldInfo:
             return np.rint(steps).astype(np.int64)
         return round(steps)
 
-    @property
+    @functools.cached_property
     def limits(self) -> tuple[int, int]:
         """The lowest and highest raw value of an integer field."""
         signed = self.dtype is not None and self.dtype.kind == "i"
@@ -478,7 +478,7 @@ class Number:
     kind: Literal["uint", "int", "float"]
     order: Literal["little", "big"]
 
-    @property
+    @functools.cached_property
     def name(self) -> str:
         """The name of the field."""
         return self.info.name
