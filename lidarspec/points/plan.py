@@ -279,18 +279,16 @@ class Plan:
 
         In that case a nan marks all coordinates alike.
         """
-        if not self._may_be_safe or not all(
-            np.isfinite(values(term.low)).all() for term in self._directions if term.low is not None
-        ):
+        if not self._may_be_safe:
             return False
-        rows = [
-            term.full.args
-            for term in self._directions
-            if term.full is not None and term.full.kind == "rows"
-        ]
-        return all(
-            (row_numbers(values(index), len(table)) < len(table) - 1).all() for index, table in rows
-        )
+        for term in self._directions:
+            if term.low is not None and not np.isfinite(values(term.low)).all():
+                return False
+            if term.full is not None and term.full.kind == "rows":
+                index, table = term.full.args
+                if (row_numbers(values(index), len(table)) >= len(table) - 1).any():
+                    return False
+        return True
 
     @cached_property
     def _may_be_safe(self) -> bool:
