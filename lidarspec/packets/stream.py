@@ -71,8 +71,10 @@ class PacketStream:
         self._type = packet_type(sensor, frame)
         self.stats = stats
         self._backend = backend
-        self._state: dict[str, bytes] = dict(state or {})
-        self._tables: dict[str, tuple[bytes, Table]] = {}
+        self._last_frames: dict[str, Table] = {}  # of other types: the last one, by its name
+        for name in self._type.others:
+            if state and name in state:
+                self._last_frames[name] = codec(sensor.frames[name]).table([state[name]])
         self._skipped = 0  # bytes since the last packet
 
         clock = self._type.clock
@@ -237,8 +239,6 @@ class PacketStream:
         self, parts: Sequence[OwnFrames], number: int, *, whole: bool
     ) -> dict[str, StateOf]:
         """Return the frames of each other type, and which was the last before each packet."""
-        if not self._state and not any(part.has_others for part in parts):
-            return dict.fromkeys(self._type.others, (None, repeated(-1, number)))
         seen = self._others_in(parts)
         return {
             name: self._state_of(name, seen.get(name, []), number=number, whole=whole)
@@ -265,31 +265,21 @@ class PacketStream:
             number += len(part.frames)
         return seen
 
-    def _last(self, name: str) -> Table:
-        """Return the last frame of another type, as a table."""
-        data = self._state[name]
-        cached = self._tables.get(name)
-        if cached is None or cached[0] is not data:
-            cached = (data, codec(self._type.sensor.frames[name]).table([data]))
-            self._tables[name] = cached
-        return cached[1]
-
     def _state_of(self, name: str, seen: Sequence[Earlier], *, number: int, whole: bool) -> StateOf:
         """Return the frames of another type, and which of them was the last before each packet."""
+        last_frame = self._last_frames.get(name)
         if not seen:
-            if name in self._state:
-                return self._last(name), repeated(0, number)
-            return None, repeated(-1, number)
+            return last_frame, repeated(-1 if last_frame is None else 0, number)
         engine = codec(self._type.sensor.frames[name])
         tables: list[Table] = [engine.gather(frames) for frames, _ in seen]
         before = np.concatenate([places for _, places in seen])
-        if name in self._state:
-            tables = [self._last(name), *tables]
+        if last_frame is not None:
+            tables = [last_frame, *tables]
             before = np.concatenate(([0], before))
         elif whole:
             before[0] = 0
-        last = seen[-1][0]
-        self._state[name] = last.data(len(last) - 1)
+        newest, _ = seen[-1]
+        self._last_frames[name] = engine.table([newest.data(len(newest) - 1)])
         which = np.repeat(np.arange(-1, len(before)), np.diff(before, prepend=0, append=number))
         return joined_tables(tables), which
 

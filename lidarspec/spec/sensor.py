@@ -222,7 +222,7 @@ class SensorDescription:
             directions=declared.simulation.directions or shared.directions,
         )
 
-    @property
+    @cached_property
     def datagrams(self) -> bool:
         """Whether the data link sends one frame per datagram."""
         return is_datagram(self.links.get("data"))
