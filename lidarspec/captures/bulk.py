@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.captures.ip import Headers
 from lidarspec.captures.pcap import CaptureReader, Datagram, StreamReader
 from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Times, records
 from lidarspec.captures.source import Source, Truncated
@@ -111,19 +110,17 @@ class RecordKind:
         return (good, at[good])
 
 
-def make_record_kind(
-    record: bytes, headers: Headers, source: Sender, form: Form
-) -> RecordKind | None:
+def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKind | None:
     """Return the kind of a record; None if its first bytes do not determine the kind.
 
     Args:
         record: all bytes of the record.
-        headers: the headers of its packet.
-        source: the sender of its datagram.
+        datagram: in it.
         form: the reader of its file.
     """
+    headers = datagram.headers
     pattern = form.pattern(record)
-    if pattern is None:
+    if headers is None or pattern is None:
         return None
     head = pattern.head
     start = pattern.head + headers.size
@@ -141,7 +138,7 @@ def make_record_kind(
         len(record),
         start,
         headers.payload_size,
-        source,
+        datagram.source,
         pattern.times,
         value,
         mask.view(np.uint64),
@@ -476,12 +473,8 @@ class _Records:
         self._singles[index] = datagram
         if self._kinds_added == MOST_KNOWN or not self._are_whole:
             return
-        headers = self._reader.headers(packet)
         record = self._storage[self._starts[index] : self._starts[index + 1]].tobytes()
-        if headers:
-            found = make_record_kind(record, headers, datagram.source, self._form)
-        else:
-            found = None
+        found = make_record_kind(record, datagram, self._form)
         if found is not None:
             self._kinds_added += 1
             self._known = [*self._known, found]

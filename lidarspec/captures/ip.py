@@ -134,6 +134,7 @@ class IpPacket(NamedTuple):
         protocol: of the first header in `body`.
         body: the bytes after the IP header.
         body_offset: the offset of `body` in the frame; 0 for a reassembled packet.
+        variable_offsets: as of `Headers`, those in the IP header.
     """
 
     source: bytes
@@ -142,6 +143,7 @@ class IpPacket(NamedTuple):
     body: bytes
     body_offset: int = 0
     fragment: Fragment | None = None
+    variable_offsets: tuple[int, ...] = ()
 
 
 class UdpPacket(NamedTuple):
@@ -212,26 +214,18 @@ def parse_udp(packet: IpPacket) -> UdpPacket:
     return UdpPacket(source, destination, start + _UDP_HEADER.size, start + length)
 
 
-def parse_headers(frame: bytes, link: int) -> Headers | None:
-    """Return the extent of the headers of a frame; None for a fragment.
+def measure_headers(packet: IpPacket, udp: UdpPacket) -> Headers | None:
+    """Return the extent of the headers of a UDP packet; None for a reassembled one.
 
     Frames of one link type and one length, with equal headers except for the variable bytes, have
     their payload at the same offset and come from the same sender: `parse_ip` and `parse_udp` read
     nothing else.
-
-    Raises:
-        NoDatagramError: as `parse_ip` and `parse_udp`.
     """
-    packet = parse_ip(frame, link)
-    if packet.fragment is not None:
+    if not packet.body_offset:
         return None
-    udp = parse_udp(packet)
     size = packet.body_offset + udp.start
-    variable_offsets = [size - 2, size - 1]  # the checksum of UDP
-    ip_start = _find_ip(frame, link)
-    if frame[ip_start] >> 4 == 4:
-        variable_offsets += [ip_start + offset for offset in _IPV4_VARIABLE_OFFSETS]
-    return Headers(size, udp.stop - udp.start, tuple(variable_offsets))
+    udp_checksum = (size - 2, size - 1)
+    return Headers(size, udp.stop - udp.start, (*udp_checksum, *packet.variable_offsets))
 
 
 @lru_cache(maxsize=256)
@@ -366,7 +360,8 @@ def _parse_ipv4(frame: bytes, start: int) -> IpPacket:
     )
     if fragment is not None and len(body) < length - header_size:
         raise NoDatagramError("short")
-    return IpPacket(source, destination, protocol, body, body_start, fragment)
+    variable_offsets = tuple(start + offset for offset in _IPV4_VARIABLE_OFFSETS)
+    return IpPacket(source, destination, protocol, body, body_start, fragment, variable_offsets)
 
 
 def _parse_ipv6(frame: bytes, start: int) -> IpPacket:

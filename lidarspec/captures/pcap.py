@@ -25,7 +25,7 @@ from lidarspec.captures.ip import (
     Reassembly,
     build_udp_frame,
     format_address,
-    parse_headers,
+    measure_headers,
     parse_ip,
     parse_udp,
 )
@@ -65,12 +65,15 @@ class Datagram:
         at: capture time in ns since 1970, of the last fragment of a fragmented datagram; 0 if the
             file has no times.
         source, destination: address and port.
+        headers: the headers of the packet that it was read from; None if other packets with equal
+            headers may have their payload elsewhere.
     """
 
     data: bytes
     at: int
     source: tuple[str, int]
     destination: tuple[str, int]
+    headers: Headers | None = field(default=None, compare=False)
 
 
 @dataclass(slots=True)
@@ -260,6 +263,7 @@ class CaptureReader(Closing):
             packet.at,
             (format_address(ip.source), udp.source),
             (format_address(ip.destination), udp.destination),
+            measure_headers(ip, udp),
         )
 
     def _count_unread(self, packet: CapturedPacket, error: NoDatagramError) -> None:
@@ -272,13 +276,6 @@ class CaptureReader(Closing):
             self.stats.snapped += 1
         else:
             self.stats.malformed += 1
-
-    def headers(self, packet: CapturedPacket) -> Headers | None:
-        """Return the headers of a packet that gave a datagram.
-
-        None if other packets with equal headers may have their payload elsewhere.
-        """
-        return parse_headers(packet.data, packet.link)
 
 
 class StreamReader(CaptureReader):
@@ -295,15 +292,12 @@ class StreamReader(CaptureReader):
         if packet.link not in USER_LINKS:
             self.stats.count_unsupported(f"link type {packet.link}")
             return None
+        headers = None
         if len(packet.data) < packet.original:
             self.stats.snapped += 1
-        return Datagram(packet.data, packet.at, UNKNOWN_ENDPOINT, UNKNOWN_ENDPOINT)
-
-    def headers(self, packet: CapturedPacket) -> Headers | None:
-        """Return the headers of a packet, which are empty; None for a packet that was cut."""
-        if len(packet.data) < packet.original:
-            return None
-        return Headers(0, len(packet.data), ())
+        else:
+            headers = Headers(0, len(packet.data), ())
+        return Datagram(packet.data, packet.at, UNKNOWN_ENDPOINT, UNKNOWN_ENDPOINT, headers)
 
 
 def datagram_record(datagram: Datagram) -> bytes:
