@@ -73,11 +73,10 @@ class Input(Protocol):
 
         A frame with parts is ignored if it lacks values that an earlier frame reported.
         """
-        if not self.sensor.info:
-            return
-        reporting = {path.partition(".")[0] for path in self.sensor.info.values()}
         for frames in found:
-            for name in reporting.intersection(frames.names):
+            for name in self.sensor.info_frames:
+                if name not in frames.names:
+                    continue
                 rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
                 for item in frames.only(rows[-1:]).found():
                     if not self._lacks_values(item):

@@ -95,8 +95,7 @@ def _of_scans(path: Path | None) -> list[Any]:
 
 def _schema(arrow: Any, scan: Scan, cloud: PointCloud, of_scans: Sequence[Any]) -> Any:
     """The fields of a scan."""
-    facts = {**scan.facts, "calibration": cloud.calibration}
-    known = arrow_schema(cloud.columns, units_of(cloud), facts)
+    known = arrow_schema(cloud.columns, units_of(cloud), scan.facts)
     return arrow.schema([*known, *of_scans], known.metadata)
 
 

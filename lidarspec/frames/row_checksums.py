@@ -108,8 +108,14 @@ def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool
     """Return whether one call for each row is faster than NumPy for all rows."""
     if not isinstance(algorithm, Crc):
         return len(rows) < ONE_BY_ONE
-    length = sum(stop - start for start, stop in spans)
+    length = _count_bytes(spans)
     return len(rows) * length < (NARROW_LOOP_BYTES if algorithm.width <= 8 else LOOP_BYTES)
+
+
+@lru_cache(maxsize=1024)
+def _count_bytes(spans: Spans) -> int:
+    """Return how many bytes of a row some spans cover."""
+    return sum(stop - start for start, stop in spans)
 
 
 def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
@@ -243,7 +249,7 @@ def _pieces(
         row); and the parts of words, as (word, offset of the eight bytes that hold the part, right
         shift, mask or None, left shift), in the order of these operations.
     """
-    total = sum(stop - start for start, stop in spans)
+    total = _count_bytes(spans)
     number = -(-total // 8)
     runs = list[tuple[int, int, int]]()
     parts = list[tuple[Any, ...]]()
@@ -308,7 +314,7 @@ def registers(
 
     The dtype is the integer that holds the register.
     """
-    length = sum(stop - first for first, stop in spans)
+    length = _count_bytes(spans)
     if 0 < length <= SHORT and len(rows) * length <= FEW:
         return _by_place(rows, spans, length, start, width, poly, refin)
     if length > SHORT and (width, poly, refin) == ZLIB:
@@ -383,7 +389,7 @@ def _narrow(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[np.uint8]:
     """`registers` of at most one byte, in one byte."""
-    length = sum(stop - first for first, stop in spans)
+    length = _count_bytes(spans)
     if not length:
         return np.full(len(rows), start, np.uint8)
     left = words(rows, spans=spans, zeros_first=True)

@@ -477,9 +477,10 @@ def backend(name: str) -> str:
 def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
     """Return all frames of a whole input.
 
-    Bytes are decoded as a stream, an iterable or (n, size) array as datagrams.
+    Args:
+        data: bytes for a decoder of a stream, else an iterable or (n, size) array of datagrams.
     """
-    if is_stream(data):
+    if decoder.stream:
         return decoder.frames(data) + decoder.rest()
     packets: Any = (
         np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)

@@ -149,6 +149,11 @@ class SensorDescription:
         """The names of the incoming frame types with IMU measurements."""
         return tuple(name for name, frame in self.incoming.items() if frame.imu is not None)
 
+    @cached_property
+    def info_frames(self) -> tuple[str, ...]:
+        """The names of the frame types with information about the device (`info`)."""
+        return tuple(dict.fromkeys(path.partition(".")[0] for path in self.info.values()))
+
     def points_of(self, frame: str) -> Callable[[Any], Points]:
         """Return the `points` function of a frame type: its own, or for data the sensor's.
 
@@ -267,8 +272,7 @@ def _check_sensor(sensor: SensorDescription) -> None:
         _check_names(sensor, "simulation.answers", sensor.simulation.answers, sensor.commands)
     _check_names(sensor, "state", sensor.state, sensor.frames)
     _check_clock(sensor)
-    info_frames = [path.partition(".")[0] for path in sensor.info.values()]
-    _check_names(sensor, "info", info_frames, sensor.frames)
+    _check_names(sensor, "info", sensor.info_frames, sensor.frames)
     _check_names(sensor, "on_open, on_close", sensor.on_open, sensor.commands)
     _check_names(sensor, "on_open, on_close", sensor.on_close, sensor.commands)
     if sensor.points is None and any(
