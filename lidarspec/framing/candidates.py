@@ -9,6 +9,9 @@ active.
 
 Weak types (`confirm` > 1) are checked in the same way, but only the first frame of a run is a live
 candidate (`weak_frames`).
+
+A candidate whose constants have not all arrived waits for them without a check, unless its type is
+weak: such candidates are near the end of the piece alone, but may be of many types.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
+from lidarspec.frames.arrays import repeated
 from lidarspec.frames.layout import Marks, Sums, words
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
@@ -29,6 +33,11 @@ from lidarspec.framing.weak_frames import Runs, find_runs
 #: candidates of one type in a piece; if there are more, the piece is made shorter, so that memory
 #: stays small.
 MAX_CANDIDATES = 1 << 15
+#: constants of a type that are compared at every offset; types with the same ones share the result.
+#: Two exclude nearly all offsets.
+SHARED_MARKS = 2
+#: types that are sorted together, the bits of a number.
+MAX_TYPES = 64
 
 Bytes1D = NDArray[np.uint8]
 Offsets = NDArray[np.intp]
@@ -114,6 +123,7 @@ class Framing:
         self._weak = {kind for kind, codec in enumerate(self.codecs) if codec.frame.confirm > 1}
         self.has_weak_types = bool(self._weak)
         self._active: dict[str | None, list[int]] = {}
+        self._filters: dict[tuple[int, ...], ConstantFilter] = {}
 
     def active(self, mode: SearchState) -> list[int]:
         """Return the types that are looked for now, in order."""
@@ -126,6 +136,13 @@ class Framing:
             ]
             self._active[mode.after] = active
         return active
+
+    def filter(self, kinds: Sequence[int]) -> ConstantFilter:
+        """Return the filter by the constants of some types behind the first two of each."""
+        key = tuple(kinds)
+        if key not in self._filters:
+            self._filters[key] = ConstantFilter([self.marks[kind][SHARED_MARKS:] for kind in key])
+        return self._filters[key]
 
     def is_weak(self, kind: int) -> bool:
         """Return whether frames of a type are accepted only in runs."""
@@ -161,54 +178,63 @@ class Framing:
 
 
 def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
-    """Return the ascending offsets at which no available byte differs from the constants.
+    """Return the ascending offsets at which no available byte differs from up to two constants.
 
     A constant behind the end of the buffer counts as matching.
     """
-    if not constants:
-        return np.arange(len(buffer))
-    length = len(buffer)
-    (first, _, _), *rest = constants
-    match = _right(buffer, *constants[0])
-    # Two constants already exclude nearly all offsets, so only these are compared on whole arrays.
-    for spot, mask, value in rest[:1]:
-        inside = min(len(match), max(length - spot, 0))
-        match[:inside] &= _right(buffer, spot, mask, value)[:inside]
-    offsets = filter_by_constants(buffer, np.flatnonzero(match), tuple(rest[1:]))
-    if first:
-        offsets = np.concatenate(
-            [
-                offsets,
-                filter_by_constants(buffer, np.arange(max(length - first, 0), length), tuple(rest)),
-            ]
-        )
-    return offsets
-
-
-def _right(buffer: Bytes1D, spot: int, mask: int, value: int) -> NDArray[np.bool_]:
-    """Return whether a constant is right at each offset at which its byte has arrived."""
-    values = buffer[spot:]
-    if mask != 0xFF:
-        values = values & np.uint8(mask)
-    return np.asarray(values == np.uint8(value))
-
-
-def filter_by_constants(buffer: Bytes1D, offsets: Offsets, constants: Marks) -> Offsets:
-    """Return the offsets at which the constants match, as far as the bytes go.
-
-    The offsets are ascending.
-    """
+    match = np.ones(len(buffer), np.bool_)
     for spot, mask, value in constants:
-        if not len(offsets):
-            break
-        inside = int(offsets.searchsorted(len(buffer) - spot))
-        values = buffer.take(offsets[:inside] + spot)
+        values = buffer[spot:]
         if mask != 0xFF:
-            values &= np.uint8(mask)
-        kept = np.flatnonzero(values == value)
-        if len(kept) < inside:
-            offsets = np.concatenate([offsets[kept], offsets[inside:]])
-    return offsets
+            values = values & np.uint8(mask)
+        inside = match[: len(values)]
+        inside &= values == np.uint8(value)
+    return np.flatnonzero(match)
+
+
+class ConstantFilter:
+    """Sorts offsets by the constants of several types, all types at once.
+
+    A set of types is a number with one bit for each. A table for each offset in a frame has the set
+    of types that allow a byte there, by the byte.
+
+    Args:
+        constants: of each type, at most `MAX_TYPES`.
+    """
+
+    def __init__(self, constants: Sequence[Marks]) -> None:
+        self._all_types = np.uint64((1 << len(constants)) - 1)
+        self._tables: dict[int, NDArray[np.uint64]] = {}
+        for number, marks in enumerate(constants):
+            for spot, mask, value in marks:
+                table = self._tables.setdefault(spot, np.full(256, self._all_types))
+                table[np.arange(256) & mask != value] &= ~np.uint64(1 << number)
+
+    def sort(self, buffer: Bytes1D, offsets: Offsets) -> dict[int, Offsets]:
+        """Return the offsets at which the constants of each type match, by its number.
+
+        Constants behind the end of the buffer count as matching. Types without any are missing.
+
+        Args:
+            offsets: ascending.
+        """
+        if not self._tables:
+            everywhere = int(self._all_types)
+            return {number: offsets for number in range(everywhere.bit_length())}
+        types = np.full(len(offsets), self._all_types)
+        for spot, table in self._tables.items():
+            inside = int(offsets.searchsorted(len(buffer) - spot))
+            types[:inside] &= table[buffer[offsets[:inside] + spot]]
+        is_any = types != 0
+        if not is_any.all():
+            types = types[is_any]
+            offsets = offsets[is_any]
+        present = int(np.bitwise_or.reduce(types))
+        return {
+            number: offsets[(types & np.uint64(1 << number)) != 0]
+            for number in range(present.bit_length())
+            if present >> number & 1
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +277,7 @@ class Candidates:
             self.buffer = buffer[: max(MAX_CANDIDATES, framing.reach)]  # each offset is one
         self._offsets_by_prefix: dict[Marks, Offsets] = {}
         self.judged: dict[int, Frames] = {}
+        self._waiting: dict[int, list[int]] = {}
         self._known: set[int] = set()
         found = self._find(mode)
         limit = min(
@@ -280,14 +307,15 @@ class Candidates:
         self._judge(found)
         parts = list[Frames]()
         all_runs = dict[int, Runs]()
-        for kind in self._framing.active(mode):
+        active = self._framing.active(mode)
+        for kind in active:
             own = self.judged.get(kind)
             if own is None:
                 continue
             if self._framing.is_weak(kind):
                 runs = find_runs(
                     own,
-                    self._merge(parts),
+                    self._merge([*parts, *self._wait(active[: active.index(kind)])]),
                     confirm=self._framing.codecs[kind].frame.confirm,
                     is_single=self._framing.switches(kind, mode),
                     final=self.final,
@@ -295,7 +323,7 @@ class Candidates:
                 all_runs[kind] = runs
                 own = runs.heads
             parts.append(own)
-        frames = self._merge(parts)
+        frames = self._merge([*parts, *self._wait(active)])
         ends = frames.starts + frames.sizes
         for kind, runs in all_runs.items():
             is_own = frames.kinds == kind
@@ -307,18 +335,46 @@ class Candidates:
             return merged(parts, final=self.final)
         return Frames.none(self.buffer)
 
+    def _wait(self, kinds: Sequence[int]) -> list[Frames]:
+        """Return the candidates of some types whose constants have not all arrived.
+
+        There is at most one for each offset, that of the first type.
+        """
+        first_kinds: dict[int, int] = {}
+        for kind in reversed(kinds):
+            first_kinds |= dict.fromkeys(self._waiting.get(kind, ()), kind)
+        if not first_kinds:
+            return []
+        starts = np.array(sorted(first_kinds), np.intp)
+        number = len(starts)
+        return [
+            Frames(
+                self.buffer,
+                np.array([first_kinds[start] for start in starts.tolist()], np.intp),
+                starts,
+                repeated(0, number),
+                status=repeated(SHORT, number),
+            )
+        ]
+
     def _find(self, mode: SearchState) -> dict[int, Offsets]:
         """Return where the constants of types stand that have not been looked for before."""
-        found: dict[int, Offsets] = {}
+        groups: dict[Marks, list[int]] = {}
         for kind in self._framing.active(mode):
             if kind not in self._known:
-                marks = self._framing.marks[kind]
-                begin = marks[:2]  # the cache key: many types share their first two constants
-                if begin not in self._offsets_by_prefix:
-                    self._offsets_by_prefix[begin] = find_by_constants(self.buffer, begin)
-                found[kind] = filter_by_constants(
-                    self.buffer, self._offsets_by_prefix[begin], marks[2:]
-                )
+                groups.setdefault(self._framing.marks[kind][:SHARED_MARKS], []).append(kind)
+        found: dict[int, Offsets] = {}
+        for begin, kinds in groups.items():
+            if begin not in self._offsets_by_prefix:
+                self._offsets_by_prefix[begin] = find_by_constants(self.buffer, begin)
+            offsets = self._offsets_by_prefix[begin]
+            if not len(offsets):
+                found |= dict.fromkeys(kinds, offsets)
+                continue
+            for first in range(0, len(kinds), MAX_TYPES):
+                some = kinds[first : first + MAX_TYPES]
+                matching = self._framing.filter(some).sort(self.buffer, offsets)
+                found |= {kind: matching.get(index, offsets[:0]) for index, kind in enumerate(some)}
         return found
 
     def _judge(self, found: Mapping[int, Offsets]) -> None:
@@ -326,6 +382,13 @@ class Candidates:
         for kind, offsets in found.items():
             if not len(offsets):
                 continue
+            if not self.final and not self._framing.is_weak(kind):
+                last = len(self.buffer) - self._framing.ends[kind]
+                number = int(offsets.searchsorted(last, "right"))
+                self._waiting[kind] = offsets[number:].tolist()
+                offsets = offsets[:number]
+                if not number:
+                    continue
             own = self._framing.survey(kind, self.buffer, offsets)
             if not own.is_sound:
                 is_right = own.status != CONSTANT
@@ -346,7 +409,6 @@ def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
     live = Frames.joined([part for part in parts if len(part)] or parts[:1])
     if len(parts) == 1:
         return live
-    # A stable sort keeps the order of the types at equal offsets; the first of these is kept.
-    order = np.argsort(live.starts, kind="stable")
+    order = np.lexsort((live.kinds, live.starts))
     is_first = np.diff(live.starts[order], prepend=-1) > 0
     return live.only(order[is_first])

@@ -6,6 +6,7 @@ These are grouped by layout and judged in bulk, as binary frames are.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -37,6 +38,7 @@ class TextCodec(Codec):
         self.size = None
         self.prefix = {offset: (0xFF, byte) for offset, byte in coder.prefix.items()}
         self.marks = marks(self.prefix)
+        self._prefix_size = max(self.prefix, default=-1) + 1
 
     @property
     def _checked_constants(self) -> Mapping[int, tuple[int, int]]:
@@ -52,22 +54,21 @@ class TextCodec(Codec):
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        status = np.full(len(offsets), LENGTH, np.uint8)
-        sizes = np.zeros(len(offsets), np.intp)
+        if stops is None:
+            stops = np.full(len(offsets), len(buffer))
+        stops = np.minimum(offsets + self.frame.max_length, stops)
+        sizes = self._coder.form.find_ends(buffer, offsets, stops)
+        number_needed = np.where(sizes == NO_END, self.frame.max_length, self._prefix_size)
+        status = np.where(offsets + number_needed > stops, SHORT, LENGTH).astype(np.uint8)
+        which = np.flatnonzero((sizes > 0) & (status != SHORT))
+        sizes[(sizes < 0) | (status == SHORT)] = 0
         errors = list[PluginError]()
         structs = dict[int, bytes]()
-        limits = offsets + self.frame.max_length
-        ends = np.minimum(limits, len(buffer) if stops is None else stops)
-        for index, (offset, end) in enumerate(zip(offsets.tolist(), ends.tolist(), strict=True)):
-            data = buffer[offset:end].tobytes()
-            try:
-                status[index], sizes[index], struct = self._decode(data, errors)
-            except SpecError:
-                raise
-            except Exception as error:
-                errors.append(PluginError.of(error, "struct"))
-                status[index] = PLUGIN
-                continue
+        decode = functools.cache(functools.partial(self._decode, errors=errors))
+        for index in which.tolist():
+            start = offsets.item(index)
+            data = buffer[start : start + sizes.item(index)].tobytes()
+            status[index], struct = decode(data)
             if struct is not None:
                 structs[index] = struct
         which = np.array(list(structs), np.intp)
@@ -87,31 +88,27 @@ class TextCodec(Codec):
         kinds = repeated(kind, len(offsets))
         return Frames(buffer, kinds, offsets, sizes, status=status, errors=tuple(errors))
 
-    def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, int, bytes | None]:
-        """Return the status, the size and the struct of a candidate.
+    def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
+        """Return the status and the struct of a candidate that ends where the form says.
 
         If there is a struct, it has to be judged; its status replaces the one returned.
-
-        Args:
-            data: the bytes from the candidate on, at most as many as the longest frame has.
         """
-        if len(data) <= max(self.prefix, default=-1):
-            return SHORT, 0, None  # it may be no candidate at all
-        size = self._coder.form.find_end(data)
-        if size == NO_END and len(data) < self.frame.max_length:
-            return SHORT, 0, None
-        if size <= 0:
-            return LENGTH, 0, None
-        decoded = self._coder.decode_whole(data[:size])
-        if decoded.problem is None:
-            return LENGTH, size, decoded.struct
-        if decoded.problem.is_checksum:
-            return CHECKSUM, size, None
-        refusal = self._coder.refusal(decoded.struct)
+        try:
+            decoded = self._coder.decode_whole(data)
+            if decoded.problem is None:
+                return LENGTH, decoded.struct
+            if decoded.problem.is_checksum:
+                return CHECKSUM, None
+            refusal = self._coder.refusal(decoded.struct)
+        except SpecError:
+            raise
+        except Exception as error:
+            errors.append(PluginError.of(error, "struct"))
+            return PLUGIN, None
         if refusal is not None and refusal.error is not None:
             errors.append(refusal.error)
-            return PLUGIN, size, None
-        return LENGTH, size, None
+            return PLUGIN, None
+        return LENGTH, None
 
     def _group(
         self, structs: Sequence[bytes]

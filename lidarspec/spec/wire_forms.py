@@ -205,6 +205,16 @@ class WireForm(Protocol):
         among these bytes, and `NO_FRAME` if no frame begins here, whatever follows.
         """
 
+    def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
+        """Return the size of the frame at each of many offsets, `NO_END` or `NO_FRAME`, (n,).
+
+        This is `find_end` in bulk, and may be `NO_FRAME` for bytes with an end, too.
+
+        Args:
+            offsets: ascending.
+            stops: where the bytes of each end that may belong to it.
+        """
+
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
         """Decode one frame, or what there is of it; see `decode_runs`."""
 
@@ -254,6 +264,11 @@ def decode_runs(reader: RunReader, next_runs: NextRuns, size: int | None) -> Dec
         return Decoded(struct, spans, size - 1)
     end = position if size is None else min(position, size - 1)
     return Decoded(struct, spans, end, Problem(position))
+
+
+def next_places(places: Offsets, offsets: Offsets, none: int) -> Offsets:
+    """Return the first of some ascending places at or behind each offset, or `none`, (n,)."""
+    return np.append(places, none)[places.searchsorted(offsets)]
 
 
 @lru_cache(maxsize=64)
@@ -323,6 +338,14 @@ class Tokens:
         if end > 0:
             return end + 1
         return NO_END
+
+    def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
+        none = len(buffer)
+        ends = next_places(np.flatnonzero(buffer == self.end[0]), offsets + 1, none)
+        starts = next_places(np.flatnonzero(buffer == self.start[0]), offsets + 1, none)
+        sizes = np.where(ends < stops, ends + 1 - offsets, NO_END)
+        sizes[starts < np.minimum(ends, stops)] = NO_FRAME
+        return sizes
 
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
         size = len(data) if data.endswith(self.end) else None
@@ -694,6 +717,43 @@ class Lines:
             return end + 2
         return NO_END
 
+    def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
+        """Return the sizes of frames, and `NO_FRAME` where a line has another length."""
+        newlines = np.flatnonzero(buffer == NEWLINE)
+        steps = np.diff(newlines, prepend=0)
+        ends = next_places(newlines[:-1][steps[1:] == 1], offsets, len(buffer))
+        has_end = ends + 2 <= stops
+        # The newlines that end the first and the last line of which all bytes have arrived.
+        first = newlines.searchsorted(offsets)
+        last = newlines.searchsorted(np.where(has_end, ends + 1, stops)) - 1
+        is_frame = np.ones(len(offsets), np.bool_)
+        places = np.append(newlines, [len(buffer)] * (len(self.head) + 1))
+        for number, place in enumerate(self._head_ends):
+            is_missing = first + number > last
+            is_frame &= np.where(
+                is_missing,
+                has_end | (offsets + place >= stops),
+                places[first + number] == offsets + place,
+            )
+        # All lines behind the head have one length, but for the last one, which may be shorter.
+        length = self.width + (self.check is not None) + 1
+        right_before = np.append(0, np.cumsum(steps == length))
+        begin = first + max(len(self.head), 1)
+        body = np.flatnonzero(last >= begin)
+        begin = begin[body]
+        last = last[body]
+        number_right = right_before[last] - right_before[begin]
+        is_frame[body] &= (number_right == last - begin) & (steps[last] <= length)
+        sizes = np.where(has_end, ends + 2 - offsets, NO_END)
+        sizes[~is_frame] = NO_FRAME
+        return sizes
+
+    @cached_property
+    def _head_ends(self) -> Sequence[int]:
+        """The offset of the end of each line of the head in a frame."""
+        lengths = [size + self._has_check(number) + 1 for number, size in enumerate(self.head)]
+        return [end - 1 for end in itertools.accumulate(lengths)]
+
     def _has_check(self, number: int) -> bool:
         return self.check is not None and number >= self.bare
 
@@ -824,6 +884,12 @@ class Escaped:
         if end > 0:
             return end + 1
         return NO_END
+
+    def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
+        ends = next_places(np.flatnonzero(buffer == self.flag), offsets + 1, len(buffer))
+        sizes = np.where(ends < stops, ends + 1 - offsets, NO_END)
+        sizes[(ends == offsets + 1) & (ends < stops)] = NO_FRAME
+        return sizes
 
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
         end = data.find(self.flag, 1)
