@@ -219,8 +219,7 @@ class ConstantFilter:
             offsets: ascending.
         """
         if not self._tables:
-            everywhere = int(self._all_types)
-            return {number: offsets for number in range(everywhere.bit_length())}
+            return dict.fromkeys(range(int(self._all_types).bit_length()), offsets)
         types = np.full(len(offsets), self._all_types)
         for spot, table in self._tables.items():
             inside = int(offsets.searchsorted(len(buffer) - spot))
@@ -380,20 +379,22 @@ class Candidates:
     def _judge(self, found: Mapping[int, Offsets]) -> None:
         self._known |= found.keys()
         for kind, offsets in found.items():
-            if not len(offsets):
+            number = self._count_arrived(kind, offsets)
+            self._waiting[kind] = offsets[number:].tolist()
+            if not number:
                 continue
-            if not self.final and not self._framing.is_weak(kind):
-                last = len(self.buffer) - self._framing.ends[kind]
-                number = int(offsets.searchsorted(last, "right"))
-                self._waiting[kind] = offsets[number:].tolist()
-                offsets = offsets[:number]
-                if not number:
-                    continue
-            own = self._framing.survey(kind, self.buffer, offsets)
+            own = self._framing.survey(kind, self.buffer, offsets[:number])
             if not own.is_sound:
                 is_right = own.status != CONSTANT
                 own = own if is_right.all() else own.only(is_right)
             self.judged[kind] = own
+
+    def _count_arrived(self, kind: int, offsets: Offsets) -> int:
+        """Return how many candidates of a type, from the first on, are judged now."""
+        if not len(offsets) or self.final or self._framing.is_weak(kind):
+            return len(offsets)
+        last = len(self.buffer) - self._framing.ends[kind]
+        return int(offsets.searchsorted(last, "right"))
 
 
 def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:

@@ -2,12 +2,16 @@
 
 Such a struct has a part whose place no formula of header fields gives. `lidarspec show` names the
 part and the reason.
+
+If this part is a text up to a terminator, the terminators of all candidates are found at once. A
+candidate without one in reach, or with another constant behind it, never gets to construct.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 
 import construct
 import numpy as np
@@ -29,8 +33,89 @@ from lidarspec.framing.results import (
     VALID,
     Frames,
 )
+from lidarspec.spec import tree
 from lidarspec.spec.description import Frame
 from lidarspec.spec.syntax import Mismatch
+from lidarspec.spec.wire_forms import next_places
+
+
+@dataclass(frozen=True)
+class _Text:
+    """The first text up to a terminator in a struct.
+
+    Attributes:
+        begin: its offset in a frame.
+        terminator: the byte that ends it.
+        following: the constant bytes that are the first to be checked behind it, by their offset
+            from the terminator.
+    """
+
+    begin: int
+    terminator: int
+    following: Mapping[int, int]
+
+    def judge(
+        self, buffer: NDArray[np.uint8], offsets: NDArray[np.intp], ends: NDArray[np.intp]
+    ) -> NDArray[np.uint8]:
+        """Return `SHORT` for candidates without a terminator, `CONSTANT` for those with another
+        constant behind it, and `VALID` for the others, (n,).
+
+        Args:
+            ends: where the bytes of each end.
+        """
+        terminators = np.flatnonzero(buffer == self.terminator)
+        places = next_places(terminators, offsets + self.begin, len(buffer))
+        status = np.where(places < ends, VALID, SHORT).astype(np.uint8)
+        for distance, byte in self.following.items():
+            has_byte = np.flatnonzero(places + distance < ends)
+            is_wrong = buffer[places[has_byte] + distance] != byte
+            status[has_byte[is_wrong]] = CONSTANT
+        return status
+
+
+def _find_text(root: tree.Node) -> _Text | None:
+    """Return the text with which the computable places of a struct end; None if another part is
+    checked before its terminator can be.
+    """
+    begin = 0
+    terminator = b""
+    distance = 1
+    following = dict[int, int]()
+    for node in _fields(root):
+        if isinstance(node, tree.Opaque) and node.terminator and not terminator:
+            terminator = node.terminator
+            begin = distance - 1
+            distance = 1
+            following.clear()
+            continue
+        if isinstance(node, tree.Blob) and isinstance(node.size, int):
+            size = node.size
+            following |= {distance + index: byte for index, byte in enumerate(node.const or b"")}
+        elif isinstance(node, tree.Number) and _is_free(node.info):
+            size = node.size
+        else:
+            break
+        distance += size
+    if not terminator:
+        return None
+    return _Text(begin, terminator[0], following)
+
+
+def _fields(node: tree.Node) -> Iterator[tree.Node]:
+    """Yield the fields of a struct in order, and a node with a checksum behind its fields."""
+    if isinstance(node, tree.Struct):
+        for member in node.members:
+            yield from _fields(member)
+    elif isinstance(node, tree.Sealed):
+        yield from _fields(node.body)
+        yield node
+    else:
+        yield node
+
+
+def _is_free(info: tree.FieldInfo) -> bool:
+    """Return whether a number may have any value."""
+    return info.const is None and info.allowed is None and not info.held
 
 
 class PlainCodec(Codec):
@@ -44,6 +129,7 @@ class PlainCodec(Codec):
     def __init__(self, frame: Frame, reason: str = "") -> None:
         super().__init__(frame)
         self.reason = reason
+        self._text = _find_text(frame.tree)
 
     def survey(
         self,
@@ -55,15 +141,16 @@ class PlainCodec(Codec):
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        status = np.zeros(len(offsets), np.uint8)
+        ends = np.minimum(offsets + self.frame.room, len(buffer) if stops is None else stops)
+        status = np.full(len(offsets), VALID, np.uint8)
+        if self._text is not None:
+            status = self._text.judge(buffer, offsets, ends)
+            is_whole = ends - offsets >= self.frame.room
+            status[is_whole & (status == SHORT)] = LENGTH
         sizes = np.zeros(len(offsets), np.intp)
         errors: list[PluginError] = []
-        if stops is None:
-            ends = offsets + self.frame.room
-        else:
-            ends = np.minimum(offsets + self.frame.room, stops)
-        for index, (offset, end) in enumerate(zip(offsets.tolist(), ends.tolist(), strict=True)):
-            data = buffer[offset:end].tobytes()
+        for index in np.flatnonzero(status == VALID).tolist():
+            data = buffer[offsets[index] : ends[index]].tobytes()
             status[index], sizes[index] = self._judge(data, errors)
         return Frames(
             buffer,

@@ -730,6 +730,7 @@ class Opaque:
         size: in bytes; None if it depends on the bytes themselves.
         form: how a field is stored: "text up to" its terminator, else its kind.
         in_bits: True for a bit block.
+        terminator: the byte that ends any bytes; b"" if the part is not read as such.
     """
 
     name: str
@@ -740,6 +741,7 @@ class Opaque:
     size: Formula | None = None
     form: str = ""
     in_bits: bool = False
+    terminator: bytes = b""
 
 
 Node = (

@@ -577,6 +577,7 @@ class _Builder:
                 _INSTEAD.get(kind, f"{kind} has no fixed place"),
                 size=size,
                 form=_form(con),
+                terminator=_terminator(con),
             )
         if not name and info.const is not None and not isinstance(node, tree.Opaque):
             return tree.Blob("", info, con.length, con.build(info.const))
@@ -789,6 +790,18 @@ def _form(con: Construct) -> str:
             return f"text up to {str(below.term)[1:]}"
         below = below.subcon
     return type(con).__name__
+
+
+def _terminator(con: Construct) -> bytes:
+    """The byte that always stands behind a field of any bytes; b"" if there is none."""
+    is_ended = (
+        isinstance(con, construct.NullTerminated)
+        and con.subcon is construct.GreedyBytes
+        and len(con.term) == 1
+        and con.consume
+        and con.require
+    )
+    return con.term if is_ended else b""
 
 
 def _constant(con: Const) -> Any:

@@ -296,6 +296,23 @@ class CountedBytes(Bytes):  # type: ignore[misc]
         return construct.stream_read(stream, length, path)
 
 
+class SoughtTerminator(construct.NullTerminated):  # type: ignore[misc]
+    """A NullTerminated that searches for its terminator, and does not read byte by byte."""
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        if len(self.term) != 1 or not self.require or not isinstance(stream, io.BytesIO):
+            return super()._parse(stream, context, path)
+        start = stream.tell()
+        end = stream.getvalue().find(self.term, start)
+        if end < 0:
+            stream.seek(0, io.SEEK_END)
+            return super()._parse(stream, context, path)  # raises, since nothing follows
+        data = stream.read(end + self.include - start)
+        stream.seek(end + self.consume)
+        within = construct.core.BytesIOWithOffsets(data, stream, start)
+        return self.subcon._parsereport(within, context, path)
+
+
 class ExactFloat(FormatField):  # type: ignore[misc]
     """A float field that keeps the bits of a NaN.
 

@@ -47,6 +47,7 @@ from lidarspec.spec.syntax.replacements import (
     Pieces,
     Sealing,
     Sizing,
+    SoughtTerminator,
     check_bound,
 )
 
@@ -63,6 +64,7 @@ _REPLACEMENTS: dict[type, type] = {
     Const: CheckedConst,
     construct.Enum: NamedEnum,
     construct.GreedyRange: FullRange,
+    construct.NullTerminated: SoughtTerminator,
 }
 
 #: attributes of constructs that hold others; "cases" does by key.
