@@ -487,12 +487,25 @@ class Expression:
         """What it comes to, element by element, by the raw values of its fields; one that is left
         out is nan.
         """
-        with np.errstate(all="ignore"):
-            columns = {
-                info.path: info.physical(np.asarray(raw.get(info.path, np.nan), np.float64))
-                for info in self.fields
-            }
-            return np.asarray(compute(self.node, {}, lambda node: columns.get(node.path)))
+        (values,) = values_of([self], raw)
+        return values
+
+
+def values_of(
+    expressions: Sequence[Expression], raw: Mapping[str, NDArray[Any]]
+) -> list[NDArray[Any]]:
+    """What expressions come to, as `Expression.values`; what they share is computed once."""
+    infos = {info.path: info for expression in expressions for info in expression.fields}
+    known = dict[Node, Any]()
+    with np.errstate(all="ignore"):
+        columns = {
+            path: info.physical(np.asarray(raw.get(path, np.nan), np.float64))
+            for path, info in infos.items()
+        }
+        return [
+            np.asarray(compute(expression.node, known, lambda node: columns.get(node.path)))
+            for expression in expressions
+        ]
 
 
 #: values of a term that are remembered.

@@ -726,6 +726,9 @@ class _Places:
         self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
         """Which candidates have a wrong constant, as far as their bytes go, (n,)."""
+        if len(which) == 1:  # each random header has constants of its own
+            data = self.longest(which)
+            return np.array([_is_refuted(constants, data)])
         offsets = self._offsets[which]
         stops = len(self._buffer) if self.stops is None else self.stops[which]
         wrong = np.zeros(len(which), np.bool_)
@@ -733,6 +736,13 @@ class _Places:
             there = offsets + spot < stops
             wrong[there] |= self._buffer[offsets[there] + spot] & mask != value
         return wrong
+
+
+def _is_refuted(constants: Mapping[int, tuple[int, int]], data: bytes | memoryview) -> bool:
+    """Return whether a constant is wrong, as far as the bytes go."""
+    return any(
+        spot < len(data) and data[spot] & mask != value for spot, (mask, value) in constants.items()
+    )
 
 
 class HeaderTree:

@@ -22,7 +22,14 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
 from lidarspec.expressions.columns import Batch, Fields
-from lidarspec.expressions.graph import Expression, Traced, conjuncts, sample_of, trace
+from lidarspec.expressions.graph import (
+    Expression,
+    Traced,
+    conjuncts,
+    sample_of,
+    trace,
+    values_of,
+)
 from lidarspec.frames.arrays import taken
 from lidarspec.frames.frame_table import Group, Rows, Table
 from lidarspec.frames.layout import (
@@ -43,6 +50,7 @@ from lidarspec.frames.parts import Region
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.results import CHECKSUM, CONSTANT, IMPLAUSIBLE, LENGTH, PLUGIN, VALID
 from lidarspec.spec.description import Frame
+from lidarspec.spec.tree import FieldInfo
 
 #: values of a few bits that are compared one by one.
 ALLOWED = 2
@@ -107,6 +115,8 @@ class Judge:
         _parts_among(self._layout, status, rows, errors, sums)
         for seal in self._layout.seals:
             _among(status, rows, functools.partial(intactness, seal, errors, sums))
+        if np.count_nonzero(status) == len(status):
+            return status
         self._check(status, rows, self._met)
         if self._checks is not None:
             self._check(status, rows, self._checks)
@@ -261,7 +271,19 @@ class Conditions:
         ):
             # a test on no elements holds, and what is combined with it is a test on none either
             return []
-        return [self._check(part, own) for part, own in zip(self._parts, leaves, strict=True)]
+        checks = list[Check]()
+        together = list[Expression]()
+        for part, own in zip(self._parts, leaves, strict=True):
+            check = self._check(part, own)
+            if isinstance(check, Lookup) or part.fields[0].axes:
+                checks.append(check)
+            else:
+                together.append(part)
+        if together:
+            every = AllOf(tuple(together))
+            own = {path: leaf for part in leaves for path, leaf in part.items()}
+            checks.append(functools.partial(holding, every, own))
+        return checks
 
     def _check(self, part: Test, leaves: Mapping[str, Leaf]) -> Check:
         places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
@@ -286,6 +308,23 @@ class Conditions:
             self._tables[key] = _table(part, single, last - first)
         shape, strides = places.pop() if places else ((), ())
         return Lookup(self._tables[key], first, shape, strides)
+
+
+@dataclass(frozen=True, eq=False)
+class AllOf:
+    """Conditions on fields outside of arrays, which share what they have in common."""
+
+    parts: tuple[Expression, ...]
+
+    @functools.cached_property
+    def fields(self) -> tuple[FieldInfo, ...]:
+        """The fields that the conditions are made of, each once."""
+        every = {info.path: info for part in self.parts for info in part.fields}
+        return tuple(every.values())
+
+    def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+        """Return whether all conditions hold, frame by frame; see `Expression.values`."""
+        return functools.reduce(np.bitwise_and, values_of(self.parts, raw))
 
 
 @dataclass(frozen=True, eq=False)
