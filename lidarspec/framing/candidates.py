@@ -406,8 +406,14 @@ def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
     parts = list[Frames]()
     for own in candidates:
         is_live = own.status <= worst
-        parts.append(own if own.is_sound or bool(is_live.all()) else own.only(is_live))
-    live = Frames.joined([part for part in parts if len(part)] or parts[:1])
+        number = np.count_nonzero(is_live)
+        if number == len(own):
+            parts.append(own)
+        elif number:
+            parts.append(own.only(is_live))
+    if not parts:
+        return Frames.none(candidates[0].buffer)
+    live = Frames.joined(parts)
     if len(parts) == 1:
         return live
     order = np.lexsort((live.kinds, live.starts))

@@ -22,6 +22,9 @@ from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Fr
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import NO_END
 
+#: Candidates of a piece that are remembered with their structs.
+MAX_REMEMBERED = 64
+
 
 class TextCodec(Codec):
     """A frame type with a wire form, whose structs are judged by their layouts.
@@ -60,33 +63,46 @@ class TextCodec(Codec):
         sizes = self._coder.form.find_ends(buffer, offsets, stops)
         number_needed = np.where(sizes == NO_END, self.frame.max_length, self._prefix_size)
         status = np.where(offsets + number_needed > stops, SHORT, LENGTH).astype(np.uint8)
-        which = np.flatnonzero((sizes > 0) & (status != SHORT))
-        sizes[(sizes < 0) | (status == SHORT)] = 0
+        is_complete = (sizes > 0) & (status != SHORT)
+        sizes[~is_complete] = 0
+        frames = Frames(buffer, repeated(kind, len(offsets)), offsets, sizes, status=status)
+        self._found = {}
+        if is_complete.any():
+            self._judge_whole(frames, np.flatnonzero(is_complete).tolist(), status, sums)
+        return frames
+
+    def _judge_whole(
+        self, frames: Frames, which: Sequence[int], status: NDArray[np.uint8], sums: Sums | None
+    ) -> None:
+        """Judge candidates that end where the form says; those alike are decoded once.
+
+        Args:
+            frames: all candidates; failures of the plugin are added to it.
+            which: indices of those to be judged.
+            status: of all candidates, changed here.
+        """
         errors = list[PluginError]()
+        decode = functools.lru_cache(MAX_REMEMBERED)(functools.partial(self._decode, errors=errors))
         structs = dict[int, bytes]()
-        decode = functools.cache(functools.partial(self._decode, errors=errors))
-        for index in which.tolist():
-            start = offsets.item(index)
-            data = buffer[start : start + sizes.item(index)].tobytes()
-            status[index], struct = decode(data)
+        for index in which:
+            status[index], struct = decode(frames.data(index))
             if struct is not None:
                 structs[index] = struct
-        which = np.array(list(structs), np.intp)
+        owners = np.array(list(structs), np.intp)
         groups, refused = self._group(list(structs.values()))
         for group in groups:
             judge = self.judge(group.layout)
-            status[which[group.where]] = judge(group.rows, errors, sums)
+            status[owners[group.where]] = judge(group.rows, errors, sums)
         for refusal, where in refused:
             if refusal.error is not None:
                 errors.append(refusal.error)
-                status[which[where]] = PLUGIN
+                status[owners[where]] = PLUGIN
+        frames.errors = tuple(errors)
         self._found = {
-            buffer[offsets[index] : offsets[index] + sizes[index]].tobytes(): struct
+            frames.data(index): struct
             for index, struct in structs.items()
             if status[index] == VALID
         }
-        kinds = repeated(kind, len(offsets))
-        return Frames(buffer, kinds, offsets, sizes, status=status, errors=tuple(errors))
 
     def _decode(self, data: bytes, errors: list[PluginError]) -> tuple[int, bytes | None]:
         """Return the status and the struct of a candidate that ends where the form says.
