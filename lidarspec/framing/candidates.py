@@ -276,6 +276,7 @@ class Candidates:
             self.buffer = buffer[: max(MAX_CANDIDATES, framing.reach)]  # each offset is one
         self._offsets_by_prefix: dict[Marks, Offsets] = {}
         self.judged: dict[int, Frames] = {}
+        self._live: dict[int, Frames] = {}
         self._waiting: dict[int, list[int]] = {}
         self._known: set[int] = set()
         found = self._find(mode)
@@ -321,6 +322,10 @@ class Candidates:
                 )
                 all_runs[kind] = runs
                 own = runs.heads
+            elif kind in self._live:
+                own = self._live[kind]
+            else:
+                own = self._live[kind] = alive(own, final=self.final)
             parts.append(own)
         frames = self._merge([*parts, *self._wait(active)])
         ends = frames.starts + frames.sizes
@@ -331,7 +336,7 @@ class Candidates:
 
     def _merge(self, parts: Sequence[Frames]) -> Frames:
         if parts:
-            return merged(parts, final=self.final)
+            return merged(parts)
         return Frames.none(self.buffer)
 
     def _wait(self, kinds: Sequence[int]) -> list[Frames]:
@@ -397,20 +402,25 @@ class Candidates:
         return int(offsets.searchsorted(last, "right"))
 
 
-def merged(candidates: Sequence[Frames], *, final: bool) -> Frames:
-    """Return the candidates of several types, by offset, one for each offset.
+def alive(candidates: Frames, *, final: bool) -> Frames:
+    """Return the candidates that are valid or, if more bytes follow, incomplete."""
+    if candidates.is_sound:
+        return candidates
+    is_live = candidates.status <= (VALID if final else SHORT)
+    number = np.count_nonzero(is_live)
+    if number == len(candidates):
+        return candidates
+    if not number:
+        return Frames.none(candidates.buffer)
+    return candidates.only(is_live)
 
-    They are valid or incomplete. At the same offset, the type that comes first is kept.
+
+def merged(candidates: Sequence[Frames]) -> Frames:
+    """Return live candidates of several types by offset, one for each offset.
+
+    At the same offset, the type that comes first is kept.
     """
-    worst = VALID if final else SHORT
-    parts = list[Frames]()
-    for own in candidates:
-        is_live = own.status <= worst
-        number = np.count_nonzero(is_live)
-        if number == len(own):
-            parts.append(own)
-        elif number:
-            parts.append(own.only(is_live))
+    parts = [own for own in candidates if len(own)]
     if not parts:
         return Frames.none(candidates[0].buffer)
     live = Frames.joined(parts)
