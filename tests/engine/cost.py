@@ -14,6 +14,8 @@ from lidarspec.framing.results import Frames
 
 #: Function calls for each byte of a stream. Compiled frames need up to 16.
 MAX_CALLS_PER_BYTE = 100
+#: Function calls for each byte of headers without a frame, which are rejected in bulk.
+MAX_REJECTING_CALLS_PER_BYTE = 8
 #: Bytes of memory for each byte of a stream that its frames are kept in.
 MAX_KEPT_PER_BYTE = 64
 

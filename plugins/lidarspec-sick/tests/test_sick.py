@@ -52,6 +52,20 @@ def test_every_scan_of_a_tim871s_is_read() -> None:
     assert named == {"sick-tim561", "sick-tim571", "sick-tim781", "sick-tim781s", "sick-tim871s"}
 
 
+def test_headers_are_counted_alike_however_the_stream_is_cut() -> None:
+    source = np.random.default_rng(1)
+    data = b"".join(b"\x02\x02\x02\x02" + source.bytes(4) + b"sAN LMCstopmeas " for _ in range(40))
+    counted = list[ls.Counters]()
+    for size in (len(data), 333, 1):
+        decoder = LMS511.decoder()
+        for start in range(0, len(data), size):
+            decoder.feed(data[start : start + size])
+        decoder.finish()
+        counted.append(decoder.stats)
+    assert counted[0].bad_length > 0
+    assert counted[1:] == counted[:1] * 2
+
+
 def test_a_telegram_in_text_is_read_and_built_again() -> None:
     data = vector_bytes("vectors_serial2d.json", "sick_tim_sra")
     cloud = decoded(TIM551, data).points()
