@@ -182,13 +182,21 @@ def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
 
     A constant behind the end of the buffer counts as matching.
     """
-    match = np.ones(len(buffer), np.bool_)
+    match: NDArray[np.bool_] | None = None
     for spot, mask, value in constants:
         values = buffer[spot:]
         if mask != 0xFF:
             values = values & np.uint8(mask)
-        inside = match[: len(values)]
-        inside &= values == np.uint8(value)
+        is_right = values == np.uint8(value)
+        if match is None and spot == 0:
+            match = is_right
+            continue
+        if match is None:
+            match = np.ones(len(buffer), np.bool_)
+        inside = match[: len(is_right)]
+        inside &= is_right
+    if match is None:
+        return np.arange(len(buffer))
     return np.flatnonzero(match)
 
 
