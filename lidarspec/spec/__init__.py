@@ -1,25 +1,25 @@
-"""What a sensor is: the names of those who write one.
+"""The vocabulary of sensor plugins: everything needed to describe a sensor.
 
     from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled,
     Sensor, Serial, Simulation, hookimpl, spread
 
-A plugin imports from here and from `lidarspec` alone. In: the facts of a manual. Out: a `Sensor`,
-which is checked when it is made; every other package is a set of functions of its description.
-Nothing in this package reads bytes of a stream. Modules in reading order:
+A plugin imports from here and from `lidarspec` alone. Input: the facts of a manual. Output: a
+`Sensor`, which is checked when it is made. All other packages are functions of its description.
+Nothing in this package reads a stream. Modules in reading order:
 
 * `description`: `Frame`, `Command`, `Simulation`, `Relative`.
-* `sensor`: `SensorDescription`, which puts all of these together; `Sensor`, in
+* `sensor`: `SensorDescription`, which combines all of these; `Sensor`, in
   `lidarspec.sensor_operations`, is a description with the engines as methods.
 * `options`: the values that options of `configure` take, from their annotations.
-* `arguments`: arguments of commands, and values that are filled in when a command is sent.
-* `fields`: units and seals, as parts of a struct.
-* `checksums`: algorithms as values; of one message.
-* `wire_forms`: frames whose fields have no fixed places on the wire: tokens, lines, escapes.
-* `links`: how a sensor is connected.
+* `arguments`: arguments of commands, and values filled in when a command is sent.
+* `fields`: units, checksums and parts, as members of a struct.
+* `checksums`: checksum algorithms as values, for one message at a time.
+* `wire_forms`: frames without fixed field offsets: tokens, lines, escapes.
+* `links`: the connections of a sensor.
 * `timing`: clocks and dates, counters, ends of scans.
-* `results`, `vocabulary`: what a `points` function returns, and what it is written with.
-* `tree`: a frame type as nodes, which all others walk.
-* `syntax`, `bits`: from construct to the tree; the bits of bit blocks, found by probing.
+* `results`, `vocabulary`: the return values of `points` functions, and functions for them.
+* `tree`: a frame type as a tree of nodes.
+* `syntax`, `bits`: from construct to the tree; the layout of bit blocks, found by probing.
 """
 
 from __future__ import annotations

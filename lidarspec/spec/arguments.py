@@ -1,9 +1,8 @@
-"""What a command is told: the kinds of its arguments, and the values that are found out when it is
-sent.
+"""Arguments of commands, and values that are filled in when a command is sent.
 
-An argument is a number in a range, a text, an address or bytes; each kind says in words what it
-takes, and as which bytes that stands in the frame. `Count` and `Address` among the `values` of a
-command are filled in by the conversation: a running number, and where we are.
+An argument is a number in a range, a text, an address or bytes. Each kind describes the values that
+it accepts and packs them into the bytes of the frame. `Count` and `Address` among the `values` of a
+command are filled in when it is sent: with a running number, and with this computer's address.
 """
 
 from __future__ import annotations
@@ -16,8 +15,9 @@ from lidarspec.errors import SpecError
 
 @dataclass(frozen=True)
 class Range:
-    """A number from `low` to `high`, in the unit of its field; written as two numbers behind the
-    path.
+    """A number from `low` to `high`, in the unit of its field.
+
+    A plugin writes it as two numbers after the path.
     """
 
     low: float
@@ -26,11 +26,12 @@ class Range:
 
 @dataclass(frozen=True)
 class Text:
-    """A text of at most `size` bytes; where its field has a fixed size, it is filled up with
-    `fill`.
+    """A text of at most `size` bytes.
+
+    If its field has a fixed size, it is filled up with `fill`.
 
     Raises:
-        SpecError: for a size below 1, and a fill that is not one byte.
+        SpecError: for a size below 1, or a fill that is not one byte.
     """
 
     size: int
@@ -44,13 +45,17 @@ class Text:
             )
 
     def words(self, room: int | None) -> str:
-        """What it takes."""
+        """Return the accepted values as text, for messages."""
         return (
             f"a text of up to {min(self.size, room or self.size)} bytes in {self.encoding.upper()}"
         )
 
     def pack(self, value: Any, room: int | None) -> bytes:
-        """The bytes of a text; ValueError for what it does not take."""
+        """Return the bytes of a text.
+
+        Raises:
+            ValueError: for a value that is not accepted.
+        """
         if isinstance(value, str):
             data = value.encode(self.encoding)
         else:
@@ -62,13 +67,14 @@ class Text:
 
 @dataclass(frozen=True)
 class Address:
-    """An IP address, "192.168.1.10": 4 bytes, an array of 4 numbers or one of 32 bits; 16 for IPv6.
+    """An IP address such as "192.168.1.10".
 
-    Among the `values` of a command it is this computer's own, as the sensor sees it.
+    Its field has 4 bytes, an array of 4 numbers or a number of 32 bits; 16 bytes for IPv6. Among
+    the `values` of a command it is this computer's own address, as the sensor sees it.
     """
 
     def words(self, room: int | None) -> str:
-        """What it takes."""
+        """Return the accepted values as text, for messages."""
         if room == 16:
             return "an IPv6 address"
         if room:
@@ -76,30 +82,38 @@ class Address:
         return "an IP address"
 
     def pack(self, value: Any, room: int | None) -> bytes:
-        """The bytes of an address; ValueError for what is none, or does not fit."""
-        from ipaddress import ip_address  # which takes longer to import than all else here
+        """Return the bytes of an address.
+
+        Raises:
+            ValueError: for a value that is not an address, or does not fit.
+        """
+        from ipaddress import ip_address  # a slow import
 
         if isinstance(value, str):
-            found = ip_address(value)
+            address = ip_address(value)
         else:
-            found = value
-        if not hasattr(found, "packed") or room not in (None, len(found.packed)):
+            address = value
+        if not hasattr(address, "packed") or room not in (None, len(address.packed)):
             raise ValueError
-        return bytes(found.packed)
+        return bytes(address.packed)
 
 
 @dataclass(frozen=True)
 class Octets:
-    """Bytes as they are; written as `bytes` behind the path."""
+    """Plain bytes; a plugin writes `bytes` after the path."""
 
     def words(self, room: int | None) -> str:
-        """What it takes."""
+        """Return the accepted values as text, for messages."""
         if room is None:
             return "bytes"
         return f"{room} bytes"
 
     def pack(self, value: Any, room: int | None) -> bytes:
-        """The bytes; ValueError for what are none, or not so many."""
+        """Return the bytes.
+
+        Raises:
+            ValueError: for another type, or another length than the field has.
+        """
         if not isinstance(value, bytes | bytearray) or room not in (None, len(value)):
             raise ValueError
         return bytes(value)
@@ -110,11 +124,14 @@ Taken = Range | Text | Address | Octets
 
 @dataclass(frozen=True)
 class Count:
-    """A running number of so many bits in `Command.values`, of which each command that is sent has
-    the next; `first` is that of the first.
+    """A running number in `Command.values`; each command sent has the next one.
+
+    Args:
+        bits: the width of the number; it wraps to 0.
+        first: the number of the first command.
 
     Raises:
-        SpecError: for a number of bits below 1, or a first number that they cannot hold.
+        SpecError: for fewer than 1 bit, or a first number that does not fit.
     """
 
     bits: int
@@ -127,25 +144,28 @@ class Count:
             )
 
     def at(self, index: int) -> int:
-        """The number of the command that is sent as the `index`-th one, from 0."""
+        """Return the number of the command that is sent as the `index`-th one, from 0."""
         return (self.first + index) % (1 << self.bits)
 
 
-#: what stands among the values of a command until it is sent.
+#: a value of a command that is not known until it is sent.
 Filled = Count | Address
 
 
 @dataclass(frozen=True)
 class Argument:
-    """An argument of a command: the path of its field, with the indices of elements of arrays
-    ("ports[1]"), and what it takes.
+    """An argument of a command.
+
+    Attributes:
+        path: the path of its field, with indices for elements of arrays: "ports[1]".
+        kind: the values that it accepts.
     """
 
     path: str
     kind: Taken
 
     def to_dict(self) -> dict[str, Any]:
-        """As data: its field, and the ends of its range or what else it takes."""
+        """Return the field, and the range or other accepted values, as JSON data."""
         own = {
             name: value.decode("latin-1") if isinstance(value, bytes) else value
             for name, value in vars(self.kind).items()
@@ -158,8 +178,10 @@ class Argument:
 
 
 def argument(given: Any) -> Argument:
-    """What ("motor.speed", 5, 15), ("data.host", Address()), ("name", Text(16)) or ("key", bytes)
-    declares.
+    """Return the argument that a plugin declared as a tuple.
+
+    Examples are ("motor.speed", 5, 15), ("data.host", Address()), ("name", Text(16)) and ("key",
+    bytes).
 
     Raises:
         SpecError: for anything else.

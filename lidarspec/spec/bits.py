@@ -1,10 +1,9 @@
-"""Bit blocks, found out by probing: which bits of a block of bytes make up each value that is
-parsed from it.
+"""Find the bits of each value of a bit block by probing its parser.
 
 A block (``BitStruct``, ``ByteSwapped``, ``BitsSwapped``, ``BytesInteger``, in any nesting) is
 linear in its bits: value = sum of bit * weight. Parsing it once with no bit set and once with each
-single bit set gives the weights; random blocks then confirm them. So no rule about bit order stands
-anywhere but in the parser that is probed.
+single bit set gives the weights; random blocks then confirm them. This way only the probed parser
+contains rules about the order of bits.
 """
 
 from __future__ import annotations
@@ -14,14 +13,15 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal
 
-#: random blocks that have to agree before a probed block is believed.
+#: number of random blocks that have to agree with a probed layout.
 CONFIRMATIONS = 8
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A run of bits of one byte that lands in a value: ``((byte & mask) >> low) << target`` is
-    added to it.
+    """A run of bits of one byte that is part of a value.
+
+    It adds ``((byte & mask) >> low) << target`` to the value.
     """
 
     byte: int
@@ -35,10 +35,10 @@ class BitField:
     """One value of a bit block.
 
     Attributes:
-        keys: where the parsed block holds it: field names and array indices.
+        keys: field names and array indices that lead to it in the parsed block.
         segments: its bits.
         width: number of bits.
-        signed: whether the top bit counts negative.
+        signed: whether the top bit is a sign bit.
         flag: whether it is parsed as False or True.
     """
 
@@ -50,8 +50,10 @@ class BitField:
 
     @cached_property
     def run(self) -> tuple[str, int, int, int] | None:
-        """The value as bits in a row of a number of whole bytes, if it is: "<" or ">", the first
-        byte, how many, and the lowest bit.
+        """The value as consecutive bits of whole bytes, None if it is not.
+
+        It is a tuple of the byte order ("<" or ">"), the first byte, the number of bytes, and the
+        lowest bit.
         """
         parts = sorted(self.segments, key=lambda part: part.byte)
         first = parts[0].byte
@@ -64,27 +66,27 @@ class BitField:
 
     @cached_property
     def is_whole(self) -> bool:
-        """Whether it is whole bytes in a row."""
+        """Whether it consists of whole consecutive bytes."""
         return self.run is not None and (self.run[2] * 8, self.run[3]) == (self.width, 0)
 
     def value(self, block: bytes | memoryview) -> int:
-        """The value in one block of bytes."""
+        """Return the value in one block of bytes."""
         total = sum((block[s.byte] & s.mask) >> s.low << s.target for s in self.segments)
         if self.signed and total >> (self.width - 1):
             return total - (1 << self.width)
         return total
 
     def masks(self, size: int) -> bytes:
-        """Which bits of each byte of a block of `size` bytes are the value's."""
-        found = bytearray(size)
+        """Return a mask for each byte of a block of `size` bytes: the bits of this value."""
+        result = bytearray(size)
         for segment in self.segments:
-            found[segment.byte] |= segment.mask
-        return bytes(found)
+            result[segment.byte] |= segment.mask
+        return bytes(result)
 
 
 @lru_cache(maxsize=64)
 def whole_bytes(size: int, order: Literal["little", "big"], *, signed: bool) -> BitField:
-    """An integer of so many whole bytes."""
+    """Return an integer of `size` whole bytes as a bit field."""
     targets = [8 * (byte if order == "little" else size - 1 - byte) for byte in range(size)]
     return BitField(
         (),
@@ -94,15 +96,16 @@ def whole_bytes(size: int, order: Literal["little", "big"], *, signed: bool) -> 
     )
 
 
-#: from a block of bytes to its values, by where the parsed block holds them.
+#: parses a block of bytes; returns its values by the keys that lead to them.
 Parse = Callable[[bytes], Mapping[tuple[str | int, ...], Any]]
 
 
 def probe(parse: Parse, size: int) -> list[BitField] | None:
-    """The bit fields of a block of `size` bytes, or None where it is not linear in its bits.
+    """Return the bit fields of a block, or None if it is not linear in its bits.
 
     Args:
-        parse: gives the values of a block; it must accept every pattern.
+        parse: returns the values of a block; it must accept every pattern.
+        size: of the block in bytes.
     """
     base = parse(bytes(size))
     if any(not isinstance(value, int) or value != 0 for value in base.values()):
@@ -115,9 +118,9 @@ def probe(parse: Parse, size: int) -> list[BitField] | None:
     fields = [
         _field(keys, pairs, flag=isinstance(base[keys], bool)) for keys, pairs in weights.items()
     ]
-    known = [field for field in fields if field is not None]
-    if len(known) == len(fields) and _confirm(parse, size, known):
-        return known
+    complete = [field for field in fields if field is not None]
+    if len(complete) == len(fields) and _confirm(parse, size, complete):
+        return complete
     return None
 
 
@@ -144,7 +147,7 @@ def _field(
 
 
 def _segments(targets: dict[int, int]) -> Iterator[Segment]:
-    """Runs of bits that keep their order within one byte."""
+    """Yield runs of bits that keep their order within one byte."""
     runs: dict[tuple[int, int, int], list[int]] = {}
     for number, bit in enumerate(sorted(targets)):
         runs.setdefault((bit // 8, bit - number, targets[bit] - bit), []).append(bit)
@@ -154,7 +157,7 @@ def _segments(targets: dict[int, int]) -> Iterator[Segment]:
 
 
 def _confirm(parse: Parse, size: int, fields: list[BitField]) -> bool:
-    import random  # nothing else that finding a sensor imports needs it
+    import random  # imported here because finding a sensor does not need it otherwise
 
     source = random.Random(size)
     for _ in range(CONFIRMATIONS):

@@ -1,13 +1,13 @@
-"""Checksum algorithms as values, each a function of one message; and the CRCs in common use by
-their names.
+"""Checksum algorithms as values, and the CRCs in common use by name.
 
-An algorithm is immutable, hashable and equal to another by its parameters. `single` is its function
-by itself, made once and called for one message after another; `lidarspec.frames.row_checksums`
-computes those of many frames at once. `CRCS` has the names that catalogues give.
+An algorithm is immutable, hashable and equal to another with the same parameters. It is called with
+the bytes of one message. `single` returns a faster function for many calls;
+`lidarspec.frames.row_checksums` computes the checksums of many frames at once. `CRCS` has the names
+of CRC catalogues.
 
-A CRC's register is kept in wire order, where the low byte is the one that meets the next data byte:
-for `refin` the usual reflected register, otherwise the usual register aligned left with its bytes
-swapped. One formula serves both.
+A CRC's register is kept in wire order: the low byte is the one that is combined with the next data
+byte. With `refin` that is the usual reflected register, otherwise the usual register aligned left
+with its bytes swapped. One formula serves both.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ Values: TypeAlias = NDArray[np.uint64]
 
 Single: TypeAlias = Callable[[bytes], int]
 
-REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # that a register is kept in, by its width
+REGISTER_BYTES = [2] * 17 + [4] * 16 + [8] * 32  # size of the register, by its width in bits
 MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 class Checksum(ABC):
-    """A checksum algorithm: an immutable value, hashable, equal to another by its parameters.
+    """A checksum algorithm: an immutable, hashable value.
 
-    `width` is its size in bits; `order` is its byte order where its field is plain bytes (an
-    integer field has its own).
+    Attributes:
+        width: its size in bits.
+        order: its byte order if its field is plain bytes; an integer field has its own.
     """
 
     width: int
@@ -47,30 +48,38 @@ class Checksum(ABC):
 
     @abstractmethod
     def __call__(self, data: Bytes) -> int:
-        """The checksum of the data, from 0 to 2**width - 1."""
+        """Return the checksum of the data, from 0 to 2**width - 1."""
 
     @abstractmethod
     def describe(self) -> str:
-        """A short phrase for people, such as "XOR-8"."""
+        """Return a short name for people, such as "XOR-8"."""
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        """The checksum of each row, shape (n,), for frames of one length, shape (n, m); one by one,
-        unless overridden.
+        """Return the checksum of each row; the default computes them one by one.
+
+        Args:
+            rows: frames of one length, shape (n, m).
+
+        Returns:
+            uint64, shape (n,).
         """
         return np.fromiter((self(row.tobytes()) for row in rows), np.uint64, len(rows))
 
 
 @dataclass(frozen=True)
 class Crc(Checksum):
-    """A cyclic redundancy check, its parameters as CRC catalogues print them; a wrong one raises
-    ValueError.
+    """A cyclic redundancy check, with the parameters of CRC catalogues.
 
     Args:
         width: bits of the register, 1 to 64.
         poly: the polynomial without its highest term, highest power first.
-        init, xorout: the register before the first byte, not reflected, and what is XORed onto it
-            as it leaves.
-        refin, refout: each byte enters, and the register leaves, with the lowest bit first.
+        init: the register before the first byte, not reflected.
+        refin: each byte is processed lowest bit first.
+        refout: the result is reflected.
+        xorout: is XORed onto the result.
+
+    Raises:
+        ValueError: for an invalid parameter.
     """
 
     width: int
@@ -113,7 +122,7 @@ class Crc(Checksum):
         return mirrored_bytes(start)
 
     def left(self, register: int) -> int:
-        """What leaves the register, in wire order, after the last byte."""
+        """Return the checksum for the register, in wire order, after the last byte."""
         if not self.refin:
             size = REGISTER_BYTES[self.width]
             register = (
@@ -139,7 +148,11 @@ class Xor(Checksum):
 
 @dataclass(frozen=True)
 class Sum(Checksum):
-    """The sum of all bytes modulo 2**width; a width outside 1 to 64 raises ValueError."""
+    """The sum of all bytes modulo 2**width.
+
+    Raises:
+        ValueError: for a width outside 1 to 64.
+    """
 
     width: int = 8
     order: ByteOrder = "little"
@@ -156,13 +169,15 @@ class Sum(Checksum):
 
 @dataclass(frozen=True)
 class WordXor(Checksum):
-    """The XOR of words of one or two bytes, low byte first, extended to 16 bits by zeros; wrong
-    sizes raise ValueError.
+    """The XOR of words of one or two bytes, low byte first, zero-extended to 16 bits.
 
     Args:
-        head: bytes in front that are two-byte words, whatever the groups.
+        head: number of bytes at the start that are always two-byte words.
         groups: sizes of the words after them, 1 or 2 bytes each, repeated; a word cut short by the
             end counts as one byte.
+
+    Raises:
+        ValueError: for invalid sizes.
     """
 
     head: int = 0
@@ -190,23 +205,23 @@ class WordXor(Checksum):
 
     @cached_property
     def halves(self) -> tuple[list[slice], list[slice]]:
-        """Where the low and the high bytes of the words stand."""
+        """The slices of the data with the low and with the high bytes of the words."""
         low = [slice(0, self.head, 2)]
         high = [slice(1, self.head, 2)]
         for number, size in enumerate(self.groups):
-            place = self.head + sum(self.groups[:number])
-            low.append(slice(place, None, sum(self.groups)))
-            high += [slice(place + 1, None, sum(self.groups))] * (size - 1)
+            start = self.head + sum(self.groups[:number])
+            low.append(slice(start, None, sum(self.groups)))
+            high += [slice(start + 1, None, sum(self.groups))] * (size - 1)
         return low, high
 
 
 @dataclass(frozen=True)
 class Fold15(Checksum):
-    """Little-endian words, each added to twice the total so far; then what is above bit 14 is added
-    to the low 15 bits.
+    """A 15-bit sum of words, each added to twice the sum so far.
 
-    The last word of an odd length is extended by a zero byte. Bits shifted past bit 29 are lost: of
-    longer data the last 30 words count.
+    The words are little-endian. At the end the bits above bit 14 are added to the low 15 bits. If
+    the length is odd, the last word is extended by a zero byte. Bits shifted past bit 29 are lost,
+    so only the last 30 words count.
 
     Source: the trailer of many vacuum cleaners' lidars; agrees with captures of two makes.
     """
@@ -226,8 +241,9 @@ class Fold15(Checksum):
 
 @dataclass(frozen=True)
 class ZeroPadded(Checksum):
-    """Another algorithm over the data and as many zero bytes as make its length a multiple of `to`,
-    as hardware that takes words has it.
+    """Another algorithm over the data, padded with zeros to a multiple of `to` bytes.
+
+    Hardware that processes whole words computes checksums this way.
     """
 
     algorithm: Checksum
@@ -257,7 +273,10 @@ def _require(checksum: Checksum, **allowed: range | tuple[object, ...]) -> None:
 
 
 def _xor(data: Bytes) -> int:
-    """The XOR of all bytes: one large integer, folded in halves down to its low byte."""
+    """Return the XOR of all bytes.
+
+    The data is one large integer, which is folded in halves down to its low byte.
+    """
     value = int.from_bytes(data, "little")
     for power in _powers(8, len(data)):
         value ^= value >> power
@@ -266,27 +285,28 @@ def _xor(data: Bytes) -> int:
 
 @lru_cache(maxsize=4096)
 def _powers(bits: int, count: int) -> tuple[int, ...]:
-    """By how much an integer is shifted and XORed onto itself until its lowest part is the XOR of
-    so many parts.
+    """Return the shifts that fold all parts of an integer into its lowest by XOR.
+
+    Args:
+        bits: size of a part.
+        count: number of parts.
     """
     return tuple(bits << power for power in reversed(range(max(count - 1, 0).bit_length())))
 
 
 def reflect(value: int, width: int) -> int:
-    """The value with its bits in the opposite order."""
+    """Return the value with its bits in reverse order."""
     return int(f"{value:0{width}b}"[::-1], 2)
 
 
 def mirrored_bytes(register: int) -> int:
-    """The register with the bits of each byte mirrored, which leads from one bit order to the
-    other.
-    """
+    """Return the register with the bits of each byte reversed."""
     return int.from_bytes(register.to_bytes(8, "little").translate(MIRROR), "little")
 
 
 @lru_cache(maxsize=256)
 def byte_table(width: int, poly: int, refin: bool) -> tuple[int, ...]:
-    """The register after one byte, by the XOR of that byte and the register's low byte."""
+    """Return the register after one byte, by the XOR of that byte and the low byte."""
     table = list(range(256))
     feedback = reflect(poly, width)
     for _ in range(8):
@@ -300,7 +320,7 @@ def _crc(width: int, poly: int, init: int = 0, *, reflected: bool = False, xorou
 
 _ONES = 0xFFFF_FFFF
 
-#: name -> its parameters, the most used first.
+#: name -> parameters; the most used ones first.
 CRCS: dict[str, Crc] = {
     "CRC-32": _crc(32, 0x04C11DB7, _ONES, reflected=True, xorout=_ONES),
     "CRC-16/MODBUS": _crc(16, 0x8005, 0xFFFF, reflected=True),
@@ -347,18 +367,18 @@ CRCS: dict[str, Crc] = {
     "CRC-32/XFER": _crc(32, 0x000000AF),
 }
 _NAMES = {crc: name for name, crc in CRCS.items()}
-#: polynomials by width.
+#: width -> the polynomials in use.
 KNOWN = {width: {crc.poly for crc in CRCS.values() if crc.width == width} for width in (8, 16, 32)}
 
 
 def name_of(crc: Crc) -> str:
-    """The catalogue's name of a CRC, "" where it has none."""
+    """Return the catalogue name of a CRC, "" if it has none."""
     return _NAMES.get(crc, "")
 
 
 def single(algorithm: Checksum) -> Single:
-    """A function from bytes to their checksum, made for one frame at a time."""
-    kind = type(algorithm)  # what derives from one of these may compute something else
+    """Return a function from bytes to their checksum, for one frame at a time."""
+    kind = type(algorithm)  # exactly these classes: a subclass may compute something else
     if kind is Xor:
         return _xor
     if kind is Sum:
@@ -372,7 +392,7 @@ def single(algorithm: Checksum) -> Single:
 
 
 def _zlib_crc(algorithm: Crc) -> Single | None:
-    """A CRC by zlib, some gigabytes a second; None where its polynomial is another."""
+    """Return a CRC computed by zlib, None if zlib does not have its polynomial."""
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) != (
         32,
         0x04C11DB7,
@@ -389,9 +409,9 @@ def _zlib_crc(algorithm: Crc) -> Single | None:
 def _single_crc(algorithm: Crc) -> Single:
     init = algorithm.init
     xorout = algorithm.xorout
-    known = _zlib_crc(algorithm)
-    if known is not None:
-        return known
+    compiled = _zlib_crc(algorithm)
+    if compiled is not None:
+        return compiled
     if (algorithm.width, algorithm.poly, algorithm.refin, algorithm.refout) == (
         16,
         0x1021,
@@ -428,8 +448,9 @@ def _wide_crc(algorithm: Crc, table: tuple[int, ...], register: int, data: bytes
 
 @lru_cache(maxsize=256)
 def _single_word_xor(algorithm: WordXor) -> Single:
-    """Groups of words are XORed as a whole, whatever their sizes, and only their XOR is taken
-    apart.
+    """Return the function of a `WordXor`.
+
+    It XORs the groups of words as wholes, and then only splits the result into words.
     """
     head = algorithm.head
     groups = algorithm.groups

@@ -1,8 +1,7 @@
-"""What a struct needs beyond construct: a unit on a field, a checksum that seals a struct, and
-parts that each have a size of their own.
+"""Additions to construct: units, checksums, sizes and parts of variable size.
 
-All are ordinary parts of a struct, so that they nest in anything; none changes the raw integers of
-the wire. Units go by name, and those few that someone may type are converted exactly.
+All are ordinary members of a struct and can be nested in anything. None of them changes the raw
+integers of the wire. Units are plain names; the few that a user may type are converted exactly.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ from lidarspec.spec import syntax as layer
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.tree import FieldInfo
 
-#: A request over a link `Http`, and the reply to it, as messages: what HTTP says besides is the
-#: link's business.
+#: An HTTP request and its reply as messages. The link `Http` handles the rest of the protocol.
 HttpRequest = Struct(
     "mark" / Const(b"HTTP"),
     "method" / Enum(Int8ub, GET=1, PUT=2, POST=3, DELETE=4),
@@ -52,7 +50,7 @@ HttpRequest = Struct(
 HttpReply = Struct(
     "mark" / Const(b"HTTP"), "status" / Int16ub, "size" / Int32ub, "body" / Bytes(this.size)
 )
-#: unit -> how many of the SI unit it is; only units that someone may type on the command line.
+#: unit -> its size in the target unit; only units that a user may type on the command line.
 _FACTORS: dict[str, dict[str, Fraction]] = {
     "m": {"m": Fraction(1), "cm": Fraction(1, 100), "mm": Fraction(1, 1000)},
     "s": {
@@ -70,19 +68,19 @@ _FACTORS: dict[str, dict[str, Fraction]] = {
 
 
 def factor(unit: str, target: str) -> Fraction | None:
-    """How many `target` one `unit` is, or None where the two measure different things."""
+    """Return `unit` in `target` units, None if they measure different quantities."""
     if unit == target:
         return Fraction(1)
     return _FACTORS.get(target, {}).get(unit)
 
 
 def is_unit(unit: str) -> bool:
-    """Whether a unit is one that can be turned into others."""
+    """Return whether a unit can be converted to others."""
     return any(unit in table for table in _FACTORS.values())
 
 
 def split_unit(text: str) -> tuple[str, str]:
-    """A number and its unit out of "324.27deg"; the unit is empty where there is none."""
+    """Split "324.27deg" into number and unit; the unit is "" if there is none."""
     known = sorted({unit for table in _FACTORS.values() for unit in table}, key=len, reverse=True)
     for unit in known:
         if text.endswith(unit) and _is_number(text[: -len(unit)]):
@@ -91,7 +89,7 @@ def split_unit(text: str) -> tuple[str, str]:
 
 
 def slug(unit: str) -> str:
-    """A unit as part of a name: "deg/s" is "deg_s"."""
+    """Return a unit as part of a name: "deg/s" becomes "deg_s"."""
     return re.sub(r"\W+", "_", unit).strip("_").lower()
 
 
@@ -104,10 +102,10 @@ def _is_number(text: str) -> bool:
 
 
 def duration(text: str) -> float:
-    """Seconds out of "10s", "500ms", "2min" or "2m", "1h", or a bare number of seconds.
+    """Return the seconds of "10s", "500ms", "2min", "2m", "1h", or of a bare number.
 
     Raises:
-        UsageError: where it is no duration, or a negative one.
+        UsageError: if the text is not a duration, or negative.
     """
     for unit, seconds in (
         ("min", 60.0),
@@ -125,19 +123,19 @@ def duration(text: str) -> float:
 
 
 def share(text: str) -> float:
-    """The number that "1%" or "0.01" says.
+    """Return the number that "1%" or "0.01" stands for.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if it is not a number.
     """
     return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
 
 
 class Scaled(layer.Describing):
-    """A number on the wire with what it measures: ``physical = raw * scale + offset`` in `unit`.
+    """A number with a unit: ``physical = raw * scale + offset``.
 
-    Parses and builds the raw number; the unit is used where physical values are asked for, and
-    never twice.
+    It parses and builds the raw number. Scale and unit are applied only if physical values are
+    requested.
 
     Args:
         subcon: a construct field that parses to a number.
@@ -146,7 +144,7 @@ class Scaled(layer.Describing):
         offset: physical value of raw 0, in `unit`.
 
     Raises:
-        SpecError: for a step that is 0 or no number, and for arguments in another order.
+        SpecError: if the scale is 0 or not a number, or arguments are in another order.
     """
 
     def __init__(self, subcon: Construct, scale: float, unit: str, offset: float = 0) -> None:
@@ -174,18 +172,20 @@ class Scaled(layer.Describing):
 
 
 class SizeOf(layer.Sizing):
-    """A number that says how many bytes a part of the frame has: filled in by `build`, whatever
-    value is given, and wrong on a frame that comes where the part is longer or shorter.
+    """The size of another part of the frame, in bytes.
+
+    `build` fills it in and ignores a given value. A parsed frame is invalid if the part has another
+    size.
 
     Args:
-        subcon: a field that parses to an integer, Int16ub.
-        part: the part, a member of the struct that the field stands in, or in one of it, "body",
-            "body.tags"; "" for that struct itself; of the struct around it with "_.", "_.body", and
-            "_" for that itself.
-        plus: what the number has beyond these bytes; less than 0 where it does not count them all.
+        subcon: a field that parses to an integer, such as Int16ub.
+        part: the path of the part from the struct that contains this field: "body", "body.tags". ""
+            is that struct itself, "_." leads to the outer struct ("_.body"), and "_" is the outer
+            struct itself.
+        plus: is added to the number of bytes; negative if some bytes do not count.
 
     Raises:
-        SpecError: for arguments in another order.
+        SpecError: if arguments are in another order.
     """
 
     def __init__(self, subcon: Construct, part: str = "", plus: int = 0) -> None:
@@ -198,16 +198,17 @@ class SizeOf(layer.Sizing):
 
 
 class Checksummed(layer.Sealing):
-    """A struct sealed by one of its own fields, wherever in it that field stands. May nest, around
-    one struct too, each with its own field.
+    """A struct with a checksum in one of its own fields, at any position in it.
+
+    It can be nested, also directly around another `Checksummed`, each with its own field.
 
     Args:
         struct: a construct Struct.
         field: dotted name of the field (or fields, low bits first) that holds the checksum.
-        algorithm: a `Checksum`; where left out, a ``lidarspec_checksum`` hook has to supply it.
-        over: names of consecutive fields that the checksum covers; by default every byte of the
-            struct except those that hold a bit of `field`.
-        absent: values of the field that mean "not filled": they pass, and stay as they are when
+        algorithm: a `Checksum`; if left out, a ``lidarspec_checksum`` hook has to supply it.
+        over: names of consecutive fields that the checksum covers; by default all bytes of the
+            struct except those that contain a bit of `field`.
+        absent: values of the field that mean "not filled": they are valid, and kept when a frame is
             built.
     """
 
@@ -273,7 +274,7 @@ class Checksummed(layer.Sealing):
         data = trial.getvalue()
         unverified = Container(
             {**context, "_params": Container(_verify=False)}
-        )  # what was just built is parsed back
+        )  # the built bytes have no valid checksum yet
         parsed = con._parsereport(io.BytesIO(data), unverified, path)
         if None not in given and self._load_stored(parsed) in self.absent:
             return con._build(blank, stream, context, path)
@@ -281,22 +282,31 @@ class Checksummed(layer.Sealing):
 
     @property
     def _marked(self) -> Construct:
-        """The struct as a frame has it, which notes where its members stand; an author may also
-        parse with it alone.
+        """The struct with recorded member offsets.
+
+        A frame prepares its struct; the struct may also be used on its own.
         """
         if isinstance(layer.unwrap(self.subcon), layer.MarkedStruct):
             return self.subcon
         return layer.prepare(self.subcon)
 
     def verdict(self, data: bytes, obj: Any, base: int = 0) -> tuple[int, int]:
-        """The checksum that stands in one parsed struct and the one that should, for its bytes,
-        which began at `base`.
+        """Return the stored and the computed checksum of one parsed struct.
+
+        Args:
+            data: the bytes of the struct.
+            obj: the parsed struct.
+            base: the offset of the struct in the parsed stream.
         """
         return self._load_stored(obj), self._compute(data, obj, base)
 
     def find_covered(self, obj: Any, size: int, base: int = 0) -> list[tuple[int, int]]:
-        """The byte ranges (start, end) within the struct that the checksum covers, for one parsed
-        frame.
+        """Return the byte ranges (start, end) in the struct that the checksum covers.
+
+        Args:
+            obj: one parsed struct.
+            size: of the struct in bytes.
+            base: its offset in the parsed stream.
         """
         if self.over is not None:
             spans = [self._span(obj, name) for name in self.over]
@@ -350,8 +360,9 @@ class Checksummed(layer.Sealing):
         return self._field(name).parse(bytes(8 * layer.bit_width(self._field(name))))  # type: ignore[no-any-return]
 
     def _span(self, obj: Any, name: str) -> tuple[int, int]:
-        """Where a dotted field stands, in bytes of the stream that was parsed; a bit field by the
-        bytes that hold it.
+        """Return the byte range of a dotted field in the parsed stream.
+
+        The range of a bit field has all bytes that contain its bits.
         """
         con = self._marked
         parts = name.split(".")
@@ -366,27 +377,27 @@ class Checksummed(layer.Sealing):
 
 
 class Parts(layer.Partition):
-    """Structs one after another, each of a size of its own: the modules of a telegram, or its tags
-    with a type and a length.
+    """Consecutive structs, each with its own size.
 
-    In the struct they are a list. In `points` each is a packet of its own
-    (``Frame(points={"modules": points})``), whose fields are ``f.distance``, and those of the frame
-    around it ``f.frame.counter``; expressions of a part see these as ``this._.counter``. Behind
-    them, ``this.modules.size`` is how many bytes all of them take.
+    Examples are the modules of a telegram, or tags with a type and a length. In the struct they are
+    a list. In `points` each part is a packet of its own (``Frame(points={"modules": points})``):
+    its fields are ``f.distance``, and fields of the outer frame ``f.frame.counter``. Expressions of
+    a part refer to the latter as ``this._.counter``. After the parts, ``this.modules.size`` is
+    their total size in bytes.
 
     Args:
-        kinds: a Struct; or several by name, for parts that are told apart by their constants: the
-            first one is taken whose constants are right, so that a struct without any, as the last,
-            takes what nobody knows.
-        count: how many there are.
-        size: the bytes of the first part of a chain, 0 for none; with `following`.
-        following: an expression of a part's own fields, the bytes of the next part, 0 behind the
-            last.
-        within: the bytes of all parts, which fill them.
+        kinds: a Struct; or several by name, for parts that are distinguished by their constants.
+            The first one with matching constants is used, so a last struct without constants takes
+            unknown parts.
+        count: the number of parts.
+        size: the bytes of the first part of a chain, 0 for none; requires `following`.
+        following: an expression of a part's own fields for the bytes of the next part; 0 after the
+            last one.
+        within: the total bytes of all parts.
 
     Raises:
-        SpecError: where what is said is not just one of `count`, `size` with `following`, and
-            `within`, or a part is no struct.
+        SpecError: unless exactly one of `count`, `size` with `following`, and `within` is given, or
+            if a part is not a struct.
     """
 
     def __init__(
@@ -454,17 +465,19 @@ class Parts(layer.Partition):
         raise SizeofError("the size of parts is theirs", path=path)
 
     def _rule(self, context: Any, path: str) -> Callable[[layer.Pieces], int]:
-        """From the parts so far to the bytes of the next one, 0 where there is none, -1 where its
-        own struct says it.
+        """Return a function from the parts so far to the bytes of the next one.
+
+        It returns 0 if there is no further part, and -1 if the struct of the part determines its
+        size.
         """
         rules = ((self.count, "count"), (self.size, "length"), (self.within, "length"))
-        known = (
+        bounds = (
             None
             if rule is None
             else layer.check_bound(evaluate(rule, context), self.limit, what, path)
             for rule, what in rules
         )
-        count, size, within = known
+        count, size, within = bounds
 
         def goes_on(found: layer.Pieces) -> int:
             if count is not None:
@@ -501,12 +514,12 @@ class Parts(layer.Partition):
         found.spans.append((kind, *span))
 
     def _kind(self, stream: Any, context: Any, path: str) -> str:
-        """The first kind whose constants are right, as far as the bytes go.
+        """Return the first kind with matching constants, as far as there are bytes.
 
         Raises:
-            Mismatch: where those of no kind are.
+            Mismatch: if no kind matches.
         """
-        spot = stream.tell()
+        start = stream.tell()
         names = list(self.cases)
         trial = Container(
             {
@@ -520,21 +533,21 @@ class Parts(layer.Partition):
             except (layer.Mismatch, ConstError) as fault:
                 if getattr(fault, "reason", "constant") == "constant":
                     continue
-            # an expression may raise anything: the part is of this kind, and fails again when it is
-            # parsed
+            # an expression may raise any exception: the part is of this kind, and fails again when
+            # it is parsed
             except Exception:
                 pass
             finally:
-                stream.seek(spot)
+                stream.seek(start)
             return name
         if len(names) > 1 and layer.verifying(context):
             raise layer.Mismatch(
-                path, spot, f"one of {', '.join(names)}", "none of these", "constant"
+                path, start, f"one of {', '.join(names)}", "none of these", "constant"
             )
         return names[-1]
 
     def _built(self, part: Any, context: Any, path: str) -> tuple[str, Any, bytes]:
-        """A part as the first kind that takes its values: its kind, value and bytes."""
+        """Build a part as the first kind that accepts it; return kind, value, bytes."""
         faults = list[ConstructError]()
         for name, case in self.cases.items():
             stream = io.BytesIO()

@@ -1,4 +1,4 @@
-"""How a sensor is connected, as declared: facts only, nothing here opens anything."""
+"""The connections of a sensor, as declared: facts only; nothing here opens a port."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from lidarspec.spec.syntax import has_member
 
 
 class Link:
-    """How bytes come and go: a kind of one's own derives from it, and the hook `lidarspec_link`
-    opens it.
+    """A kind of connection; other kinds derive from it.
+
+    The hook `lidarspec_link` opens a link of another kind.
 
     Attributes:
-        datagrams: whether frames come one to a datagram.
+        datagrams: whether each datagram is a frame.
     """
 
     @property
     def datagrams(self) -> bool:
-        """Whether frames come one to a datagram."""
+        """Whether each datagram is a frame."""
         return False
 
 
@@ -28,8 +29,8 @@ class Serial(Link):
     """A UART or USB serial port, 8N1.
 
     Args:
-        bauds: the baud rate, or all that the models of this id use, the most likely first.
-        dtr, rts: level of the control lines while open; None leaves them alone.
+        bauds: the baud rate, or all rates that models with this id use, the most likely first.
+        dtr, rts: levels of the control lines while the port is open; None does not set them.
     """
 
     bauds: tuple[int, ...]
@@ -51,19 +52,19 @@ class Serial(Link):
 
 @dataclass(frozen=True, eq=False)
 class Assembled:
-    """What a datagram says that is a fragment of a message: of which one, and which part of it.
+    """The fields of a datagram that is a fragment of a message.
 
     Args:
         struct: the construct Struct of a fragment, or of its header alone.
-        key: the field, or fields, that tell messages apart, such as a counter; no two of 16
-            messages in a row have the same.
+        key: the field, or fields, that identify a message, such as a counter; no two of 16
+            consecutive messages have the same key.
         index: the field with the number of the fragment in its message.
         count: the field with the number of fragments of the message.
-        payload: the field of bytes that is a part of the message; "" where that is all that stands
-            behind the struct.
+        payload: the field of bytes with the fragment's part of the message; "" if that is
+            everything after the struct.
         first: the index of the first fragment.
-        in_bytes: `index` is the place of the fragment in the message in bytes, and `count` the
-            bytes of the message.
+        in_bytes: whether `index` is the offset of the fragment in the message and `count` the size
+            of the message, both in bytes.
 
     Raises:
         SpecError: for a field that the struct does not have.
@@ -84,29 +85,29 @@ class Assembled:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """The fields that tell messages apart."""
+        """The fields that identify a message."""
         if isinstance(self.key, str):
             return (self.key,)
         return tuple(self.key)
 
     def wrong(self, reason: str) -> SpecError:
-        """An error that says where it is."""
+        """Return an error with the path of this declaration."""
         return SpecError(reason, path="links.data.assembled")
 
 
 @dataclass(frozen=True, init=False)
 class Udp(Link):
-    """UDP datagrams, one frame each, or with `stream` a byte stream cut into datagrams (telegrams
-    that span several).
+    """UDP datagrams: one frame each, or pieces of a byte stream.
 
     Args:
-        ports: the default destination ports; of data hints only, since magic and length decide; of
-            commands the sensor's.
-        assembled: what says how datagrams are joined to a message, where one does not fit into one;
-            others pass as they are.
-        broadcast: the port to which commands are broadcast while nobody knows the address of the
-            sensor: whoever answers is it.
-        local: the port here that commands are sent from, where the sensor asks for one; any by
+        ports: the default destination ports. For data they are only hints, since constants and
+            length identify a frame; commands are sent to this port of the sensor.
+        stream: whether the datagrams are a byte stream, for telegrams that span several.
+        assembled: the rule that joins datagrams to messages, if a message does not fit into one;
+            other datagrams are passed on unchanged.
+        broadcast: the port to which commands are broadcast while the address of the sensor is
+            unknown; the first host that replies is the sensor.
+        local: the local port that commands are sent from, if the sensor requires one; any port by
             default.
     """
 
@@ -148,20 +149,21 @@ class Udp(Link):
 
 @dataclass(frozen=True)
 class Tcp(Link):
-    """A TCP byte stream from `port` of the sensor."""
+    """A TCP byte stream from a port of the sensor."""
 
     port: int
 
 
 @dataclass(frozen=True)
 class Http(Link):
-    """Requests to the web server of the sensor: the frames of its commands are `HttpRequest`, those
-    of its replies `HttpReply`.
+    """Requests to the web server of the sensor.
+
+    The frames of its commands are `HttpRequest`, those of its replies `HttpReply`.
 
     Args:
         port: of the server.
-        timeout: seconds that a request may take in all.
-        largest: the longest body of a reply, in bytes; a longer one is refused.
+        timeout: maximum seconds for a whole request.
+        largest: the maximum size of a reply's body in bytes; a longer one is an error.
     """
 
     port: int = 80
@@ -170,10 +172,10 @@ class Http(Link):
 
     @property
     def datagrams(self) -> bool:
-        """Whether each message is a frame: it is."""
+        """Always True: each message is a frame."""
         return True
 
 
 def is_datagram(link: Link | None) -> bool:
-    """Whether frames arrive one to a datagram over this link."""
+    """Return whether each datagram of a link is a frame; False without a link."""
     return link is not None and link.datagrams

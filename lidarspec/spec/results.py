@@ -1,8 +1,8 @@
-"""What a sensor's `points` function returns: columns of a batch of packets, not yet flattened.
+"""Return values of a sensor's `points` function: columns of a batch of packets.
 
-The engine turns them into a `PointCloud`: coordinates, masks, REP-103 and REP-117 are its work.
-Conventions of the columns: metres, radians, seconds; azimuth counter-clockwise from the manual's
-zero direction, elevation from the horizon; a range of 0 is no return.
+The engine makes a `PointCloud` of them: it flattens the columns, and handles coordinates, masks,
+REP-103 and REP-117. Conventions of the columns: metres, radians, seconds; azimuth counter-clockwise
+from the manual's zero direction, elevation from the horizon; a range of 0 is no return.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 
 from lidarspec.errors import SpecError
 
-#: anything that broadcasts against the packets: a column, a NumPy array or a number.
+#: a value that broadcasts against the packets: a column, a NumPy array or a number.
 Array = Any
 
-#: what a further column of points may be called, and what it may not, since something beside it is.
+#: valid name of an additional column; names in `TAKEN` already have a meaning.
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 TAKEN = frozenset(
     (
@@ -59,15 +59,15 @@ TAKEN |= {"complete"}
 
 @dataclass(frozen=True, eq=False)
 class Extra:
-    """A further column of points, with what it is in.
+    """An additional column of points, with its unit and type.
 
     Args:
-        values: as those of any other column; nan where a point has none.
-        unit: "m/s"; "" for a plain number. By default that of the field, where the values are a
-            field as it stands.
-        dtype: of the column: a NumPy type of numbers. By default that of the wire, where the values
-            are a field as it stands that is a whole number; bool for conditions, else float32. In a
-            type of integers nan is 0.
+        values: a column, an array or a number; nan if a point has no value.
+        unit: such as "m/s"; "" for a pure number. The default for values that are an unchanged
+            field is the field's unit.
+        dtype: a numeric NumPy type. The default is the type of the wire for values that are an
+            unchanged integer field, bool for conditions, and float32 otherwise. In an integer type
+            nan becomes 0.
     """
 
     values: Array
@@ -82,10 +82,10 @@ class Extra:
 
 
 def _name_extras(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
-    """The further columns of points by name, each with what it is in.
+    """Return the additional columns by name, each as an `Extra`.
 
     Raises:
-        SpecError: for a name that means something else, or is none.
+        SpecError: for an invalid name, or one that already has a meaning.
     """
     for name in extra:
         if not _NAME.fullmatch(name) or name in TAKEN:
@@ -103,24 +103,20 @@ def _name_extras(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
 class Polar:
     """Points given by range and direction.
 
-    Args:
-        range: metres; 0 is no return, `inf` stays, nan is wrong.
-        azimuth: radians, counter-clockwise seen from above; a nan makes the point invalid.
-        elevation: radians above the horizon.
-        intensity: the wire's number; None where the sensor has none.
-        time: seconds after the packet's clock.
-        ring: number of the laser or channel, None where there is none.
-        return_index: 0 for the first or only return, 1 for the second ...; None where there is one.
-        invalid: True where the sensor marks a point as wrong (becomes nan).
-        origin: (x, y, z) in metres of where the beam starts, columns allowed, in REP-103 axes.
-        nominal: True where a default calibration stands in for the sensor's own, which the cloud
-            then says.
-        column: number of the column in its turn, from 0, where points are columns of rows;
-            `PointCloud.organised` places it by that.
-        extra: further columns by name: values, or an `Extra` with their unit and type.
+    Args: range: metres; 0 is no return, `inf` is kept, nan is invalid. azimuth: radians,
+        counter-clockwise seen from above; a nan makes the point invalid. elevation: radians above
+        the horizon. intensity: the number on the wire; None if the sensor has none. time: seconds
+        after the packet's clock. ring: number of the laser or channel; None if there is none.
+        return_index: 0 for the first or only return, 1 for the second ...; None if there is only
+        one. invalid: True if the sensor marks a point as invalid (becomes nan). origin: (x, y, z)
+        of the start of the beam, metres, in REP-103 axes; numbers or columns. nominal: True if a
+        default calibration replaces the sensor's own; `PointCloud.nominal` reports it. column:
+        number of the column in its revolution, from 0, if points form columns of rings; used by
+        `PointCloud.organised`. extra: additional columns by name: values, or an `Extra` with their
+        unit and type.
 
     Raises:
-        SpecError: for a name in `extra` that means something else.
+        SpecError: for a name in `extra` that already has a meaning.
     """
 
     range: Array
@@ -144,22 +140,18 @@ class Polar:
 class Cartesian:
     """Points given by coordinates.
 
-    Args:
-        x, y, z: metres, x forward, y left, z up; all three 0 is no return, one that is nan or
-            infinite makes the point invalid.
-        intensity: the wire's number; None where the sensor has none.
-        time: seconds after the packet's clock.
-        ring: number of the laser or channel, None where there is none.
-        return_index: 0 for the first or only return, 1 for the second ...; None where there is one.
-        invalid: True where the sensor marks a point as wrong (becomes nan).
-        nominal: True where a default calibration stands in for the sensor's own, which the cloud
-            then says.
-        column: number of the column in its turn, from 0, where points are columns of rows;
-            `PointCloud.organised` places it by that.
-        extra: further columns by name: values, or an `Extra` with their unit and type.
+    Args: x, y, z: metres, x forward, y left, z up; all three 0 is no return; a nan or infinite one
+        makes the point invalid. intensity: the number on the wire; None if the sensor has none.
+        time: seconds after the packet's clock. ring: number of the laser or channel; None if there
+        is none. return_index: 0 for the first or only return, 1 for the second ...; None if there
+        is only one. invalid: True if the sensor marks a point as invalid (becomes nan). nominal:
+        True if a default calibration replaces the sensor's own; `PointCloud.nominal` reports it.
+        column: number of the column in its revolution, from 0, if points form columns of rings;
+        used by `PointCloud.organised`. extra: additional columns by name: values, or an `Extra`
+        with their unit and type.
 
     Raises:
-        SpecError: for a name in `extra` that means something else.
+        SpecError: for a name in `extra` that already has a meaning.
     """
 
     x: Array
@@ -183,17 +175,18 @@ Points = Polar | Cartesian
 
 @dataclass(frozen=True, eq=False)
 class Imu:
-    """What an inertial measurement unit in the sensor feels, in SI and in the axes of the points
-    (REP-145): x forward, y left, z up.
+    """Measurements of an IMU in the sensor, in SI units and the axes of the points.
+
+    The axes are those of REP-145: x forward, y left, z up.
 
     Args:
         angular_velocity: about x, y and z, rad/s, right-handed: positive about z turns to the left.
-        linear_acceleration: along x, y and z, m/s2, gravity in it: a level sensor at rest has
+        linear_acceleration: along x, y and z, m/s2, including gravity: a level sensor at rest has
             +9.80665 along z.
         time: seconds after the packet's clock.
 
     Raises:
-        SpecError: where it is not three of each.
+        SpecError: unless there are three columns of each.
     """
 
     angular_velocity: tuple[Array, Array, Array]

@@ -1,4 +1,4 @@
-"""What a sensor is: the facts of its manual as fields of a `SensorDescription`.
+"""The facts of a sensor's manual as fields of a `SensorDescription`.
 
 A description is immutable. It checks that its parts fit together when it is made. The engines
 (`frames`, `framing`, `points`, `packets`, `scans`) are functions of a description. Plugins and
@@ -48,7 +48,7 @@ from lidarspec.trust import beside
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: version of the plugin interface; the engine reads this one and the one before.
+#: version of the plugin interface; the engine reads this one and the previous one.
 API = 1
 STATUSES = ("manual", "vectors", "capture", "hardware")
 #: the keys of `Sensor.info`.
@@ -60,7 +60,7 @@ _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)+")
 OPTIONS = ("frame", "answer", "cut")
 FRAMES_OF_REFERENCE = ("rep103", "vendor")
 _Sensor = TypeVar("_Sensor", bound="SensorDescription")
-#: a text that an untrusted file may give as an option: it is not a path.
+#: a text that an untrusted file may give as an option, because it cannot be a path.
 _WORD = re.compile(r"[A-Za-z0-9_+-]{1,40}")
 
 

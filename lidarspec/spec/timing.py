@@ -39,8 +39,11 @@ class OnWrap:
 
 @dataclass(frozen=True)
 class OnFlag:
-    """Cut before every packet (or row of an array) in which the field `name` is not 0, or is
-    `value` where that is given.
+    """Cut before every packet (or row of an array) with a set flag.
+
+    Args:
+        name: the path of the flag's field.
+        value: the value of a set flag; by default every value except 0.
     """
 
     name: str
@@ -66,12 +69,12 @@ class OnChange:
 
 @dataclass(frozen=True)
 class OnJump:
-    """Cut before every packet (or row) in which the field `name` is farther than `by` from the one
-    before, either way.
+    """Cut before every packet (or row) with a large step of the field `name`.
 
     Args:
-        name: a field path; an angle goes the short way around the circle.
-        by: in the unit of the field, more than its largest step within a scan.
+        name: a field path. Steps of an angle are measured the short way around the circle.
+        by: the smallest step that cuts, in either direction; in the unit of the field, more than
+            its largest step within a scan.
     """
 
     name: str
@@ -87,7 +90,7 @@ class OnRewind:
 
 @dataclass(frozen=True)
 class Every:
-    """Cut after a number of seconds of packet time, for sensors without a physical period."""
+    """Cut after a number of seconds of packet time."""
 
     seconds: float
 

@@ -350,7 +350,7 @@ def _shift(a: Array, step: int) -> Array:
 
 
 def _apply(function: Callable[..., Any], *values: Array) -> Array:
-    """`function` of arrays; where one of them is a column, the column's way of applying it."""
+    """Return `function` of arrays; a column applies the function itself."""
     for value in values:
         if hasattr(value, "apply_function"):
             return value.apply_function(function, *values)
