@@ -1,25 +1,25 @@
-"""Where bytes come from, and go to.
+"""Inputs and outputs: ports, sockets, files and simulated sensors.
 
-In: a SOURCE as text. Out: an open `Transport`, which gives `Chunk`s and takes bytes to send.
+Input: a SOURCE as text. Output: an open `Transport`, which yields `Chunk`s and sends bytes.
 Modules in reading order:
 
-* `protocol`: what a transport is, live or not; plugins derive from it.
-* `open_url`: from a SOURCE to the transport that opens it.
+* `protocol`: the base classes of transports; plugins derive from them.
+* `open_url`: opens the transport of a SOURCE.
 * `addresses`, `host_clock`: a live SOURCE as a value; the times of arrivals.
-* `base`: what live transports share: reading a stream, waiting, errors of the system.
+* `base`: functions of all live transports: reading a stream, waiting, system errors.
 * `serial`, `udp`, `tcp`: live sources.
 * `http`: requests to the web server of a sensor.
 * `simulated`: `sim:`, a simulated sensor in this process.
-* `bags`: robotics logs, which hold packets as ROS's messages.
-* `hexadecimal`: bytes as people print them.
+* `bags`: robotics logs with packets in ROS messages.
+* `hexadecimal`: bytes as hexadecimal text.
 * `files`: recordings, captures, raw bytes, standard input.
-* `ports`: which serial and UDP ports this computer has, and who holds them.
+* `ports`: the serial and UDP ports of this computer, and the programs that use them.
 
-In the opposite direction, in the place of a sensor:
+In the opposite direction, to send like a sensor:
 
 * `outlets`: pseudo-terminals, UDP and TCP in one loop.
 * `http_line`: HTTP in the same loop.
-* `destinations`: from a destination as text to its outlet.
+* `destinations`: makes the outlet of a destination.
 * `serving`: a simulated sensor at an outlet, in real time.
 * `simulated_files`: a simulated sensor written to a file.
 * `replays`: a recording that is sent again at its recorded times.

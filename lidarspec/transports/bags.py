@@ -1,17 +1,15 @@
-"""Robotics logs as transports: the packets that drivers record, in ROS 1 bags, ROS 2 bags and MCAP
-files.
+"""Read packets from robotics logs: ROS 1 bags, ROS 2 bags and MCAP files.
 
-A driver publishes a packet as a message, or those of a scan as a list with the time of each.
-Messages are known by what they hold, whoever named them: a type with a list of `packets`, or one
-that is itself called a packet; and in each packet its bytes as `data` or `buf`, of which the first
-`size` count where that is a field, and its `stamp`. Logs say how their messages are laid out; of
-those that do not, as ROS 2 bags in SQLite of releases before Iron, the layout is the one of
-`UNTOLD` that fills a message to its end.
+A driver publishes a packet as a message, or the packets of a scan as a list with a time each.
+Messages are recognised by content, not by name: a type with a list of `packets`, or a type with
+"packet" in its name. Each packet has its bytes as `data` or `buf`, of which the first `size` are
+used if there is such a field, and a `stamp`. Most logs contain the definitions of their messages.
+For those that do not, such as ROS 2 bags in SQLite of releases before Iron, the definition in
+`UNTOLD` that fills a message to its end is used.
 
-Packets that lidarspec writes into logs, or its ROS 2 node publishes, are std_msgs/UInt8MultiArray,
-the one message of every ROS that holds bytes and says nothing of them. The padding before the
-bytes, as long as `data_offset` says, is the time of the arrival; the label says whether they are a
-datagram.
+Packets that lidarspec or its ROS 2 node writes are std_msgs/UInt8MultiArray, the only message of
+every ROS release that contains plain bytes. The padding before the bytes, of `data_offset` bytes,
+is the arrival time; the label is `DATAGRAM` or `STREAM`.
 """
 
 from __future__ import annotations
@@ -29,8 +27,8 @@ from lidarspec.transports.protocol import Chunk, Transport
 
 _RULE = "=" * 80
 _LIST = f"std_msgs/Header header\nPacket[] packets\n{_RULE}\nMSG: {{package}}/Packet\n"
-#: layouts of messages that a log does not tell; those with lengths, which are seldom right by
-#: chance, come first.
+#: definitions to try if a log has none; those with lengths come first, because they rarely fit by
+#: chance.
 UNTOLD = (
     f"{_LIST}builtin_interfaces/Time stamp\nuint8[] data",
     f"{_LIST}builtin_interfaces/Time stamp\nuint8[] data\nuint32 size",
@@ -41,12 +39,12 @@ UNTOLD = (
     "std_msgs/Header header\nuint8 is_info\nuint8 is_first\nuint8[] data",
     "uint8[] buf",
 )
-#: fields that hold the bytes of a packet.
+#: fields with the bytes of a packet.
 BYTES = ("data", "buf")
-#: topics that a message names.
+#: maximum number of topics in a message.
 NAMED = 6
-#: what lidarspec writes: the type, the time of arrival, int64 ns, and the label of the dimension of
-#: datagrams and of a byte stream.
+#: packets written by lidarspec: the type, the arrival time as int64 ns, and the labels of the
+#: dimension for datagrams and for a byte stream.
 RAW = "std_msgs/msg/UInt8MultiArray"
 STAMP = struct.Struct("<q")
 DATAGRAM = "datagram"
@@ -54,8 +52,12 @@ STREAM = "stream"
 
 
 class Log(NamedTuple):
-    """A kind of log: what it is, the reader that rosbags has for it, and how messages are
-    serialized.
+    """A kind of log.
+
+    Attributes:
+        what: its name in messages.
+        module, reader: the class of rosbags that reads it.
+        form: the serialization of its messages.
     """
 
     what: str
@@ -64,7 +66,7 @@ class Log(NamedTuple):
     form: str = "cdr"
 
 
-#: logs by how they begin; those in several files are a folder with metadata.yaml.
+#: first bytes -> kind of log; a log of several files is a folder with metadata.yaml.
 LOGS = {
     b"#ROSBAG V": Log("a ROS 1 bag", "rosbags.rosbag1", "Reader", "ros1"),
     b"\x89MCAP0\r\n": Log(
@@ -78,9 +80,7 @@ FOLDER = Log("a ROS 2 bag", "rosbags.rosbag2", "Reader")
 
 
 def log_of(path: str, head: bytes = b"") -> Log | None:
-    """What kind of log a file is by its first bytes, or a folder by what is in it; None where it is
-    none.
-    """
+    """Return the kind of a log by its first bytes or its folder, None for other files."""
     if os.path.isdir(path):
         if os.path.isfile(os.path.join(path, "metadata.yaml")):
             return FOLDER
@@ -89,14 +89,14 @@ def log_of(path: str, head: bytes = b"") -> Log | None:
 
 
 class BagTransport(Transport):
-    """The packets of a robotics log, in the order in which it has their messages.
+    """The packets of a robotics log, in the order of its messages.
 
-    Each comes at its own stamp, else that of its message, else at the time of the log. The topics
-    of a namespace are those of one sensor, its data and its status; where packets come from several
-    namespaces, these are their senders.
+    The time of a packet is its own stamp, else that of its message, else that of the log. The
+    topics of one namespace belong to one sensor. If several namespaces have packets, the namespace
+    is the sender.
 
     Args:
-        sender: only the packets of this namespace, or this topic.
+        sender: yield only the packets of this namespace or topic.
     """
 
     datagrams = True
@@ -146,17 +146,17 @@ class BagTransport(Transport):
                 if link.msgtype == RAW:
                     yield raw_chunk(message)
                     continue
-                heard = _ns(getattr(message, "header", None)) or at
+                message_ns = _ns(getattr(message, "header", None)) or at
                 for packet in getattr(message, "packets", [message]) if message is not None else ():
                     data = next(getattr(packet, name) for name in BYTES if hasattr(packet, name))
                     yield Chunk(
                         data[: getattr(packet, "size", None)].tobytes(),
-                        _ns(packet) or heard,
+                        _ns(packet) or message_ns,
                         sender,
                     )
 
     def _streams(self, link: Any) -> bool:
-        """Whether the packets of a connection are pieces of a byte stream."""
+        """Return whether the packets of a connection are pieces of a byte stream."""
         if link.msgtype != RAW:
             return False
         first = next((self._message(link, raw) for _, _, raw in self._log.messages([link])), None)
@@ -169,8 +169,9 @@ class BagTransport(Transport):
         self._log.close()
 
     def _message(self, link: Any, raw: bytes) -> Any:
-        """A message by the first layout that it fills, which is that of those behind it; None where
-        there is none.
+        """Return a message by the first definition that fits, None if none fits.
+
+        The following messages use the same definition.
         """
         layouts = self._layouts[link.id]
         for layout in layouts:
@@ -188,7 +189,7 @@ class BagTransport(Transport):
 
     @contextmanager
     def _failures(self) -> Iterator[None]:
-        """Whatever rosbags, and the libraries that it asks, raise of a damaged file."""
+        """Raise SourceError for every exception that reading a damaged file causes."""
         try:
             yield
         except LidarSpecError:
@@ -201,7 +202,7 @@ class BagTransport(Transport):
 
 
 def raw_chunk(message: Any) -> Chunk:
-    """A packet out of a message of the node, as rosbags or rclpy have it."""
+    """Return the packet in a message of lidarspec, as rosbags or rclpy return it."""
     data = bytes(message.data)
     padding = message.layout.data_offset
     return Chunk(data[padding:], STAMP.unpack_from(data)[0] if padding == STAMP.size else None)
@@ -212,14 +213,16 @@ def _namespace(topic: str) -> str:
 
 
 def _ns(stamped: Any) -> int:
-    """The stamp of a message, ns; 0 where it has none."""
+    """Return the stamp of a message in ns, 0 if it has none."""
     stamp = getattr(stamped, "stamp", None)
     return 0 if stamp is None else stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 def _layouts(link: Any) -> list[Any]:
-    """How the messages of a connection may be laid out, as stores of types; none where they hold no
-    packets.
+    """Return type stores with the possible definitions of a connection's messages.
+
+    Returns:
+        An empty list if the messages contain no packets.
     """
     typesys = import_library("rosbags.typesys", "ros")
     if link.msgtype == RAW and "packets" in link.topic:
@@ -227,10 +230,10 @@ def _layouts(link: Any) -> list[Any]:
     is_told = link.msgdef.format.name == "MSG"
     if (
         is_told and "packet" not in (link.msgtype + link.msgdef.data).lower()
-    ):  # nor need rosbags understand it
+    ):  # do not parse the definitions of other messages, which rosbags may not support
         return []
     package = link.msgtype.partition("/")[0]
-    found = []
+    stores = []
     for text in (link.msgdef.data,) if is_told else UNTOLD:
         store = typesys.get_typestore(
             typesys.Stores.EMPTY if is_told else typesys.Stores.ROS2_HUMBLE
@@ -242,12 +245,12 @@ def _layouts(link: Any) -> list[Any]:
                 text if is_told else text.format(package=package), link.msgtype
             )
         )
-        found += [store] if _carries(store.fielddefs, link.msgtype) else []
-    return found
+        stores += [store] if _carries(store.fielddefs, link.msgtype) else []
+    return stores
 
 
 def _carries(types: Mapping[str, Any], name: str) -> bool:
-    """Whether messages of a type hold packets."""
+    """Return whether messages of a type contain packets."""
     fields = dict(types[name][1])
     element: Any = (
         _element(fields.get("packets"))
@@ -261,8 +264,10 @@ def _carries(types: Mapping[str, Any], name: str) -> bool:
 
 
 def _element(field: Any) -> Any:
-    """What a field is an array of: the name of a type, or that of a number with its length; None
-    where it is none.
+    """Return the element of an array field, None for other fields.
+
+    Returns:
+        The name of a type; or for numbers a tuple of their type and the length.
     """
     if field is not None and field[0].name in ("ARRAY", "SEQUENCE"):
         return field[1][0][1]

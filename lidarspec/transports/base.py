@@ -1,4 +1,4 @@
-"""What live transports share: reading a stream, waiting for descriptors, errors of the system."""
+"""Functions of all live transports: reading a stream, waiting, system errors."""
 
 from __future__ import annotations
 

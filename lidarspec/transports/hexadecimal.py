@@ -1,11 +1,11 @@
-r"""Bytes as people print them: hexadecimal text, with what stands beside the bytes.
+r"""Read bytes from hexadecimal text and the output of common tools.
 
-Bytes are written "54 2c", "542c", "54:2c", "0x54, 0x2C", "\x54\x2c", as an array of C or a list of
-Python; "#", "//" and "/* */" are comments. A line may begin with a time, [12:00:01.123], or an
-offset, and end with the bytes as characters, as xxd, hexdump -C, tcpdump and Wireshark print it; it
-may be one of candump, of a logic analyser's table or of sigrok's annotations. Each of these is told
-by what none of the others has. What can be read in two ways is not read: `AMBIGUOUS` says which,
-and how to print it otherwise.
+Supported are "54 2c", "542c", "54:2c", "0x54, 0x2C", "\x54\x2c", arrays in C and lists in Python;
+"#", "//" and "/* */" start comments. A line may begin with a time such as [12:00:01.123] or an
+offset, and end with the bytes as characters, as xxd, hexdump -C, tcpdump and Wireshark print them.
+Lines of candump, tables of logic analysers and annotations of sigrok are supported too. Each format
+is recognised by a feature that no other format has. Ambiguous text is an error: `AMBIGUOUS` has the
+reasons and the alternatives.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from lidarspec.transports.protocol import Chunk
 
 #: bytes of a line that are read at once.
 BLOCK = 1 << 18
-#: digits of a word that a message shows.
+#: characters of an invalid word in a message.
 QUOTED = 64
-#: characters of a dump's line that has others beside its bytes, at most.
+#: maximum length of a dump's line with characters after its bytes.
 LONGEST_ROW = 1 << 10
 _BETWEEN, _NO_DIGIT, _COMMENT = (
     re.compile(r"[\s,;:{}]+"),
@@ -31,8 +31,8 @@ _BETWEEN, _NO_DIGIT, _COMMENT = (
 )
 _HEX = "[0-9a-fA-F]"
 _PLAIN = re.compile(r"\s*(?:(?:[0-9a-fA-F]{2})+(?:\s+|$))*")
-#: lines with the bytes as digits, where they belong to and when they came: of candump, of its log,
-#: of sigrok's annotations of a UART.
+#: lines with bytes as digits, a bus and a time: candump, the log of candump, sigrok's annotations
+#: of a UART.
 FORMS = (
     re.compile(
         rf"\s*(?:\((?P<at>\d+\.\d+)\)\s+)?(?P<bus>[a-zA-Z]\w*\s+{_HEX}{{3,8}})\s+\[(?P<size>\d+)\]\s*"
@@ -43,26 +43,25 @@ FORMS = (
     ),
     re.compile(rf"\s*(?:\d+-\d+\s+)?(?:uart-\d+|UART: RX(?: data)?):\s+(?P<digits>{_HEX}{{2}})\s*"),
 )
-#: a line of a dump: its offset, what sets this off, and the rest; and the end of one, which is an
-#: offset alone.
+#: a line of a dump: its offset, the mark after it, and the rest. The last line has only an offset.
 _ROW = re.compile(
     rf"\s*(?:0[xX])?(?P<offset>{_HEX}{{3,16}})(?P<mark>:(?=\s)|(?=\s\s|\s*$)|(?<=^{_HEX}{{7}})(?="
     rf" {_HEX}{{2}}\b))(?P<rest>.*)"
 )
 _GAP = re.compile(r"\s{2,}")
-#: a time before the bytes: of the day, with a date or not; or seconds.
+#: a time before the bytes: time of day with an optional date, or seconds.
 _CLOCK = re.compile(
     r"\s*(?P<bracket>\[)?(?:(?P<date>\d{4}-\d\d-\d\d)["
     r" T])?(?P<clock>(?:[01]?\d|2[0-3]):[0-5]\d:[0-5]\d)(?:[.,](?P<fraction>\d{1,9}))?Z?"
     r"(?(bracket)\]|(?=[\s:>]))\s*(?:->|[:>])?\s*"
 )
 _SECONDS = re.compile(r"\s*(?:[\[(]\s*)?(?P<at>\d+\.\d+)[\])]?:?\s+")
-#: what an array begins with, and a variable that is none; a string of escaped bytes.
+#: the start of an array; a variable that is not an array; a string of escaped bytes.
 _ARRAY = re.compile(r".*[\w\]]\s*=\s*(?:[{\[]|$)|\s*\[(?=\s*0[xX])")
 _NUMBER = re.compile(r"[\w\s]+=\s*\w+\s*;\s*")
 _STRING = re.compile(r"""\bb?(["'])((?:\\x[0-9a-fA-F]{2})*)\1|(["'])((?:\\x[0-9a-fA-F]{2})*)\3""")
 _IN_ARRAY = re.compile(rf"0[xX]{_HEX}{{1,2}}")
-#: lines that mean bytes in two ways, or others than those that stand there, and why.
+#: ambiguous lines, and the reason.
 AMBIGUOUS = {
     re.compile(
         rf"\s*:{_HEX}{{10,}}\s*"
@@ -81,19 +80,22 @@ AMBIGUOUS = {
 
 
 class HexText:
-    """The reader of one text, line by line; it knows what began in the lines before."""
+    """Reader of one text, line by line.
+
+    It keeps the state of comments, arrays and dumps that span lines.
+    """
 
     def __init__(self) -> None:
         self._in_comment = self._in_array = False
-        self._columns: tuple[int, int] | None = None  # of a table: the values and the times
+        self._columns: tuple[int, int] | None = None  # of a table: the columns of values and times
         self._bus = ""
-        self._position: int | None = None  # bytes since a dump began whose offsets are not marked
+        self._position: int | None = None  # bytes since the start of a dump with unmarked offsets
 
     def line(self, text: str) -> Chunk:
-        """The bytes of a line, and when they came where it says so.
+        """Return the bytes of a line, with its time if it has one.
 
         Raises:
-            ValueError: where something else is in it, or it can be read in two ways.
+            ValueError: for other content, or an ambiguous line.
         """
         at = None
         if not self._in_comment:
@@ -113,16 +115,16 @@ class HexText:
         return Chunk(data, at)
 
     def finish(self) -> None:
-        """Nothing, at the end of the text.
+        """Check the end of the text.
 
         Raises:
-            ValueError: where a comment goes on.
+            ValueError: if a comment has not ended.
         """
         if self._in_comment:
             raise ValueError("a comment begins with /* and does not end")
 
     def _frame(self, text: str) -> Chunk | None:
-        """A line of `FORMS`; all have to be of one sender."""
+        """Return the bytes of a line of `FORMS`; all lines need the same sender."""
         found = next((match for form in FORMS if (match := form.fullmatch(text))), None)
         if found is None:
             return None
@@ -137,7 +139,7 @@ class HexText:
         return Chunk(data, _nanoseconds(facts.get("at")))
 
     def _cell(self, text: str) -> Chunk | None:
-        """A line of a logic analyser's table, whose first line names columns."""
+        """Return the bytes of a table's line; the first line names the columns."""
         if self._columns is None:
             names = [name.strip(' "').lower() for name in text.split(",")]
             values = [number for number, name in enumerate(names) if name in ("value", "data")]
@@ -160,8 +162,9 @@ class HexText:
         return Chunk(_whole_bytes(value) if value else b"", _nanoseconds(at))
 
     def _row(self, text: str) -> bytes | None:
-        """A line of a dump, as its offset shows: it is marked as one, or the number of bytes before
-        it.
+        """Return the bytes of a line of a dump, None for other lines.
+
+        Its offset is marked, or equals the number of bytes before it.
         """
         found = _ROW.fullmatch(text)
         if found is None:
@@ -184,7 +187,7 @@ class HexText:
         return data
 
     def _strip_comments(self, text: str) -> str:
-        """A line without its comments."""
+        """Return a line without comments."""
         kept = ""
         while True:
             if self._in_comment:
@@ -200,8 +203,8 @@ class HexText:
             self._in_comment = True
 
     def _plain(self, text: str) -> bytes:
-        """The bytes of a line that has nothing else in it."""
-        if _NUMBER.fullmatch(text):  # the length that xxd -i prints
+        """Return the bytes of a line without offset and time."""
+        if _NUMBER.fullmatch(text):  # the length in the output of xxd -i
             return b""
         if begun := _ARRAY.match(text):
             self._in_array = True
@@ -220,7 +223,7 @@ class HexText:
 
 
 def _split_time(text: str) -> tuple[int | None, str]:
-    """The time that a line begins with, ns, and what is behind it."""
+    """Return the time at the beginning of a line in ns, and the rest of the line."""
     if found := _SECONDS.match(text):
         return _nanoseconds(found["at"]), text[found.end() :]
     found = _CLOCK.match(text)
@@ -240,7 +243,7 @@ def _split_time(text: str) -> tuple[int | None, str]:
 
 
 def _nanoseconds(seconds: str | None) -> int | None:
-    """Seconds as a decimal number, as ns; None where they are none, or more than a time can be."""
+    """Return decimal seconds in ns, None if they are invalid or out of range."""
     whole, _, fraction = (seconds or "").partition(".")
     if not whole.isdecimal() or not (fraction or "0").isdecimal():
         return None
@@ -251,8 +254,9 @@ def _nanoseconds(seconds: str | None) -> int | None:
 
 
 def _shown(text: str) -> bytes:
-    """The bytes of a dump's line behind its offset; characters beside them, between "|" or behind a
-    gap, have to be those of the bytes.
+    """Return the bytes of a dump's line after its offset.
+
+    Characters after the bytes, between "|" or behind a gap, have to match the bytes.
     """
     text, bar, _ = text.partition("  |")
     data = b""
@@ -281,7 +285,10 @@ def _shown(text: str) -> bytes:
 
 
 def _is_of(characters: str, data: bytes) -> bool:
-    """Whether these are the characters of bytes, those that cannot be printed as others."""
+    """Return whether these characters stand for the bytes.
+
+    Bytes that cannot be printed may have any replacement.
+    """
     pairs = zip(characters, data, strict=False)
     return len(characters) <= len(data) and all(
         ord(one) == byte or one == "." or not one.isascii() for one, byte in pairs
@@ -289,7 +296,7 @@ def _is_of(characters: str, data: bytes) -> bool:
 
 
 def _digits(text: str) -> bytes:
-    """The bytes of words of hexadecimal digits."""
+    """Return the bytes of words of hexadecimal digits."""
     if _PLAIN.fullmatch(text):
         return bytes.fromhex(text)
     words = _BETWEEN.split(_STRING.sub(r"\2\4 ", text).replace("\\x", " "))
@@ -308,15 +315,16 @@ def _whole_bytes(word: str) -> bytes:
 
 
 def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
-    """The bytes of hexadecimal text, a chunk for each line; one that is longer than a block comes
-    in several.
+    """Yield the bytes of hexadecimal text, a chunk for each line.
+
+    A line that is longer than a block yields several chunks.
 
     Args:
         name: of the file, for messages.
-        readline: the next line, or so many bytes of it.
+        readline: returns the next line, or the given number of bytes of it.
 
     Raises:
-        WireError: where something else is in it.
+        WireError: for other content.
     """
     reader = HexText()
     text = ""
@@ -333,7 +341,7 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
             if block.endswith(b"\n"):
                 goes_on = ""
                 number = number + 1
-            else:  # so does a comment in the line; an offset is at its beginning alone
+            else:  # a comment also continues; only the beginning of a line can be an offset
                 if re.search("#|//", goes_on + text[:end]):
                     goes_on = "#"
                 else:
@@ -345,7 +353,10 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
 
 
 def between(text: str) -> int:
-    """Where hexadecimal text can be cut: behind or before its last mark, else between two bytes."""
+    """Return an index at which hexadecimal text can be cut.
+
+    It is next to the last separator, else between two bytes.
+    """
     return (
         max(
             *(text.rfind(mark) + 1 for mark in " \t\n,;:{}"), *(text.rfind(mark) for mark in "\\/#")
@@ -355,10 +366,10 @@ def between(text: str) -> int:
 
 
 def parse_hex(text: str) -> bytes:
-    """The bytes that hexadecimal text stands for.
+    """Return the bytes that hexadecimal text stands for.
 
     Raises:
-        ValueError: where something else is in it, or it can be read in two ways.
+        ValueError: for other content, or ambiguous text.
     """
     reader = HexText()
     data = b"".join(reader.line(line).data for line in text.splitlines())
@@ -367,11 +378,11 @@ def parse_hex(text: str) -> bytes:
 
 
 def is_hexadecimal(head: bytes, *, whole: bool) -> bool:
-    """Whether input begins as hexadecimal text.
+    """Return whether input begins with hexadecimal text.
 
     Args:
         head: its first bytes.
-        whole: whether these are all of it.
+        whole: whether `head` is the whole input.
     """
     try:
         text = head.decode("ascii")

@@ -1,4 +1,7 @@
-"""SOURCE, the one noun for where bytes come from: text to transport."""
+"""Open the transport of a SOURCE.
+
+A SOURCE is the text that names an input: a file, a port, a URL, a device of `lidarspec.toml`.
+"""
 
 from __future__ import annotations
 
@@ -22,27 +25,26 @@ from lidarspec.transports.protocol import LiveTransport, Transport
 
 #: scheme -> the module of lidarspec.transports whose `connect(address, sensor)` opens it.
 SCHEMES = {"serial": "serial", "udp": "udp", "tcp": "tcp", "sim": "simulated"}
-#: what may stand behind the ? of a file: who sent, and which file of an archive.
+#: options of a file, after "?": the sender, and the member of an archive.
 FILE_OPTIONS = {"src", "file"}
 _SCHEME = re.compile(r"^([a-z][a-z0-9+.-]+):")
-#: names of serial ports: Windows' COM4, and everything that POSIX systems call theirs.
+#: names of serial ports: COM4 on Windows, and all names on POSIX systems.
 _PORT = re.compile(r"(COM\d+|\\\\\.\\\w+|/dev/(tty|cu\.|pts/|serial/|rfcomm).*)", re.IGNORECASE)
-#: what stands in /dev and is read like a file.
+#: devices in /dev that are read like files.
 _NO_PORTS = {"null", "zero", "full", "random", "urandom", "stdin", "fd"}
 
 
 def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
-    """The open transport for a SOURCE.
+    """Open the transport of a SOURCE.
 
     Args:
-        sensor: whose declared link says what the source leaves out: baud rate, control lines,
-            ports.
+        source: a file, "-", a port, a URL, or the name of a device in `lidarspec.toml`.
+        sensor: the source of defaults: baud rate, control lines, ports.
 
     Raises:
-        UsageError: for a scheme that neither the package nor a plugin knows, and what each kind of
-            source does not take.
-        SourceError: where it cannot be opened.
-        SpecError: where a plugin gives something that is no `Transport`.
+        UsageError: for an unknown scheme, or options that the kind of source does not accept.
+        SourceError: if it cannot be opened.
+        SpecError: if a plugin returns an object that is not a `Transport`.
     """
     text = resolve(source)
     address = live_address(text)
@@ -62,16 +64,16 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
 
 
 def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
-    """The open transport for a SOURCE that does not end by itself.
+    """Open the transport of a live SOURCE.
 
     Args:
-        sensor: whose declared link says what the source leaves out: baud rate, control lines,
-            ports.
+        source: a port, a URL, or the name of a device in `lidarspec.toml`.
+        sensor: the source of defaults: baud rate, control lines, ports.
 
     Raises:
-        UsageError: for a file, a scheme that nobody knows, and what its kind of source does not
-            take.
-        SourceError: where it cannot be opened.
+        UsageError: for a file, an unknown scheme, or options that the kind of source does not
+            accept.
+        SourceError: if it cannot be opened.
     """
     opened = transport(source, sensor)
     if isinstance(opened, LiveTransport):
@@ -81,7 +83,7 @@ def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
 
 
 def resolve(source: str | Path) -> str:
-    """The SOURCE itself: that of the device where it is the name of one in `lidarspec.toml`."""
+    """Return the SOURCE of a device in `lidarspec.toml`; other text is unchanged."""
     device = find_device(source)
     if device is None:
         return str(source)
@@ -89,14 +91,12 @@ def resolve(source: str | Path) -> str:
 
 
 def is_live(source: str | Path) -> bool:
-    """Whether a SOURCE, or the device of this name, goes on by itself."""
+    """Return whether a SOURCE, or the device with this name, is live."""
     return live_address(resolve(source)) is not None
 
 
 def live_address(source: str | Path) -> Address | None:
-    """What a SOURCE says where it is no file: its scheme, place and options; None for files and
-    standard input.
-    """
+    """Return scheme, place and options of a SOURCE, None for files and standard input."""
     text = str(source)
     if is_port(text):
         return Address.parse(text, scheme="serial")
@@ -108,7 +108,7 @@ def live_address(source: str | Path) -> Address | None:
 
 
 def is_port(text: str) -> bool:
-    """Whether a SOURCE without a scheme names a serial port."""
+    """Return whether a SOURCE without a scheme names a serial port."""
     name = text.partition("?")[0]
     path = Path(name)
     if os.path.exists(name) and path.is_char_device():
@@ -117,60 +117,60 @@ def is_port(text: str) -> bool:
 
 
 def has_control(source: str | Path) -> bool:
-    """Whether a source says by itself where commands go: ``control=HOST[:PORT]``."""
+    """Return whether a source has the option ``control=HOST[:PORT]``."""
     address = live_address(source)
     return address is not None and bool(address.options.get("control"))
 
 
 def control_link(source: str | Path, name: str, link: Link, host: str | None) -> LiveTransport:
-    """The open transport of a link that commands go over apart from the data.
+    """Open the transport of a link that carries commands but no data.
 
     Args:
+        source: the SOURCE of the data; its ``control=HOST[:PORT]`` has priority over `host`.
         name, link: the link as the sensor declares it.
-        host: the sensor's address as far as it is known; ``control=HOST[:PORT]`` of the source
-            comes before it.
+        host: the sensor's address, None if it is unknown.
 
     Raises:
-        UsageError: where nobody says the address.
-        SourceError: where it cannot be opened.
+        UsageError: if the address is unknown, or no plugin opens such a link.
+        SourceError: if it cannot be opened.
     """
     address = live_address(source)
     if address is not None:
-        said = address.options.get("control", "")
+        control = address.options.get("control", "")
     else:
-        said = ""
-    if live_address(said) is not None:
-        return live(said)
-    found, port = Address(said, "", said).host_and_port()
-    known = found or host
-    if isinstance(link, Tcp) and known:
-        return live(f"tcp://{_bracket(known)}:{port or link.port}")
-    if isinstance(link, Http) and known:
+        control = ""
+    if live_address(control) is not None:
+        return live(control)
+    control_host, port = Address(control, "", control).host_and_port()
+    remote_host = control_host or host
+    if isinstance(link, Tcp) and remote_host:
+        return live(f"tcp://{_bracket(remote_host)}:{port or link.port}")
+    if isinstance(link, Http) and remote_host:
         from lidarspec.transports.http import HttpTransport
 
-        return HttpTransport(known, replace(link, port=port or link.port))
-    if isinstance(link, Udp) and (known or link.broadcast):
+        return HttpTransport(remote_host, replace(link, port=port or link.port))
+    if isinstance(link, Udp) and (remote_host or link.broadcast):
         from lidarspec.transports.udp import UdpTransport
 
         if address is not None:
-            everybody = address.options.get("broadcast", "255.255.255.255")
+            broadcast_host = address.options.get("broadcast", "255.255.255.255")
         else:
-            everybody = ""
+            broadcast_host = ""
         remote = (
-            resolve_host(known or everybody, str(source)),
-            port or (link.ports[0] if known and link.ports else link.broadcast),
+            resolve_host(remote_host or broadcast_host, str(source)),
+            port or (link.ports[0] if remote_host and link.ports else link.broadcast),
         )
-        own = "::" if ":" in remote[0] else ""
+        local_host = "::" if ":" in remote[0] else ""
         label = f"udp://{_bracket(remote[0])}:{remote[1]}"
         return UdpTransport(
             label,
             [link.local],
-            host=own,
-            sender=remote[0] if known else None,
+            host=local_host,
+            sender=remote[0] if remote_host else None,
             remote=remote,
-            broadcast=not known,
+            broadcast=not remote_host,
         )
-    opened = registry().call("lidarspec_link", source=str(source), link=link, host=known)
+    opened = registry().call("lidarspec_link", source=str(source), link=link, host=remote_host)
     if isinstance(opened, LiveTransport):
         return opened
     if opened is not None:
@@ -190,7 +190,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
 
 
 def _open(address: Address, sensor: Sensor | None) -> Transport:
-    """The open transport of a SOURCE with a scheme, which the package or a plugin knows."""
+    """Open a SOURCE with a scheme, with the package or a plugin."""
     if address.scheme in SCHEMES:
         module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")
         opened: Transport = module.connect(address, sensor)

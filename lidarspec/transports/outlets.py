@@ -4,9 +4,9 @@ Simulated sensors and replays use the same mechanism. A `Line` is the sensor's e
 sends without waiting and returns the commands that have arrived. An `Outlet` holds the line of the
 data and the lines of the sensor's other links, and waits for all of them in one loop.
 
-As a real sensor does, an outlet sends whether or not somebody listens, and counts the bytes that
-nobody read. With `patient=True` it waits for a slow reader instead. A replay requires that, because
-it has to arrive complete; so does a simulated sensor that runs as fast as it is read.
+Like a real sensor, an outlet sends without a listener too, and counts the bytes that were not read.
+With `patient=True` it waits for a slow reader instead. A replay requires that, because it has to
+arrive complete; so does a simulated sensor that runs as fast as it is read.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Line:
     Attributes:
         place: the SOURCE string with which a program on this computer opens the link.
         port: the port that it listens on, 0 for none.
-        has_listener: whether somebody listens, as far as this is known.
-        unsent_bytes: the number of bytes that nobody read in time.
+        has_listener: whether there is a listener, as far as this is known.
+        unsent_bytes: the number of bytes that were not read in time.
     """
 
     place: str = ""
@@ -450,7 +450,7 @@ class TcpLine(Line):
 class PtyLine(Line):
     """A pseudo-terminal that programs open by its path, POSIX only.
 
-    Bytes that are sent while nobody has it open are lost, as on a serial cable.
+    Bytes that are sent while no program has it open are lost, as on a serial cable.
 
     Args:
         link: a symbolic link to the terminal, which is created and removed with it.
@@ -487,7 +487,7 @@ class PtyLine(Line):
         return []
 
     def plug(self) -> None:
-        """Make a terminal in raw mode that nobody has open."""
+        """Make a terminal in raw mode that no program has open."""
         if not has_terminals():
             raise _missing_terminal_error("this system has no pseudo-terminals")
         try:
@@ -649,12 +649,12 @@ class Outlet:
 
     @property
     def has_listener(self) -> bool:
-        """Whether somebody listens to the data, as far as this is known."""
+        """Whether there is a listener, as far as this is known."""
         return self.data.has_listener
 
     @property
     def unsent_bytes(self) -> int:
-        """The number of data bytes that nobody read in time."""
+        """The number of data bytes that were not read in time."""
         return self.data.unsent_bytes
 
     def receive(self, wait: float) -> list[tuple[str, bytes]]:
@@ -676,7 +676,7 @@ class Outlet:
         Commands that the listener sends are ignored.
 
         Raises:
-            Disconnected: if nobody listens any more.
+            Disconnected: if there is no listener any more.
             SourceError, UsageError: as `Line.send`.
         """
         self.data.receive()
@@ -700,7 +700,7 @@ class Outlet:
             line.plug()
 
     def finish(self) -> None:
-        """Wait until the last bytes of the data have been read, or nobody reads them."""
+        """Wait until the last bytes of the data have been read, or there is no reader."""
         self.data.finish()
 
     def close(self) -> None:

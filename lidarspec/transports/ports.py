@@ -1,6 +1,4 @@
-"""The serial and UDP ports of this computer: which there are, who may open them, and who has them
-open.
-"""
+"""The serial and UDP ports of this computer, their permissions and their users."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ except ImportError:  # no POSIX
     grp = None  # type: ignore[assignment]
 
 _PROCESSES = Path("/proc")
-#: tables of the UDP sockets of this computer, and where in a line port and inode stand.
+#: tables of the UDP sockets of this computer.
 _UDP_TABLES = ("/proc/net/udp", "/proc/net/udp6")
 
 
@@ -28,10 +26,10 @@ class SerialPort:
 
     Attributes:
         path: "/dev/ttyUSB0" or "COM4".
-        description: what the system knows of it.
-        lasting: a name that stays the same when it is plugged in elsewhere; "" where there is none.
+        description: the system's description of the device.
+        lasting: a name that does not depend on the USB socket; "" if there is none.
         allowed: whether this user may open it.
-        users: the programs that have it open, as far as can be seen.
+        users: the programs that have it open, as far as the system shows them.
     """
 
     path: str
@@ -53,8 +51,8 @@ class User:
 
 
 def serial_ports() -> list[SerialPort]:
-    """The serial ports of this computer, by name."""
-    found = []
+    """Return the serial ports of this computer, sorted by name."""
+    ports = []
     for port in sorted(list_ports.comports(), key=lambda port: str(port.device)):
         if port.description not in (None, "n/a"):
             description = port.description
@@ -65,16 +63,16 @@ def serial_ports() -> list[SerialPort]:
         else:
             maker = ""
         path = port.device
-        found.append(
+        ports.append(
             SerialPort(
                 path, f"{description}{maker}".strip(), lasting(path), is_allowed(path), users(path)
             )
         )
-    return found
+    return ports
 
 
 def lasting(port: str) -> str:
-    """The name under /dev/serial/by-id that leads to a port, "" where there is none."""
+    """Return the name under /dev/serial/by-id of a port, "" if there is none."""
     links = sorted(Path("/dev/serial/by-id").glob("*"))
     return next(
         (str(link) for link in links if os.path.realpath(link) == os.path.realpath(port)), ""
@@ -82,13 +80,13 @@ def lasting(port: str) -> str:
 
 
 def is_allowed(port: str) -> bool:
-    """Whether this user may open a port; a name that is no file is taken for one that he may."""
+    """Return whether this user may open a port; True if there is no such file."""
     effective = os.access in os.supports_effective_ids
     return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK, effective_ids=effective)
 
 
 def group(port: str) -> str:
-    """The group that may open a port, "" where only root may, or nobody knows."""
+    """Return the group that may open a port; "" if only root may, or it is unknown."""
     with contextlib.suppress(OSError, KeyError):
         status = os.stat(port)
         if grp is not None and status.st_mode & 0o060 == 0o060 and status.st_gid:
@@ -97,8 +95,9 @@ def group(port: str) -> str:
 
 
 def users(port: str) -> tuple[User, ...]:
-    """The programs that have a port open, this one left out; without root's rights only one's own
-    are seen.
+    """Return the other programs that have a port open.
+
+    Without root's rights, only this user's programs are visible.
     """
     path = os.path.realpath(port)
     if os.path.exists(path):
@@ -109,9 +108,10 @@ def users(port: str) -> tuple[User, ...]:
 
 
 def udp_users(port: int) -> tuple[User, ...] | None:
-    """The programs that have a UDP port open, this one left out; None where it is free.
+    """Return the other programs that have a UDP port open, None if it is free.
 
-    Empty where it is that of a user whose programs are not to be seen.
+    Returns:
+        An empty tuple if the program belongs to another user and is not visible.
     """
     inodes = set()
     for table in _UDP_TABLES:
@@ -126,7 +126,7 @@ def udp_users(port: int) -> tuple[User, ...] | None:
 
 
 def _holding(wanted: Callable[[str], bool]) -> Iterator[User]:
-    """The programs of which an open file leads to what is wanted."""
+    """Yield the programs with an open file that `wanted` accepts."""
     for process in _PROCESSES.glob("[0-9]*") if _PROCESSES.is_dir() else ():
         if int(process.name) == os.getpid():
             continue
@@ -138,27 +138,30 @@ def _holding(wanted: Callable[[str], bool]) -> Iterator[User]:
 
 
 def _targets(folder: Path) -> Iterator[str]:
-    """What the open files of a process lead to."""
+    """Yield the targets of a process's open files."""
     for name in os.listdir(folder):
         with contextlib.suppress(OSError):
             yield os.readlink(folder / name)
 
 
 def count_received() -> dict[str, int]:
-    """Packets that each network interface has received so far; empty where the system does not
-    tell.
+    """Return the number of packets that each network interface has received so far.
+
+    Returns:
+        An empty dict if the system does not report it.
     """
-    found = {}
+    received = {}
     with contextlib.suppress(OSError, ValueError, IndexError):
         for line in Path("/proc/net/dev").read_text(encoding="ascii").splitlines()[2:]:
             name, _, counts = line.partition(":")
-            found[name.strip()] = int(counts.split()[1])
-    return found
+            received[name.strip()] = int(counts.split()[1])
+    return received
 
 
 def filters_senders(interface: str) -> bool:
-    """Whether the system throws away packets from addresses that it would not answer over this
-    interface (strict rp_filter).
+    """Return whether the system drops packets from senders without a route back.
+
+    That is strict rp_filter on this interface.
     """
     with contextlib.suppress(OSError):
         values = [

@@ -1,8 +1,8 @@
-"""What a plugin can add besides sensors: file formats and sources.
+"""Base classes for transports and file formats, which plugins can add.
 
-A `Transport` is the only place for input and output: it gives `Chunk`s and takes bytes. What it can
-do is said by its class (a `LiveTransport` does not end by itself) and by its attributes, all of
-which have a default here.
+A `Transport` does all input and output: it yields `Chunk`s and sends bytes. Its class and its
+attributes describe its abilities: a `LiveTransport` does not end by itself, and all attributes have
+defaults here.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from typing import Any, BinaryIO, Self
 
 from lidarspec.errors import SourceError, UsageError
 
-#: seconds between two looks at whether somebody wants to stop.
+#: seconds between two checks for a request to stop.
 POLL = 0.05
-#: who sends datagrams: address and port.
+#: address and port of a sender of datagrams.
 Sender = tuple[str, int]
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Whose datagrams are wanted: those of an address, or of one of its ports; a sender is `in` it,
-    or not.
+    """The requested sender: an address, or one of its ports.
+
+    ``sender in origin`` is true for datagrams of this sender.
     """
 
     host: str
@@ -36,19 +37,21 @@ class Origin:
 
     @classmethod
     def parse(cls, text: str) -> Origin:
-        """What "192.168.1.201", "192.168.1.201:2368", "fe80::1" and "[fe80::1]:2368" stand for.
+        """Return the origin for ADDRESS or ADDRESS:PORT.
+
+        Examples are "192.168.1.201", "192.168.1.201:2368", "fe80::1" and "[fe80::1]:2368".
 
         Raises:
-            UsageError: for a port that is none.
+            UsageError: for an invalid port.
         """
-        found = re.fullmatch(r"\[(.*)\](?::(.*))?|([^:]*):([^:]*)", text)
-        if found is None:
+        match = re.fullmatch(r"\[(.*)\](?::(.*))?|([^:]*):([^:]*)", text)
+        if match is None:
             return cls(text)
-        host = found[1] or found[3] or ""
-        if found[1] is None:
-            port = found[4]
+        host = match[1] or match[3] or ""
+        if match[1] is None:
+            port = match[4]
         else:
-            port = found[2]
+            port = match[2]
         if port is not None and not (port.isdecimal() and 0 < int(port) < 65536):
             raise UsageError(f"src={text}: a sender is ADDRESS or ADDRESS:PORT")
         return cls(host, None if port is None else int(port))
@@ -58,19 +61,20 @@ class Origin:
 
 
 def endpoint(sender: Sender) -> str:
-    """A sender as it is written, and as `src=` takes it: "192.168.1.201:2368", "[fe80::1]:2368"."""
+    """Return a sender as `src=` accepts it: "192.168.1.201:2368", "[fe80::1]:2368"."""
     if ":" in sender[0]:
         return f"[{sender[0]}]:{sender[1]}"
     return f"{sender[0]}:{sender[1]}"
 
 
 def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
-    """What to call each sender: by its address, and its port where several of one address send to
-    one port; "" where nobody knows it.
+    """Return a name for each sender: its address, with the port if that is ambiguous.
+
+    The port is added if several senders of one address send to the same port. The name of an
+    unknown sender is "".
 
     Args:
-        ends: sender and receiver of datagrams; a sensor may send from several ports, but not the
-            same.
+        ends: sender and receiver of datagrams.
     """
     known = dict.fromkeys(ends)
     ports = defaultdict[tuple[str, int | None], set[int]](set)
@@ -86,16 +90,16 @@ def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Se
 
 @dataclass(frozen=True)
 class Format:
-    """A file format by suffix.
+    """A file format, identified by suffix.
 
     Args:
-        suffix: with its dot, ".csv".
+        suffix: including the dot, ".csv".
         description: a few words for lists.
-        write: writes scans to a path; `every_point` also those without a return.
-        holds: what it has a place for that not every format has: "organized" points, as rows and
-            columns, where `write` is given `organized=True` with a single scan; "scans" each by
-            itself, organised ones always; "beams" and "frame-id" of ROS's messages; "packets" as
-            they came, which `write` is given as `packets=`.
+        write: writes scans to a path; with `every_point`, also points without a return.
+        holds: the optional features of the format. "organized": points in rows and columns; `write`
+            is called with `organized=True` and a single scan. "scans": scans are stored separately,
+            and always organized. "beams" and "frame-id": those of ROS messages. "packets": raw
+            packets, which `write` gets as `packets=`.
     """
 
     suffix: str
@@ -104,22 +108,21 @@ class Format:
     holds: tuple[str, ...] = ()
 
     def __call__(self, path: Path, scans: Iterable[Any], *, every_point: bool = False) -> None:
-        """Write the scans."""
+        """Write scans to a file."""
         self.write(path, scans, every_point=every_point)
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """What a transport read at once: a datagram, or a piece of a byte stream.
+    """The bytes of one read: a datagram, or a piece of a byte stream.
 
     Attributes:
         data: the bytes.
-        at: arrival time, ns since 1970; None where nobody knows it.
+        at: arrival time, ns since 1970; None if unknown.
         sender: (address, port) of a datagram, else None.
-        receiver: (address, port) that a datagram was sent to, where it is known.
-        gap: whether the line was interrupted before it: a frame begun earlier does not go on here.
-        quiet: whether the line had fallen silent before it: what waited there for more bytes was
-            given up.
+        receiver: (address, port) that a datagram was sent to, None if unknown.
+        gap: whether the line was interrupted before it: an incomplete frame does not continue here.
+        quiet: whether the line was silent before it: an incomplete frame was discarded then.
     """
 
     data: bytes
@@ -131,10 +134,10 @@ class Chunk:
 
 
 class Closing:
-    """A context manager that is closed at the end."""
+    """A context manager with a `close` method."""
 
     def close(self) -> None:
-        """Give everything back."""
+        """Release all resources."""
         raise NotImplementedError
 
     def __enter__(self) -> Self:
@@ -150,19 +153,18 @@ class Closing:
 
 
 class Transport(ABC):
-    """Where bytes come from, and go to. A source of one's own derives from it.
+    """An input and output of bytes; other sources derive from it.
 
     Attributes:
         datagrams: whether each chunk is one datagram.
-        baud: of a serial line; None for anything else.
-        warnings: what is to be said of it so far, such as where a file is damaged, or that a
-            receive buffer is too small.
-        foreign: datagrams from other senders than the one asked for, so far.
-        kernel_drops: datagrams that the system threw away, so far, since nobody fetched them in
-            time.
-        disconnects: interruptions of the line that a recording tells of, so far.
-        unread: bytes of a damaged file that could not be read, so far.
-        stored: the file that is read, as it is stored: one that unpacks it stands before it.
+        baud: the baud rate of a serial line; None for all others.
+        warnings: the warnings so far, such as a damaged file or a small receive buffer.
+        foreign: number of datagrams so far from other senders than the requested one.
+        kernel_drops: number of datagrams so far that the system dropped because they were not read
+            in time.
+        disconnects: number of interruptions so far that a recording reports.
+        unread: number of bytes of a damaged file so far that could not be read.
+        stored: the file as it is stored, below a decompressing one.
     """
 
     datagrams: bool = False
@@ -176,28 +178,31 @@ class Transport(ABC):
 
     @abstractmethod
     def chunks(self) -> Iterator[Chunk]:
-        """What arrives, until the input ends.
+        """Yield chunks as they arrive, until the input ends.
 
         Raises:
-            SourceError: where it cannot be read.
+            SourceError: if it cannot be read.
         """
 
     @property
     def place(self) -> tuple[int, int] | None:
-        """How many bytes of the stored file were read, and how many there are; None where nobody
-        knows.
-        """
+        """The read bytes and the size of the stored file; None if unknown."""
         stored: Any = self.stored
         if stored is None or not stored.seekable():
             return None
         size: int = (
             stored.size if hasattr(stored, "size") else os.fstat(stored.fileno()).st_size
-        )  # in a store, or here
+        )  # in a store, or on this computer
         return stored.tell(), size
 
     def skip(self, at: int) -> bool:
-        """Pass over what arrived before a time, ns since 1970, where that can be done without
-        reading it: whether it was.
+        """Skip everything that arrived before a time, if that needs no reading.
+
+        Args:
+            at: the time, ns since 1970.
+
+        Returns:
+            Whether data was skipped.
         """
         return False
 
@@ -206,22 +211,23 @@ class Transport(ABC):
         """Send bytes to the device.
 
         Raises:
-            SourceError: where nothing can be sent.
+            SourceError: if nothing can be sent.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Give the port, socket or file back."""
+        """Close the port, socket or file."""
 
 
 def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
-    """Why there are no bytes in a file: what its transport says of it, or that there are none."""
+    """Return the reason why a file has no bytes: the warnings of its transport."""
     return "; ".join(warnings) or f"{source} holds no bytes"
 
 
 class Disconnected(SourceError):
-    """The device behind a live source went away; `LiveTransport.reopen` finds it again when it
-    comes back.
+    """Raised if the device of a live source disappears.
+
+    `LiveTransport.reopen` opens it again when it is back.
     """
 
 
@@ -229,14 +235,13 @@ class LiveTransport(Transport):
     """A transport that does not end by itself: a port, a socket, a simulated device.
 
     Attributes:
-        label: how the user called it, for messages.
+        label: the user's name for it, for messages.
         closed: whether it was closed, which ends `chunks`.
-        overflow: what a reader's queue should do when it is full: "drop_oldest", or "block" for a
-            source without a pace of its own.
-        silence: seconds without a byte after which nothing of a frame can be under way: what waits
-            for more is given up then.
-        addressed: whether what is written has somewhere to go.
-        stranger: who sent the last of the datagrams that are `foreign`.
+        overflow: the policy of a reader's full queue: "drop_oldest", or "block" for a source that
+            waits for its reader.
+        silence: seconds without a byte after which an incomplete frame is discarded.
+        addressed: whether `write` has a destination.
+        stranger: the sender of the last `foreign` datagram.
     """
 
     label: str = ""
@@ -247,24 +252,31 @@ class LiveTransport(Transport):
 
     @property
     def addressed(self) -> bool:
-        """Whether what is written has somewhere to go: always, but for datagrams while nobody knows
-        where the sensor is.
+        """Whether `write` has a destination.
+
+        It is False only for datagrams while the address of the sensor is unknown.
         """
         return True
 
     def accept(self, sender: Sender) -> None:
-        """Take a sender for the sensor: what is written goes there. Lines that know their other end
-        have nothing to learn.
+        """Use a sender as the sensor's address, which `write` sends to.
+
+        Lines with a fixed other end do nothing.
         """
 
     @abstractmethod
     def read(self, timeout: float) -> list[Chunk]:
-        """What has arrived; an empty list where nothing did for `timeout` seconds, or it was
-        closed.
+        """Return the chunks that have arrived.
+
+        Args:
+            timeout: seconds to wait for the first one.
+
+        Returns:
+            An empty list if nothing arrived in time, or the transport was closed.
 
         Raises:
-            Disconnected: where the device went away.
-            SourceError: where nothing can ever be read again.
+            Disconnected: if the device disappeared.
+            SourceError: if nothing can be read any more.
         """
 
     @abstractmethod
@@ -272,28 +284,29 @@ class LiveTransport(Transport):
         """Open it again after `Disconnected`.
 
         Raises:
-            SourceError: where it is not there yet.
+            SourceError: if the device is not back yet.
         """
 
     def chunks(self) -> Iterator[Chunk]:
-        """What arrives, until the transport is closed or its device goes away."""
+        """Yield chunks until the transport is closed or its device disappears."""
         while not self.closed:
             yield from self.read(POLL)
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
-        """Set control lines, which only a serial port has; None leaves one as it is.
+        """Set the control lines of a serial port; None leaves a line unchanged.
 
         Raises:
-            UsageError: where there are none.
+            UsageError: if there are no control lines.
         """
         raise UsageError(f"{self.label}: only a serial port has control lines")
 
     def link(self, name: str) -> LiveTransport | None:
-        """The open transport of another link of the same device; None where it has an address of
-        its own.
+        """Return the open transport of another link of the same device.
+
+        None if that link has an address of its own.
         """
         return None
 
     def peer(self) -> str | None:
-        """The host of the device, as far as it is known."""
+        """Return the host of the device, None if unknown."""
         return None

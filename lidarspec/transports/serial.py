@@ -1,10 +1,12 @@
-"""Serial ports: opened for one program alone, read as bytes come, found again when they were
+"""Read and write serial ports.
+
+A port is opened for one program alone, read as bytes arrive, and opened again after it was
 unplugged.
 
-After a hang-up pyserial raises SerialException, a bare OSError, `termios.error` (no OSError), or
-TypeError out of a port that is closed meanwhile; all of them mean that the device is gone. On POSIX
-the port is read through its descriptor: waiting, then one `read` of everything there, with a short
-pause after each so that a fast line does not wake us for every byte.
+After a hang-up pyserial raises SerialException, a bare OSError, `termios.error` (not an OSError),
+or TypeError if the port is closed at the same time; all of them mean that the device is gone. On
+POSIX the port is read through its descriptor: wait, then one `read` of everything available, with a
+short pause after each read so that a fast line does not wake the thread for every byte.
 """
 
 from __future__ import annotations
@@ -38,11 +40,11 @@ try:
 except ImportError:  # no POSIX
     TermiosError = OSError  # type: ignore[assignment,misc]
 
-#: everything that a port which went away raises.
+#: the exceptions of a port that disappeared.
 GONE = (serial.SerialException, OSError, TermiosError, TypeError, ValueError)
-#: bytes read at once.
+#: maximum bytes per read.
 BLOCK = 1 << 16
-#: seconds that a device may take to accept what is written.
+#: seconds that a device may take to accept written bytes.
 WRITE_TIMEOUT = 2.0
 OPTIONS = ("baud", "dtr", "rts")
 
@@ -52,11 +54,11 @@ class SerialTransport(StreamTransport):
 
     Args:
         port: its name, "/dev/ttyUSB0" or "COM4".
-        baud: any rate that the port can make.
-        dtr, rts: levels of the control lines while it is open; None leaves them to the system.
+        baud: any rate that the port supports.
+        dtr, rts: levels of the control lines while it is open; None does not set them.
 
     Raises:
-        SourceError: where it cannot be opened: missing, in use, no permission, no such rate.
+        SourceError: if it cannot be opened: missing, in use, no permission, unsupported rate.
     """
 
     baud: int
@@ -93,8 +95,9 @@ class SerialTransport(StreamTransport):
             raise disconnected_error(self.label, error) from None
 
     def _send(self, descriptor: int, left: memoryview) -> None:
-        """Write through the descriptor, of whatever number: pyserial asks `select`, which knows
-        none above 1,023.
+        """Write through the descriptor.
+
+        pyserial calls `select`, which does not support descriptors above 1,023.
         """
         limit = time.monotonic() + WRITE_TIMEOUT
         while left:
@@ -113,7 +116,7 @@ class SerialTransport(StreamTransport):
             except GONE as error:
                 if not {errno.ENOTTY, errno.EINVAL} & set(
                     error_numbers(error)
-                ):  # of a port without such lines, as a pseudo-terminal
+                ):  # the port has no control lines, as a pseudo-terminal
                     raise disconnected_error(self.label, error) from None
 
     def reopen(self) -> None:
@@ -145,7 +148,7 @@ class SerialTransport(StreamTransport):
         return port
 
     def _refusal(self, error: Exception) -> SourceError:
-        """Why the port does not open, and what to type."""
+        """Return the error for a port that cannot be opened, with the next command."""
         number = error.errno if isinstance(error, OSError) else None
         source = f"serial://{self.label}{sensor_option(self._sensor)}"
         if number == errno.ENOENT or "FileNotFoundError" in str(error):
@@ -176,8 +179,8 @@ class SerialTransport(StreamTransport):
         descriptor = self._port.fileno()
         with contextlib.suppress(BlockingIOError):
             if data := os.read(descriptor, BLOCK):
-                # as a rule, after the pause; nothing may mean a hang-up, which the system tells
-                # only who waits
+                # usually after the pause; an empty read can mean a hang-up, which only a wait
+                # detects
                 return data
         if not wait_readable(descriptor, timeout):
             return b""
@@ -188,15 +191,16 @@ class SerialTransport(StreamTransport):
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
-    """The open port of a serial SOURCE: "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0"
-    or "COM4".
+    """Open the port of a serial SOURCE.
+
+    Examples are "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0" and "COM4".
 
     Args:
-        sensor: whose baud rate and control lines are taken where the source does not say.
+        sensor: the source of defaults: baud rate and control lines.
 
     Raises:
-        UsageError: where nobody says the baud rate, or for an option that a port does not take.
-        SourceError: where it cannot be opened.
+        UsageError: if the baud rate is unknown, or for an option that ports do not have.
+        SourceError: if it cannot be opened.
     """
     address.check(OPTIONS)
     declared = data_link(sensor, Serial)

@@ -86,7 +86,7 @@ def serve(
         seconds: how long; by default without end.
         stop: ends the loop when it is set.
         on_pass: called in every pass of the loop, at least every 50 ms.
-        patient: switch the device on when somebody listens.
+        patient: switch the device on when there is a listener.
 
     Raises:
         SourceError: if nothing can be sent any more.
@@ -179,7 +179,7 @@ class Served(Closing):
     """A simulated sensor at an outlet, in a thread of its own; a context manager.
 
     Args:
-        patient: switch the device on when somebody listens.
+        patient: switch the device on when there is a listener.
 
     Attributes:
         device: the simulated device; its `heard` has the names of the commands that it recognized.

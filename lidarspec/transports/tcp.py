@@ -1,4 +1,4 @@
-"""TCP: a byte stream from a sensor, connected again when it breaks."""
+"""Read a byte stream over TCP, and connect again after a disconnection."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from lidarspec.transports.base import (
 )
 from lidarspec.transports.protocol import Disconnected
 
-#: bytes read at once.
+#: maximum bytes per read.
 BLOCK = 1 << 18
-#: seconds that a connection may take at first, and when it is tried again.
+#: timeouts of the first connection and of later attempts, in seconds.
 PATIENCE = 5.0
 AGAIN = 0.5
-#: seconds without a byte that a connection may need to bring what was sent: lost segments are sent
-#: again after 0.2 s, 0.4 s, 0.8 s ...
+#: seconds without a byte after which an incomplete frame is discarded: lost segments are sent again
+#: after 0.2 s, 0.4 s, 0.8 s ...
 SILENCE = 10.0
 
 
@@ -36,7 +36,7 @@ class TcpTransport(StreamTransport):
     """A connection to a sensor.
 
     Raises:
-        SourceError: where nobody answers.
+        SourceError: if the connection fails.
     """
 
     silence = SILENCE
@@ -73,14 +73,14 @@ class TcpTransport(StreamTransport):
 
     def _connect(self, patience: float) -> socket.socket:
         try:
-            found = socket.create_connection(self._address, patience)
+            connection = socket.create_connection(self._address, patience)
         except OSError as error:
             raise self._refusal(error) from None
-        found.settimeout(PATIENCE)
-        found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.settimeout(PATIENCE)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with contextlib.suppress(OSError):
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        return found
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        return connection
 
     def _refusal(self, error: OSError) -> SourceError:
         host, port = self._address
@@ -102,14 +102,14 @@ class TcpTransport(StreamTransport):
 
 
 def connect(address: Address, sensor: Sensor | None = None) -> TcpTransport:
-    """The open connection of a TCP SOURCE: "tcp://192.168.1.200:2111".
+    """Open the connection of a TCP SOURCE: "tcp://192.168.1.200:2111".
 
     Args:
-        sensor: whose port is taken where the source names none.
+        sensor: its port is used if the source has none.
 
     Raises:
-        UsageError: where host or port are missing, or for an option.
-        SourceError: where nobody answers.
+        UsageError: if host or port are missing, or for an option.
+        SourceError: if the connection fails.
     """
     address.check(())
     host, port = address.host_and_port()

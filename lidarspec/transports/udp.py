@@ -298,17 +298,17 @@ class UdpTransport(LiveTransport):
 
     def read(self, timeout: float) -> list[Chunk]:
         sleep_until(self._next_read)
-        found: list[Chunk] = []
+        chunks: list[Chunk] = []
         if self.closed:
             ready = []
         else:
             ready = [key.data for key, _ in self._selector.select(timeout)]
         for one in ready:
-            self._fetch(one, found)
+            self._fetch(one, chunks)
         self.kernel_drops = sum(each.drops for each in self._sockets)
-        gathers = 0 < len(found) < SLOT_COUNT and all(one.is_timed for one in ready)
+        gathers = 0 < len(chunks) < SLOT_COUNT and all(one.is_timed for one in ready)
         self._next_read = time.monotonic() + READ_PAUSE_S if gathers else 0.0
-        return found
+        return chunks
 
     def write(self, data: bytes) -> None:
         if self._remote is None:
