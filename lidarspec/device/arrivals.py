@@ -1,7 +1,7 @@
-"""What a device reads from, live or not: an input that gives frames in batches.
+"""The interface of a device's input, live or not, and the input of a file.
 
-`FileInput` is that of a file or standard input, which are read as fast as they are asked for;
-`live_input` has the other.
+An input returns frames in batches. `FileInput` reads a file or standard input as fast as the caller
+requests frames. `live_input` has the input of a live source.
 """
 
 from __future__ import annotations
@@ -37,11 +37,9 @@ from lidarspec.transports.protocol import Chunk, Transport
 class Arrival:
     """Frames of a piece of input, in stream order.
 
-    Attributes:
-        found: the frames of every incoming type.
-        interrupted: whether input is missing behind them: no frame, packet or scan goes on there.
-        replaced: whether these are the frames of another sensor than those before, of which nothing
-            counts any more.
+    Attributes: found: the frames of every incoming type. interrupted: whether input is missing
+        after them: no frame, packet or scan continues there. replaced: whether these frames come
+        from another sensor than the previous ones, which have to be discarded.
     """
 
     found: list[Frames] = field(default_factory=list)
@@ -50,15 +48,15 @@ class Arrival:
 
 
 class Input(Protocol):
-    """Where a device has its frames from, live or not; what nothing is said of is as with a file.
+    """The source of a device's frames; the defaults here are those of a file.
 
     Attributes:
-        is_live: whether data come at their own pace, and not from a file.
-        decoder: what finds the frames on the data link.
-        stays_on: whether the sensor is left as it is at the end.
-        sensor: whose frames they are, configured with the options that it has `learned` of itself.
-        told: the last frame of each type that says what `Sensor.info` declares, on whichever link
-            it came.
+        is_live: whether data arrives at its own pace, and not from a file.
+        decoder: finds the frames of the data link.
+        stays_on: whether the sensor is left running at the end.
+        sensor: the sensor, configured with the `learned` options.
+        learned: the options that the sensor reported.
+        told: the last frame of each type with a field of `Sensor.info`, from any link.
     """
 
     is_live: bool = False
@@ -91,23 +89,23 @@ class Input(Protocol):
 
     @property
     def state(self) -> str:
-        """How it is doing, in one or two words."""
+        """The state of the source, in one or two words."""
 
     @property
     def ended(self) -> bool:
-        """Whether nothing comes any more."""
+        """Whether the input has ended."""
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the source now."""
+        """The present warnings about the source."""
 
     @property
     def stats(self) -> Counters:
-        """The counters of everything read so far, those of the transports included."""
+        """The counters of everything read so far, including those of the transports."""
 
     @property
     def queued(self) -> int | None:
-        """Chunks that have arrived and wait to be decoded; None where nothing waits."""
+        """The number of chunks that wait to be decoded; None if there is no queue."""
         return None
 
     @property
@@ -142,19 +140,25 @@ class Input(Protocol):
         """Send the commands that the sensor declares for its start.
 
         Raises:
-            CommandError: where the device does not start, unless it sends data all the same.
+            CommandError: if the device does not start, unless it sends data nevertheless.
         """
 
     def next(self, wait: float) -> Arrival | None:
-        """The next frames; None where none come within `wait` seconds, or at the end.
+        """Return the next frames.
+
+        Args:
+            wait: seconds to wait.
+
+        Returns:
+            None if none arrive in time, or at the end.
 
         Raises:
-            SourceError: where nothing can be read any more.
-            UsageError: where several senders' frames would be mixed.
+            SourceError: if nothing can be read any more.
+            UsageError: if frames of several senders would be mixed.
         """
 
     def mark(self) -> int:
-        """How much has been produced; for `caught_up`."""
+        """Return the amount of data produced so far, for `caught_up`."""
         return 0
 
     def caught_up(self, mark: int) -> bool:
@@ -165,21 +169,21 @@ class Input(Protocol):
         return True
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """The reply to a command, which other threads may wait for at the same time.
+        """Send a command and return the reply; other threads may do the same.
 
         Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not
-                take; nothing is sent.
-            CommandError: where the device refuses, the connection is lost or there is no device;
-                ReplyTimeout where it keeps silent.
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
+                is sent.
+            CommandError: if the device refuses, the connection is lost, or there is no device.
+            ReplyTimeout: if the device does not reply.
         """
 
     def write(self, data: bytes, link: str = "data") -> None:
-        """Send bytes as they are; what answers them is read as everything else.
+        """Send bytes as they are; a reply is read like all other data.
 
         Raises:
-            UsageError: for a text, and for a link that the sensor does not have.
-            SourceError: where the connection is lost, or there is no device.
+            UsageError: for a text, or a link that the sensor does not have.
+            SourceError: if the connection is lost, or there is no device.
         """
 
     def first_frames(self) -> FirstFrames:
@@ -243,7 +247,7 @@ def _set_arrival(
 
 
 def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
-    """The frames of some types, one by one."""
+    """Return the frames of some types, one by one."""
     picked = []
     for frames in found:
         kinds = [index for index, name in enumerate(frames.names) if name in awaited]
@@ -263,7 +267,7 @@ class FileInput(Input):
 
     Attributes:
         state: "streaming", "ended" or "closed".
-        senders: who has sent its frames.
+        senders: the senders of its frames.
     """
 
     state = "streaming"
@@ -276,7 +280,7 @@ class FileInput(Input):
         self._transport = opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self.senders = Senders(source, sensor)
-        self._together = 0  # bytes; 0: as many as are worth it
+        self._together = 0  # in bytes; 0 for the fastest size
         self._arrivals = self._read()
 
     @property
@@ -312,24 +316,24 @@ class FileInput(Input):
         return self._transport.place
 
     def next(self, wait: float) -> Arrival | None:
-        found = next(self._arrivals, None)
-        if found is None:
+        arrival = next(self._arrivals, None)
+        if arrival is None:
             self.state = "ended"
         else:
-            self.note(found.found)
-        return found
+            self.note(arrival.found)
+        return arrival
 
     def skip(self, at: int) -> bool:
         return self._transport.skip(at)
 
     def gather(self, until: float) -> None:
-        """What is in a file is there."""
+        """Do nothing: the data of a file does not arrive over time."""
 
     def read_ahead(self, size: int) -> None:
         self._together = size
 
     def begin(self) -> None:
-        """A file has no sensor to be started."""
+        """Do nothing: a file has no sensor that could be started."""
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         raise CommandError(
@@ -342,7 +346,7 @@ class FileInput(Input):
     def close(self) -> None:
         self.state = "closed"
         self._transport.close()
-        self._arrivals = iter(())  # which holds this one, and both what was read
+        self._arrivals = iter(())  # it refers to this object and to the data that was read
 
     def first_frames(self) -> FirstFrames:
         """Find the frames that apply from the start of the file.
@@ -367,7 +371,7 @@ class FileInput(Input):
             )
 
     def _read(self) -> Iterator[Arrival]:
-        """Every incoming frame, in batches."""
+        """Yield every incoming frame, in batches."""
         if isinstance(self._transport, CaptureTransport):
             for datagrams in self._transport.batches():
                 if datagrams.gap:
@@ -416,7 +420,7 @@ class FileInput(Input):
             yield found
 
     def _portions(self) -> Iterator[Chunk]:
-        """The chunks, of a stream cut where they are longer than what is read ahead."""
+        """Yield the chunks; chunks of a stream are cut to the size of `read_ahead`."""
         for chunk in self._transport.chunks():
             rest = chunk
             while self.decoder.stream and 0 < (size := self._together) < len(rest.data):

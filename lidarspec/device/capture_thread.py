@@ -1,13 +1,13 @@
 """Capture in a thread, which queues incoming data for decoding.
 
-The thread does nothing but read, keep the time, record and queue, so that a consumer which is slow,
-or busy in Python, costs no byte. A recording gets everything; the queue is bounded by its policy:
-with "drop_oldest" the oldest chunks give way, with "block" the thread waits. What was produced is
-always what was consumed, dropped or still waits.
+The thread only reads, keeps the time, records and queues, so that a consumer which is slow, or busy
+in Python, loses no byte. A recording gets everything. The queue is bounded, with a policy:
+"drop_oldest" drops the oldest chunks, "block" makes the thread wait. Every produced chunk is
+consumed, dropped or still in the queue.
 
-When the device goes away the thread says so, tries to find it again with growing pauses, and marks
-the first chunk after the gap. Silence is what the system has confirmed, not what a thread that got
-no time believes: reads that came back empty.
+If the device disappears, the thread reports it, tries to open it again with growing pauses, and
+marks the first chunk after the gap. Silence is measured by reads that returned nothing: time in
+which the thread did not run does not count.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from lidarspec.recording.appending import Log
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 
-#: what waits in a queue at most: chunks, and bytes in them; several seconds of the fastest sensors.
+#: limits of a queue, chunks and bytes; several seconds of the fastest sensors.
 CHUNKS = 1 << 16
 BYTES = 1 << 25
-#: seconds between attempts to find a device again, at first and at most.
+#: first and longest pause between attempts to open a device again, in seconds.
 SOON = 0.02
 LATER = 0.25
 POLICIES = ("drop_oldest", "block")
 
 
 class Mark(Enum):
-    """What happens on a link besides data."""
+    """An event on a link besides data."""
 
     SILENT = "silent"
     LOST = "lost"
@@ -46,15 +46,15 @@ Event = tuple[str, Item]
 
 
 class BoundedQueue:
-    """What arrived on the links of a device and was not taken yet.
+    """The events on the links of a device that have not been taken yet.
 
     Args:
-        policy: what to do when it is full: "drop_oldest" or "block".
-        chunks, size: what it holds at most: chunks, and bytes in them.
+        policy: of a full queue: "drop_oldest" or "block".
+        chunks, size: the maximum number of chunks, and of bytes in them.
 
     Attributes:
-        produced, consumed, dropped: chunks; ``produced == consumed + dropped + len(queue)`` always
-            holds.
+        produced, consumed, dropped: numbers of chunks; ``produced == consumed + dropped +
+            len(queue)`` always holds.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class BoundedQueue:
         return self._waiting
 
     def put(self, link: str, items: Iterable[Item]) -> None:
-        """Add what happened on a link, in order."""
+        """Add events of a link, in order."""
         with self._changed:
             for item in items:
                 if isinstance(item, Chunk):
@@ -99,37 +99,36 @@ class BoundedQueue:
         empty.
 
         Args:
-            until: a time of the monotonic clock up to which everything is gathered before any of it
-                is given.
+            until: a time of the monotonic clock; events are gathered until then.
             chunks: how many events at most.
         """
         pause = min(until - time.monotonic(), timeout)
         if pause > 0 and not self.closed:
-            time.sleep(pause)  # what arrives meanwhile wakes nobody
+            time.sleep(pause)  # data that arrives meanwhile does not wake this thread
         with self._changed:
             self._changed.wait_for(
                 lambda: self._events or self._kept or self.closed, timeout - max(pause, 0.0)
             )
-            found = list(self._kept)
+            events = list(self._kept)
             self._kept.clear()
-            if len(found) + len(self._events) <= chunks and not self._cut:
-                found += self._events
+            if len(events) + len(self._events) <= chunks and not self._cut:
+                events += self._events
                 self._events.clear()
                 self.consumed += self._waiting
                 self._waiting = self._size = 0
-            while self._events and len(found) < chunks:
-                found.append(self._left())
+            while self._events and len(events) < chunks:
+                events.append(self._left())
             self._changed.notify_all()
-            return found
+            return events
 
     def close(self) -> None:
-        """Nobody is going to take anything any more: whoever waits is let go."""
+        """Accept no further events, and wake all waiting threads."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
 
     def _left(self) -> Event:
-        """The oldest event, which somebody takes."""
+        """Remove the oldest event of the queue and return it."""
         link, item = self._events.popleft()
         if isinstance(item, Chunk):
             self.consumed += 1
@@ -166,17 +165,17 @@ class Capture:
 
     Args:
         transport: the open transport; closed with the capture.
-        queue: where it goes to.
+        queue: receives the events.
         link: the name of the link.
         log: the recording, if there is one.
-        clock: of the host, for what is recorded besides data.
+        clock: the host's clock, for recorded events.
 
     Attributes:
         transport: the transport.
-        connected: whether the device is there.
-        disconnects: how often it went away.
-        last: when something last arrived, by `time.monotonic`; the time of opening before that.
-        warnings: what is to be said of the host's clock.
+        connected: whether the device is connected.
+        disconnects: how often it disappeared.
+        last: the time of the last arrival by `time.monotonic`; at first the time of opening.
+        warnings: warnings about the host's clock.
     """
 
     def __init__(
@@ -203,7 +202,7 @@ class Capture:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop reading and give the port or socket back; a second call does nothing."""
+        """Stop reading and close the port or socket; a second call does nothing."""
         self._stop.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(5.0)
@@ -215,7 +214,7 @@ class Capture:
         All events that come out of the queue afterwards are recorded.
         """
         while not self._handing.acquire(timeout=POLL):
-            self._queue.take(0.0)  # which it may wait for
+            self._queue.take(0.0)  # the thread may wait for room in the queue
         self._log = log
         while self._queue.take(0.0):
             pass
@@ -252,7 +251,7 @@ class Capture:
             self._queue.put(self._link, [error])
 
     def _hand_on(self, chunks: list[Chunk], *, gap: bool, quiet: bool) -> None:
-        """Record and queue what arrived, with what happened before it."""
+        """Record and queue chunks, and mark the first one after a gap or silence."""
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
         self._look_at_the_clock(chunks[0])

@@ -1,10 +1,10 @@
 """Demonstrate a session with a simulated sensor, end to end.
 
-The sensor is on a real line. It is asked to start, read, recorded and read again.
+The sensor is connected to a real line. It is started, read, recorded and read again.
 
-A serial sensor stands on a pseudo-terminal, or on a TCP port where the system has none; the others
-send UDP datagrams on loopback. The line does its harm on the way. What was recorded is decoded once
-more, and has to give the same points.
+A serial sensor uses a pseudo-terminal, or a TCP port if the system has none; others send UDP
+datagrams on loopback. The line adds errors. The recording is decoded again, and has to give the
+same points.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals
 from lidarspec.transports.serving import Served
 
-#: seconds that the scans may take beyond those that they last.
+#: additional seconds that the scans may take.
 PATIENCE = 15.0
-#: seconds without a scan after which nothing is on the way any more.
+#: seconds without a scan after which all sent data has arrived.
 QUIET = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Demonstration:
-    """What the demo saw.
+    """The results of the demonstration.
 
     Attributes:
-        sensor, place: whose, and where it stood.
-        replies: to the commands that opened it.
-        scans: those that came, the last one the last whole one.
+        sensor, place: the sensor, and its address.
+        replies: of the commands that opened it.
+        scans: the received scans; the last one is complete.
         stats: the decoder's counters.
-        sent, intact: packets that were sent, and that left the line unharmed.
-        digest: SHA-256 of the points of the whole scans.
-        again: SHA-256 of the points of the recording, decoded once more.
+        sent, intact: numbers of packets sent, and of those without errors after the line.
+        digest: SHA-256 of the points of the complete scans.
+        again: SHA-256 of the points of the recording.
         recorded: bytes in the recording.
     """
 
@@ -68,16 +68,16 @@ class Demonstration:
 def demonstrate(
     sensor: Sensor, *, turns: int = 5, errors: float = 0.01, seed: int = 1
 ) -> Demonstration:
-    """Let a simulated sensor work until so many whole scans have come.
+    """Run a simulated sensor until a number of complete scans has arrived.
 
     Args:
-        turns: whole scans wanted.
+        turns: the number of complete scans.
         errors: share of the bytes of a stream that are damaged, at most one in each of the longest
-            frames; of datagrams, those lost.
+            frames; for datagrams, the share of lost ones.
 
     Raises:
-        SourceError: where no line can be had, or the scans do not come.
-        PluginError: where a function of the plugin raises.
+        SourceError: if no line is available, or the scans do not arrive.
+        PluginError: if a function of the plugin raises.
     """
     longest = sensor.frames[sensor.data_frame].max_length
     if sensor.datagrams:
@@ -101,13 +101,13 @@ def demonstrate(
 
 
 def digest(scans: Sequence[Scan]) -> str:
-    """SHA-256 of the coordinates, ranges and intensities of scans."""
-    found = hashlib.sha256()
+    """Return the SHA-256 of the coordinates, ranges and intensities of scans."""
+    hasher = hashlib.sha256()
     for scan in scans:
         points = scan.points
         for column in (points.xyz, points.range, points.intensity):
-            found.update(b"" if column is None else column.tobytes())
-    return found.hexdigest()
+            hasher.update(b"" if column is None else column.tobytes())
+    return hasher.hexdigest()
 
 
 def _live(
@@ -147,7 +147,7 @@ def _read(
         if sum(one.whole for one in scans) >= turns:
             served.stop_sending()
             while device.newest(QUIET) is not None:
-                pass  # what is still on the way counts as sent, so it is read too
+                pass  # data that is still on the way counts as sent, so it is read too
             break
         if time.monotonic() > limit:
             break

@@ -37,9 +37,9 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Closing, LiveTransport, Transport
 
-#: The first frames, which are checked for being another sensor's.
+#: number of first frames that are compared with related models.
 _MAX_CHECKED_FRAMES = 64
-#: The length of one wait for data, if the whole wait has no end.
+#: the maximum length of one wait for data.
 _LONG_WAIT_S = 3600.0
 
 
@@ -181,10 +181,8 @@ class Device(Closing):
         A file is read once, by all iterators together. After `latest` they begin with the batch in
         which its scan was found.
 
-        Args:
-            frame: the name of a frame type; by default the data frame.
-            wait: yield an empty batch if none has come for so many seconds, so that the caller can
-                do something else.
+        Args: frame: the name of a frame type; by default the data frame. wait: yield an empty batch
+            if none arrives for this number of seconds, so that the caller can do something else.
 
         Raises:
             SourceError: if a file has been read to its end before.
@@ -222,11 +220,9 @@ class Device(Closing):
         A file is read once, by all iterators together. After `latest` they begin with the batch in
         which its scan was found.
 
-        Args:
-            wait: yield None if no scan has come for so many seconds, so that the caller can do
-                something else.
-            select: the scans and the parts of them to yield. Nothing is read after the last one,
-                and long stretches of a recording before the first one are skipped.
+        Args: wait: yield None if no scan arrives for this number of seconds, so that the caller can
+            do something else. select: the scans and the parts of them to yield. Nothing is read
+            after the last one, and long stretches of a recording before the first one are skipped.
 
         Raises:
             SourceError: if a file has been read to its end before.
@@ -243,9 +239,8 @@ class Device(Closing):
         They are in the axes of the carrier if the sensor has a mount. `Scan.imu` has the samples
         that belong to a scan. A file is read once, by all iterators together.
 
-        Args:
-            wait: yield no samples if none have come for so many seconds, so that the caller can do
-                something else.
+        Args: wait: yield no samples if none arrive for this number of seconds, so that the caller
+            can do something else.
 
         Raises:
             UsageError: if no frame of the sensor has IMU samples.
@@ -275,7 +270,7 @@ class Device(Closing):
             timeout: seconds to wait.
 
         Raises:
-            SourceTimeout: if none comes in time.
+            SourceTimeout: if none arrives in time.
             SourceError: if the input has ended or the device was closed.
         """
         if timeout is None:
@@ -294,7 +289,7 @@ class Device(Closing):
                 raise self.make_timeout_error()
 
     def newest(self, wait: float) -> Scan | None:
-        """Return the newest whole scan, as `latest`; None if none comes within `wait` seconds.
+        """Return the newest whole scan, as `latest`, or None after `wait` seconds.
 
         Raises:
             SourceError: if the input has ended or the device was closed.
@@ -324,10 +319,10 @@ class Device(Closing):
         return suggest(error, f"lidarspec doctor {quote(str(self.source))} -s {self.sensor.id}")
 
     def skip(self, at: int) -> bool:
-        """Skip input that arrived before a time, without reading it; return whether it is possible.
+        """Skip input that arrived before a time; return whether that is possible.
 
-        Frames that were read already are still returned. After them the stream continues as after
-        an interruption.
+        Nothing is read for it. Frames that were read already are still returned. After them the
+        stream continues as after an interruption.
 
         Args:
             at: ns since 1970.
@@ -335,9 +330,9 @@ class Device(Closing):
         return self._input.skip(at)
 
     def gather(self, until: float) -> None:
-        """Let arriving data of a live source wait, to decode it together with less processor time.
+        """Let arriving data wait, to decode it together with less processor time.
 
-        It does not wait longer than the `wait` of an iterator.
+        It does not wait longer than the `wait` of an iterator. A file ignores this.
 
         Args:
             until: a time of `time.monotonic`.
@@ -345,10 +340,10 @@ class Device(Closing):
         self._input.gather(until)
 
     def read_ahead(self, size: int) -> None:
-        """Read a file in portions of about `size` bytes from now on; 0 for the fastest size.
+        """Read a file in portions of about `size` bytes from now on.
 
         A program that shows a file at its recorded pace uses this: counters, and the input of a
-        `Witness`, are then not far ahead of the picture.
+        `Witness`, are then not far ahead of the picture. 0 is the fastest size.
         """
         self._input.read_ahead(size)
 
@@ -398,7 +393,10 @@ class Device(Closing):
         self._input.stays_on = True
 
     def close(self) -> None:
-        """Stop the sensor if it was started, and close the source; a second call does nothing."""
+        """Stop the sensor if it was started, and close the source.
+
+        A second call does nothing.
+        """
         self._finalizer()
 
     def __repr__(self) -> str:
@@ -502,7 +500,7 @@ class Device(Closing):
     def _iter_arrivals(
         self, wait: float | None, ahead: Arrival | None = None
     ) -> Iterator[Arrival | None]:
-        """Yield what arrives, until the end; None if nothing has come for `wait` seconds."""
+        """Yield arrivals until the end; None if there is none for `wait` seconds."""
         if ahead is not None:
             yield ahead
         while not self._input.ended:
@@ -520,7 +518,7 @@ class Device(Closing):
         return arrival
 
     def _check_first_frames(self) -> list[str]:
-        """Return a warning if the first frames are another sensor's, or name another model.
+        """Return a warning if the first frames belong to another sensor or model.
 
         They are checked once, when there are enough of them.
         """
@@ -602,7 +600,7 @@ def open(
 
 
 def _describe_nominal(sensor: Sensor) -> str:
-    """Return a warning about a default calibration, with the way to give the sensor's own one."""
+    """Return a warning about a nominal calibration, and how to give the unit's own."""
     text = f"{sensor.id}: points by the nominal calibration of the model, not of this unit"
     files = [name for name in sensor.configure.files if name not in sensor.options]
     if files:

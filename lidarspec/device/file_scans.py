@@ -1,15 +1,15 @@
 """The scans of a file in one pass that can be resumed at a bookmark.
 
-Another process can go on from a bookmark.
+Another process can continue from a bookmark.
 
-What comes behind a place of a file depends on what was before it: bytes of a frame that has begun,
-frames that hold state, the turns that the clock has made, the counter, packets that wait for
-others, which way the angle turns. A bookmark is all of this, pickled, so that the scans behind it
-are, bit for bit, those of one pass. What no byte changes stands in it by its name: the sensor's
-functions, structs and rules, which could not be pickled, are those of the sensor that goes on.
+Decoding from the middle of a file needs state from the bytes before it: an incomplete frame, frames
+with state, the number of clock wraps, the packet counter, waiting packets, the direction of
+rotation. A bookmark is all of this, pickled, so that the scans after it are bit for bit those of
+one pass. Objects that no input changes, such as the functions, structs and rules of a sensor,
+cannot be pickled. The bookmark refers to them by name, and the resumed sensor supplies them.
 
-A scan belongs to whoever saw its beginning: behind a bookmark the one under way is left out, and
-before it is read to its end.
+A scan belongs to the piece in which it begins: the piece after a bookmark leaves out the incomplete
+scan, and the piece before it reads that scan to its end.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ from lidarspec.transports.files import CaptureTransport, FileTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Closing, LiveTransport
 
-#: what is pickled as it is.
+#: types that are pickled as they are.
 _PLAIN = (bool, int, float, str, bytes, type(None), type)
 
 
 class FileScans(Closing):
-    """The scans of a file: an iterator, which `survey` passes over quickly.
+    """The scans of a file: an iterator, which `survey` can skip quickly.
 
     Args:
         source: the file.
-        sensor: whose.
-        bookmark: where to begin: what `survey` gave for the same file and sensor.
+        sensor: the sensor that recorded it.
+        bookmark: the start, as returned by `survey` for the same file and sensor.
 
     Raises:
-        UsageError: for a source that is no file.
-        SourceError: where it cannot be read.
+        UsageError: for a source that is not a file.
+        SourceError: if it cannot be read.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, bookmark: bytes | None = None) -> None:
@@ -79,12 +79,12 @@ class FileScans(Closing):
 
     @property
     def stats(self) -> Counters:
-        """The counters of everything up to here, of what is before the bookmark too."""
+        """The counters of everything read, including the part before the bookmark."""
         return self._input.stats
 
     @property
     def warnings(self) -> list[str]:
-        """What is to be said about the file."""
+        """The present warnings about the file."""
         return self._input.warnings
 
     def __iter__(self) -> Iterator[Scan]:
@@ -113,7 +113,7 @@ class FileScans(Closing):
         self._input.close()
 
     def _next(self) -> Iterator[Scan] | None:
-        """The scans that the next bytes complete; None at the end."""
+        """Return the scans that the next bytes complete, None at the end."""
         arrival = self._input.next(0)
         if arrival is None:
             return None
@@ -129,7 +129,7 @@ class FileScans(Closing):
 
     @property
     def _place(self) -> int:
-        """How much of the file has been read, about."""
+        """The approximate number of bytes read."""
         if isinstance(self._transport, CaptureTransport):
             reader = self._transport.reader
         else:
@@ -172,17 +172,20 @@ class FileScans(Closing):
 
 
 def _constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
-    """What no byte changes, by name: all that a sensor holds, and what is made of it alone."""
-    found = dict[tuple[Any, ...], Any]()
-    _walk(sensor, (), found, set())
+    """Return the objects that no input changes, by name.
+
+    They are the parts of a sensor, and objects derived from it alone.
+    """
+    constants = dict[tuple[Any, ...], Any]()
+    _walk(sensor, (), constants, set())
     codecs = {("codec", name): codec(frame) for name, frame in sensor.frames.items()}
-    return {**found, **codecs, ("framing",): decoder.framing}
+    return {**constants, **codecs, ("framing",): decoder.framing}
 
 
 def _walk(
     value: Any, name: tuple[Any, ...], found: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
-    """Add a value and all that it holds to what was found, each under the names that lead there."""
+    """Add a value and its parts, each under the names that lead to it."""
     if isinstance(value, _PLAIN) or id(value) in seen:
         return
     found[name] = value
@@ -199,7 +202,7 @@ def _walk(
 
 
 class _Writer(pickle.Pickler):
-    """Pickles what a reader remembers."""
+    """Pickles the state of a reader."""
 
     def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
@@ -245,7 +248,7 @@ class _Writer(pickle.Pickler):
 
 
 class _Loader(pickle.Unpickler):
-    """Unpickles what a reader remembered, for the same sensor."""
+    """Unpickles the state of a reader, for the same sensor."""
 
     def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:
         super().__init__(file)

@@ -16,8 +16,7 @@ from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, told_seconds
 from lidarspec.sensor_operations import Sensor
 
-#: bytes of a file without any frame that could tell the turn of the clock; then no such frame is
-#: expected.
+#: bytes of a file to search for a frame type that could tell the turn of the clock.
 REFERENCE_SEARCH_BYTES = 64 << 20
 
 
@@ -27,7 +26,7 @@ class FirstFrames:
 
     Attributes:
         state: the first frame of each type that `points` takes its state from, by name.
-        reference: the first frame that tells the turn of the clock; None if there is none.
+        reference: the first frame that determines the turn of the clock; None if there is none.
     """
 
     state: dict[str, bytes] = field(default_factory=dict)
@@ -40,10 +39,10 @@ def is_searched(sensor: Sensor) -> bool:
 
 
 def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstFrames:
-    """Return what applies from the start of a file.
+    """Return the frames that apply from the start of a file.
 
     Args:
-        batches: its frames, which are read no further than needed.
+        batches: its frames, which are read only as far as needed.
     """
     first = FirstFrames()
     missing = set(sensor.state)
@@ -79,7 +78,7 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
 def _find_reference(
     sensor: Sensor, name: str, frames: Frames, rows: NDArray[np.intp]
 ) -> ClockReference | None:
-    """Return the first of some frames that tells the turn of the clock."""
+    """Return the first of some frames that determines the turn of the clock."""
     assert sensor.clock is not None
     table = codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:

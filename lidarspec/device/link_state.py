@@ -62,7 +62,7 @@ class LinkState:
             self._only_others_since = time.monotonic()
 
     def record_frames(self, found: Sequence[Frames]) -> None:
-        """Record what was decoded."""
+        """Record decoded frames."""
         stats = self._decoder.stats
         if any(map(len, found)):
             self._framed_bytes = stats.bytes_in

@@ -61,12 +61,13 @@ class LiveInput(Input):
     """A sensor on a live transport.
 
     Args:
-        source, sensor, opened: the open transport of the data link, and whose.
+        source, sensor: the source and its sensor.
+        opened: the open transport of the data link.
         policy: of the queue, "drop_oldest" or "block".
-        record: makes what gets everything that arrives and is sent, before the queue, of the sensor
-            as it is read.
-        learns: whether `begin` is to be called, in which the sensor may say how it is read: nothing
-            counts before that.
+        record: makes the recorder for the configured sensor, or returns None. It gets everything
+            that arrives and is sent, before the queue.
+        learns: whether `begin` will be called, in which the sensor may report options. Data before
+            that is discarded.
         period: seconds between two decodings.
     """
 
@@ -101,7 +102,7 @@ class LiveInput(Input):
             self._backend = "numpy"
         else:
             self._backend = (
-                chosen  # none by itself that stops to compile: nothing would be decoded meanwhile
+                chosen  # "auto" does not compile here: nothing would be decoded meanwhile
             )
         self.queue = BoundedQueue(policy)
         self._session = Session(sensor)
@@ -110,7 +111,7 @@ class LiveInput(Input):
         self._captures = {}
         self._senders = SenderFilter(source, sensor, datagrams=opened.datagrams)
         self._ready = deque[Arrival]()
-        self._answering: dict[str, SenderFilter] = {}  # who answers what was broadcast, by link
+        self._answering: dict[str, SenderFilter] = {}  # senders of replies to broadcasts
         self._clock = HostClock()
         self._turn = threading.RLock()
         self._talk = threading.RLock()
@@ -134,7 +135,7 @@ class LiveInput(Input):
 
     @property
     def state(self) -> str:
-        """What `LinkState` says, or "closed"."""
+        """The state of `LinkState`, or "closed"."""
         if self._closed:
             return "closed"
         return self._link_state.name
@@ -200,7 +201,7 @@ class LiveInput(Input):
                 self._adopt()
 
     def _adopt(self) -> None:
-        """Go on as the sensor that was learned of; what came before counts for nothing."""
+        """Continue with the reported options, and discard all earlier data."""
         try:
             self.sensor = self.sensor.configure(**self.learned)
         except UsageError as error:
@@ -242,7 +243,7 @@ class LiveInput(Input):
         self._due = max(self._due, until)
 
     def read_ahead(self, size: int) -> None:
-        """Nothing can be read before it comes."""
+        """Do nothing: live data cannot be read ahead."""
 
     def mark(self) -> int:
         return self.queue.produced
@@ -281,7 +282,7 @@ class LiveInput(Input):
             raise type(error)("; ".join([str(error), *remarks])) from None
 
     def _find_own_address(self, name: str) -> None:
-        """Let the session know where we are, as the sensor sees it, where a command says that."""
+        """Set the session's host if a command contains this computer's address."""
         command = self.sensor.commands.get(name)
         if command is not None and any(
             isinstance(value, Address) for value in command.filled.values()
@@ -303,7 +304,7 @@ class LiveInput(Input):
             self._write(Outgoing(link, bytes(data)))
 
     def _await_sender(self, link: str, seconds: float) -> None:
-        """Wait for a first datagram where it alone says where the sensor is."""
+        """Wait for a first datagram if only that reveals the address of the sensor."""
         data = self._captures["data"].transport
         is_known = (
             link in self._captures
@@ -329,7 +330,7 @@ class LiveInput(Input):
                 capture.close()
 
     def _shut_down(self) -> None:
-        """Send the commands for the end, as far as the device still listens."""
+        """Send the commands for the end, if the device is still connected."""
         if self.stays_on:
             return
         if (
@@ -357,7 +358,7 @@ class LiveInput(Input):
                 pending.result()
 
     def _help(self, pending: Pending | None = None) -> None:
-        """Do a turn of the work, unless another thread is at it."""
+        """Run the decoders once, unless another thread runs them."""
         if not self._turn.acquire(timeout=MAX_TURN_S / 5):
             return
         try:
@@ -369,10 +370,10 @@ class LiveInput(Input):
             self._ready.popleft()
 
     def _pump(self, wait: float) -> None:
-        """Take what has arrived within `wait` seconds, decode it, and let the session know.
+        """Decode data that arrives within `wait` seconds, and drive the session.
 
-        Nothing is given up before that is looked at; where this comes late, on a busy computer,
-        those who read were held up as well.
+        A request only times out after the arrived data was checked for its reply. If this runs late
+        on a busy computer, replies were delayed as well.
         """
         with self._talk:
             deadline = self._session.deadline
@@ -393,13 +394,13 @@ class LiveInput(Input):
         if self._checked:
             self._compare()
         elif (silent := list(self._session.unanswered.values())) and silent != self._silent:
-            # for each beat that is not answered once: the sensor may have started anew, and have
-            # forgotten everything
+            # at each unanswered heartbeat, once: the sensor may have restarted and lost its
+            # settings
             self._silent = silent
             self._start_again()
 
     def _take(self, link: str, run: list[Chunk] | Mark | BaseException) -> None:
-        """Decode consecutive chunks of a link, or note what happened on it."""
+        """Decode consecutive chunks of a link, or handle an event on it."""
         if isinstance(run, list):
             self._decode(link, run)
         elif isinstance(run, Mark):
@@ -425,7 +426,7 @@ class LiveInput(Input):
         decoder = self._decoders[link]
         if chunks[0].gap:
             self._hand_on(link, decoder.rest(), interrupted=True)
-        if link == "data" and chunks[0].sender is not None:  # then all chunks of the link have one
+        if link == "data" and chunks[0].sender is not None:  # then all of them have one
             self._decode_senders(chunks)
             return
         if link in self._answering:
@@ -450,7 +451,7 @@ class LiveInput(Input):
     def _of_the_sensor(self, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks that the sensor sent.
 
-        If another sensor is selected now, incomplete frames of the previous one are given up.
+        If another sensor is selected now, incomplete frames of the previous one are discarded.
         """
         mine = self._senders.select(chunks)
         self._link_state.record_senders(is_sensor=bool(mine))
@@ -460,7 +461,10 @@ class LiveInput(Input):
         return mine
 
     def _of_who_answered(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
-        """What the first one that answered a broadcast sent: it is the sensor, on every link."""
+        """Return the chunks of the first sender that replied to a broadcast.
+
+        It is the sensor, on every link.
+        """
         mine = self._answering[link].select(chunks)
         if (address := self._answering[link].address) is not None:
             self._captures[link].transport.accept(address)
@@ -468,7 +472,7 @@ class LiveInput(Input):
         return mine
 
     def _host(self) -> str | None:
-        """The address of the sensor, as far as it is known."""
+        """Return the address of the sensor, None if unknown."""
         answered = [
             kept.address[0] for kept in self._answering.values() if kept.address is not None
         ]
@@ -489,7 +493,7 @@ class LiveInput(Input):
                 self._ready.append(Arrival(found, interrupted=interrupted))
 
     def _start_again(self) -> None:
-        """The device is back: it has forgotten what it was told."""
+        """Send the opening commands again: the device is back, and has lost its state."""
         with self._talk:
             names = self.sensor.on_open if self._stops else ()
             self._checked += [self._session.request(name, self._clock.now()) for name in names]
@@ -514,7 +518,7 @@ class LiveInput(Input):
                 ]
 
     def _speak(self) -> None:
-        """Send what the session wants to be sent."""
+        """Send the outgoing data of the session."""
         for outgoing in self._session.outgoing():
             try:
                 self._write(outgoing)
@@ -536,7 +540,7 @@ class LiveInput(Input):
                 self._recorder.write(Chunk(outgoing.data, self._clock.now()), "out")
 
     def _opened(self, link: str) -> LiveTransport:
-        """The transport of a link; one apart from the data's is opened when it is first needed."""
+        """Return the transport of a link; open it on first use."""
         if link not in self._captures:
             data = self._captures["data"].transport
             opened = data.link(link) or control_link(
@@ -556,16 +560,16 @@ def _is_broadcast(link: Link | None) -> bool:
 
 
 def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:
-    """Events with consecutive chunks of one link joined, up to where the line was interrupted."""
-    found: list[tuple[str, list[Chunk] | Mark | BaseException]] = []
-    run: list[Chunk] = []  # the last of them, empty where that is no chunks
+    """Join consecutive chunks of one link, up to each interruption."""
+    runs: list[tuple[str, list[Chunk] | Mark | BaseException]] = []
+    run: list[Chunk] = []  # the last run of chunks; empty after another event
     for link, item in events:
         if not isinstance(item, Chunk):
             run = []
-            found.append((link, item))
-        elif run and found[-1][0] == link and not item.gap:
+            runs.append((link, item))
+        elif run and runs[-1][0] == link and not item.gap:
             run.append(item)
         else:
             run = [item]
-            found.append((link, run))
-    return found
+            runs.append((link, run))
+    return runs

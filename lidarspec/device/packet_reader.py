@@ -1,4 +1,4 @@
-"""Make packets of one type, and scans, out of the frames that arrive.
+"""Make packets of one type, and scans, from arriving frames.
 
 A `PacketReader` keeps the state that a batch of packets needs from the batches before it.
 """

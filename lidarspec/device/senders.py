@@ -22,7 +22,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import Chunk, Sender, endpoint
 
-#: senders that are examined while the sensor is unknown, and ports of it that are remembered.
+#: limit of examined senders while the sensor is unknown, and of remembered ports.
 MAX_SENDERS = 16
 
 
@@ -37,7 +37,7 @@ class Senders:
         self._source = source
         self._sensor = sensor
         self._owner: Sender | None = None
-        self._now: dict[str, Sender] = {}  # who sends the frames of a type, and who did before
+        self._now: dict[str, Sender] = {}  # the current and previous senders of each frame type
         self._before: dict[str, dict[Sender, None]] = {}
 
     def see(self, sent: Iterable[tuple[str, Sender]]) -> None:
@@ -92,7 +92,7 @@ class SenderFilter(Senders):
         datagrams: whether each datagram is a whole frame, not a piece of a stream.
 
     Attributes:
-        foreign: datagrams of others, so far; `stranger` sent the first of them.
+        foreign: number of datagrams of other senders so far; `stranger` sent the first of them.
         has_changed: whether the last call of `select` has selected another sender than the one read
             before.
     """
@@ -104,11 +104,11 @@ class SenderFilter(Senders):
         self.stranger: Sender | None = None
         self._is_sure = False
         self._datagrams = datagrams
-        self._first: Sender | None = None  # whose stream is read while nobody has sent a frame
+        self._first: Sender | None = None  # sender of a stream before its first frame
         self._probes: dict[Sender, Decoder] = {}
         self._strangers: dict[
             Sender, None
-        ] = {}  # other sensors' ports at the address of the sensor
+        ] = {}  # ports of other sensors at the address of the sensor
 
     @property
     def address(self) -> Sender | None:
@@ -163,8 +163,7 @@ class SenderFilter(Senders):
         """Return those of the frames from the address of the sensor that its ports sent.
 
         Args:
-            sent: the type and the sender of each frame, or, where one sender sent them all, of each
-                type.
+            sent: the type and the sender of each frame, or of each type if one sender sent all.
         """
         known = len(self._strangers)
         for name, sender in sent:
@@ -253,7 +252,7 @@ def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tupl
     If one sender sent all of them, each type is listed once. Returns [] if senders are not known.
 
     Args:
-        end: where these datagrams end in everything that was decoded.
+        end: the end of these datagrams, in bytes since the start of the input.
     """
     senders = {chunk.sender for chunk in chunks}
     if None in senders:

@@ -1,19 +1,20 @@
-"""Commands and their replies, sans-IO: requests in, what to send out; frames in, replies out.
+"""Commands and their replies, without I/O.
 
-All times are the caller's, in ns of one monotonic clock. On each link one request is under way at a
-time; the others wait in a queue, also while the device settles. The reply is looked for among all
-frames that arrive on the link, data or not.
+Requests go in, and bytes to send come out; frames go in, and replies come out. All times are the
+caller's, in ns of one monotonic clock. Each link has one request at a time. Others wait in a queue,
+also while the device settles. All frames that arrive on the link, data or not, are compared with
+the expected reply.
 
-A late answer is never taken for the next one's. A sending that was not answered in time is *owed*
-an answer, until twice the time that it may take has passed since. While one is owed that could be
-the reply to the next request as well (a type of frame in common, and no field in which the two have
-to differ), that request is held back; an owed answer that does come is counted in `late` and frees
-it. A frame that arrived before a request was sent is no answer to it. An answer that is later still
-can be told from the next one's only by what the command `matches` or `echoes`.
+A late reply must not be used for the next request. If a sent command gets no reply in time, the
+session still expects one, until twice the timeout has passed. If that late reply could also be the
+reply to the next request (a common frame type, and no field in which the two have to differ), the
+next request is held back. A late reply that does arrive is counted in `late`, and releases it. A
+frame that arrived before a request was sent is not its reply. After twice the timeout, only the
+fields in `matches` or `echoes` distinguish a late reply from the next one.
 
-A running number (`Count`) is filled in where a request is made, so that what is sent once more has
-the number that it had; `echoes` then tells its answer from every other. What a reply teaches is for
-the owner of the session, who configures the sensor.
+A running number (`Count`) is filled in when a request is made, so that a repeated command has the
+same number; `echoes` then distinguishes its reply from all others. The owner of the session
+configures the sensor with the options that a reply reports.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from lidarspec.spec.description import Command
 from lidarspec.spec.options import Learned
 from lidarspec.spec.tree import FieldInfo
 
-#: fields that a reply's repr shows.
+#: maximum number of fields in a reply's repr.
 SHOWN = 6
 _MISSING = object()
 SECOND = 1_000_000_000
@@ -41,7 +42,7 @@ SECOND = 1_000_000_000
 
 @dataclass(frozen=True)
 class Outgoing:
-    """What is to be done on a link now: first the levels of its control lines, then the bytes."""
+    """Bytes to send on a link, after setting its control lines."""
 
     link: str
     data: bytes
@@ -52,14 +53,11 @@ class Outgoing:
 class Reply:
     """The answer to a command.
 
-    Attributes:
-        command: the name of the command.
-        frame: the type of the frame that answered; None where no answer is documented.
-        values: its fields, raw wire integers as `Sensor.parse` gives them; ``reply["path"]`` is the
-            physical value.
-        confirmed: whether the device answered.
-        at: when, in the session's clock; for one that is not confirmed, when the command was sent.
-        data: the bytes of the frame.
+    Attributes: command: the name of the command. frame: the type of the frame that answered; None
+        if no answer is documented. values: its fields, raw wire integers as `Sensor.parse` returns
+        them; ``reply["path"]`` is the physical value. confirmed: whether the device answered. at:
+        the arrival time by the session's clock; without a reply, the time when the command was
+        sent. data: the bytes of the frame.
     """
 
     command: str
@@ -71,7 +69,7 @@ class Reply:
     fields: Mapping[str, FieldInfo] = field(default_factory=dict, compare=False)
 
     def __getitem__(self, path: str) -> Any:
-        """The value of a field in its unit; a list where it is in an array.
+        """Return the value of a field in its unit, a list if it is in an array.
 
         Raises:
             UnknownField: for a path that the frame does not have.
@@ -91,17 +89,15 @@ class Reply:
             for info in self.fields.values()
             if info.const is None and found_at(self.values, info.path) is not _MISSING
         ]
-        told = [
+        shown_fields = [
             f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}"
             for info in free[:SHOWN]
         ]
-        return (
-            f"Reply({self.command}, {self.frame}: {', '.join(told)}{', ...' * (len(free) > SHOWN)})"
-        )
+        return f"Reply({self.command}, {self.frame}: {', '.join(shown_fields)}{', ...' * (len(free) > SHOWN)})"
 
 
 class Pending:
-    """A command that was asked for, and becomes its reply or its failure."""
+    """The future result of a command: its reply or its failure."""
 
     def __init__(self, place: str) -> None:
         self._place = place
@@ -114,17 +110,17 @@ class Pending:
 
     @property
     def failure(self) -> CommandError | None:
-        """Why there is no reply; None where there is one, or it is not known yet."""
+        """The error if there is no reply; None for success, or if it is not done."""
         if isinstance(self._outcome, CommandError):
             return self._outcome
         return None
 
     def result(self) -> Reply:
-        """The reply.
+        """Return the reply.
 
         Raises:
             ReplyTimeout: if none came in time.
-            CommandError: if the device answered with something else, or the command was given up.
+            CommandError: if the device answered with something else, or the command was abandoned.
             UsageError: if it is not done.
         """
         if self._outcome is None:
@@ -134,7 +130,7 @@ class Pending:
         return self._outcome
 
     def settle(self, outcome: Reply | CommandError) -> None:
-        """Make it done; for the session."""
+        """Set the result; called by the session."""
         self._outcome = outcome
 
 
@@ -143,9 +139,9 @@ class Expected:
     """The frames that can be the reply to one request.
 
     Attributes:
-        tables: for each type of frame its fields.
-        values: what its fields must be, those of them that the type has.
-        refusal: the type of the frame that refuses; None where there is none.
+        tables: frame type -> fields by path.
+        values: path -> required value; paths that a type does not have are ignored.
+        refusal: the type of the frame that refuses; None if there is none.
     """
 
     tables: Mapping[str, Mapping[str, FieldInfo]]
@@ -153,7 +149,7 @@ class Expected:
     refusal: str | None = None
 
     def differs(self, frame: str, values: Any) -> list[str]:
-        """What is wrong with a frame as the reply, field by field; empty where it is the reply."""
+        """Return the differences between a frame and the reply; empty if there are none."""
         if frame not in self.tables:
             return [f"a frame {frame}"]
         asked = {path: value for path, value in self.values.items() if path in self.tables[frame]}
@@ -166,7 +162,7 @@ class Expected:
         return [f"{path} {there} instead of {asked[path]}" for path, there in wrong]
 
     def alike(self, other: Expected) -> bool:
-        """Whether one frame could be the reply to both."""
+        """Return whether one frame could be the reply to both."""
         return any(
             all(
                 other.values.get(path, value) == value
@@ -207,7 +203,13 @@ def _physical(info: FieldInfo, value: Any) -> Any:
 
 @dataclass(eq=False)
 class _Request:
-    """A command on its way: the times of its sendings, and when it is given up."""
+    """A command in progress.
+
+    Attributes:
+        timeout: ns from the first sending until it fails.
+        sent: the times of its sendings.
+        wrong: the differences of the last frame that was almost the reply.
+    """
 
     name: str
     command: Command
@@ -224,7 +226,7 @@ class _Request:
 
     @property
     def next_sending(self) -> int | None:
-        """When it is sent once more, None where it is not."""
+        """The time at which it is sent again, None if it is not."""
         again = self.sent[-1] + _ns(self.command.timeout)
         if len(self.sent) <= self.command.retries and again < self.gives_up:
             return again
@@ -232,13 +234,13 @@ class _Request:
 
     @property
     def patience(self) -> int:
-        """How long after a sending its answer is still thought possible."""
+        """The time after a sending in which a late reply is possible, in ns."""
         return 2 * max(self.timeout, _ns(self.command.timeout))
 
 
 @dataclass(frozen=True, eq=False)
 class _Owed:
-    """An answer that may still come."""
+    """A reply that may still arrive."""
 
     expected: Expected
     until: int
@@ -246,7 +248,7 @@ class _Owed:
 
 @dataclass(eq=False)
 class _Line:
-    """What goes on on one link; nothing is sent before `quiet`."""
+    """The state of one link; nothing is sent before `quiet`."""
 
     queue: deque[_Request] = field(default_factory=deque)
     current: _Request | None = None
@@ -254,7 +256,7 @@ class _Line:
     quiet: int = 0
 
     def ready(self) -> int | None:
-        """When the next request in the queue may be sent, None where there is none."""
+        """Return the time at which the next request may be sent, None without one."""
         if self.current is not None or not self.queue:
             return None
         expected = self.queue[0].expected
@@ -282,16 +284,15 @@ class _Beat:
 class Session:
     """The commands of one sensor on its links.
 
-    Feed it every frame that arrives, those included that `Decoder.idle` finds when the line has
-    fallen silent: a device that stops in the middle of a frame answers in what looks like the rest
-    of it.
+    Pass every arriving frame to it, including those that `Decoder.idle` finds in silence: a device
+    that stops in the middle of a frame replies in bytes that look like the rest of it.
 
     Attributes:
         sensor: the sensor.
         started: whether a command that starts the sensor was sent, and none since that stops it.
-        late: answers that came after they had been given up.
-        unanswered: why heartbeats are not answered any more, by command.
-        host: the address of this computer as the sensor sees it, None where nobody knows it.
+        late: number of replies that arrived after their timeout.
+        unanswered: command -> error of a heartbeat that is not answered any more.
+        host: the address of this computer as the sensor sees it, None if unknown.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -308,18 +309,20 @@ class Session:
     def request(
         self, name: str, now: int, /, *, timeout: float | None = None, **arguments: Any
     ) -> Pending:
-        """The promise of a command's reply; the command is sent as soon as its link is free.
+        """Queue a command, and return its future reply.
+
+        It is sent as soon as its link is free.
 
         Args:
             name: of the command.
             now: the time in ns.
-            timeout: seconds to wait in all; by default the command's own for each time that it is
-                sent.
+            timeout: seconds to wait in total; by default the command's own timeout for each
+                sending.
             arguments: of the command, in units.
 
         Raises:
-            UnknownCommand, UnknownField, MissingField, OutOfRange: for what the sensor does not
-                take; nothing is sent.
+            UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
+                is sent.
         """
         filled = {
             path: self._next(value)
@@ -352,13 +355,13 @@ class Session:
         return pending
 
     def outgoing(self) -> list[Outgoing]:
-        """What is to be sent now, in order; each is given out once."""
+        """Return everything that has to be sent now, in order, once."""
         out = self._out
         self._out = []
         return out
 
     def awaited(self, link: str = "data") -> frozenset[str]:
-        """The types of frames that `receive` has to see on a link now; it passes over others."""
+        """Return the frame types that `receive` needs from a link; it ignores others."""
         line = self._lines.get(link)
         if line is None:
             return frozenset()
@@ -368,7 +371,7 @@ class Session:
         return frozenset(name for one in expected for name in (*one.tables, one.refusal) if name)
 
     def receive(self, found: Iterable[Found], now: int, *, link: str = "data") -> None:
-        """Take frames that arrived on a link at the time `now`."""
+        """Process frames that arrived on a link at the time `now`."""
         line = self._lines.get(link)
         if line is None:
             return
@@ -378,7 +381,7 @@ class Session:
         self._advance(link, now)
 
     def tick(self, now: int) -> None:
-        """Send again, give up, end settling, and beat, as far as it is time to."""
+        """Send again, time out, end settling, and send heartbeats that are due."""
         for name, beat in list(self._beats.items()):
             if now >= beat.due:
                 beat.due = now + _ns(self.sensor.commands[name].every)
@@ -400,7 +403,7 @@ class Session:
 
     @property
     def deadline(self) -> int | None:
-        """When `tick` is needed next; None where nothing is waited for."""
+        """The time at which `tick` is needed next; None if there is none."""
         times = [beat.due for beat in self._beats.values()]
         for line in self._lines.values():
             current = line.current
@@ -412,11 +415,11 @@ class Session:
 
     @property
     def busy(self) -> bool:
-        """Whether a request waits to be sent or answered; heartbeats to come do not count."""
+        """Whether a request waits to be sent or answered; future heartbeats do not count."""
         return any(line.current is not None or line.queue for line in self._lines.values())
 
     def abandon(self, reason: str, link: str | None = None) -> None:
-        """Give up every request and heartbeat, or those on one link.
+        """Fail every request and stop every heartbeat, or those on one link.
 
         The link was lost, or no caller waits. Replies to commands that were sent are still
         expected.
@@ -457,7 +460,7 @@ class Session:
         return codec(self.sensor.frames[frame]).schema.fields
 
     def _advance(self, link: str, now: int) -> None:
-        """Send what the queue has, up to the first request that is answered or held back."""
+        """Send queued requests, up to the first that waits for a reply or is held back."""
         line = self._lines[link]
         line.owed = [owed for owed in line.owed if owed.until > now]
         while (ready := line.ready()) is not None and now >= ready:
@@ -476,7 +479,7 @@ class Session:
         self.started = (self.started or command.starts) and not command.stops
 
     def _take(self, line: _Line, item: Found, now: int) -> None:
-        """The reply to the current request, an answer that is owed, or neither."""
+        """Use a frame as the reply to the current request, or as a late reply."""
         values = self.sensor.parse(item.data, item.frame)
         current = line.current
         if self._is_refusal(line, item, values, now):
@@ -507,7 +510,7 @@ class Session:
             current.wrong = f"{item.frame} with {', '.join(differs)}"
 
     def _is_refusal(self, line: _Line, item: Found, values: Any, now: int) -> bool:
-        """Return whether a frame refuses the oldest request that waits for a reply.
+        """Return whether a frame refuses the oldest request without a reply.
 
         The frame does not tell which request it refuses.
         """
@@ -538,7 +541,7 @@ class Session:
         request.pending.settle(error)
 
     def _close(self, line: _Line, request: _Request, *, answers: int, since: int) -> None:
-        """The link is free again; every sending but those answered is owed its answer."""
+        """Free the link; each sending without a reply may still get a late one."""
         line.current = None
         line.quiet = since + _ns(request.command.settle)
         if request.expected is not None:
@@ -548,7 +551,9 @@ class Session:
 
 
 def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
-    """The options that a reply teaches, by name; none where the command learns nothing.
+    """Return the options that a reply reports, by name.
+
+    Empty if the command learns nothing.
 
     Raises:
         CommandError: for a reply that cannot be learned from.
@@ -558,7 +563,7 @@ def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
         return {}
     place = f"{sensor.id} {reply.command}"
     try:
-        told = {
+        options = {
             name: value.encode() if isinstance(value, str) else value
             for name, value in learns(reply.values).items()
         }
@@ -566,14 +571,15 @@ def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
         raise CommandError(
             f"{place}: nothing can be learned from the reply: {type(error).__name__}: {error}"
         ) from error
-    for name, value in told.items():
+    for name, value in options.items():
         if not isinstance(value, bytes | int | float):
             raise CommandError(
                 f"{place}: {name} is learned as a number, bytes or a text, not as"
                 f" {type(value).__name__}"
             )
     return {
-        name: Learned(value) if isinstance(value, bytes) else value for name, value in told.items()
+        name: Learned(value) if isinstance(value, bytes) else value
+        for name, value in options.items()
     }
 
 
@@ -582,17 +588,17 @@ def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
 
     Returns "" if no value has a label.
     """
-    told = [
+    reasons = [
         f"{path} {name} ({number})"
         for path, info in fields.items()
         for number, name in info.labels.items()
         if found_at(values, path) == name
     ]
-    return ", ".join(told)
+    return ", ".join(reasons)
 
 
 def _silence(sensor: Sensor, request: _Request) -> CommandError:
-    """What to say when the time is up."""
+    """Return the error for a request without a reply."""
     place = f"{sensor.id} {request.name}"
     if request.wrong:
         return CommandError(f"{place}: the device answered with {request.wrong}")

@@ -6,11 +6,11 @@
     mount = {x = 0.2, yaw_deg = 90, inverted = true}
     options = {calibration = "./angles.csv"}
 
-A name stands for its device wherever a SOURCE is asked for; ``./front`` is the file of that name.
-The file in the user's configuration directory comes first, and then the nearest one, in the working
-directory or above it, that belongs to the user: it adds names, and hides none. A project may come
-from anybody, so its file runs no Python and leads to no path outside its folder, unless the user
-has allowed that folder. A file with a mistake takes away its own devices, and no others.
+A name can be used as any SOURCE; ``./front`` is the file of that name. The file in the user's
+configuration directory is read first, and then the nearest one of the user in the working directory
+or above it, which adds names but replaces none. A project may be untrusted, so its file runs no
+Python and refers to no path outside its folder, unless the user has allowed that folder. A mistake
+in a file disables the devices of that file only.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.stores import is_stored
 from lidarspec.trust import FILE, beside, document, foreign, is_trusted, own_settings
 
-#: what can be a name: nothing that has a suffix, a scheme or a folder, and no port of a system that
-#: calls them by letters.
+#: a valid name: no suffix, scheme or folder, and not the name of a port on Windows.
 _NAME = re.compile(r"(?!(?i:com|lpt)\d+$)[A-Za-z][A-Za-z0-9_-]*")
 _KEYS = ("source", "sensor", "mount", "options")
 
@@ -43,14 +42,15 @@ class Named:
     """A device of a settings file.
 
     Attributes:
-        name: how it is called.
+        name: its name.
         source: a SOURCE.
-        sensor: id, alias or path of a module; None where it is to be detected.
-        mount: how it is mounted; None where nothing is said.
-        options: what the sensor is configured with.
-        file: where it stands.
-        hidden: another file that has a device of this name, which is not used.
-        believed: whether the file is the user's own, or in a folder that the user has allowed.
+        sensor: id, alias or path of a module; None to detect it.
+        mount: its pose; None if not given.
+        options: options of the sensor.
+        file: the settings file.
+        hidden: another file with a device of this name, which is not used.
+        believed: whether the file is trusted: the user's own, or in a folder that the user has
+            allowed.
     """
 
     name: str
@@ -63,32 +63,32 @@ class Named:
     believed: bool = True
 
     def configure(self) -> Sensor | None:
-        """The sensor with its options; None where it is to be detected.
+        """Return the sensor with its options, None if it has to be detected.
 
         Raises:
-            UsageError: for a sensor that is not installed, or an option that it does not take.
+            UsageError: for a sensor that is not installed, or an invalid option.
         """
         if self.sensor is None:
             return None
-        found = named_sensor(self.sensor)
+        sensor = named_sensor(self.sensor)
         if not self.options:
-            return found
+            return sensor
         place = f"{self.file}: [device.{self.name}]"
         try:
             if self.believed:
                 options = self.options
             else:
-                options = found.configure.options_of_file(self.options, Path(self.file).parent)
+                options = sensor.configure.options_of_file(self.options, Path(self.file).parent)
         except UsageError as error:
             raise self._asking(UsageError(f"{place}: {error}")) from None
         try:
-            configured: Sensor = found.configure(**options)
+            configured: Sensor = sensor.configure(**options)
         except UsageError as error:
             raise UsageError(f"{place}: {error}") from None
         return configured
 
     def refusal(self) -> UsageError | None:
-        """Why a file that is not believed cannot have this device; None where it can."""
+        """Return the reason why an untrusted file cannot have this device, else None."""
         if self.believed:
             return None
         folder = Path(self.file).parent
@@ -115,17 +115,16 @@ class Named:
         return None
 
     def _asking(self, error: UsageError) -> UsageError:
-        """The error, with the command that allows the folder of the file."""
+        """Return the error with the command that allows the folder of the file."""
         return suggest(error, f"lidarspec trust {quote(str(Path(self.file).parent))}")
 
 
 def find_device(source: str | Path) -> Named | None:
-    """The device of this name; None for every other SOURCE.
+    """Return the device with this name, None for every other SOURCE.
 
     Raises:
-        UsageError: for a device of a file with a mistake, which is named with table and key, or
-            with something that only a folder may name that the user has allowed; and for a word
-            that is neither a name nor a file.
+        UsageError: for a mistake in the device's file, with table and key; for a device that is
+            only allowed in a trusted folder; and for a word that is neither a name nor a file.
         SourceError: for a settings file that cannot be read.
     """
     word = str(source)
@@ -155,13 +154,13 @@ def find_device(source: str | Path) -> Named | None:
 
 
 def devices() -> dict[str, Named]:
-    """Every device that is named here, of files without a mistake; the user's own come first."""
+    """Return all devices of files without a mistake, the user's own first."""
     return _known()[0]
 
 
 def _known() -> tuple[dict[str, Named], list[LidarSpecError]]:
-    """Every device that is named here, and what is wrong with files that could not be read."""
-    found: dict[str, Named] = {}
+    """Return all devices, and the errors of files that could not be read."""
+    known: dict[str, Named] = {}
     faults = []
     for path in files():
         try:
@@ -170,8 +169,8 @@ def _known() -> tuple[dict[str, Named], list[LidarSpecError]]:
             faults.append(fault)
             continue
         for name, device in devices.items():
-            found[name] = replace(found[name], hidden=device.file) if name in found else device
-    return found, faults
+            known[name] = replace(known[name], hidden=device.file) if name in known else device
+    return known, faults
 
 
 def files() -> list[Path]:
@@ -193,11 +192,11 @@ def files() -> list[Path]:
 
 
 def read(path: Path) -> dict[str, Named]:
-    """The devices of one file.
+    """Return the devices of one file.
 
     Raises:
         UsageError: for a mistake in it, with table and key.
-        SourceError: where it cannot be read.
+        SourceError: if it cannot be read.
     """
     content = document(path)
     is_own = path == own_settings()
@@ -228,14 +227,14 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
         raise UsageError(
             f'{path}: {place}: source is missing, such as source = "serial:///dev/ttyUSB0"'
         )
-    for key, kind, told in (
+    for key, kind, expected in (
         ("source", str, "text"),
         ("sensor", str, "text"),
         ("mount", dict, "a table"),
         ("options", dict, "a table"),
     ):
         if key in table and not isinstance(table[key], kind):
-            raise UsageError(f"{path}: {place}: {key} is {told}, not {shown(table[key])}")
+            raise UsageError(f"{path}: {place}: {key} is {expected}, not {shown(table[key])}")
     options = {key: _beside(path, value) for key, value in table.get("options", {}).items()}
     if "mount" in table:
         mount = _mount(path, place, table["mount"])
@@ -286,7 +285,10 @@ def _closest(word: str, known: Iterable[str]) -> str:
 
 
 def _beside(path: Path, value: Any) -> Any:
-    """A path that begins with a dot as one from the file's folder; everything else as it is."""
+    """Return a path that begins with a dot relative to the file's folder.
+
+    Other values are unchanged.
+    """
     if isinstance(value, str) and value.startswith(("./", "../")):
         return str(path.parent / value)
     return value

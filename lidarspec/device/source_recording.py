@@ -1,10 +1,10 @@
 """Record a source as data arrives.
 
-A live source is recorded until it is told to end, a file as fast as the disk allows.
+A live source is recorded until the recording is ended, a file as fast as the disk allows.
 
-A live source whose sensor is known is a `Device`: it is started and stopped, and what arrives is
-decoded to be counted. Without a sensor a `Capture` reads it and nothing is sent. The recorder is
-made when the source is open, since only then it is known what it carries.
+A live source with a known sensor is a `Device`: it is started and stopped, and the data is decoded
+to be counted. Without a sensor a `Capture` reads it and nothing is sent. The recorder is made after
+the source is opened, because its format depends on the source.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
-#: seconds between two looks at the time and at the disk.
+#: seconds between two checks of the time and of the disk.
 TURN = 0.1
-#: what may change in a warning that has been said.
+#: the parts of a warning that change from one to the next.
 _FIGURES = re.compile(r"[\d.]+")
 
 
@@ -64,13 +64,11 @@ class TimedLog:
     Sent data is always recorded.
 
     Args:
-        recorder: what writes the file; closed with this one.
+        recorder: writes the file; closed with this one.
         seconds: the limit; None for none.
 
-    Attributes:
-        first, last: arrival times of what was recorded first and last, ns; None before anything
-            was.
-        is_over: whether it takes nothing that arrives any more.
+    Attributes: first, last: arrival times of the first and the last recorded chunk, ns; None before
+        the first. is_over: whether it ignores all further arrivals.
     """
 
     def __init__(self, recorder: Appender, seconds: float | None) -> None:
@@ -100,7 +98,7 @@ class TimedLog:
         return chunk.at is None or (self.last is not None and chunk.at <= self.last)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record what was sent, and what was received unless it is over."""
+        """Record sent data, and received data until the limit."""
         if direction == "in" and chunk.at is not None:
             if self.first is None:
                 self.first = chunk.at
@@ -112,11 +110,11 @@ class TimedLog:
         self._recorder.write(chunk, direction)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record what happened to the line."""
+        """Record an event of the line."""
         self._recorder.event(name, at, **details)
 
     def end(self) -> None:
-        """Take nothing that arrives any more."""
+        """Ignore all further arrivals."""
         self.is_over = True
 
     def close(self) -> None:
@@ -125,24 +123,24 @@ class TimedLog:
 
 
 class SourceRecording:
-    """Everything that a source sends, brought into one file.
+    """Record everything that a source sends to one file.
 
     Args:
         source: any SOURCE.
         target: an .lsr, .pcap, .pcapng or .bin file.
-        sensor: whose bytes they are; without it they are recorded as they come.
-        seconds, count: when it ends: after a time, or so many data packets of the sensor, or
-            datagrams; None: never.
-        start: whether the sensor is sent the commands for its start and end.
+        sensor: the sensor; without it raw bytes are recorded.
+        seconds, count: the limits: a time, and a number of data packets of the sensor, or of
+            datagrams; None for no limit.
+        start: whether the commands for its start and end are sent to the sensor.
         overwrite: whether the file may exist.
-        salvage: go on behind damaged places, where the source is a recording.
+        salvage: continue after damaged parts, if the source is a recording.
 
     Attributes:
         recorder: the file, None before the source is open.
-        device: what reads a live source, None where its sensor is not known.
-        packets: data packets of the sensor so far, or datagrams; in the end as many as are in the
-            file.
-        elapsed: seconds since the source was open; in the end those between the first and the last
+        device: reads a live source; None if its sensor is unknown.
+        packets: number of data packets of the sensor so far, or of datagrams; at the end, of those
+            in the file.
+        elapsed: seconds since the source was opened; at the end, between the first and the last
             arrival in the file.
     """
 
@@ -174,11 +172,11 @@ class SourceRecording:
         self._began = 0.0
 
     def run(self) -> Generator[str, None, None]:
-        """Record until the end; again and again what is to be said, or "".
+        """Record until the end; yield messages, or "" regularly.
 
         Raises:
-            UsageError: for a file that exists, or cannot hold what the source gives.
-            SourceError: where the source cannot be read, or the file not be written.
+            UsageError: for a file that exists, or cannot contain the data of the source.
+            SourceError: if the source cannot be read, or the file cannot be written.
         """
         if self._sensor is not None and is_live(self._source):
             return self._record_device(self._sensor)
@@ -210,9 +208,9 @@ class SourceRecording:
                             " recording goes on"
                         ] = None
                         time.sleep(TURN)
-                    told = {_FIGURES.sub("", text): text for text in [*news, *failures]}
-                    yield "\n".join(text for what, text in told.items() if what not in known)
-                    known = set(told)
+                    current = {_FIGURES.sub("", text): text for text in [*news, *failures]}
+                    yield "\n".join(text for what, text in current.items() if what not in known)
+                    known = set(current)
             finally:
                 self._end(log)
                 with contextlib.suppress(Exception, SystemExit):
@@ -229,7 +227,7 @@ class SourceRecording:
         return count == len(packets)
 
     def _end(self, log: TimedLog) -> None:
-        """Record nothing more that arrives, and measure the time by what is in the file."""
+        """Ignore further arrivals, and set `elapsed` to the duration of the file."""
         log.end()
         if log.seconds is not None:
             self.elapsed = log.seconds
@@ -252,7 +250,7 @@ class SourceRecording:
             yield from source.warnings
 
     def _record_live(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
-        """What arrives is recorded by a thread; here it is counted and thrown away."""
+        """Count and discard the data that a thread records."""
         queue = BoundedQueue()
         with contextlib.closing(Capture(source, queue, log=log)) as capture:
             try:
@@ -287,7 +285,7 @@ class SourceRecording:
         return marks
 
     def _copy(self, source: Transport, log: TimedLog) -> Generator[str, None, None]:
-        """What is in a file; standard input gets the time of its arrival."""
+        """Copy a file; data of standard input gets the time of its arrival."""
         clock = HostClock()
         assert self.recorder is not None
         for chunk in source.chunks():
@@ -302,7 +300,7 @@ class SourceRecording:
             self.packets += source.datagrams
 
     def _open_log(self, source: Transport, sensor: Sensor | str | None) -> TimedLog:
-        """The recorder, now that the source is open, and the sensor known as it is read."""
+        """Return the recorder for an open source and its configured sensor."""
         counts = source.datagrams or (
             self._sensor is not None and isinstance(source, LiveTransport)
         )
