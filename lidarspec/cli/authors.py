@@ -1,4 +1,4 @@
-"""`new`, `check` and `export`: for those who write a sensor."""
+"""`new`, `check` and `export`: the verbs for authors of sensors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from lidarspec.testing.subject import EXAMPLES
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 
-#: bytes of a capture that are looked at.
+#: Maximum number of bytes of a capture that are analysed.
 MOST = 1 << 22
 
 
@@ -69,13 +69,13 @@ def new(
     link: str | None,
     capture: str | None,
 ) -> None:
-    """A distribution for a sensor of your own, which works before anything in it is changed.
+    """Create a distribution for your own sensor; it works before you change anything.
 
-    It has an invented sensor with frames, checksum, points, commands and simulation, its tests, and
-    the entry point by which it is found once it is installed. With --distribution it joins a
-    family: a module and tests of its own, beside those that are there. With --from-capture it has
-    what the bytes of a capture can be told to consist of: sync bytes, length, checksum, counters,
-    angles, each with the evidence for it; what cannot be told is called unknown.
+    It holds an invented sensor with frames, checksum, points, commands and simulation, its tests,
+    and the entry point that makes it known once it is installed. --distribution adds a module and
+    its tests to a distribution that exists. --from-capture drafts the frames from the bytes of a
+    capture: sync bytes, length, checksum, counters and angles, each with its evidence; all other
+    bytes are marked as unknown.
     """
     names = Names(sensor_id, distribution or "", vendor or "", model or "")
     if sensor_id in sensors():
@@ -109,8 +109,9 @@ def new(
 
 
 def _draft_files(names: Names, link: str | None, capture: str) -> dict[str, str]:
-    """The files with a draft of the capture's frames: of several senders and ports, those that the
-    most bytes come from and go to.
+    """Return the files with a draft of the frames of a capture.
+
+    If several senders or ports occur, the group with the most bytes is used.
     """
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(transport(capture)) as opened:
@@ -165,9 +166,9 @@ def check(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Check a sensor, a file or a distribution against every promise of the test kit.
+    """Check a sensor, a file or a distribution against every property of the test kit.
 
-    No test file is needed. Exit code 1 if there are findings.
+    No test file is needed. The exit code is 1 if there are findings.
     """
     import_library("hypothesis", "testing")
     file = Path(vectors) if vectors else None
@@ -192,7 +193,6 @@ def check(
 
 
 def _format_report(report: Report, *, verbose: bool) -> list[str]:
-    """A report in paragraphs."""
     paragraphs = [str(finding) for finding in report.findings]
     number = len(report.findings)
     if number:
@@ -223,9 +223,10 @@ def _format_report(report: Report, *, verbose: bool) -> list[str]:
     help="One frame type alone; by default all, or the one that carries the points.",
 )
 def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> None:
-    """A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi.
+    """Export a sensor's spec: wireshark, c, ksy (Kaitai), md, svg, json, pyi.
 
-    SENSOR is an id or a file ./mysensor.py. What the target cannot say is refused, with the reason.
+    SENSOR is an id or a file ./mysensor.py. If the target cannot express a part of the spec, the
+    export fails and gives the reason.
     """
     sensor = named_sensor(sensor_id)
     chosen = sensor if frame is None else select_frame(sensor, frame)

@@ -1,4 +1,4 @@
-"""`build` and `send`: one frame out of field=value; a command sent to a sensor, and its reply."""
+"""`build` and `send`: build a frame from field=value; send a command."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from lidarspec.transports.hexadecimal import parse_hex
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
 
-#: seconds to wait for what comes back on bytes sent by hand, and of silence behind it that end it.
+#: Timeout for the reply to bytes of --hex, and the silence that ends it, in seconds.
 ANSWERED = 1.0
 QUIET = 0.2
 
@@ -41,11 +41,11 @@ QUIET = 0.2
 def build(
     sensor_id: str, frame: str, assignments: Sequence[str], as_json: bool, output: str | None
 ) -> None:
-    """The bytes of one frame from field=value; a unit makes a value physical.
+    """Build one frame from field=value; a value with a unit is physical.
 
-    A bare number is the wire's integer. points[*].distance=1m sets every element,
+    A bare number is the raw integer. points[*].distance=1m sets every element,
     points[3].intensity=7 one; later ones win. Constants, counts and checksums are filled in. -o
-    writes the bytes themselves, or text where FILE ends in .hex.
+    writes the bytes, or hexadecimal text if FILE ends in .hex.
     """
     sensor = named_sensor(sensor_id)
     if "=" in frame:
@@ -107,9 +107,9 @@ def send(
 ) -> None:
     """Send a command to a sensor, and print its reply.
 
-    Nothing else is sent: a sensor that it starts goes on when the verb ends. Values are in the unit
-    that `show` prints, or bring their own: rate=600rpm. A sensor that keeps silent until it is
-    started has to be named with -s.
+    Nothing else is sent: a sensor that is started keeps running when the verb ends. Values are in
+    the unit that `show` prints, or have a unit of their own: rate=600rpm. A sensor that sends
+    nothing until it is started has to be named with -s.
     """
     if (command is None) == (digits is None):
         raise UsageError("send takes either the name of a command, or bytes: --hex 'a5 50'")
@@ -142,7 +142,7 @@ def _bytes(digits: str) -> bytes:
 
 
 class _Answer:
-    """What arrives, in the place of a recording."""
+    """A recorder that keeps the received chunks in memory."""
 
     error = None
 
@@ -154,14 +154,15 @@ class _Answer:
             self.chunks.append(chunk)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Nothing is made of it: what was lost is missing in the answer."""
+        """Ignore events: lost data is missing in the answer."""
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing."""
 
     def after(self, number: int, seconds: float) -> list[Chunk]:
-        """The chunks behind the first so many: until the line has been quiet for a moment, or so
-        many seconds have passed.
+        """Return the chunks from index `number` on.
+
+        Waits until nothing has arrived for `QUIET` seconds, at most `seconds`.
         """
         end = time.monotonic() + seconds
         heard = number
@@ -184,9 +185,7 @@ def _write(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Send bytes, and print what comes back, explained; data frames, which come all the same, are
-    only counted.
-    """
+    """Send bytes, and explain the reply; data frames are only counted."""
     _refuse_file(device, source)
     sensor = device.sensor
     before = len(answer.chunks)
@@ -200,7 +199,7 @@ def _write(
     rest = [piece for piece in found if piece.frame not in sensor.data_frames]
     if len(rest) < len(
         found
-    ):  # they go on: what is cut off by the beginning and the end of listening is of these
+    ):  # data frames continue: the incomplete pieces at both ends belong to them
         note(f"{len(found) - len(rest)} data frames came meanwhile")
         rest = [piece for piece in rest if piece.is_valid or piece not in (found[0], found[-1])]
     parts = [

@@ -1,9 +1,9 @@
-"""What can stand at a place of the command line, for completion in bash, zsh and fish: click's own,
-with what lidarspec knows.
+"""Completion of the command line in bash, zsh and fish.
 
-`_LIDARSPEC_COMPLETE=bash_source lidarspec` prints what the shell has to be told. What stands for a
-parameter follows from its name, which means the same in every verb (`BY_NAME`): ids of sensors,
-frames, fields, commands, ports, devices of `lidarspec.toml`, files.
+Extends click's own completion with the names that lidarspec knows.
+`_LIDARSPEC_COMPLETE=bash_source lidarspec` prints the code for the shell. The name of a parameter
+decides how it is completed, in every verb alike (`BY_NAME`): ids of sensors, frames, fields,
+commands, ports, devices of `lidarspec.toml`, files.
 """
 
 from __future__ import annotations
@@ -31,16 +31,17 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.ports import serial_ports
 
-#: the variable in which a shell says what it wants.
+#: The environment variable that holds the request of the shell.
 VARIABLE = "_LIDARSPEC_COMPLETE"
-#: where bash breaks words, as a user does not.
+#: The characters at which bash splits words.
 BREAKS = ":="
 
 
 @add_completion_class
 class Bash(BashComplete):
-    """click's completion for bash, with words that hold ``:`` or ``=``, and without a blank behind
-    ``field=`` and ``sim:``.
+    """click's completion for bash, with support for words that contain ``:`` or ``=``.
+
+    No blank is added after ``field=`` and ``sim:``.
     """
 
     source_template = BashComplete.source_template.replace(
@@ -50,7 +51,7 @@ class Bash(BashComplete):
     _broken = ""
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """The words in front of the cursor, and the one at it, put together again."""
+        """Return the words before the cursor, and the word at it, joined again."""
         args, incomplete = super().get_completion_args()
         words: list[str] = []
         for word in (*args, incomplete):
@@ -63,23 +64,21 @@ class Bash(BashComplete):
         return args, incomplete
 
     def format_completion(self, item: CompletionItem) -> str:
-        """What bash puts in the place of the last piece of the word."""
+        """Return the completion of the part of the word that bash replaces."""
         return f"{item.type},{item.value.removeprefix(self._broken)}"
 
 
 def complete(group: click.Command, instruction: str) -> int:
-    """Print what a shell asks for; the exit code."""
+    """Print the completions that a shell requests, and return the exit code."""
     try:
-        with warnings.catch_warnings(
-            action="ignore"
-        ):  # the verb itself will say what there is to say
+        with warnings.catch_warnings(action="ignore"):  # the verb itself prints the warnings
             return shell_complete(group, {}, "lidarspec", VARIABLE, instruction)
-    except LidarSpecError:  # settings or plugins with a mistake, which the verb itself will name
+    except LidarSpecError:  # faulty settings or plugins, which the verb itself reports
         return 1
 
 
 def attach(command: click.Command) -> None:
-    """Have the parameters of a verb completed by their names."""
+    """Complete the parameters of a verb by their names."""
     for param in command.params:
         names = BY_NAME.get(param.name or "")
         if names is not None and isinstance(param.type, click.types.StringParamType):
@@ -104,8 +103,9 @@ def _sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Devices, ports, simulated sensors, and files beside them; where there are files alone the
-    shell does that better.
+    """Return devices, ports and simulated sensors, with the files that match.
+
+    If only files match, nothing is returned: the shell completes files better.
     """
     if incomplete.startswith("sim:"):
         simulated = [f"sim:{name}" for name in registry().names()]
@@ -124,8 +124,9 @@ def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _sensor(ctx: click.Context) -> Sensor | None:
-    """The sensor of the words in front of the cursor: named, of a device of lidarspec.toml, or
-    simulated.
+    """Return the sensor that the words before the cursor name.
+
+    It is given by -s, by a device of lidarspec.toml, or simulated.
     """
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])
@@ -151,7 +152,7 @@ def _commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Fields of a frame, or arguments of a command."""
+    """Return the fields of a frame, or the arguments of a command."""
     sensor = _sensor(ctx)
     frame = ctx.params.get("frame") or ""
     command = ctx.params.get("command") or ""
@@ -166,19 +167,19 @@ def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _format_path(path: str, info: FieldInfo) -> str:
-    """The path of a field for all elements of its arrays: "points[*].distance"."""
+    """Return the path of a field for all elements of its arrays: "points[*].distance"."""
     *outer, last = path.split(".")
     steps = [*(f"{step}[*]" if step in info.axes else step for step in outer), last]
     return ".".join(steps) + ("[*]" if last in info.axes and info.kind != "bytes" else "")
 
 
 def _columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """What colours can show of each sensor; columns of its own are known once there are points."""
+    """Return the columns of every sensor; others are unknown before there are points."""
     return ("range", "intensity")
 
 
 def _formats(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    from lidarspec.formats import formats  # which brings NumPy
+    from lidarspec.formats import formats  # imports NumPy
 
     return [suffix.removeprefix(".") for suffix in formats()]
 
@@ -195,13 +196,13 @@ def _verbs(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _either(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """A sensor or a distribution."""
+    """Return sensors and distributions."""
     return [*registry().names(), *sorted({plugin.distribution for plugin in registry().plugins})]
 
 
-#: what is all that there can be; elsewhere files can stand as well.
+#: Functions that return all possible values; for others, files are possible as well.
 LISTED = (_frames, _commands, _assignments, _verbs, _columns, _formats)
-#: the name of a parameter -> what can stand there.
+#: Name of a parameter -> function that returns its possible values.
 BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "sensor_id": _sensors,
     "source": _sources,

@@ -132,25 +132,25 @@ def convert(
     piece_size: float | None,
     as_json: bool,
 ) -> None:
-    """Write the points of a capture or raw file to a file, in the format of its suffix.
+    """Write the points of a recording or capture to a file of another format.
 
-    .csv and .npz hold x y z range azimuth elevation intensity time ring return_index column, those
-    that the sensor has, its further columns, and the number of the scan; metres, radians, and
-    seconds since the scan's stamp. .npy, .ply, .pcd and .lzf.pcd, which is compressed, hold x y z
-    intensity ring time, further columns and, of several scans, their number; .bin, as KITTI has it,
-    x y z intensity; .xyz x y z. For a file each scan put the place of a number into the name,
-    scans/%05d.pcd; %F, %H, %M and %S stand for date, hour, minute and second of the scans that
-    share a file.
+    The suffix of OUT decides the format. .csv and .npz hold x y z range azimuth elevation intensity
+    time ring return_index column, as far as the sensor has them, its further columns, and the
+    number of the scan, in metres, radians, and seconds since the scan's stamp. .npy, .ply, .pcd and
+    the compressed .lzf.pcd hold x y z intensity ring time, further columns and, for several scans,
+    their number; .bin, as in KITTI, x y z intensity; .xyz x y z. To write one file for each scan,
+    put a number into the name: scans/%05d.pcd. With %F, %H, %M and %S (date, hour, minute, second)
+    the scans of one such time share a file.
 
-    .lsr, .pcap and .pcapng hold the packets themselves, as they were received.
+    .lsr, .pcap and .pcapng hold the packets as they were received.
 
     Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap,
-    .bag, .rosbag2, .db3), of Foxglove (.foxglove.mcap) and of Rerun (.rrd) take libraries that are
+    .bag, .rosbag2, .db3), of Foxglove (.foxglove.mcap) and of Rerun (.rrd) need libraries that are
     not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove,rerun].
 
     With --to each IN is a file, a pattern in quotes, 'drives/**/*.pcap', or a URL,
-    s3://bucket/a.pcap, and OUT a folder. What is done is written down there, in manifest.jsonl: the
-    same command again does what is missing. A file that fails stops no other.
+    s3://bucket/a.pcap, and OUT is a folder. Its manifest.jsonl lists the finished pieces: the same
+    command again does only the missing ones. If a file fails, the others are still converted.
     """
     properties = {
         "beams": selection.beams,

@@ -1,6 +1,7 @@
 """Failures as one message on stderr and an exit code.
 
-The exit code depends on whose fault the failure is. A traceback is never shown.
+The exit code depends on whose fault the failure is. A traceback is printed only with --verbose or
+LIDARSPEC_DEBUG.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ NO_DATA = 4
 DEVICE = 5
 INTERRUPTED = 130
 
-#: error class -> exit code and the next command; the first that fits, "{sensor}" and "{verb}"
-#: filled in.
+#: (error class, exit code, next command); the first entry that matches applies. "{sensor}" and
+#: "{verb}" are filled in.
 CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...] = (
     (errors.UnknownSensor, USAGE, "lidarspec sensors"),
     (
@@ -41,7 +42,7 @@ CODES: tuple[tuple[type[Exception] | tuple[type[Exception], ...], int, str], ...
 
 
 def report(error: Exception, verb: str) -> int:
-    """Print what went wrong and what to do next; the exit code."""
+    """Print an error and the next command, and return the exit code."""
     code, command = next(
         ((code, command) for kind, code, command in CODES if isinstance(error, kind)),
         (FINDINGS, ""),
@@ -67,7 +68,7 @@ def report(error: Exception, verb: str) -> int:
 
 
 def _lacks_sensors(error: Exception) -> bool:
-    """Whether bytes or a device are nobody's because no sensor is installed."""
+    """Return whether an error occurs because no sensor is installed."""
     suggestion = errors.suggestion(error)
     named = (
         str(getattr(error, "sensor", ""))
@@ -94,8 +95,10 @@ def _message(error: Exception) -> str:
 
 
 def _following(error: Exception, command: str, verb: str) -> str:
-    """The next command; what is said of plugins, where an unknown sensor may be one of a plugin
-    that does not load.
+    """Return the next command.
+
+    For an unknown sensor it is `lidarspec plugins` if a plugin fails to load, as that plugin may
+    provide the sensor.
     """
     from lidarspec.plugins import registry
 
@@ -108,7 +111,7 @@ def _following(error: Exception, command: str, verb: str) -> str:
         return f"lidarspec check {shlex.quote(error.path)}"
     if (
         isinstance(error, errors.PluginError) and error.file and sensor not in registry()
-    ):  # one of a file that was named
+    ):  # a plugin of a file that the user named
         return f"lidarspec check {shlex.quote(errors.shown_path(error.file))}"
     if "{sensor}" in command and not sensor:
         if isinstance(error, errors.SpecError):

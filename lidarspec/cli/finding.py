@@ -1,6 +1,4 @@
-"""`ports`, `detect`, `doctor` and `crc`: what is there, whose bytes come, why nothing comes, and
-which checksum it is.
-"""
+"""`ports`, `detect`, `doctor` and `crc`: find ports, sensors, faults, checksums."""
 
 from __future__ import annotations
 
@@ -46,20 +44,20 @@ from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
 from lidarspec.transports.protocol import no_bytes
 
-#: doubt below which a match may well be chance.
+#: Bits of evidence below which a match may be chance.
 WEAK = 12
-#: matches that are printed, and the texts that read as hexadecimal.
+#: Maximum number of matches to print.
 PRINTED = 4
 HEX = (".hex", ".txt")
 LONGEST = 1 << 16
-#: checksums that are told of unknown bytes.
+#: Maximum number of checksums to print for unknown bytes.
 TOLD = 2
 
 
 @click.command()
 @output_options
 def ports(as_json: bool, output: str | None) -> None:
-    """The serial ports of this computer, and the UDP ports that installed sensors send to."""
+    """List the serial ports of this computer, and the UDP ports of installed sensors."""
     serial = serial_ports()
     udp = {port: udp_users(port) for port in udp_ports()}
     if as_json:
@@ -87,7 +85,7 @@ def ports(as_json: bool, output: str | None) -> None:
 
 
 def _senders(port: int) -> list[str]:
-    """The installed sensors whose data come to a UDP port."""
+    """Return the installed sensors that send data to a UDP port."""
     return [
         sensor.id
         for sensor in sensors().values()
@@ -132,12 +130,12 @@ def _udp(port: int, users: tuple[User, ...] | None) -> dict[str, Any]:
 def crc(
     words: Sequence[str], period: int | None, offset: int, as_json: bool, output: str | None
 ) -> None:
-    """Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.
+    """Find the checksum of sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.
 
-    Frames are words of hexadecimal digits, one each; a text file with a frame in each line (.hex,
-    .txt); or a capture. Of raw bytes the frames are found out, or --period says how long they are.
-    The more frames, the surer the answer: a dozen is plenty. Of a long file the beginning is looked
-    at.
+    Frames are arguments of hexadecimal digits, one frame each; a text file with one frame on each
+    line (.hex, .txt); or a capture. In raw bytes the frames are found by their structure, or by
+    their length in --period. More frames give a surer result: a dozen is plenty. Only the beginning
+    of a long file is read.
     """
     frames = _frames(words, period, offset)
     found = search(frames)
@@ -202,7 +200,7 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
 
 
 def checksum_told(match: Match) -> dict[str, Any]:
-    """A match for JSON."""
+    """Return a match as a JSON object."""
     return {
         "checksum": match.algorithm.describe(),
         "name": match.name,
@@ -261,13 +259,13 @@ def _text(match: Match, length: int) -> str:
 def detect(
     source: str | None, duration: float, start: bool, as_json: bool, output: str | None
 ) -> None:
-    """Which installed sensor sends, and at which port and baud rate.
+    """Identify the installed sensor that sends, its port and its baud rate.
 
-    SOURCE is a port, a file or a capture; without it every serial port is listened to at every baud
-    rate that installed sensors declare, and every UDP port. A sensor fits by the share of the bytes
-    in frames that pass checksum and plausibility. Sensors with the same frames are told apart by
-    their clocks, names in their frames and baud rates, as far as that goes; those that were ruled
-    out are listed with -v.
+    SOURCE is a port, a file or a capture; by default every serial port at every baud rate that
+    installed sensors declare, and every UDP port. A sensor matches by the share of the bytes in
+    frames with valid checksum and plausible values. Sensors with the same frames are distinguished
+    by their clocks, names in their frames and baud rates, as far as possible; -v also lists the
+    sensors that were ruled out.
     """
     if source == "-":
         raise suggest(
@@ -333,7 +331,7 @@ def _one(
 
 
 def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
-    """Return whose bytes come over each port, all of which are listened to at the same time."""
+    """Listen to all ports at the same time, and yield a verdict for each."""
     serial = [port.path for port in serial_ports()]
     udp = udp_ports()
     note(
@@ -357,7 +355,7 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
 
 
 def _unknown(found: Sequence[Verdict]) -> Structure | None:
-    """What the bytes are made of that fit no sensor."""
+    """Return the structure of the bytes that fit no sensor."""
     heard = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
     if heard is not None and heard.size:
         return structure(heard.chunks, datagrams=heard.datagrams)
@@ -370,7 +368,7 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
         alike = {score.sensor.id for score in one.alike}
         listed = one.scores
         if voice.loudness <= 0 and (one.alike or one.others):
-            listed = one.alike  # without those that were ruled out
+            listed = one.alike  # without the sensors that were ruled out
         for score in listed:
             if score.sensor.id not in alike:
                 verdict_of = "no"
@@ -482,8 +480,9 @@ def _conclusions(
 
 
 def _missing(found: Sequence[Verdict]) -> list[KnownSensor]:
-    """Return the sensors that are not installed and may have sent the most of the bytes, if no
-    installed one fits.
+    """Return the sensors that are not installed and may have sent most of the bytes.
+
+    Returns an empty list if an installed sensor fits.
     """
     if any(one.scores or one.fault for one in found):
         return []
@@ -500,7 +499,7 @@ def _verb(one: Verdict) -> str:
 
 
 def _following(source: str | None, unknown: Structure | None) -> str:
-    """What to type where bytes come that no sensor fits."""
+    """Return the next command for bytes that fit no sensor."""
     if source is None or live_address(source) is not None:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
     if unknown is None or unknown.checksums:
@@ -513,7 +512,7 @@ def _following(source: str | None, unknown: Structure | None) -> str:
 
 
 def _again(one: Verdict) -> str:
-    """The source as it has to be opened for the sensor that was found."""
+    """Return the source with the baud rate and the sender that were found."""
     source = one.heard.source
     heard = one.heard
     link = data_link(one.sensor, Serial)
@@ -525,7 +524,7 @@ def _again(one: Verdict) -> str:
 
 
 def _verdict_to_dict(one: Verdict) -> dict[str, Any]:
-    """A verdict for JSON."""
+    """Return a verdict as a JSON object."""
     heard = one.heard
     return {
         "source": heard.source,
@@ -604,11 +603,11 @@ def doctor(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """What keeps a sensor's bytes from coming, and the command that mends it.
+    """Diagnose why no data arrives from a sensor, and suggest a fix.
 
-    Looks for missing ports and rights, ports in use, small buffers, silence, a wrong baud rate, a
-    wrong interface. Without SOURCE all ports of this computer. Ends with 1 where something is
-    wrong.
+    Checks for missing ports and permissions, ports in use, small buffers, silence, a wrong baud
+    rate and a wrong interface. Without SOURCE it checks all ports of this computer. The exit code
+    is 1 if something is wrong.
     """
     if sensor_id is None:
         sensor = None

@@ -1,4 +1,4 @@
-"""`parse` and `explain`: the frames in some bytes, and every byte of them, as they are found."""
+"""`parse` and `explain`: print the frames in some bytes, or every byte of them."""
 
 from __future__ import annotations
 
@@ -42,9 +42,10 @@ def parse(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """The fields of each frame in some bytes.
+    """Print the fields of each frame in some bytes.
 
-    With --slice, which goes by the times of arrival, offsets count from its beginning.
+    With --slice, which selects by the times of arrival, offsets count from the beginning of the
+    slice.
     """
     with open_input(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id)
@@ -68,7 +69,7 @@ def parse(
 
 
 def _fields(sensor: Sensor, piece: Piece) -> dict[str, Any]:
-    """A frame for JSON."""
+    """Return a frame as a JSON object."""
     facts = {"frame": piece.frame, "offset": piece.offset, "size": len(piece.data)}
     return {**facts, "fields": plain(sensor.parse(piece.data, piece.frame))}
 
@@ -134,12 +135,12 @@ def explain(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Every byte of each frame: offset, hex, field, value, unit, meaning.
+    """Explain every byte of each frame: offset, hex, field, value, unit, meaning.
 
-    A damaged frame is told with what became of it: a flipped bit, a lost or inserted byte, where it
-    is cut off. With --bad the exit code is 1 where something is damaged. OFFSETs are those that are
-    printed, 940 or 0x3ac; of a capture, in the payloads, joined; with --slice, which goes by the
-    times of arrival, they count from its beginning.
+    For a damaged frame the damage is described: a flipped bit, a lost or inserted byte, or the
+    position at which it is cut off. With --bad the exit code is 1 if something is damaged. OFFSETs
+    are those that are printed, 940 or 0x3ac; in a capture they count through the joined payloads;
+    with --slice, which selects by the times of arrival, from the beginning of the slice.
     """
     if at is not None and stretch is not None:
         raise UsageError("--at is for one byte, and --bytes for several: leave out one of them")
@@ -169,8 +170,12 @@ def listing(
     every: bool = False,
     verdicts: bool = False,
 ) -> Iterator[Line]:
-    """The lines of explained pieces, each below a title, which says what stands `at` a byte, and
-    with `verdicts` what is wrong.
+    """Yield the lines of explained pieces, each below a title.
+
+    Args:
+      at: the offset of a byte; the title names its field.
+      every: draw the bits of every element of an array.
+      verdicts: add the damage of each piece to its title.
     """
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)
@@ -191,20 +196,20 @@ def listing(
 
 
 class Selection:
-    """What of an input is shown, and what has gone by.
+    """Selects the pieces of an input to show, and counts the others.
 
     Args:
-        frame: one frame type alone.
-        count: frames at most; with `bad`, damaged ones.
-        bad: damaged pieces alone.
-        at, stretch: what stands at this byte alone, or in these, as "FROM:TO".
+        frame: show only this frame type.
+        count: maximum number of frames; with `bad`, of damaged ones.
+        bad: show only damaged pieces.
+        at, stretch: show only the byte at this offset, or these bytes, as "FROM:TO".
 
     Attributes:
-        valid, damaged, unframed, others: frames, damaged ones, bytes that are in neither, and
-            frames of other types.
+        valid, damaged, unframed, others: numbers of valid frames, damaged frames, bytes outside
+            frames, and frames of other types.
 
     Raises:
-        UsageError: for a stretch that is none.
+        UsageError: if `stretch` is invalid.
     """
 
     def __init__(
@@ -230,7 +235,7 @@ class Selection:
         self.valid = self.damaged = self.unframed = self.others = 0
 
     def frames(self, found: Iterable[Piece]) -> Iterator[Piece]:
-        """The frames, and no others."""
+        """Yield the valid frames."""
         for piece in found:
             if piece.is_valid:
                 self.valid += 1
@@ -241,10 +246,10 @@ class Selection:
                 self.unframed += len(piece.data)
 
     def parts(self, found: Iterable[Piece]) -> Iterator[tuple[Piece, Explanation]]:
-        """What is to be shown, explained, as it is found.
+        """Yield the selected pieces with their explanations, as they are found.
 
         Raises:
-            WireError: for a whole input that does not even begin like a frame.
+            WireError: if no part of the input begins like a frame.
         """
         for piece in found:
             if piece.offset >= self._to:
@@ -282,12 +287,12 @@ class Selection:
             raise suggest(fault, f"lidarspec show {self._sensor.id}") from None
 
     def conclude(self, given: Heard) -> None:
-        """Say what was shown of how much.
+        """Print the counts of an input that was shown.
 
         Raises:
-            UsageError: where the input ends before the stretch.
-            WireError: where it holds no frame.
-            Exit: where what was looked for is damage, and there is some.
+            UsageError: if the input ends before the stretch.
+            WireError: if it has no frame.
+            Exit: if `bad` is set and there is damage.
         """
         if self._ended and not self._shown and self._end <= self._from:
             raise UsageError(f"{given.source} has {self._end} bytes: there is no byte {self._from}")
@@ -319,7 +324,7 @@ class Selection:
 
 
 def _stretch(text: str | None) -> tuple[float, float]:
-    """From which byte up to which."""
+    """Return the first offset and the end of "FROM:TO"."""
     first, colon, last = (text or ":").partition(":")
     try:
         start = int(first or "0", 0)
@@ -342,7 +347,7 @@ def _compare(
     as_json: bool,
     output: str | None,
 ) -> None:
-    """Print what differs between the first frame of the input and another one."""
+    """Print the differences between the first frame of the input and another frame."""
     frames = (
         piece
         for piece in found
@@ -388,14 +393,12 @@ def _compare(
 def _sensor(
     given: Heard, sensor_id: str | Sensor | None, *, damaged: bool = False
 ) -> tuple[Sensor, list[str]]:
-    """The sensor named, or the one whose bytes these are, and the ids of all whose bytes they could
-    be.
-    """
+    """Return the sensor that is named or fits the bytes, and the ids of all that fit."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
     from lidarspec.detect.identification import (
         fitting,
-    )  # with all that detecting a sensor takes, which a named one does not need
+    )  # not needed for a named sensor, and slow to import
 
     found = fitting(given.chunks, datagrams=given.datagrams)
     if found:
@@ -429,8 +432,9 @@ def _raw_text(raw: Any) -> str:
 
 
 def plain(parsed: Any) -> Any:
-    """A parsed frame as JSON takes it: its fields, bytes as hexadecimal text, null for nan and
-    infinity.
+    """Return a parsed frame as JSON values.
+
+    Bytes become hexadecimal text, nan and infinity null.
     """
     if isinstance(parsed, dict):
         return {name: plain(value) for name, value in parsed.items() if not name.startswith("_")}

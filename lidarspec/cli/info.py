@@ -17,10 +17,11 @@ from lidarspec.explaining.contents import contents, shown
 @click.argument("files", metavar="FILE...", nargs=-1, required=True)
 @output_options
 def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
-    """What is in a file: kind, times, senders, sensor, rates, loss, and how it is read.
+    """Describe the contents of files: kind, times, senders, sensor, rates, loss.
 
-    FILE is anything that is read: a recording, a capture, a robotics log, bytes. Of a long one the
-    beginning is looked at, and when it ends. Several files are printed in turn.
+    FILE is any readable file: a recording, a capture, a robotics log, raw bytes. Of a long file
+    only the beginning is read, and the time of its end. Several files are printed one after
+    another.
     """
     unknown_files = []
 

@@ -48,15 +48,15 @@ if TYPE_CHECKING:
     from lidarspec.device.device import Device
     from lidarspec.transports.files import FileTransport
 
-#: maximum length of hexadecimal text that is copied into the suggested command.
+#: Maximum length of hexadecimal text that is copied into the suggested command.
 REPEATED = 400
-#: maximum length of other input that is quoted in a message.
+#: Maximum length of other input that is quoted in a message.
 QUOTED = 64
-#: maximum number of bytes that `read` returns.
+#: Maximum number of bytes that `read` returns.
 MOST = 1 << 20
-#: timeout for the first frame of a device, in seconds.
+#: Timeout for the first frame of a device, in seconds.
 PATIENCE = 10.0
-#: polling interval for a source that sends nothing, in seconds.
+#: Polling interval for a source that sends nothing, in seconds.
 LOOK = 0.1
 
 
@@ -140,9 +140,7 @@ def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 
 
 def _standard_input(file: FileTransport) -> Iterator[Chunk]:
-    """What comes over standard input, as it comes; hexadecimal text as the bytes that it stands
-    for.
-    """
+    """Yield the bytes of standard input as they arrive; hexadecimal text is converted."""
     head = sys.stdin.buffer.read(LOOKED_AT)
     stdin = sys.stdin.buffer
     if not is_hexadecimal(head, whole=len(head) < LOOKED_AT):
@@ -161,7 +159,7 @@ def _standard_input(file: FileTransport) -> Iterator[Chunk]:
 
 
 def read(words: Sequence[str]) -> Heard:
-    """The input that the words of a command line stand for; of a long one the beginning.
+    """Return the first `MOST` bytes of the input that command-line arguments name.
 
     Raises:
         UsageError: for text that is neither hexadecimal nor a file.
@@ -172,7 +170,7 @@ def read(words: Sequence[str]) -> Heard:
 
 
 def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
-    """Why words are neither a file nor hexadecimal digits."""
+    """Return the error for arguments that are neither a file nor hexadecimal digits."""
     from lidarspec.transports.open_url import live_address
 
     text = " ".join(words)
@@ -226,7 +224,7 @@ def refuse_overwriting(
 
 
 def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
-    """The files that may be read where this is given."""
+    """Yield the files that may be read for this argument."""
     if isinstance(given, Sensor):
         yield from (str(value) for value in given.options.values() if isinstance(value, str | Path))
         return
@@ -240,7 +238,7 @@ def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
 
     with contextlib.suppress(
         LidarSpecError
-    ):  # settings that are wrong are told of where a name is looked up
+    ):  # errors in the settings are reported when a device is looked up
         known = find_device(word)
         yield from (
             (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
@@ -248,7 +246,7 @@ def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
 
 
 def no_frame(sensor: Sensor, given: Heard) -> WireError:
-    """Why there is no frame of this sensor in the input, with the next command."""
+    """Return the error for input without a frame of this sensor."""
     data = given.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
     command = f"lidarspec explain {quote(given.source)} -s {sensor.id}"
@@ -448,8 +446,8 @@ class Patience:
         """Raise an error if the timeout has passed without a data frame.
 
         Raises:
-            CommandError, WireError: where the device has sent nothing, or nothing of the sensor's,
-                for too long.
+            CommandError, WireError: if the device has sent nothing, or no frame of the sensor, for
+                too long.
         """
         waited = time.monotonic() - self._began
         if (
@@ -463,13 +461,16 @@ class Patience:
 def scans_of(
     device: Device, source: str, select: Selection | None = None, *, until: float = math.inf
 ) -> Iterator[Scan]:
-    """The scans of a device that are wanted, which has to send its first data frame in time;
-    `until`: a time of `time.monotonic`.
+    """Yield the selected scans of a device.
+
+    Args:
+        select: the scans to yield; by default all.
+        until: a time of `time.monotonic` at which to end.
 
     Raises:
-        CommandError, WireError: where the device has sent nothing, or nothing of the sensor's, for
-            too long.
-        UsageError: where there are scans, and none of them is wanted.
+        CommandError, WireError: if the device has sent nothing, or no frame of the sensor, for too
+            long.
+        UsageError: if none of the scans is selected.
     """
     patience = Patience(device, source)
     for scan in device.scans(wait=LOOK, select=select):

@@ -10,7 +10,7 @@ from lidarspec.cli.output import drawn, emit_parts
 from lidarspec.errors import printable
 from lidarspec.explaining.listing import Line, fold, text as plain_text
 
-#: the colours of what stands in a line, by its role.
+#: The style of each role of a part of a line.
 STYLES = {
     "title": "bold",
     "offset": "dim",
@@ -25,10 +25,10 @@ STYLES = {
 
 
 def emit_lines(lines: Iterable[Line], output: str | None) -> None:
-    """Print lines as they are made: coloured and folded to its width on a terminal, else as plain
-    text.
+    """Print lines as they are made: coloured on a terminal, else as plain text.
 
-    NO_COLOR and FORCE_COLOR are obeyed; coloured output into a pipe is not folded.
+    Lines are folded to the width of the terminal. Respects NO_COLOR and FORCE_COLOR; coloured
+    output into a pipe is not folded.
     """
     may_be_coloured = sys.stdout.isatty() or "FORCE_COLOR" in os.environ
     if output is not None or not may_be_coloured:

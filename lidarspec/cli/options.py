@@ -1,5 +1,6 @@
-"""The options and the kinds of values that verbs share, and those that select: the same words in
-every verb that reads.
+"""Options and types of values that verbs share, and the options that select scans.
+
+Every verb that reads has the same options for selection.
 """
 
 from __future__ import annotations
@@ -22,14 +23,12 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def sensor_option(function: Function) -> Function:
-    """``-s/--sensor``, and what it is configured with."""
+    """Add ``-s/--sensor`` and the options that configure the sensor."""
     return _add_sensor_option(configuring(function))  # type: ignore[return-value]
 
 
 def configuring(function: Function) -> Function:
-    """``-O`` and ``--calibration``, with which the sensor is configured: the verb is given an id,
-    or the sensor so configured.
-    """
+    """Add ``-O`` and ``--calibration``; the verb gets an id or the configured sensor."""
 
     @functools.wraps(function)
     def call_with_sensor(
@@ -47,8 +46,9 @@ def configuring(function: Function) -> Function:
 
 
 def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same options, as they are typed: `sensor_id`, `options` and `calibration`, as
-    `configure_sensor` takes them.
+    """Add the options of `sensor_option`, and pass them on as typed.
+
+    The verb gets `sensor_id`, `options` and `calibration`, which `configure_sensor` takes.
     """
     return _add_sensor_option(_optional(function))
 
@@ -73,14 +73,15 @@ def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
 def configure_sensor(
     sensor_id: str | None, options: Sequence[str], calibration: str | None
 ) -> str | Sensor | None:
-    """The id, or the sensor with these options.
+    """Return the id, or the sensor with these options.
 
     Args:
         options: "NAME=VALUE" each.
-        calibration: a file.
+        calibration: the name of a file.
 
     Raises:
-        UsageError: for options without a sensor or a value, and for those that it does not take.
+        UsageError: for options without a sensor or a value, and for options that the sensor does
+            not have.
     """
     options = [*options, *(() if calibration is None else (f"calibration={calibration}",))]
     if not options:
@@ -115,7 +116,7 @@ def _value(sensor: Sensor, name: str, text: str) -> Any:
 
 
 def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
-    """``-n/--count``: so many, and then the verb ends."""
+    """Add ``-n/--count``: the number of items after which the verb ends."""
     return click.option(
         "-n",
         "--count",
@@ -126,7 +127,7 @@ def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
 
 
 def colour_option(function: Function) -> Function:
-    """``--colour`` of pictures, in both spellings."""
+    """Add ``--colour`` for pictures, in both spellings."""
     told = "What colours show: range, intensity, or a further column of the points."
     return click.option(
         "--colour",
@@ -140,12 +141,12 @@ def colour_option(function: Function) -> Function:
 
 
 class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
-    """A number, or two, written in a way of their own.
+    """A type of option for one or two numbers with a syntax of their own.
 
     Args:
-        name: what it is, for help pages.
-        parse: the number of a text; a text that is none is a ValueError or UsageError.
-        form: how it looks, for messages.
+        name: the name of the type, for help pages.
+        parse: returns the number of a text; raises ValueError or UsageError for invalid text.
+        form: the expected syntax, for messages.
     """
 
     def __init__(self, name: str, parse: Callable[[str], Any], form: str) -> None:
@@ -154,7 +155,7 @@ class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of cl
         self._form = form
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number."""
+        """Return the number, or fail with a message."""
         if not isinstance(value, str):
             return value
         try:
@@ -202,8 +203,9 @@ def _speed(text: str) -> float:
 
 
 def _between(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
-    """What stands before and behind the colon of a text, None where nothing does; dates have colons
-    of their own.
+    """Return the values before and after the colon of a text, None if empty.
+
+    Every colon is tried, because dates contain colons.
     """
     for place in (place for place, mark in enumerate(text) if mark == ":"):
         try:
@@ -225,7 +227,7 @@ def _moment(text: str) -> float | datetime:
 
 
 def _index(text: str) -> int:
-    return int(text)  # one below 0 is refused by `Selection`, which says why
+    return int(text)  # `Selection` refuses negative numbers, and gives the reason
 
 
 def _indices(text: str) -> tuple[int, int | None]:
@@ -246,28 +248,28 @@ def _distances(text: str) -> tuple[float, float]:
     return low or 0.0, math.inf if high is None else high
 
 
-#: seconds from "10s", "500ms", "2min", "1h" or a bare number.
+#: Seconds, from "10s", "500ms", "2min", "1h" or a bare number.
 DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
-#: a number from 0 to 1, from "1%" or "0.01".
+#: A number from 0 to 1, from "1%" or "0.01".
 SHARE = Number("share", _share, "share, such as 1% or 0.01")
-#: bytes, from "940" or "0x3ac".
+#: An offset in bytes, from "940" or "0x3ac".
 OFFSET = Number("offset", _offset, "offset of a byte, such as 940 or 0x3ac")
-#: bytes, from "256MB" or "1GB".
+#: A number of bytes, from "256MB" or "1GB".
 BYTES = Number("size", _bytes, "size from 1MB on, such as 256MB or 1GB")
-#: a factor above 0; 0 for "max".
+#: A factor above 0; 0 for "max".
 SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")
-#: from when to when, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
+#: A begin and an end, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
 SLICE = Number(
     "slice",
     lambda text: _between(text, _moment),
     "slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:",
 )
-#: from which number to which, from "5:10".
+#: A first and a last index, from "5:10".
 INDICES = Number("indices", _indices, "slice of whole numbers, such as 5:10, 5: or :10")
-#: from how far to how far, metres, from "0.5m:30m".
+#: A minimum and a maximum range in metres, from "0.5m:30m".
 DISTANCES = Number("distances", _distances, "span of distances, such as 0.5m:30m, 50cm: or :30")
 
-#: what selects, by the name of its argument of `Selection`.
+#: Argument of `Selection` -> its option.
 SELECTING: dict[str, Callable[[Any], Any]] = {
     "times": click.option(
         "--slice",
@@ -316,7 +318,7 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
 
 
 def selecting(*names: str) -> Callable[[Function], Function]:
-    """Some of the options that select; the verb is given a `Selection`."""
+    """Add some of the options that select; the verb gets a `Selection`."""
 
     def options(function: Function) -> Function:
         @functools.wraps(function)
@@ -338,6 +340,6 @@ def selecting(*names: str) -> Callable[[Function], Function]:
 
 
 def points_option(function: Function) -> Function:
-    """``--all`` and ``--valid``."""
+    """Add ``--all`` and ``--valid``."""
     told = "Points without a valid return as well, or not.  [default: --valid]"
     return click.option("--all/--valid", "every_point", default=False, help=told)(function)

@@ -1,6 +1,4 @@
-"""What verbs print: text, tables or JSON, on standard output or into a file; and one line on a
-terminal that says how far a verb is.
-"""
+"""Print results on standard output or into a file, and show progress."""
 
 from __future__ import annotations
 
@@ -28,10 +26,10 @@ if TYPE_CHECKING:
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-#: seconds between two lines.
+#: Seconds between two updates of the progress line.
 PERIOD = 0.2
-#: blanks between columns of a table; those before prose below its row; the least width of prose
-#: beside it.
+#: Blanks between columns of a table; indentation of prose below its row; minimum width of a
+#: column of prose.
 GAP = 2
 HANGING = 6
 PROSE = 24
@@ -67,13 +65,13 @@ def output_option(function: Function) -> Function:
 
 
 class Progress(contextlib.AbstractContextManager["Progress"]):
-    """A line on standard error, where that is a terminal; a context manager that takes it away at
-    the end.
+    """A progress line on standard error if that is a terminal.
+
+    A context manager that removes the line at the end.
 
     Args:
-        unit: an amount of work in words.
-        period: seconds in which one text is shown at most; 0 to show each, where few come and one
-            may stand for long.
+        unit: formats an amount of work.
+        period: minimum seconds between two updates; 0 shows every text.
     """
 
     def __init__(self, unit: Callable[[float], str] = str, period: float = PERIOD) -> None:
@@ -84,8 +82,11 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._bar: Bar | None = None
 
     def __call__(self, text: Callable[[], str], done: tuple[float, float] | None = None) -> None:
-        """Show a text, made only where it is time for one; a bar, the rate and the time that is
-        left, where it is known what of how much is done."""
+        """Show a text, which is made only if an update is due.
+
+        If `done`, the completed and the total amount, is known, a bar, the rate and the remaining
+        time are shown as well.
+        """
         if not self._is_shown or time.monotonic() < self._due:
             return
         self._due = time.monotonic() + self._period
@@ -101,8 +102,9 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
         self._bar.refresh()
 
     def follow(self, remarks: Iterable[str], text: Callable[[], str]) -> None:
-        """Show a text while something goes on, and what it remarks; empty remarks only pass the
-        time.
+        """Show a text while a task runs, and print its remarks.
+
+        An empty remark only updates the text.
         """
         for remark in remarks:
             self(text)
@@ -110,12 +112,12 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
                 self.note(remark)
 
     def note(self, remark: str) -> None:
-        """Say something else, in the place of the line."""
+        """Print a remark in place of the progress line."""
         self.clear()
         note(remark)
 
     def clear(self) -> None:
-        """Take the line away."""
+        """Remove the progress line."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
@@ -126,7 +128,7 @@ class Progress(contextlib.AbstractContextManager["Progress"]):
 
 
 def _bar(*, is_measured: bool) -> Bar:
-    """A line of text, with a bar behind it where it is measured how far it is."""
+    """Return a line of text, with a bar if the total is known."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -162,7 +164,7 @@ def _bar(*, is_measured: bool) -> Bar:
 
 
 def size(number: float) -> str:
-    """Bytes in words: "1.5 MB"."""
+    """Format a number of bytes: "1.5 MB"."""
     if number < 1000:
         power = 0
     elif number < 1e6:
@@ -177,11 +179,12 @@ def size(number: float) -> str:
 
 
 def emit(content: str | bytes, output: str | None) -> None:
-    """Text, or bytes as they are, to standard output or into a file, which keeps what it held until
-    the new content is whole.
+    """Write text or bytes to standard output or to a file.
+
+    An existing file is replaced only after the new content is complete.
 
     Raises:
-        SourceError: where the file cannot be written.
+        SourceError: if the file cannot be written.
     """
     emit_parts([content], output)
 
@@ -189,8 +192,10 @@ def emit(content: str | bytes, output: str | None) -> None:
 def emit_parts(
     parts: Iterable[str | bytes], output: str | None, *, colour: bool | None = None
 ) -> None:
-    """Texts, a line or more each, or bytes, as they are made; the same places as `emit`; `colour`:
-    whether colours stay in a pipe.
+    """Write texts of one or more lines, or bytes, as they are made, like `emit`.
+
+    Args:
+        colour: keep colours in a pipe.
     """
     if output is None or output == "-":
         for part in parts:
@@ -198,10 +203,10 @@ def emit_parts(
         return
     from lidarspec.formats.writing import (
         replacing,
-    )  # and all that scans are made of, for the verbs that write a file
+    )  # imports the modules of scans, which only verbs that write a file need
 
     path = Path(output)
-    is_replaced = path.is_file() or not path.exists()  # and not a device or a pipe
+    is_replaced = path.is_file() or not path.exists()  # False for a device or a pipe
     with (
         system_errors(output),
         replacing(path) if is_replaced else contextlib.nullcontext(path) as written,
@@ -212,22 +217,20 @@ def emit_parts(
 
 
 def emit_json(value: Any, output: str | None) -> None:
-    """A value as JSON; the same places as `emit`."""
+    """Write a value as JSON, like `emit`."""
     emit(json.dumps(value, indent=2, allow_nan=False), output)
 
 
 def emit_json_list(
     head: dict[str, Any], name: str, items: Iterable[Any], output: str | None
 ) -> None:
-    """An object as JSON whose last entry is a list, each item as it is made; the same places as
-    `emit`.
-    """
+    """Write a JSON object that ends with a list, each item as it is made, like `emit`."""
     beginning = json.dumps({**head, name: []}, indent=2, allow_nan=False).removesuffix("]\n}")
     emit_parts(itertools.chain(_items(beginning, items), ["  ]\n}"]), output)
 
 
 def _items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
-    """Each item with the comma that belongs behind it: one is held back until the next is there."""
+    """Yield each item with its comma; one item is held back until the next is known."""
     held = beginning
     for number, item in enumerate(items):
         yield held + "," * bool(number)
@@ -236,11 +239,11 @@ def _items(beginning: str, items: Iterable[Any]) -> Iterator[str]:
 
 
 def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | None = None) -> str:
-    """Rows as aligned columns; fitted to a terminal's width where there is one, each row in one
-    line otherwise.
+    """Format rows as aligned columns, fitted to the width of a terminal.
 
-    Cells are folded between words, so that an id or a path stays whole. Where that leaves too
-    little for the last column, which has the prose, it stands in lines of its own below each row.
+    Without a terminal each row is one line. Cells are folded between words, so that ids and paths
+    stay whole. If that leaves too little width for the prose of the last column, it is printed on
+    lines of its own below each row.
     """
     lines = [headers, *rows]
     if output is None and sys.stdout.isatty():
@@ -256,7 +259,7 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], output: str | N
 
 
 def _widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
-    """The widths of columns, the widest folded first, but never within a word."""
+    """Return the widths of columns, the widest folded first, never within a word."""
     columns = list(zip(*lines, strict=True))
     widths = [max(map(len, cells)) for cells in columns]
     for place in sorted(range(len(columns)), key=lambda place: -widths[place]):
@@ -267,7 +270,7 @@ def _widths(lines: Sequence[Sequence[str]], room: int) -> list[int]:
 
 
 def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator[str]:
-    """The lines of one row; cells for which there is no width below it."""
+    """Yield the lines of one row; cells without a width are printed below it."""
 
     def wrap(cell: str, width: int) -> list[str]:
         if len(cell) > width:
@@ -282,8 +285,9 @@ def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator
 
 
 def drawn(what: Text) -> str:
-    """What rich draws, as text to echo in colour; rich itself would end the process on a closed
-    pipe.
+    """Render an object of rich as coloured text.
+
+    Printing with rich itself would end the process on a closed pipe.
     """
     from rich.console import Console
 

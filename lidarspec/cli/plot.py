@@ -78,12 +78,12 @@ def plot(
     ramp: str,
     max_range: float | None,
 ) -> None:
-    """A scan as a picture; or intensities, ranges and rates over time.
+    """Draw a scan, or intensities, ranges and rates over time.
 
-    A scan is drawn to scale, from above, and from the side where the points are not in one plane.
-    --kind intensity counts how often each intensity comes, ranges says how many returns there are
-    at each range over time, and rates how many packets and scans a second, with what is lost or
-    wrong among them. All but the SVG of a scan takes matplotlib: lidarspec[plot].
+    A scan is drawn to scale from above, and also from the side if the points are not in one plane.
+    --kind intensity draws a histogram of the intensities, ranges the number of returns at each
+    range over time, and rates the packets and scans per second, with losses and errors. All but the
+    SVG of a scan needs matplotlib: lidarspec[plot].
     """
     if output == "-":
         suffix = ".svg"
@@ -120,9 +120,9 @@ def _draw_scan(
 
 
 def _find_scan(device: Device, source: str, selection: Selection, number: int) -> Scan:
-    """Return a whole scan by its number, counted from 1.
+    """Return a complete scan by its number, counted from 1.
 
-    If there are fewer whole scans it is the last whole one, or an incomplete one if there is none.
+    If there are fewer, returns the last complete scan, or an incomplete one if there is none.
     """
     chosen: Scan | None = None
     whole_count = 0
@@ -147,7 +147,7 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
 def _draw_over_time(
     device: Device, source: str, selection: Selection, kind: str, end_s: float
 ) -> Any:
-    """Return a figure of the data that come up to a time of `time.monotonic`."""
+    """Return a figure of the data until a time of `time.monotonic`."""
     title = f"{device.sensor.id}, {Path(source).name if device.place else source}"
     if kind == "rates":
         rates = figures.Rates(Feed(device, select=selection), end_s)

@@ -1,4 +1,4 @@
-"""`read` and `stats`: what a sensor sends, as rows; and how it is doing, a line at a time."""
+"""`read` and `stats`: print points, packets, or statistics at intervals."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.view.feed import LOOK_S, Feed
 from lidarspec.view.meter import Reading, format_figure
 
-#: width and decimals of the columns of points.
+#: Width and decimals of the columns of points.
 POINTS = {
     **dict.fromkeys(("x", "y", "z", "range"), (9, 3)),
     **dict.fromkeys(("azimuth", "elevation"), (9, 4)),
@@ -46,19 +46,19 @@ POINTS = {
         "column": (6, 0),
     },
 }
-#: digits of a packet's field, of a further column of points in float32, and the width of a column
-#: at least.
+#: Digits of a field of a packet, digits of a further column in float32, and the minimum width of a
+#: column.
 DIGITS = 10
 SINGLE = 7
 NARROWEST = 8
-#: digits of a float64 in JSON.
+#: Digits of a float64 in JSON.
 KEPT = 14
 
 Row = dict[str, Any]
 Units = Mapping[str, str]
-#: lines after which the names of the columns are said again.
+#: Number of rows after which the column names are repeated.
 AGAIN = 20
-#: seconds by which sums of intervals may be off.
+#: Tolerance for sums of intervals, in seconds.
 ROUNDED = 1e-6
 
 
@@ -88,12 +88,12 @@ def read(
     every_point: bool,
     as_json: bool,
 ) -> None:
-    """The points that a sensor sends, a row each; or its packets.
+    """Print the points that a sensor sends, or its packets, one row each.
 
-    Points come as their scan is completed, with the columns of a PointCloud and the number of the
-    scan: metres, radians, seconds since the scan's stamp. Packets have their offset in the input,
-    their time, and the values of their fields in units; arrays are printed only by --json. Of what
-    selects, --slice and --time are for packets too.
+    Points are printed when their scan is complete, with the columns of a PointCloud and the number
+    of the scan, in metres, radians, and seconds since the scan's stamp. Packets are printed with
+    their offset in the input, their time, and the values of their fields in units; arrays only with
+    --json. Of the options that select, packets accept --slice and --time.
     """
     with open_device(source, sensor_id) as device:
         if frame is not None and frame not in device.sensor.frames:
@@ -115,7 +115,7 @@ def read(
 
 
 def _lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]:
-    """Each row as JSON, or all as aligned columns with their names and units above."""
+    """Yield each row as JSON, or as aligned columns below their names and units."""
     widths: list[int] = []
     for units, row in rows:
         if as_json:
@@ -132,7 +132,7 @@ def _lines(rows: Iterable[tuple[Units, Row]], *, as_json: bool) -> Iterator[str]
 
 
 def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units, Row]]:
-    """The points of each scan, when it is complete; of the pieces at the beginning and end too."""
+    """Yield the points of each complete scan, and of the incomplete ones at both ends."""
     units: Units = UNITS
     for number, scan in enumerate(scans):
         if every_point:
@@ -148,7 +148,7 @@ def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units
 def _packets(
     device: Device, frame: str | None, until: float, patience: Patience, selection: Selection
 ) -> Iterator[tuple[Units, Row]]:
-    """The packets one by one, with the fields of their header in units; arrays as arrays."""
+    """Yield each packet with the fields of its header in units; arrays stay arrays."""
     if replace(selection, times=(None, None), time="device") != Selection():
         raise UsageError("packets are selected by --slice and --time alone")
     wanted = Slice(selection.times)
@@ -208,7 +208,7 @@ def _row(cells: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON takes it: null for nan and infinity, whole numbers without a point."""
+    """Return a value for JSON: null for nan and infinity, whole numbers as integers."""
     if isinstance(value, np.ndarray):
         return [_plain(item) for item in value]
     if isinstance(value, np.generic):
@@ -219,15 +219,15 @@ def _plain(value: Any) -> Any:
     if isinstance(number, float):
         if not math.isfinite(number):
             return None
-        # a float32 has the digits that it prints; scales of ten leave their rounding in the last
-        # digits of a float64
+        # A float32 has the digits that it prints; decimal scales cause rounding errors in the last
+        # digits of a float64.
         if number.is_integer() and abs(number) < 2**53:
             return int(number)
         return float(str(value) if single else f"{number:.{KEPT}g}")
     return number
 
 
-#: name and unit of each figure, the width of its column (0: only in the summary), and its text.
+#: Name and unit of each figure, the width of its column (0: only in the summary), and its text.
 FIGURES: tuple[tuple[str, str, int, Callable[[Reading], str]], ...] = (
     ("speed", "Hz", 6, lambda r: format_figure(r.speed_hz, "{:.2f}")),
     ("packets", "/s", 8, lambda r: format_figure(r.packet_rate_hz, "{:.1f}")),
@@ -241,20 +241,20 @@ FIGURES: tuple[tuple[str, str, int, Callable[[Reading], str]], ...] = (
     ("input", "kB/s", 0, lambda r: format_figure(r.bytes_per_s, "{:.1f}", 1e-3)),
 )
 COLUMNS = [figure for figure in FIGURES if figure[2]]
-#: of the columns of `stats`: the time, the figures, and what waits.
+#: Widths of the columns of `stats`: the time, the figures, and the queue.
 WIDTHS = [6, *(width for _, _, width, _ in COLUMNS), 6]
 
 
 @dataclass
 class Lines:
-    """What is printed: a row of figures for each interval, or a JSON object."""
+    """Prints a row of figures, or a JSON object, for each interval."""
 
     device: Device
     as_json: bool
     printed: int = 0
 
     def interval(self, at: float | None, reading: Reading) -> None:
-        """The figures of one interval, which ended `at` seconds after the beginning."""
+        """Print the figures of one interval, which ended `at` seconds after the beginning."""
         if self.as_json:
             self._emit({"kind": "interval", "at_s": at, **self._figures(reading)})
             return
@@ -272,7 +272,7 @@ class Lines:
         sys.stdout.flush()
 
     def summary(self, reading: Reading) -> None:
-        """The figures of everything."""
+        """Print the figures of the whole input."""
         if self.as_json:
             self._emit(
                 {"kind": "summary", **self._figures(reading), "stats": self.device.stats.to_dict()}
@@ -334,13 +334,12 @@ def stats(
     max_errors: float | None,
     as_json: bool,
 ) -> None:
-    """How a sensor is doing: speed, rates, errors, loss, jitter, queue.
+    """Print speed, rates, errors, loss, jitter and queue of a sensor.
 
-    A line for each interval, and a summary at the end. Errors are frames whose checksum, length or
-    values are wrong; loss counts
-    what is missing by the sensor's own counter or clock. A file is read as fast as possible, in
-    batches, and by the time of its packets: there an interval can be longer than asked for. Several
-    sources are read in turn.
+    One line for each interval, and a summary at the end. Errors are frames with a wrong checksum,
+    length or value; loss counts missing packets by the sensor's own counter or clock. A file is
+    read as fast as possible, in batches, and by the time of its packets, so that an interval can be
+    longer than requested. Several sources are read one after another.
     """
     lasting = min(duration or math.inf, interval * count if count else math.inf)
     has_findings = False
@@ -357,9 +356,7 @@ def stats(
                 has_findings = True
             try:
                 conclude(device)
-            except (
-                click.exceptions.Exit
-            ):  # damage; the sources behind this one are read all the same
+            except click.exceptions.Exit:  # damage; the remaining sources are still read
                 has_findings = True
     if has_findings:
         raise click.exceptions.Exit(FINDINGS)
@@ -369,7 +366,7 @@ def _print_stats(source: str, feed: Feed, lines: Lines, interval: float, lasting
     """Print the lines and the summary of one source, and return the summary.
 
     Args:
-        interval, lasting: seconds from line to line, and of all lines together.
+        interval, lasting: seconds between two lines, and in total.
     """
     start = time.monotonic()
     try:
@@ -388,7 +385,11 @@ def _print_stats(source: str, feed: Feed, lines: Lines, interval: float, lasting
 
 
 def _summary(feed: Feed, start: float) -> Reading:
-    """The figures of everything, since a time of `time.monotonic` where the source is live."""
+    """Return the figures of the whole input.
+
+    Args:
+        start: a time of `time.monotonic`, from which a live source is measured.
+    """
     return feed.meter.summary(
         feed.device.stats, time.monotonic() - start if feed.device.is_live else None
     )
@@ -410,9 +411,7 @@ def _by_the_clock(
 
 
 def _by_the_packets(feed: Feed, lines: Lines, interval: float, lasting: float) -> None:
-    """Print a line for each interval of the packets' own time, where they have one; as long as a
-    batch at least.
-    """
+    """Print a line for each interval of the packets' time, at least one batch long."""
     start: int | None = None
     edges = 0
     passed = 0.0

@@ -1,6 +1,4 @@
-"""`record` and `replay`: everything that a source sends into one file, and what was recorded out
-again, byte for byte and in time.
-"""
+"""`record` and `replay`: record a source into a file, and send a recording again."""
 
 from __future__ import annotations
 
@@ -78,10 +76,10 @@ def record(
     times: str | None,
     as_json: bool,
 ) -> None:
-    """Record a source, with the time of every arrival, in one file that survives a crash.
+    """Record a source with arrival times, in one file that survives a crash.
 
-    A sensor that is named, with -s or by the source (sim:ID), is started, and what it is stands in
-    the file; without, bytes are recorded as they come.
+    A sensor that is named, with -s or by the source (sim:ID), is started, and its description is
+    stored in the file. Without a sensor, raw bytes are recorded.
     """
     check_suffix(target)
     if times is not None:
@@ -154,7 +152,7 @@ def _print_recording(task: SourceRecording) -> None:
 
 
 def _describe_recording(task: SourceRecording, kept: Appender) -> str:
-    """What has been recorded, in words."""
+    """Return the number of records and bytes in words."""
     packets = f"{task.packets} packets, " if task.packets else ""
     return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
 
@@ -162,7 +160,7 @@ def _describe_recording(task: SourceRecording, kept: Appender) -> str:
 def _sum_up_recording(
     task: SourceRecording, kept: Appender, source: str, sensor: Sensor | None, *, as_json: bool
 ) -> None:
-    """What was recorded, and what can be done with it; an empty file is not left behind."""
+    """Print a summary of a recording and the next command; delete an empty file."""
     device = task.device
     if not kept.records:
         if not kept.discard():
@@ -197,8 +195,9 @@ def _sum_up_recording(
 
 
 def _describe_damage(stats: Counters) -> str:
-    """Return the counters of lost and damaged input in words, without those of what was decoded:
-    some of it is not in the file.
+    """Format the counters of lost and damaged input.
+
+    Counters of decoded data are omitted, because not all of that data is in the file.
     """
     counters = stats.to_dict()
     for name in ("frames", "bytes_in", "pending"):
@@ -207,7 +206,7 @@ def _describe_damage(stats: Counters) -> str:
 
 
 def _view_of(kept: Appender, sensor: Sensor | None) -> str:
-    """The command that shows what was recorded."""
+    """Return the command that shows a recording."""
     if isinstance(kept, Recorder) and kept.header.sensor:
         return f"lidarspec view {shlex.quote(kept.path)}"
     return f"lidarspec {_view_words(sensor, kept.path)}"
@@ -248,11 +247,11 @@ def replay(
     selection: Selection,
     as_json: bool,
 ) -> None:
-    """A recording or capture, sent again as it came: bit for bit, and by the clock.
+    """Replay a recording or capture, byte for byte and in real time.
 
-    To a pty or tcp:// it begins when somebody opens it. udp:// without a port uses those of the
-    recording. A new .lsr or .pcap file keeps the times of the recording. --slice goes by the times
-    of arrival.
+    A pty or tcp:// starts when a reader opens it. udp:// without a port uses those of the
+    recording. A new .lsr or .pcap file keeps the times of the recording. --slice selects by the
+    times of arrival.
     """
     if is_live(file):
         raise suggest(

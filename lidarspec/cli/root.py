@@ -1,6 +1,7 @@
-"""The verbs and what they share: loaded when asked for, failures told in one message, exit codes.
+"""The verbs, their shared options, and the entry point `main`.
 
-Nothing here imports NumPy or construct, so that ``lidarspec --help`` is quick.
+A verb's module is imported when the verb is used; a failure becomes one message and an exit code.
+This module imports neither NumPy nor construct, so that ``lidarspec --help`` is quick.
 """
 
 from __future__ import annotations
@@ -22,100 +23,91 @@ from lidarspec.entry_points import VERBS as PLUGGED, EntryPoint, entry_points
 from lidarspec.errors import did_you_mean, suggest
 from lidarspec.known_sensors import install_command
 
-#: group -> verb -> (module, what it does); the texts are those of the verbs' own help.
+#: Group -> verb -> (module, summary); the summary equals the first line of the verb's help.
 GROUPS = {
     "look": {
-        "sensors": ("sensors", "The installed sensors, and how far each is proven."),
-        "show": ("sensors", "What a sensor is, and the wire table of each of its frames."),
+        "sensors": ("sensors", "List the installed sensors, and how each was verified."),
+        "show": ("sensors", "Describe a sensor, with a wire table for each of its frames."),
         "ports": (
             "finding",
-            "The serial ports of this computer, and the UDP ports that installed sensors send to.",
+            "List the serial ports of this computer, and the UDP ports of installed sensors.",
         ),
-        "detect": ("finding", "Which installed sensor sends, and at which port and baud rate."),
-        "doctor": (
+        "detect": (
             "finding",
-            "What keeps a sensor's bytes from coming, and the command that mends it.",
+            "Identify the installed sensor that sends, its port and its baud rate.",
         ),
+        "doctor": ("finding", "Diagnose why no data arrives from a sensor, and suggest a fix."),
         "plugins": (
             "sensors",
-            "The plugins that were found, and what is wrong with those that do not load.",
+            "List the plugins that were found, and errors of those that do not load.",
         ),
         "trust": (
             "sensors",
-            "Allow a folder: its lidarspec.toml may name Python files, and files elsewhere.",
+            "Trust a folder: its lidarspec.toml may name Python files, and files elsewhere.",
         ),
         "demo": (
             "sim",
-            "Start a simulated sensor on a port, read it over a bad line, record it and draw it.",
+            "Simulate a sensor on a port, read it over a bad line, record it and draw it.",
         ),
-        "help": ("root", "What a verb does, and its options; without a verb, all of them."),
+        "help": ("root", "Print the help of a verb, or the list of all verbs."),
     },
     "stream": {
-        "read": ("read", "The points that a sensor sends, a row each; or its packets."),
-        "view": ("view", "A sensor at work, drawn in the terminal, or with --web in the browser."),
+        "read": ("read", "Print the points that a sensor sends, or its packets, one row each."),
+        "view": ("view", "Draw a live sensor in the terminal, or with --web in the browser."),
         "record": (
             "recordings",
-            "Record a source, with the time of every arrival, in one file that survives a crash.",
+            "Record a source with arrival times, in one file that survives a crash.",
         ),
-        "replay": (
-            "recordings",
-            "A recording or capture, sent again as it came: bit for bit, and by the clock.",
-        ),
-        "sim": ("sim", "A simulated sensor on a serial port, UDP, TCP or in a file."),
+        "replay": ("recordings", "Replay a recording or capture, byte for byte and in real time."),
+        "sim": ("sim", "Simulate a sensor on a serial port, UDP, TCP or in a file."),
         "send": ("build", "Send a command to a sensor, and print its reply."),
-        "stats": ("read", "How a sensor is doing: speed, rates, errors, loss, jitter, queue."),
+        "stats": ("read", "Print speed, rates, errors, loss, jitter and queue of a sensor."),
     },
     "files": {
         "info": (
             "info",
-            "What is in a file: kind, times, senders, sensor, rates, loss, and how it is read.",
+            "Describe the contents of files: kind, times, senders, sensor, rates, loss.",
         ),
         "convert": (
             "convert",
-            "Write the points of a capture or raw file to a file, in the format of its suffix.",
+            "Write the points of a recording or capture to a file of another format.",
         ),
-        "plot": ("plot", "A scan as a picture; or intensities, ranges and rates over time."),
+        "plot": ("plot", "Draw a scan, or intensities, ranges and rates over time."),
     },
     "bytes": {
-        "parse": ("frames", "The fields of each frame in some bytes."),
+        "parse": ("frames", "Print the fields of each frame in some bytes."),
         "explain": (
             "frames",
-            "Every byte of each frame: offset, hex, field, value, unit, meaning.",
+            "Explain every byte of each frame: offset, hex, field, value, unit, meaning.",
         ),
-        "build": (
-            "build",
-            "The bytes of one frame from field=value; a unit makes a value physical.",
-        ),
+        "build": ("build", "Build one frame from field=value; a value with a unit is physical."),
         "crc": (
             "finding",
-            "Which checksum seals some sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.",
+            "Find the checksum of sample frames: XOR, sums, or a CRC of 8, 16 or 32 bits.",
         ),
     },
     "authors": {
         "new": (
             "authors",
-            (
-                "A distribution for a sensor of your own, which works before anything in it is"
-                " changed."
-            ),
+            "Create a distribution for your own sensor; it works before you change anything.",
         ),
         "check": (
             "authors",
-            "Check a sensor, a file or a distribution against every promise of the test kit.",
+            "Check a sensor, a file or a distribution against every property of the test kit.",
         ),
         "export": (
             "authors",
-            "A sensor's spec for another tool: wireshark, c, ksy (Kaitai), md, svg, json, pyi.",
+            "Export a sensor's spec: wireshark, c, ksy (Kaitai), md, svg, json, pyi.",
         ),
     },
 }
 VERBS = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
-#: verbs of plugins that are installed only where somebody asks for them.
+#: Verbs of plugins that are installed separately -> distribution.
 ELSEWHERE = {"ros2": "lidarspec-ros2"}
 
 
 def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Option:
-    """An option that says how much is said."""
+    """Return an option that sets the amount of remarks."""
 
     def set_verbosity(ctx: click.Context, param: click.Parameter, value: bool) -> None:
         if value:
@@ -124,7 +116,7 @@ def _make_verbosity_option(loudness: int, *names: str, help: str) -> click.Optio
     return click.Option(names, is_flag=True, expose_value=False, callback=set_verbosity, help=help)
 
 
-#: the options of all verbs, but for those that have one of the same name.
+#: Options of all verbs, except of verbs that have an option of the same name.
 SPOKEN = (
     _make_verbosity_option(
         -1,
@@ -146,7 +138,10 @@ SPOKEN = (
 
 @functools.cache
 def find_added_verbs() -> dict[str, EntryPoint]:
-    """The verbs of installed plugins, none of which is loaded for it; ours come first."""
+    """Return the verbs of installed plugins, without loading them.
+
+    A plugin cannot replace a verb of lidarspec.
+    """
     return {entry.name: entry for entry in entry_points(PLUGGED) if entry.name not in VERBS}
 
 
@@ -200,7 +195,7 @@ class Verbs(click.Group):
                 )
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
-        """The verbs, none of which is loaded for it; and the options."""
+        """Return the verbs, without loading them, and the options."""
         from click.shell_completion import CompletionItem
 
         known = {verb: text for verb, (_, text) in VERBS.items()} | {
@@ -216,7 +211,7 @@ class Verbs(click.Group):
     def main(  # type: ignore[override]
         self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any
     ) -> NoReturn:
-        """Run one verb and exit with its code; no exception leaves this."""
+        """Run one verb and exit with its code; raises no other exception."""
         if instruction := os.environ.get("_LIDARSPEC_COMPLETE"):
             from lidarspec.cli.completion import complete
 
@@ -252,7 +247,7 @@ def _run(group: click.Group, words: list[str]) -> int:
 
 
 def _spent(seconds: float) -> str:
-    """The time that a verb took, and its memory, where the system counts it."""
+    """Format the time of a verb, and its memory if the system reports it."""
     try:
         import resource
     except ImportError:
@@ -293,7 +288,7 @@ main.params += SPOKEN
 @click.argument("verb", required=False)
 @click.pass_context
 def help(ctx: click.Context, verb: str | None) -> None:
-    """What a verb does, and its options; without a verb, all of them."""
+    """Print the help of a verb, or the list of all verbs."""
     root = ctx.find_root()
     if verb is None:
         say(root.get_help())

@@ -1,7 +1,7 @@
-"""The verbs that look at what is installed, and the one that says what is believed beside it.
+"""`sensors`, `show`, `plugins` and `trust`: the installed sensors and plugins.
 
-`sensors` and `show` are typed often and need little of the package: each function imports what the
-other verbs do not need.
+`sensors` and `show` are used often and need little of the package: each function imports the
+modules that the other verbs do not need.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ if TYPE_CHECKING:
     from lidarspec.sensor_operations import Sensor
     from lidarspec.spec.description import Frame
 
-#: packets that a plan is shown for: as many as a turn may take, since some of them are shorter.
+#: Number of packets for which a plan is shown; a turn has at most so many, of different lengths.
 PACKETS = 32
 
 
 def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
-    """Return a row for each installed sensor, and the plugins that failed to load; most need not be
-    loaded.
+    """Return a row for each installed sensor, and the plugins that failed to load.
+
+    Most plugins are not loaded for this.
     """
     is_fresh = (
         "lidarspec.plugins" not in sys.modules
-    )  # else the program may have registered sensors of its own
+    )  # otherwise the program may have registered sensors of its own
     rows = list_described_sensors() if is_fresh else None
     if rows is not None:
         return rows, []
@@ -82,7 +83,7 @@ def guide() -> str:
 @click.command()
 @output_options
 def sensors(as_json: bool, output: str | None) -> None:
-    """The installed sensors, and how far each is proven."""
+    """List the installed sensors, and how each was verified."""
     known, broken = list_sensors()
     if as_json:
         from lidarspec.plugins import registry
@@ -122,7 +123,7 @@ def sensors(as_json: bool, output: str | None) -> None:
 )
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
-    """What a sensor is, and the wire table of each of its frames."""
+    """Describe a sensor, with a wire table for each of its frames."""
     from lidarspec.frames.wire_table import frame_size, wire_table
     from lidarspec.plugins import sensor as named_sensor, summarize_links
 
@@ -176,7 +177,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
 
 
 def _unit(sensor: Sensor, path: str) -> str:
-    """The unit of a field, as "frame.path", behind a comma."""
+    """Return the unit of a field, "frame.path", after a comma."""
     from lidarspec.frames.schema import schema
 
     frame, _, field = path.partition(".")
@@ -190,7 +191,7 @@ def _unit(sensor: Sensor, path: str) -> str:
 
 
 def _plan(sensor: Sensor, frame: str) -> list[str]:
-    """The plan of a data frame in lines, or why there is none."""
+    """Return the plan of a data frame in lines, or the reason why there is none."""
     from lidarspec.frames.frame_table import Rows
     from lidarspec.framing.results import Counters, Found, packed
     from lidarspec.packets.stream import PacketStream
@@ -222,10 +223,11 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
 @output_options
 @click.pass_context
 def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
-    """The plugins that were found, and what is wrong with those that do not load.
+    """List the plugins that were found, and errors of those that do not load.
 
-    They are loaded in another process first, and if anything is wrong, each in one of its own, so
-    that one that hangs or ends the program is named. Exit code 1 where something is wrong.
+    They are loaded in another process first and, if anything is wrong, each in a process of its
+    own, so that a plugin that hangs or ends the program is named. The exit code is 1 if something
+    is wrong.
     """
     from lidarspec.plugins import try_plugins
 
@@ -245,7 +247,7 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
 
 
 def _describe_plugin(plugin: Plugin) -> str:
-    """The sensors of a plugin, and what is wrong with it."""
+    """Return the sensors of a plugin, and its error."""
     if plugin.error and not plugin.sensors:
         error = f"not loaded: {plugin.error}"
     else:
@@ -256,10 +258,10 @@ def _describe_plugin(plugin: Plugin) -> str:
 @click.command()
 @click.argument("folder", default=".")
 def trust(folder: str) -> None:
-    """Allow a folder: its lidarspec.toml may name Python files, and files elsewhere.
+    """Trust a folder: its lidarspec.toml may name Python files, and files elsewhere.
 
-    It is for folders of your own whose files you know; it is kept, and holds for this folder alone.
-    For a single run the variable LIDARSPEC_TRUST names one.
+    Use it only for your own folders with files that you know. It is stored permanently, and holds
+    for this folder alone. LIDARSPEC_TRUST trusts a folder for a single run.
     """
     say(
         f"{trusted(folder)}: what its {FILE} names is believed from now on;"
@@ -268,7 +270,7 @@ def trust(folder: str) -> None:
 
 
 def _facts(sensor: Sensor) -> dict[str, Any]:
-    """What is known of a sensor, for JSON."""
+    """Return the facts about a sensor as a JSON object."""
     from lidarspec.exports.json import facts, link_data
 
     return {

@@ -1,6 +1,4 @@
-"""`sim` and `demo`: a simulated sensor on a serial port, UDP, TCP or in a file; and one that is
-read, recorded and drawn.
-"""
+"""`sim` and `demo`: simulate a sensor on a port or in a file, and show one."""
 
 from __future__ import annotations
 
@@ -42,9 +40,9 @@ from lidarspec.view.polar import picture
 if TYPE_CHECKING:
     from rich.text import Text
 
-#: seconds that go into a file where nobody says how many.
+#: Default duration of a file, in seconds.
 IN_A_FILE = 10.0
-#: cells of the picture at most, and lines that are kept for the summary.
+#: Maximum width and height of the picture in cells, and lines reserved for the summary.
 WIDEST = 100
 HIGHEST = 42
 SUMMARY = 8
@@ -54,7 +52,7 @@ PLACES = (
 )
 
 
-@click.command(short_help="A simulated sensor on a serial port, UDP, TCP or in a file.")
+@click.command(short_help="Simulate a sensor on a serial port, UDP, TCP or in a file.")
 @click.argument("sensor_id", metavar="SENSOR")
 @configuring
 @click.option("--to", metavar="PLACE", help=PLACES)
@@ -135,10 +133,10 @@ def sim(
     force: bool,
     as_json: bool,
 ) -> None:
-    """A simulated sensor on a serial port, UDP, TCP or in a file.
+    """Simulate a sensor on a serial port, UDP, TCP or in a file.
 
-    It behaves as its spec says: it keeps real time, answers commands, starts and stops. Where it is
-    goes to standard output, all else to standard error.
+    It behaves as its spec describes: it runs in real time, replies to commands, starts and stops.
+    Its place is printed on standard output, all else on standard error.
     """
     sensor = named_sensor(sensor_id)
     faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
@@ -181,7 +179,7 @@ def sim(
 def _tell(
     sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool
 ) -> None:
-    """Where the sensor is, with its other links, and what to type next."""
+    """Print the place of the sensor, its other links, and the next command."""
     following = f"lidarspec view {shlex.quote(source)} {format_sensor_options(sensor)}"
     if as_json:
         emit_json(
@@ -201,9 +199,7 @@ def _tell(
 
 
 def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Callable[[], None]:
-    """What is called while the sensor is at work: says which commands arrive, and that the plug was
-    pulled.
-    """
+    """Return a callback that prints received commands, and when the plug is pulled."""
     began = time.monotonic()
     heard = 0
     present = True
@@ -239,7 +235,7 @@ def _sent(device: SimulatedDevice) -> str:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
-    """Start a simulated sensor on a port, read it over a bad line, record it and draw it."""
+    """Simulate a sensor on a port, read it over a bad line, record it and draw it."""
     simulated = (
         one
         for one in registry().sensors().values()

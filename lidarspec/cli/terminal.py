@@ -1,9 +1,8 @@
-"""Standard output and standard error: all that verbs print goes through here, whatever it is made
-of and whether or not anybody reads it.
+"""Standard output and standard error of all verbs.
 
-Addresses, file names and texts of devices and plugins are others': what would steer a terminal is
-spelled out. Remarks that nobody can read end no verb, a recording least of all; data that cannot be
-written are a failure.
+Addresses, file names and texts of devices and plugins come from others: characters that control a
+terminal are escaped. A remark that cannot be written does not end a verb, which would stop a
+recording; data that cannot be written is an error.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from lidarspec.errors import SourceError, printable
 
 
 class Voice:
-    """How much is said beside the data.
+    """The amount of remarks printed beside the data.
 
     Attributes:
-        loudness: -1 nothing, 1 more than by default; each command begins with 0.
+        loudness: -1 for none, 1 for more than by default; each command begins with 0.
     """
 
     loudness = 0
 
 
 voice = Voice()
-#: what a line changes about colours, and nothing else.
+#: The sequences that change colours, and do nothing else.
 _COLOURS = re.compile(r"(\x1b\[[0-9;]*m)")
 
 
@@ -41,11 +40,11 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
     """Print data on standard output; bytes as they are.
 
     Args:
-        colour: whether colours in the text stay in a pipe; None: it has none of ours.
+        colour: keep colours of the text in a pipe; None if the text has none of ours.
 
     Raises:
-        BrokenPipeError: where nobody reads any more.
-        SourceError: where it cannot be written otherwise.
+        BrokenPipeError: if the reader has closed the pipe.
+        SourceError: if it cannot be written for another reason.
     """
     if isinstance(content, str):
         if colour is None:
@@ -57,7 +56,7 @@ def say(content: str | bytes, *, nl: bool = True, colour: bool | None = None) ->
 
 
 def note(text: str) -> None:
-    """Print a remark beside the data on standard error, if anybody reads there and wants to."""
+    """Print a remark on standard error, unless remarks are off or it is closed."""
     if voice.loudness < 0:
         return
     try:
@@ -68,8 +67,9 @@ def note(text: str) -> None:
 
 @contextlib.contextmanager
 def streams() -> Iterator[None]:
-    """What a verb needs around it: all three streams, also closed ones; warnings as remarks, once
-    each; everything printed.
+    """Prepare standard input, output and error for a verb, and flush them.
+
+    Closed streams are replaced. Each warning is printed once, as a remark.
 
     Raises:
         BrokenPipeError, SourceError: as `say`.
@@ -77,8 +77,8 @@ def streams() -> Iterator[None]:
     voice.loudness = 0
     for name, flags in (("stdin", os.O_RDONLY), ("stdout", os.O_RDONLY), ("stderr", os.O_WRONLY)):
         if getattr(sys, name) is None:
-            # A file opened later would take its number and what is printed; output that was closed
-            # is refused.
+            # A file opened later would get the number of a closed stream, and with it what is
+            # printed. Output that was closed is refused.
             descriptor = os.open(os.devnull, flags)
             mode = "r" if name == "stdin" else "w"
             setattr(sys, name, open(descriptor, mode, closefd=False))  # noqa: SIM115
@@ -104,7 +104,7 @@ def streams() -> Iterator[None]:
 
 
 def silence() -> None:
-    """Nobody reads any more: what is still buffered goes nowhere, without a complaint at exit."""
+    """Discard buffered output, so that a closed pipe causes no error at exit."""
     _lose(sys.stdout)
 
 
@@ -134,7 +134,7 @@ def _lose(stream: Any) -> None:
 
 @contextlib.contextmanager
 def ended_by_terminate() -> Iterator[None]:
-    """SIGTERM ends it as Ctrl-C does, so that a link does not stay behind."""
+    """Handle SIGTERM like Ctrl-C, so that a symbolic link is removed."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield

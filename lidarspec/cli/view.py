@@ -1,6 +1,4 @@
-"""`view`: a sensor at work, drawn in the terminal, on a page in the browser, or in the viewer of
-Rerun.
-"""
+"""`view`: draw a live sensor in the terminal, on a web page, or in Rerun's viewer."""
 
 from __future__ import annotations
 
@@ -92,16 +90,15 @@ def view(
     in_rerun: bool,
     output: str | None,
 ) -> None:
-    """A sensor at work, drawn in the terminal, or with --web in the browser.
+    """Draw a live sensor in the terminal, or with --web in the browser.
 
-    From above, and from the side where the points are not in one plane. A file is played at its own
-    speed. One picture is printed where standard output is no terminal.
+    It is drawn from above, and also from the side if the points are not in one plane. A file is
+    played at its own speed. If standard output is no terminal, one picture is printed.
 
     Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all again, ?
     helps, q quits.
 
-    --rerun needs lidarspec[rerun]; a file is read there as fast as possible, and its time runs in
-    the viewer.
+    --rerun needs lidarspec[rerun]; it reads a file as fast as possible, and the viewer plays it.
     """
     if once + web + in_rerun > 1:
         raise UsageError("--once, --web and --rerun are three ways to look at it: choose one")
@@ -215,10 +212,11 @@ def _in_rerun(
     duration: float | None,
     selection: Selection,
 ) -> None:
-    """Scans in Rerun's viewer, or in a file of its, until the input ends or somebody has had
-    enough.
+    """Show scans in Rerun's viewer, or write its file.
+
+    Ends with the input or after the duration.
     """
-    from lidarspec.formats.rerun import RERUN  # with all other formats, which take a moment
+    from lidarspec.formats.rerun import RERUN  # imports all formats, which takes a moment
     from lidarspec.view.rerun import SCHEMES, show
 
     if target and not target.startswith(SCHEMES):
@@ -237,10 +235,10 @@ def _in_rerun(
 
 
 def _show(device: Device, window: Window, *, taken: bool) -> None:
-    """The window, until it is closed or its terminal is.
+    """Run the window until it or its terminal is closed.
 
     Args:
-        taken: standard input is the data.
+        taken: whether standard input is the data.
     """
     try:
         with Screen(sys.stdout, keyboard(taken=taken)) as screen:
@@ -254,10 +252,10 @@ def _show(device: Device, window: Window, *, taken: bool) -> None:
 def _draw_once(
     device: Device, source: str, ramp: str, patience: float, selection: Selection
 ) -> str:
-    """One picture of the first whole scan, and a line about it.
+    """Return a picture of the first complete scan, and a line about it.
 
     Raises:
-        WireError, CommandError: where none comes.
+        WireError, CommandError: if no scan arrives.
     """
     feed = Feed(device, select=selection)
     end = time.monotonic() + patience
