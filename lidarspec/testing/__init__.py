@@ -1,26 +1,25 @@
-"""A test kit for authors: what a sensor's declaration has to keep, as a class for pytest and as
-`lidarspec check`.
+"""A test kit for authors of sensors: a class for pytest, and `lidarspec check`.
 
     from lidarspec.testing import SensorConformance
 
     class TestMine(SensorConformance):
         sensor = "acme-x1"        # an id, a Sensor value, or a file such as "./acme.py"
 
-In: a sensor. Out: passed tests, or findings with place, reason and what to write. Modules in
-reading order:
+In: a sensor. Out: passed tests, or findings with location, reason and remedy. Modules in reading
+order:
 
 * `properties`: the table of properties that every sensor must have.
 * `conformance`: everything that `check` checks, as one test for pytest.
-* `findings`: the rules, and how a property says that it does not hold.
-* `subject`: a sensor under test, and what it is fed.
-* `declared`: what shows in the declaration alone.
-* `frames`: single frames, sound and damaged.
-* `consistency`: whether angles, clock and times of points agree.
-* `geometry`: whether points are where the manual has them.
-* `commands`: requests, replies, and the simulated sensor's answers.
+* `findings`: the rules, and the exception of a property that does not hold.
+* `subject`: a sensor under test, with its examples.
+* `declared`: checks of the declaration alone.
+* `frames`: checks of single frames, valid and damaged.
+* `consistency`: agreement of angles, clock and times of points.
+* `geometry`: directions and positions of points.
+* `commands`: requests, replies, and the replies of the simulated sensor.
 * `streams`: streams of frames, decoded twice and in batches.
 * `clouds`: assertions about point clouds.
-* `vectors`: golden frames out of a manual or capture.
+* `vectors`: golden frames from a manual or capture.
 * `check`: all of it without pytest, for a name, file, distribution or folder.
 * `plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.
 """
@@ -43,7 +42,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'lidarspec.testing' has no attribute {name!r}")
     import_library("hypothesis", "testing")
     pytest = import_library("pytest", "testing")
-    if "lidarspec.testing.clouds" not in sys.modules:  # pytest warns of one that is
+    # pytest warns if the module is imported already
+    if "lidarspec.testing.clouds" not in sys.modules:
         pytest.register_assert_rewrite("lidarspec.testing.clouds")
     from lidarspec.testing import conformance
 

@@ -1,12 +1,11 @@
-"""`lidarspec check` without the command line: every property and every rule over a sensor, a file
-or a distribution.
+"""Check a sensor, a file or a distribution with every property and every rule.
 
-A name is made a `Target` first: the sensors that it stands for, what kept others from being loaded,
-and the modules that they are written in. The text of these modules is read twice: for mistakes that
-show in it alone (what Python accepts, and what then does something else than it says), and for
-where fields, frames, functions, commands and sensors stand, so that a finding names file and line
-(`Places`). Then each sensor is held to its declaration and to the properties of `properties`, in
-their order, and what it acknowledges is left out of the `Report`.
+A name is resolved to a `Target`: its sensors, the errors of sensors that do not load, and the
+modules that declare them. The source of these modules is parsed for two purposes: to find mistakes
+that are valid Python but do something unintended, and to find the lines of fields, frames,
+functions, commands and sensors, so that a finding names file and line (`Places`). Then each
+sensor's declaration is checked, and its properties in the order of `properties`. Acknowledged
+findings are left out of the `Report`.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ from lidarspec.testing.subject import EXAMPLES, Subject
 from lidarspec.testing.vectors import lacking
 from lidarspec.trust import document
 
-#: the name of a file of golden vectors.
+#: Name of a file of golden vectors.
 VECTORS = "vectors.json"
-#: what the registry says -> the rule.
+#: Text of an error of the registry -> rule.
 SAID = (
     ("there is no hook", "LS002"),
     ("lacks @hookimpl", "LS003"),
@@ -50,15 +49,16 @@ SAID = (
 
 @dataclass(eq=False)
 class Target:
-    """Something to check.
+    """The sensors to check.
 
     Attributes:
-        sensors: that were found in it.
-        findings: what kept others from being found.
-        files: the modules that it is written in.
-        vectors: its golden vectors: beside its modules, or in the folder of its distribution's
-            source or the tests there.
-        family: the ids of the sensors that share them: of the file, or of the whole distribution.
+        sensors: the sensors of the target that could be loaded.
+        findings: the reasons why others could not be loaded.
+        files: the modules that declare them.
+        vectors: the golden vectors, next to the modules, or in the source folder of the
+            distribution or its tests.
+        family: the ids of the sensors that share the vectors, those of the file or of the
+            distribution.
     """
 
     sensors: list[Sensor] = field(default_factory=list)
@@ -69,13 +69,15 @@ class Target:
 
 
 def target(text: str | Path) -> Target:
-    """What a name stands for: a file, one sensor of it ("FILE.py:id"), the id or alias of an
-    installed one, a distribution or its folder.
+    """Return the target of a name.
+
+    The name is a file, a sensor of a file ("FILE.py:id"), the id or alias of an installed sensor, a
+    distribution, or the folder of a distribution.
 
     Raises:
-        SourceError: for a file that is not there, and for the folder of a distribution that is not
+        SourceError: for a file that does not exist, or the folder of a distribution that is not
             installed.
-        UnknownSensor: for a name that is nothing of all this.
+        UnknownSensor: for any other name.
     """
     name = str(text)
     if (Path(name) / "pyproject.toml").is_file():
@@ -124,7 +126,7 @@ def _file(file: Path, wanted: str) -> Target:
 
 
 def _folder(folder: Path) -> Target:
-    """The distribution whose source is in a folder."""
+    """Return the target of the distribution with its source in a folder."""
     file = folder / "pyproject.toml"
     project = document(file).get("project")
     if isinstance(project, dict):
@@ -140,7 +142,7 @@ def _folder(folder: Path) -> Target:
 
 
 def _vectors(files: Iterable[Path]) -> Path | None:
-    """The golden vectors of some modules."""
+    """Return the file of golden vectors of some modules, None if there is none."""
     beside = dict.fromkeys(file.resolve().parent for file in files)
     sources = [
         home
@@ -153,7 +155,7 @@ def _vectors(files: Iterable[Path]) -> Path | None:
 
 
 def _entries(distribution: str) -> list[EntryPoint]:
-    """What a distribution adds: modules with hooks, and sensors by id and alias."""
+    """Return the entry points of a distribution: modules with hooks, and sensors."""
     entries = [*entry_points(GROUP), *entry_points(SENSORS)]
     return [entry for entry in entries if _normal(entry.distribution) == _normal(distribution)]
 
@@ -187,8 +189,9 @@ def _distribution(entries: list[EntryPoint]) -> Target:
 
 
 def _rivals(sensors: list[Sensor]) -> list[Finding]:
-    """The plugins that were refused because of a name of these sensors, or that these were refused
-    for: each with who has it.
+    """Return findings for plugins with the same sensor ids or aliases.
+
+    Each names the plugin that owns the id.
     """
     names = {name for sensor in sensors for name in (sensor.id, *sensor.aliases)}
     refused = [
@@ -203,9 +206,7 @@ def _rivals(sensors: list[Sensor]) -> list[Finding]:
 
 
 def _holders(sensors: list[Sensor], file: Path) -> list[Finding]:
-    """The installed plugins, written in other files than this one, that have the ids of its
-    sensors.
-    """
+    """Return findings for installed plugins that have the ids of sensors in this file."""
     return [
         Finding(
             "LS005",
@@ -223,10 +224,12 @@ def _holders(sensors: list[Sensor], file: Path) -> list[Finding]:
 
 
 def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
-    """The sensors of a plugin, loaded on its own, with its own hooks applied.
+    """Return the sensors of a plugin that is loaded on its own.
+
+    Its own hooks are applied.
 
     Raises:
-        Exception: whatever it fails with.
+        Exception: any error of the plugin.
     """
     if isinstance(plugin, Sensor):
         return [registry().apply_hooks(plugin)]
@@ -248,7 +251,7 @@ def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
 
 
 def loading(error: BaseException, files: list[Path]) -> Finding:
-    """The finding for what a plugin failed with when it was loaded."""
+    """Return the finding for an error while loading a plugin."""
     if isinstance(error, SpecError) and error.__cause__ is not None:
         cause = error.__cause__
     else:
@@ -279,7 +282,7 @@ def loading(error: BaseException, files: list[Path]) -> Finding:
 
 
 def _loading_rule(error: BaseException, cause: BaseException) -> str:
-    """The rule of a failure, by its kind and by what was going on."""
+    """Return the rule of a loading error."""
     functions = [spot.name for spot in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
         return error.rule
@@ -297,8 +300,9 @@ def _strip_markup(text: str) -> str:
 
 
 def module_files(value: str) -> list[Path]:
-    """The files of the module, or of the package, that an entry point names; none where there is
-    none.
+    """Return the source files of the module or package of an entry point.
+
+    Returns an empty list if there is none.
     """
     try:
         found = importlib.util.find_spec(value.partition("[")[0].partition(":")[0].strip())
@@ -313,7 +317,7 @@ def module_files(value: str) -> list[Path]:
 
 
 def _readable(file: Path) -> bool:
-    """Whether its text is Python."""
+    """Return whether a file is valid Python."""
     try:
         compile(file.read_text(encoding="utf-8"), str(file), "exec")
     except (SyntaxError, ValueError):
@@ -329,8 +333,9 @@ Spot = tuple[str, int]
 
 
 class Places:
-    """The text of some modules by file, to be asked where things stand in it: fields by their
-    names, all else by kind and name.
+    """The locations of declarations in the source of some modules.
+
+    Fields are found by their names, everything else by kind and name.
     """
 
     def __init__(self, trees: Mapping[str, ast.Module]) -> None:
@@ -345,7 +350,7 @@ class Places:
                 self._others.setdefault((kind, name), (file, line))
 
     def locate(self, finding: Finding, sensor: Sensor | None = None) -> Finding:
-        """The finding with the file and line of what it is about, where they can be told."""
+        """Return the finding with its file and line, if they can be found."""
         if finding.file:
             return finding
         spot = self._spot(finding.path, sensor) or (
@@ -367,7 +372,7 @@ class Places:
         )
 
     def _field(self, parts: tuple[str, ...]) -> Spot | None:
-        """The field whose names in the text are the longest end of the path."""
+        """Return the location of the field with the longest match of the end of the path."""
         fitting = [
             (len(chain), spot) for chain, spot in self._fields if parts[-len(chain) :] == chain
         ]
@@ -377,7 +382,7 @@ class Places:
 
 
 def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
-    """Where a function of a frame type is written."""
+    """Return the location of a function of a frame type."""
     if sensor is None or frame not in sensor.frames:
         return None
     own = sensor.frames[frame]
@@ -396,7 +401,7 @@ def _function(frame: str, name: str, sensor: Sensor | None) -> Spot | None:
 
 
 def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """What may be a key, a frame type or a sensor: kind, name and line."""
+    """Yield kind, name and line of every possible key, frame type and sensor."""
     for node in ast.walk(tree):
         match node:
             case ast.Dict(keys=keys, values=values):
@@ -414,7 +419,7 @@ def _iter_names(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
 
 
 def _fields(node: ast.AST, chain: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Every ``"name" / construct`` with the names that it stands within."""
+    """Yield each ``"name" / construct`` with its path of names and its line."""
     match node:
         case ast.BinOp(op=ast.Div(), left=ast.Constant(value=str(name)), right=right):
             yield (*chain, name), node.lineno
@@ -424,7 +429,7 @@ def _fields(node: ast.AST, chain: tuple[str, ...]) -> Iterator[tuple[tuple[str, 
                 yield from _fields(child, chain)
 
 
-#: calls that read the clock of the wall.
+#: Calls that read the system clock.
 WALL_CLOCKS = frozenset(
     [
         "time.time",
@@ -440,7 +445,7 @@ BROAD = frozenset({"Exception", "BaseException"})
 
 
 def check_texts(trees: Mapping[str, ast.Module]) -> list[Finding]:
-    """The findings in the text of some modules, by file."""
+    """Return the findings in the source of some modules, by file."""
     return [
         Finding(code, what, file=file, line=node.lineno)
         for file, tree in trees.items()
@@ -483,7 +488,7 @@ def _mistakes(
 
 
 def _names_of_this(tree: ast.Module) -> set[str]:
-    """The names under which construct's `this` and `obj_` are known in a module."""
+    """Return the names under which a module imports construct's `this` and `obj_`."""
     imported = [
         alias
         for node in ast.walk(tree)
@@ -496,7 +501,7 @@ def _names_of_this(tree: ast.Module) -> set[str]:
 
 
 def _tests(node: ast.AST) -> list[ast.expr]:
-    """The expressions whose truth Python asks for at a node."""
+    """Return the expressions that Python tests for truth at a node."""
     match node:
         case (
             ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test) | ast.Assert(test=test)
@@ -510,7 +515,7 @@ def _tests(node: ast.AST) -> list[ast.expr]:
 
 
 def _is_expression(test: ast.expr, names: set[str]) -> bool:
-    """Whether a test is an expression of construct: made of `this`, and no call."""
+    """Return whether a test is an expression made of construct's `this`."""
     return not isinstance(test, ast.BoolOp | ast.Call) and bool(_names(test) & names)
 
 
@@ -519,7 +524,7 @@ def _names(tree: ast.AST) -> set[str]:
 
 
 def _silent(body: list[ast.stmt]) -> bool:
-    """Whether a handler does nothing with what it caught."""
+    """Return whether an exception handler ignores the exception."""
     match body:
         case [ast.Pass() | ast.Continue() | ast.Expr(value=ast.Constant())]:
             return True
@@ -529,7 +534,7 @@ def _silent(body: list[ast.stmt]) -> bool:
 
 
 def _short_write(call: ast.Call, *, sockets: bool) -> bool:
-    """Whether a call writes as much as it can, and its count is what is dropped."""
+    """Return whether a call may write only a part, with its return value dropped."""
     match call.func:
         case ast.Attribute(value=ast.Name(id="os"), attr="write"):
             return True
@@ -538,27 +543,27 @@ def _short_write(call: ast.Call, *, sockets: bool) -> bool:
     return False
 
 
-#: Rules without which there is nothing to try.
+#: Rules without which no property can be tested.
 FATAL = frozenset({"LS213", "LS114", "LS115", "LS301"})
 #: Name of the properties that are skipped then.
 ELSE = "everything else"
 
 
-#: Called with what is looked at, and with how many properties are done, of how many.
+#: Called with the current step, the number of finished properties and their total.
 Watch = Callable[[str, int, int], None]
 
 
 @dataclass(eq=False)
 class Report:
-    """What was found.
+    """The result of a check.
 
     Attributes:
-        name: the sensor's id, or what was checked where there is none.
-        findings: what is wrong.
-        held: how many properties hold.
-        skipped: property -> why it does not apply.
-        measured: what was measured of frames along the way.
-        picture: what was measured of points, and what it has to be held against.
+        name: the sensor's id, or the checked name if there is no sensor.
+        findings: the findings.
+        held: the number of properties that hold.
+        skipped: property -> the reason why it does not apply.
+        measured: measured values of frames.
+        picture: measured values of points, to compare with the manual.
     """
 
     name: str
@@ -569,7 +574,7 @@ class Report:
     picture: dict[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as JSON has it."""
+        """Return the report as a JSON object."""
         return {**vars(self), "findings": [finding.to_dict() for finding in self.findings]}
 
 
@@ -583,19 +588,18 @@ def reports(
     tested: Sequence[Sensor] = (),
     watch: Watch = lambda text, done, total: None,
 ) -> Iterator[Report]:
-    """A report of the text and the loading of a target, where there is something to say, and one of
-    each of its sensors.
+    """Yield a report of each sensor of a target, and one of loading errors if any.
 
     Args:
-        name: what was asked for.
-        examples: of each frame type, for each property.
-        strategies: "frame.field" -> how its raw value is drawn, for fields of which no valid value
-            can be derived.
-        vectors: golden vectors; by default those that the target has.
-        tested: related models that are tested too: what they share with a sensor is not tested
-            again.
-        watch: is called with what is looked at before it is, and how many properties of how many
-            are done.
+        name: the name that was given.
+        examples: examples of each frame type, for each property.
+        strategies: "frame.field" -> a hypothesis strategy or function for its raw value, for fields
+            of which no valid value can be derived.
+        vectors: golden vectors; by default those of the target.
+        tested: related models that are tested too: parts that they share with a sensor are not
+            tested again.
+        watch: called with the current step before it begins, the number of finished properties and
+            their total.
     """
     trees = {
         str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files
@@ -624,12 +628,12 @@ def reports(
 
 
 def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -> None:
-    """Pass on what is looked at in one sensor of several."""
+    """Report the progress of one sensor of several."""
     watch(text, before + done, total)
 
 
 def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
-    """What the picture of a sensor has to be held against."""
+    """Yield facts to compare with the measured values of a sensor."""
     sensor = subject.sensor
     missing = lacking(subject)
     if missing:
@@ -642,7 +646,7 @@ def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
 
 
 def _watch_case(watch: Callable[[str, int], None], sensor_id: str, done: int, case: str) -> None:
-    """Pass on which case of a property is looked at."""
+    """Report the case of a property before it is tested."""
     watch(f"{sensor_id}: {case}", done)
 
 

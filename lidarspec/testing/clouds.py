@@ -39,7 +39,7 @@ def assert_well_formed(cloud: PointCloud) -> None:
 
 
 def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) -> None:
-    """Fail unless both clouds have the same columns, masks, places, directions and times.
+    """Fail unless both clouds have the same columns, masks, positions and times.
 
     Coordinates are compared at the size of the range, azimuths on the circle, times to a
     microsecond. All other columns have to be equal.
@@ -73,7 +73,7 @@ def assert_same_places(one: PointCloud, other: PointCloud, *, ulps: int = ULPS) 
 
 
 def _reach(cloud: PointCloud) -> NDArray[np.float32]:
-    """Return the largest coordinate of each point, at least 1 m, as the size of its rounding."""
+    """Return the largest absolute coordinate of each point, at least 1 m, float32."""
     lengths = np.stack([cloud.range, cloud.x, cloud.y, cloud.z, np.ones(len(cloud))])
     with np.errstate(invalid="ignore"):
         size = np.nanmax(np.abs(lengths), axis=0, initial=0).astype(np.float32)
@@ -83,9 +83,12 @@ def _reach(cloud: PointCloud) -> NDArray[np.float32]:
 def _is_close(
     one: NDArray[Any], other: NDArray[Any], tolerance: Any, full_circle: float = 0.0
 ) -> bool:
-    """Return whether two arrays differ by no more than a tolerance, on a circle if one is given.
+    """Return whether two arrays differ by no more than a tolerance.
 
     NaN equals NaN, and an infinity itself.
+
+    Args:
+        full_circle: the period of angles; 0 compares plain numbers.
     """
     if one.dtype != other.dtype or one.shape != other.shape:
         return False

@@ -1,6 +1,4 @@
-"""Commands: they parse back, hold their arguments to their ranges, and the simulated sensor answers
-as documented.
-"""
+"""Checks of commands: frames, ranges of arguments, and simulated replies."""
 
 from __future__ import annotations
 
@@ -21,13 +19,15 @@ from lidarspec.spec.links import is_datagram
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import Subject
 
-#: ns of one step of a simulated conversation.
+#: Nanoseconds of one step of a simulated exchange.
 STEP = 20_000_000
 
 
 def arguments(subject: Subject, name: str, share: float) -> dict[str, Any]:
-    """An argument for each that a command takes, so far between its lowest and its highest value,
-    or as long, of its longest.
+    """Return a value for each argument of a command.
+
+    Args:
+        share: position from 0 to 1 between the lowest and the highest value, or of the length.
     """
     return {
         key: _value(subject.sensor, name, key, share)
@@ -49,8 +49,9 @@ def _value(sensor: Sensor, name: str, key: str, share: float) -> Any:
 
 
 def a_command_parses_back(subject: Subject, name: str) -> None:
-    """The frame of a command has its fixed values, its arguments within half a step, and builds
-    again.
+    """Check that a command's frame has its fixed values and its arguments.
+
+    The arguments are read back within half a step, and the frame is built again.
     """
     for share in (0.0, 0.37, 1.0):
         try:
@@ -60,9 +61,7 @@ def a_command_parses_back(subject: Subject, name: str) -> None:
 
 
 def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
-    """Fail unless the command's frame parses back to its fixed values, and to its arguments within
-    half a step.
-    """
+    """Fail unless the command's frame parses back to its fixed values and arguments."""
     command = sensor.commands[name]
     data = sensor.command(name, **given)
     if command.frame is None:
@@ -89,7 +88,7 @@ def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
 
 
 def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
-    """An argument outside its range is refused."""
+    """Check that arguments outside their ranges are refused."""
     for key, declared in subject.sensor.commands[name].arguments.items():
         kind = declared.kind
         ends: tuple[float | str, ...]
@@ -114,10 +113,10 @@ def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
 def an_exchange_holds(
     sensor: Sensor, name: str, given: dict[str, Any], data: bytes, answer: bytes | None, place: str
 ) -> None:
-    """A command with these arguments has these bytes, and these bytes are its reply.
+    """Check that a command has these bytes, and that `answer` is its reply.
 
     Raises:
-        Violation: where they are other ones, or no such reply.
+        Violation: if the bytes differ, or the reply does not match.
     """
     command = sensor.commands[name]
     try:
@@ -142,7 +141,7 @@ def an_exchange_holds(
 
 
 def replies_can_match(subject: Subject, name: str) -> None:
-    """Every field that a reply is told by is a field of one of the replies."""
+    """Check that every field that identifies a reply is a field of one of the replies."""
     command = subject.sensor.commands[name]
     answers = [subject.fields(reply) for reply in command.replies]
     for path in (*command.matches, *command.echoes) if answers else ():
@@ -155,9 +154,10 @@ def replies_can_match(subject: Subject, name: str) -> None:
 
 
 def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
-    """The simulated sensor gives the documented reply in time, to one of three sets of arguments.
+    """Check that the simulated sensor sends the documented reply in time.
 
-    It may keep silent if `answers` decide by the arguments: a sensor need not know those values.
+    Three sets of arguments are tried; one reply is enough. A missing reply is accepted if `answers`
+    depend on the arguments: a sensor need not know those values.
     """
     command = subject.sensor.commands[name]
     if command.frame is None or not command.replies:
@@ -183,12 +183,12 @@ def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
 
 
 def _learn(subject: Subject, name: str, reply: Reply) -> None:
-    """Configure the sensor with what it learns from a simulated reply."""
+    """Configure the sensor with the values that it learns from a simulated reply."""
     sensor = subject.sensor
     try:
         if told := learned(sensor, reply):
             sensor.configure(**told)
-    except Exception as error:  # whatever `learns` and `configure` of the plugin fail with
+    except Exception as error:  # any error of `learns` and `configure` of the plugin
         if name in sensor.simulation.answers:
             which = "its reply, as given by"
         else:
@@ -198,10 +198,10 @@ def _learn(subject: Subject, name: str, reply: Reply) -> None:
 
 
 def _ask(subject: Subject, name: str, given: dict[str, float]) -> Reply:
-    """The reply of a simulated sensor to a command.
+    """Return the reply of a simulated sensor to a command.
 
     Raises:
-        CommandError: where there is none, or another one.
+        CommandError: if there is no reply, or another one.
     """
     command = subject.sensor.commands[name]
     sensor = subject.sensor

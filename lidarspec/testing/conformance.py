@@ -28,14 +28,13 @@ def assert_conformance(
     vectors: str | Path | None = None,
     tested: Sequence[Sensor] = (),
 ) -> list[Report]:
-    """Fail with every finding of `lidarspec check` about the sensor; return its reports.
+    """Fail with every finding of `lidarspec check`; return the reports.
 
-    That another installed plugin has its id (LS005) concerns the environment and is left to
-    `check`.
+    LS005, an id that another installed plugin has, concerns the environment and is left to `check`.
 
     Args:
         sensor: an id, a `Sensor`, or a file that describes one.
-        examples: how many examples of each frame type a property tries.
+        examples: number of examples of each frame type for each property.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
             `random.Random`, for fields of which no valid value can be derived.
         vectors: a file of golden vectors; by default those that `check` finds.
@@ -70,7 +69,7 @@ class SensorConformance:
 
     Attributes:
         sensor: an id, a `Sensor`, or a file that describes one.
-        examples: how many examples of each frame type a property tries; the default is 40, or
+        examples: number of examples of each frame type for each property; the default is 40, or
             LIDARSPEC_EXAMPLES.
         strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
             `random.Random`, for fields of which no valid value can be derived.
@@ -86,7 +85,7 @@ class SensorConformance:
     def test_conformance(
         self, request: pytest.FixtureRequest, record_property: Callable[[str, object], None]
     ) -> None:
-        """The sensor conforms: its declaration is sound, and every property holds."""
+        """Check that the declaration is valid and every property holds."""
         __tracebackhide__ = True
         if self.vectors:
             vectors = request.path.parent / self.vectors

@@ -1,8 +1,7 @@
-"""Whether the parts of a declaration agree with each other: angles and points, clock and wrap,
-times of points and clock.
+"""Checks that the parts of a declaration agree: angles, points, clock and times.
 
-Packets are made from the sensor's `sweep`, as far along it as a property needs: its first packets
-seldom cross the full circle, or the time at which the clock starts again.
+Packets are made from the sensor's `sweep`, as far along it as a property needs: the first packets
+seldom cross the full circle, or the time at which the clock wraps.
 """
 
 from __future__ import annotations
@@ -24,20 +23,19 @@ from lidarspec.testing.findings import require
 from lidarspec.testing.geometry import BACK, SMALL, make_sweep, read
 from lidarspec.testing.subject import Subject
 
-#: packets whose clock is looked at: far along the sweep, so that a clock that starts again has done
-#: so.
+#: Numbers of the packets whose clock is checked: far along the sweep, so that the clock has
+#: wrapped.
 FAR_PACKETS = (0, *(start * 10**power for power in range(8) for start in (1, 2, 4, 7)))
-#: packets whose points' times are looked at.
+#: Number of packets whose times of points are checked.
 TIMED_PACKETS = 64
-#: steps of the clock, from packet to packet, over which the points of a single packet may be
-#: spread.
+#: Maximum spread of the times of one packet's points, in clock steps from packet to packet.
 MOST_STEPS = 30
-#: parts of the full circle by which a packet is turned.
+#: Number of shifts of a packet's angles over the full circle.
 TURNS = 24
 
 
 def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
-    """Far along the sweep the clock never reads more than the time at which it starts again."""
+    """Check that far along the sweep the clock stays below `wraps_at`."""
     clock = subject.sensor.clock
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None or not isinstance(clock, Clock) or clock.wraps_at is None:
@@ -47,7 +45,7 @@ def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
         frames = maker.seal(maker.table([sweep(number) for number in FAR_PACKETS]))
         packets = read(subject, name, frames, by_clock=False)
         readings = clock_ns(subject.sensor, packets.batch())
-    except LidarSpecError:  # a property of its own says what fails
+    except LidarSpecError:  # another property reports the failure
         return
     most = int(readings.max(initial=0))
     said = f"along the sweep it reads {most / 1e9:g} s, and wraps_at is {float(clock.wraps_at):g} s"
@@ -55,9 +53,7 @@ def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
 
 
 def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
-    """Along the sweep the points of a packet are not spread over many of the clock's steps from
-    packet to packet.
-    """
+    """Check that the times of a packet's points spread over few clock steps."""
     frames = make_sweep(subject, name, TIMED_PACKETS)
     if subject.sensor.clock is None or len(frames) < 3:
         return
@@ -77,7 +73,7 @@ def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
 
 
 def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
-    """Points turn with the angles of their packet, also across the full circle."""
+    """Check that points turn with the angles of their packet."""
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
         return

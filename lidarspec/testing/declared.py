@@ -1,5 +1,6 @@
-"""What can be read off a declaration without any bytes of a sensor: units, sources, lengths, sync,
-coverage, tests of plausibility.
+"""Checks of a declaration without any bytes of a sensor.
+
+They concern units, sources, lengths, sync bytes, coverage by checksums, and `plausible`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import field_of, find_fields, trace_points
 from lidarspec.testing.subject import Subject
 
-#: field names that stand for a measure.
+#: Names of fields that hold a measured value.
 MEASURES = frozenset(
     [
         "distance",
@@ -46,27 +47,28 @@ MEASURES = frozenset(
         "timestamp",
     ]
 )
-#: share of the places in a payload at which a sync pattern may stand by chance.
+#: Maximum share of payload offsets at which a sync pattern may match by chance.
 COMMON = 1 / 200
-#: Examples whose length is looked at before a frame is simulated for it.
+#: Number of examples whose length is measured before a frame is simulated for it.
 FIRST_LENGTHS = 3
-#: Examples whose length is looked at in all.
+#: Number of examples whose length is measured in all.
 LENGTHS = 12
-#: example frames in whose payloads the sync pattern is counted, with the usual number of examples.
+#: Number of example frames in whose payloads the sync pattern is counted, by default.
 SYNC_EXAMPLES = 12
-#: Bits of constants and checksums up to which a frame is weak: noise makes one every few megabytes.
+#: Bits of constants and checksums up to which a frame is weak: random bytes match one every few
+#: megabytes.
 WEAK_BITS = 24
-#: The same for a frame without points, which does no harm to a picture.
+#: The same for a frame without points, which does not damage a point cloud.
 WEAK_BITS_WITHOUT_POINTS = 16
 #: The same in datagrams, which have checksums of their own.
 WEAK_BITS_IN_DATAGRAMS = 8
-#: how many times the length of the longest random frame a longest length may be.
+#: Maximum ratio of `max_length` to the length of the longest random frame.
 FAR = 8
-#: seconds after which nobody cares any more that a clock starts again.
+#: Seconds after which the wrap of a clock no longer matters.
 LONG = 7 * 86_400
-#: what points are made of, and the units of the fields that go into it.
+#: Column of points -> units of the fields that it comes from.
 UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
-#: names of fields that hold how bright a return is, and of those that hold no measure.
+#: Names of fields that hold the intensity of a return, and of fields that hold a code.
 INTENSITY = re.compile(
     r"(\w+_)?(intensity|intensities|reflectivity|reflectance|rssi|amplitude|brightness|quality|signal)(_\w+)?"
 )
@@ -77,7 +79,7 @@ Findings = Iterator[tuple[str, str, str]]
 
 
 def check_declaration(subject: Subject) -> list[Finding]:
-    """The findings in a declaration, as (code, what, path) made into findings of this sensor."""
+    """Return the findings of a declaration."""
     sensor = subject.sensor
     checks: list[Findings] = [
         _sensor(sensor),
@@ -92,7 +94,7 @@ def check_declaration(subject: Subject) -> list[Finding]:
     for check in checks:
         try:
             findings += [Finding(code, what, path, sensor.id) for code, what, path in check]
-        except Exception as error:  # out of the plugin's own functions
+        except Exception as error:  # raised by the plugin's own functions
             findings.append(Finding("LS414", f"{type(error).__name__}: {error}", "", sensor.id))
     return findings
 
@@ -113,7 +115,7 @@ def _sensor(sensor: Sensor) -> Findings:
 
 
 def _check_required_fields(sensor: Sensor) -> Findings:
-    """The fields that scans, clock and counter come from have to be there."""
+    """Yield the missing fields of scans, clock and counter."""
     known = {
         path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.named
     }
@@ -143,7 +145,7 @@ def _check_required_fields(sensor: Sensor) -> Findings:
 
 
 def _clock(sensor: Sensor) -> Findings:
-    """A clock that starts again within days has to say so."""
+    """Yield a finding if a clock wraps within days and `wraps_at` is missing."""
     clock = sensor.clock
     if (
         not isinstance(clock, Clock)
@@ -169,7 +171,10 @@ def _clock(sensor: Sensor) -> Findings:
 
 
 def _options(sensor: Sensor) -> Findings:
-    """Yield the options that `configure` never reads, or whose choices all give the same sensor."""
+    """Yield the options that `configure` ignores.
+
+    An option is ignored if it is never read, or if all its choices give the same sensor.
+    """
     function = sensor.configure.function
     if isinstance(function, partial):
         plain = function.func
@@ -194,9 +199,7 @@ def _options(sensor: Sensor) -> Findings:
 
 
 def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
-    """Return whether `configure` accepts two values of an option at least, and returns an equal
-    sensor for all.
-    """
+    """Return whether `configure` accepts several values, and returns equal sensors."""
     accepted = 0
     for value in values:
         try:
@@ -219,7 +222,7 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
     if not engine.is_compiled:
-        if not _is_reply(subject.sensor, name):  # a reply comes once, when it is asked for
+        if not _is_reply(subject.sensor, name):  # a reply comes only once, on request
             yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
     elif engine.size is not None and engine.size != frame.max_length:
         yield (
@@ -250,8 +253,9 @@ def _is_reply(sensor: Sensor, name: str) -> bool:
 
 
 def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
-    """A longest length that frames of random content do not come near to: damage is waited for that
-    much longer.
+    """Yield a finding if `max_length` is far above the lengths of random frames.
+
+    The decoder waits much longer than needed for a frame with a corrupt length.
     """
     sizes = list[int]()
     try:
@@ -259,7 +263,7 @@ def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
             if FAR * size >= frame.max_length:
                 return
             sizes.append(size)
-    except LidarSpecError:  # said elsewhere
+    except LidarSpecError:  # another check reports it
         return
     yield (
         "LS203",
@@ -272,8 +276,9 @@ def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
 
 
 def _sizes(subject: Subject, name: str) -> Iterator[int]:
-    """The lengths of examples, and of a simulated frame between them, whose simulation takes long
-    and is seldom needed.
+    """Yield the lengths of examples and of a simulated frame.
+
+    The simulated frame comes late, because it takes long and is seldom needed.
     """
     yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS))
     if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
@@ -283,10 +288,10 @@ def _sizes(subject: Subject, name: str) -> Iterator[int]:
 
 
 def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
-    """Yield the lengths of valid frames in which one header field is raised as far as the longest
-    length allows.
+    """Yield the lengths of valid frames with one large value in a header field.
 
-    Random headers seldom have large counts, and a `sweep` may have the same count in all packets.
+    The value is the largest that `max_length` allows. Random headers seldom have large counts, and
+    a `sweep` may have the same count in all packets.
     """
     frame = subject.sensor.frames[name]
     engine = codec(frame)
@@ -309,8 +314,9 @@ def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
 
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:
-    """Fields whose names stand for a measure, without a unit; `Scaled(..., "")` says that it is a
-    pure number.
+    """Yield fields without a unit whose names stand for a measured value.
+
+    `Scaled(..., "")` declares a pure number.
     """
     pure = _find_pure_numbers(frame) | (_find_multiplied(subject, name) if frame.data else set())
     for path, info in codec(frame).schema.all_fields.items():
@@ -329,13 +335,13 @@ def _names(subject: Subject, name: str, frame: Frame) -> Findings:
 
 
 def _find_multiplied(subject: Subject, name: str) -> set[str]:
-    """The fields that make ranges together with another one, which has the unit."""
+    """Return the fields that are multiplied with a field in metres to give ranges."""
     try:
         infos = [
             field_of(subject, name, node)
             for node in find_fields(getattr(trace_points(subject, name), "range", None))
         ]
-    except Exception:  # said elsewhere
+    except Exception:  # another check reports it
         return set()
     known = any(info is not None and factor(info.unit, "m") is not None for info in infos)
     if known:
@@ -344,10 +350,12 @@ def _find_multiplied(subject: Subject, name: str) -> set[str]:
 
 
 def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
-    """Return the paths of fields that are declared as pure numbers: Scaled with an empty unit.
+    """Return the paths of fields that are declared as pure numbers.
+
+    They are Scaled with an empty unit.
 
     Args:
-        with_scale: whether a factor may be declared too, as of the components of a direction.
+        with_scale: whether a factor may be declared too, as for the components of a direction.
     """
     return {
         info.path
@@ -379,9 +387,9 @@ def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
 
 
 def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
-    """Yield fields of a sealed frame that none of its checksums covers.
+    """Yield fields of a frame with checksums that none of its checksums covers.
 
-    Many checksums begin behind the header. Fields in front of all checksums are no findings.
+    Many checksums begin after the header: fields before all checksums are no findings.
     """
     reported: set[str] = set()
     for layout in layouts:
@@ -414,7 +422,7 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
 
 
 def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> Findings:
-    """How often the constants at the start stand within payloads."""
+    """Yield a finding if the constant bytes at the start are common in payloads."""
     if subject.sensor.datagrams or frame.confirm > 1:
         return
     if not engine.prefix:
@@ -433,7 +441,7 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
         matching &= (data[offset : offset + len(matching)] & mask) == value
     expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
     share = float(matching.mean())
-    # of few bytes chance alone makes a larger share
+    # with few bytes, chance alone gives a larger share
     chance = COMMON + 4 * (COMMON / len(matching)) ** 0.5
     share = expected if expected > COMMON else share
     if expected > COMMON or share > chance:
@@ -441,7 +449,7 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
 
 
 def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) -> Findings:
-    """Whether constants and checksums alone keep noise out."""
+    """Yield a finding if constants and checksums are too few to reject random bytes."""
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
     checked = [
@@ -470,13 +478,13 @@ def _weak_bits(sensor: Sensor, frame: Frame) -> int:
 
 
 def _points(subject: Subject, name: str) -> Findings:
-    """Whether `points` can be traced, and where its columns come from."""
+    """Yield the findings of `points`: whether it can be traced, and its source fields."""
     try:
         result = trace_points(subject, name)
     except Untraceable as reason:
         yield "LS208", str(reason), f"{name}.points"
         return
-    except Exception:  # a property of its own says what fails at work
+    except Exception:  # another property reports the failure
         return
     for column, units in UNITS.items():
         if hasattr(result, column):
@@ -485,8 +493,9 @@ def _points(subject: Subject, name: str) -> Findings:
 
 
 def _intensity(subject: Subject, name: str, result: Any) -> Findings:
-    """An intensity that comes from a field of another name, while no column uses the field that is
-    named so.
+    """Yield a finding if the intensity comes from a field with another name.
+
+    Applies if no column uses the field that is named intensity.
     """
     own = [
         field_of(subject, name, node) for node in find_fields(getattr(result, "intensity", None))
@@ -518,12 +527,12 @@ def _intensity(subject: Subject, name: str, result: Any) -> Findings:
 
 
 def _reach(subject: Subject) -> Findings:
-    """A range limit that no data frame can hold in the field that its ranges are."""
+    """Yield a finding if a range limit exceeds the largest value of the range field."""
     reach: list[tuple[float, str]] = []
     for name in subject.sensor.data_frames:
         try:
             result = trace_points(subject, name)
-        except Exception:  # said elsewhere
+        except Exception:  # another check reports it
             return
         value = getattr(result, "range", None)
         if isinstance(value, Traced) and value.node.kind == "field":
@@ -554,7 +563,7 @@ def _reach(subject: Subject) -> Findings:
 def _column(
     subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]
 ) -> Findings:
-    """A column that no field in a unit of its kind goes into."""
+    """Yield a finding if no source field of a column has a unit of its kind."""
     infos = [field_of(subject, name, node) for node in find_fields(value, looked_up=False)]
     measured = [info for info in infos if info is not None and factor(info.unit, "m") is not None]
     if column == "range" and measured and all(CODE.fullmatch(info.name) for info in measured):

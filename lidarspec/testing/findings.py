@@ -1,9 +1,8 @@
-"""What `lidarspec check` and the test kit say of a sensor: findings, each under a rule that says
-why it matters and what to write.
+"""The findings of `lidarspec check` and the test kit, and their rules.
 
-The rules are a table, to which a test holds the reference page. A property raises `Violation`
-(through `require`) where it does not hold, and a `Finding` is made of it; findings that a
-declaration acknowledges with a reason are left out last, by `left_over`.
+The rules are a table, which a test compares with the reference page. A property raises `Violation`
+(through `require`) if it does not hold, which becomes a `Finding`; findings that a declaration
+acknowledges with a reason are removed at the end, by `left_over`.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from lidarspec.sensor_operations import Sensor
 
 
 class Rule(NamedTuple):
-    """A rule: what is wrong in a few words, why it matters, and what to write instead."""
+    """A rule: the fault in a few words, why it matters, and the remedy."""
 
     code: str
     title: str
@@ -25,9 +24,9 @@ class Rule(NamedTuple):
     write: str
 
 
-#: code, title, why it matters, what to write instead. LS0xx is loading, LS1xx the struct, LS2xx the
-#: declaration, LS3xx single frames, LS4xx streams, LS5xx points, LS6xx commands, LS7xx golden
-#: vectors, LS8xx the text of modules.
+#: Code, title, reason and remedy of each rule. LS0xx: loading, LS1xx: the struct, LS2xx: the
+#: declaration, LS3xx: single frames, LS4xx: streams, LS5xx: points, LS6xx: commands, LS7xx: golden
+#: vectors, LS8xx: the source of modules.
 _TABLE = """
 LS001 the plugin cannot be imported | none of its sensors exists for anybody | mend the error that is printed
 LS002 a hook that does not exist | pluggy passes over a misspelt name in silence | one of the names of the hook reference
@@ -148,14 +147,14 @@ RULES = {
 
 @dataclass(frozen=True)
 class Finding:
-    """A mistake at a place in a spec.
+    """A fault at a position in a spec.
 
     Attributes:
-        code: of its rule.
-        what: what is wrong there.
-        path: frame, and field below it ("data.points.distance"); "" where it concerns the whole.
-        sensor: its id; "" where it never came to be one.
-        file, line: where that stands, "" and 0 where it is not known.
+        code: the code of its rule.
+        what: a description of the fault.
+        path: frame, and field below it ("data.points.distance"); "" if it concerns the sensor.
+        sensor: the id of the sensor; "" if there is none.
+        file, line: the location in the source; "" and 0 if it is unknown.
     """
 
     code: str
@@ -167,11 +166,11 @@ class Finding:
 
     @property
     def rule(self) -> Rule:
-        """The rule that it is a case of."""
+        """The rule that is violated."""
         return RULES[self.code]
 
     def to_dict(self) -> dict[str, Any]:
-        """The finding and its rule as JSON has them."""
+        """Return the finding and its rule as a JSON object."""
         return {
             **asdict(self),
             "title": self.rule.title,
@@ -202,7 +201,7 @@ class Finding:
 
 
 class Violation(AssertionError):
-    """A property that does not hold: the test kit's failure, and the check's finding."""
+    """The exception of a property that does not hold."""
 
     def __init__(self, code: str, what: str, path: str = "") -> None:
         self.code = code
@@ -214,20 +213,21 @@ class Violation(AssertionError):
 
 
 def require(holds: object, code: str, what: str, path: str = "") -> None:
-    """Raise a `Violation` unless something holds.
+    """Raise a `Violation` unless `holds`.
 
     Raises:
-        Violation: with this code, text and place.
+        Violation: with this code, text and path.
     """
     if not holds:
         raise Violation(code, what, path)
 
 
 def left_over(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[Finding]:
-    """The findings without those that a sensor's declaration acknowledges with a reason.
+    """Return the findings that a declaration does not acknowledge with a reason.
 
     Args:
-        whole: these are all findings, and an acknowledgement of none of them is one more.
+        whole: whether these are all findings; then an acknowledgement without a finding is a
+            finding, too.
     """
     given = {
         "": sensor.acknowledged,

@@ -27,25 +27,25 @@ def virtual_port(
     rate: float = 1.0,
     faults: Faults | None = None,
 ) -> Iterator[Served]:
-    """A simulated sensor on a real port, as a context: a pseudo-terminal, or a socket.
+    """Put a simulated sensor on a pseudo-terminal or a socket; a context manager.
 
     Args:
         sensor: an id or a Sensor.
-        to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; TCP port 0 takes one that is
-            free.
-        link: a symbolic link that leads to the pseudo-terminal, also after it was unplugged and
-            came back; by default one in a folder of its own.
-        scene: what it sees; by default a room of the seed's, in which somebody walks.
-        seed: of the scene, the faults and the fillers.
-        rate: how many times faster than in reality; inf: as fast as it is asked.
-        faults: what goes wrong on its links.
+        to: "pty", "udp://127.0.0.1:PORT" or "tcp://127.0.0.1:PORT"; TCP port 0 takes a free one.
+        link: a symbolic link to the pseudo-terminal, also after it was unplugged and plugged in
+            again; by default one in a temporary folder.
+        scene: the surroundings of the sensor; by default a random room with a walking person.
+        seed: seed of the scene, the faults and the fillers.
+        rate: speed relative to real time; inf: as fast as it is read.
+        faults: the faults on its links.
 
     Yields:
-        What has a `path` to open, the `device` with the names of the commands that it `heard`,
+        An object with a `path` to open, the `device` with the names of the commands that it
+            `heard`,
         `unplug` and `plug`.
 
     Raises:
-        SourceError: where the port cannot be had.
+        SourceError: if the port cannot be opened.
     """
     if isinstance(sensor, Sensor):
         known = sensor
@@ -54,8 +54,8 @@ def virtual_port(
     device = SimulatedDevice(known, scene=scene, seed=seed, rate=rate, faults=faults)
     with contextlib.ExitStack() as stack:
         if to == "pty" and link is None:
-            # The system names each pseudo-terminal anew, and may give the old name to somebody
-            # else's meanwhile.
+            # The system gives each pseudo-terminal a new name, and may give the old name to another
+            # process meanwhile.
             link = (
                 Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarspec-port-")))
                 / "port"

@@ -1,10 +1,9 @@
-"""What holds for single frames: examples repeat, bytes and values survive both ways, edits are read
-back, types are told apart.
+"""Checks of single frames: examples, round trips, edits, damage, types.
 
-construct leaves bits out, cuts numbers and takes what does not belong together without a word; each
-of these shows when a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
-which shrinks a failure to the field at fault. A damaged frame may be a `WireError`, or pass with a
-bit that no checksum covers, which is measured.
+construct omits bits, truncates numbers and accepts contradictory values without an error; each of
+these shows when a frame is parsed and built again. Edits of fields are drawn by Hypothesis,
+which shrinks a failure to the field at fault. A damaged frame may raise `WireError`, or pass with a
+changed bit that no checksum covers, which is measured.
 """
 
 from __future__ import annotations
@@ -29,32 +28,32 @@ from lidarspec.testing import subject as material
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.subject import MANY, Subject
 
-#: Examples of a frame that construct alone reads in which bytes are changed.
+#: Number of examples, read by plain construct, in which bytes are changed.
 CHANGED_EXAMPLES = 3
-#: Values that each of their bytes is changed to, with the usual number of examples.
+#: Number of values that each of their bytes is changed to, by default.
 CHANGES = 8
-#: Example frames that edits begin with.
+#: Number of example frames that edits begin with.
 BASES = 8
-#: Edits of one frame, at most.
+#: Maximum number of edits of one frame.
 MOST = 3
-#: places at which a frame is cut short or changed, at least.
+#: Minimum number of offsets at which a frame is cut short or changed.
 LEAST_SPOTS = 12
-#: bytes of a long frame's cuts together: each is parsed as far as it goes.
+#: Maximum total bytes of the truncated copies of a long frame.
 CUT_BYTES = 1 << 20
-#: bytes of a long frame's changed copies together, where construct alone reads it.
+#: Maximum total bytes of the changed copies of a long frame that plain construct reads.
 CHANGED_BYTES = 300_000
-#: frames of which every bit is flipped, with the usual number of examples, and at least.
+#: Number of frames of which every bit is flipped: by default, and at least.
 SAMPLES = 3
 LEAST_SAMPLES = 2
-#: bytes that are checked for the flipped bits of one frame: in a longer one than this allows, some
-#: of its bytes are chosen.
+#: Maximum number of bytes that are checked for the flipped bits of one frame; for a longer one,
+#: some of its bytes are chosen.
 FLIPPED_BYTES = 1 << 23
 
 
 def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
-    """Examples of a frame type can be built, parse, repeat and differ.
+    """Check that examples of a frame type can be built, parse, repeat and differ.
 
-    None is longer than declared.
+    None may be longer than declared.
     """
     frame = subject.sensor.frames[name]
     try:
@@ -94,7 +93,7 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
 
 
 def bytes_survive_parsing_and_building(subject: Subject, name: str) -> None:
-    """build(parse(bytes)) == bytes for every example, reserved bits included."""
+    """Check build(parse(bytes)) == bytes for every example, reserved bits included."""
     sensor = subject.sensor
     for seed in subject.seeds(name):
         data = subject.example(name, seed=seed)
@@ -109,9 +108,10 @@ def bytes_survive_parsing_and_building(subject: Subject, name: str) -> None:
 
 
 def every_raw_value_survives(subject: Subject, name: str) -> None:
-    """Changed bytes of a frame that construct alone reads are built again, seals aside.
+    """Check that changed bytes survive parsing and building, apart from checksums.
 
-    Such a frame may contain functions of the author's own, which may lose values.
+    Applies to frames that plain construct reads: they may contain functions of the author's own,
+    which may lose values.
     """
     engine = codec(subject.sensor.frames[name])
     if engine.is_compiled:
@@ -157,8 +157,9 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
 
 
 def what_follows_is_held(subject: Subject, name: str) -> None:
-    """A frame in which a field is not what its `Rebuild` says is refused: it would be built as
-    another.
+    """Check that a frame is refused if a field differs from its `Rebuild`.
+
+    Such a frame would be built as a different one.
     """
     sensor = subject.sensor
     engine = codec(subject.sensor.frames[name])
@@ -190,7 +191,7 @@ def what_follows_is_held(subject: Subject, name: str) -> None:
 
 
 def is_cut(before: Any, after: Any) -> bool:
-    """Whether a number came back a step too low."""
+    """Return whether a number came back one step too low."""
     if (
         not isinstance(before, int | float)
         or not isinstance(after, int | float)
@@ -203,7 +204,7 @@ def is_cut(before: Any, after: Any) -> bool:
 
 
 def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:
-    """A frame built from its physical values is the frame that they were read from."""
+    """Check that a frame built from its physical values has the original bytes."""
     for seed in subject.seeds(name):
         data = subject.example(name, seed=seed)
         values = material.physical(subject.sensor, name, data)
@@ -216,7 +217,7 @@ def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:
 
 
 def parse_finds_out_the_type(subject: Subject, name: str) -> None:
-    """Parsing without a type gives what parsing as one of the fitting types gives."""
+    """Check that parsing without a type equals parsing as one of the matching types."""
     data = subject.example(name, seed=1)
     fitting = [other for other in subject.sensor.frames if fits(subject.sensor, data, other)]
     require(name in fitting, "LS306", "its own example is not parsed as such a frame", name)
@@ -230,7 +231,7 @@ def parse_finds_out_the_type(subject: Subject, name: str) -> None:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether two parsed frames are equal; a NaN equals itself bit by bit."""
+    """Return whether two parsed frames are equal; NaNs are compared bit by bit."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     if isinstance(one, list) and isinstance(other, list):
@@ -241,7 +242,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> None:
-    """Raise the violation for bytes that became others, with the field in which they differ."""
+    """Raise the violation for bytes that changed, with the field in which they differ."""
     spot = next(
         (index for index, pair in enumerate(zip(data, built, strict=False)) if pair[0] != pair[1]),
         min(len(data), len(built)),
@@ -269,7 +270,7 @@ def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> 
 
 
 def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of a parsed frame: (path with indices, value)."""
+    """Yield the values of a parsed frame: (path with indices, value)."""
     if isinstance(parsed, dict):
         for key, value in parsed.items():
             yield from leaves(value, f"{path}.{key}" if path else key)
@@ -281,7 +282,7 @@ def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def acceptable(subject: Subject, name: str, values: Any) -> bytes | None:
-    """The frame of these values; None where they cannot go together."""
+    """Return the frame with these values; None if they contradict each other."""
     try:
         return subject.sensor.build(name, values)
     except UsageError:
@@ -289,7 +290,7 @@ def acceptable(subject: Subject, name: str, values: Any) -> bytes | None:
 
 
 def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
-    """A few drawn fields of a frame, set to drawn values, are read back as they were written."""
+    """Check that drawn values of fields are read back as they were written."""
     from hypothesis import HealthCheck, given, seed, settings, strategies as st
 
     sensor = subject.sensor
@@ -337,7 +338,7 @@ def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
 
 
 def _check(subject: Subject, name: str, parsed: Any, spots: list[Any], edits: list[int]) -> None:
-    """Hold what was written at some of a frame's integers to what is read there."""
+    """Check that the edited integers of a frame are read back."""
     built = acceptable(subject, name, parsed)
     if built is None:
         return
@@ -367,9 +368,7 @@ def _check(subject: Subject, name: str, parsed: Any, spots: list[Any], edits: li
 
 
 def _values(info: FieldInfo, own: Any, st: Any) -> Any:
-    """What a field's raw value is drawn from: the author's strategy, or its range and the edges of
-    it.
-    """
+    """Return a strategy for a field's raw value: the author's, or one of its range."""
     if own is not None and hasattr(own, "example"):
         return own
     low, high = info.limits
@@ -392,7 +391,7 @@ def free(info: FieldInfo | None) -> bool:
 
 
 def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
-    """A frame that is cut short at any byte is a `WireError` with its place."""
+    """Check that a frame that is cut short raises `WireError` with its offset."""
     data = subject.example(name, seed=2)
     spots = subject.limit_to_bytes(
         name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CUT_BYTES
@@ -414,7 +413,10 @@ def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
 
 
 def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> None:
-    """A mutated frame parses or raises `WireError`, with and without verification."""
+    """Check that a mutated frame parses or raises `WireError`.
+
+    Parsing without verification may raise nothing else, either.
+    """
     sensor = subject.sensor
     source = subject.source(f"mutations {name}")
     types = (name, None) if len(sensor.frames) <= MANY else (name,)
@@ -430,8 +432,9 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> Non
 
 
 def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
-    """Every flipped bit under a checksum makes the frame invalid; how many of the others pass is
-    measured.
+    """Check that every flipped bit under a checksum makes the frame invalid.
+
+    The share of other flipped bits that pass is measured.
     """
     engine = codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
@@ -477,8 +480,9 @@ def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
 
 
 def _flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequence[int]:
-    """Return the bytes of a frame whose bits are flipped: all, or of a long frame one of each field
-    and others by chance.
+    """Return the offsets of the bytes whose bits are flipped.
+
+    These are all bytes, or for a long frame one of each field and some random ones.
     """
     number = FLIPPED_BYTES // (8 * length)
     if number >= length:

@@ -1,13 +1,12 @@
-"""Whether the points of a sensor are where its manual has them, as far as that shows without the
-manual.
+"""Checks of a sensor's points that are possible without its manual.
 
-Four things are looked at. Of examples: clouds keep the conventions, and what `points` returns,
-traced, says which fields each column is made of. Of packets along the sensor's `sweep`: directions
-are radians, go one way from beam to beam, cross the full circle without a leap, and exist for a
-single point; clock and counter run on. Of a frame whose angle is moved by a few steps: which way
-the points turn, and whether the vendor's axes turn that way. Of packets simulated in a room: the
-points that come back lie on its walls, by a geometry of this module's own (`off`), not the
-simulator's. What is measured on the way is told (`Subject.picture`), to be held against the manual.
+Four kinds of frames are used. Examples: clouds keep the conventions, and tracing `points` shows the
+source fields of each column. Packets along the sensor's `sweep`: directions are radians, have
+one sense from beam to beam, cross the full circle without a jump, and exist for a single point;
+clock and counter increase. Frames with an angle that is changed by a few steps: the sense in which
+the points turn agrees with the vendor's axes. Packets simulated in a room: the decoded points lie
+on its walls, by a geometry of this module's own (`off`), not the simulator's. Measured values are
+reported (`Subject.picture`), to be compared with the manual.
 """
 
 from __future__ import annotations
@@ -46,47 +45,51 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
 
-#: packets along the sweep whose directions are looked at.
+#: Number of packets along the sweep whose directions are checked.
 PACKETS = 400
-#: packets in the room of a scene, of short frames and of frames longer than `LONG_FRAME_BYTES`.
+#: Number of packets in a simulated room: for short frames, and for frames longer than
+#: `LONG_FRAME_BYTES`.
 SCENE_PACKETS = 200
 LONG_SCENE_PACKETS = 50
 LONG_FRAME_BYTES = 1500
-#: bytes of packets along the sweep, the same for counters, which wrap, and of packets in the room.
+#: Maximum total bytes of packets along the sweep, for counters (which wrap), and in the room.
 SWEEP_BYTES = 1 << 22
 COUNTER_BYTES = 1 << 24
 SCENE_BYTES = 1 << 21
-#: packets that are made at least, however long their frames are.
+#: Minimum number of packets, for frames of any length.
 LEAST_PACKETS = 8
-#: Radians beyond which an azimuth along a sweep can only be degrees.
+#: Radians beyond which an azimuth along a sweep must be in degrees.
 TURNS = 4 * np.pi
-#: Radians beyond which a drawn azimuth can only be degrees.
+#: Radians beyond which the azimuth of a random frame must be in degrees.
 DRAWN = 15 * np.pi
-#: Share of the steps that go one way if a sensor rotates, at least.
+#: Minimum share of steps in one direction if a sensor rotates.
 ONE_WAY = 0.8
-#: A step against the direction that is too long, in radians.
+#: Maximum step against the direction, in radians.
 BACK = np.deg2rad(1.5)
 #: The same in medians of all steps.
 MEDIANS = 4
-#: raw steps by which an angle is moved to see whether the points move with it.
+#: Raw steps by which an angle is changed to see if the points move with it.
 SMALL = 4
-#: examples that values are put into, until one has points, with the usual number of examples.
+#: Number of examples that are tried until one has points, by default.
 BASES = 8
-#: radians from point to point above which they turn.
+#: Radians from point to point above which a sensor rotates.
 SEEN = 1e-5
-#: share of a direction along one of two axes from which on it is that axis's.
+#: Minimum component along one of two axes for a direction to belong to that axis.
 ALONG = 0.9
-#: Metres by which float32 puts a point off its surface.
+#: Metres by which float32 moves a point off its surface.
 EXACT = 2e-6
 #: Metres of half a step that a header or a code word may widen.
 UNTOLD = 0.004
 
 
 def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYTES) -> list[bytes]:
-    """Return the first packets along the sensor's `sweep`, none if it declares none or the frame
-    type is not compiled.
+    """Return the first packets along the sensor's `sweep`.
 
-    Of long frames fewer packets are made, which have `total` bytes.
+    Returns an empty list if there is no `sweep` or the frame type is not compiled.
+
+    Args:
+        packets: maximum number of packets.
+        total: maximum number of their bytes.
     """
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
@@ -105,8 +108,9 @@ def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYT
 
 
 def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = True) -> Packets:
-    """Frames of one data type, decoded, with the sensor's clock or without; a mode that another
-    frame switches to begins with it.
+    """Decode frames of one data type, with or without the sensor's clock.
+
+    If several frame types have points, the mode of this type is selected.
     """
     if by_clock:
         sensor = subject.sensor
@@ -118,11 +122,12 @@ def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = T
 
 
 def trace_points(subject: Subject, name: str) -> Any:
-    """What `points` returns for traced columns of one example; None where the frame is not
-    compiled.
+    """Return the result of `points` for traced columns of one example.
+
+    Returns None if the frame is not compiled.
 
     Raises:
-        Untraceable: where it cannot be traced, with the reason.
+        Untraceable: if it cannot be traced, with the reason.
     """
     if name not in subject.traced:
         subject.traced[name] = _trace_points(subject, name)
@@ -143,17 +148,17 @@ def _trace_points(subject: Subject, name: str) -> Any:
 
 
 def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
-    """Return the fields that traced values are made of.
+    """Return the fields that traced values come from.
 
     Args:
-        looked_up: whether fields count that are only looked up in a table.
+        looked_up: include fields that are only used as an index of a table.
     """
     nodes = traverse(*values, into=lambda node: looked_up or not isinstance(node.function, LookUp))
     return [node for node in nodes if node.kind in ("field", "state")]
 
 
 def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
-    """The field that a node is, of this frame type or of the state that another one leaves."""
+    """Return the field of a node, in this frame type or in the state."""
     if node.path.startswith("frame.") and node.kind == "state":
         return subject.fields(name).get(node.path.removeprefix("frame."))
     if node.kind == "state":
@@ -166,10 +171,9 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
 
 
 def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np.float64]] | None:
-    """Azimuths and elevations of points as `points` gives them, before they are folded, padding
-    left out.
+    """Return azimuths and elevations from `points` before folding, without padding.
 
-    Those of points by coordinates are the ones that are declared for their simulation; None where
+    For Cartesian points these are the directions that are declared for the simulation; None if
     there are none.
     """
     packets = packets.with_points
@@ -195,9 +199,7 @@ def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np
 
 
 def _declared_directions(subject: Subject, name: str) -> list[NDArray[np.float64]] | None:
-    """The directions of the first frames that are declared for a simulation; None where there are
-    none.
-    """
+    """Return the simulated directions of the first frames, None if there are none."""
     declared = subject.sensor.simulation_of(name).directions
     if declared is None:
         return None
@@ -209,8 +211,10 @@ def _declared_directions(subject: Subject, name: str) -> list[NDArray[np.float64
 
 
 def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
-    """float32 metres and radians, azimuth in [-pi, pi), no place without a return; and `points`
-    does not fail.
+    """Check that clouds keep the conventions, and that `points` does not fail.
+
+    The conventions are float32 metres and radians, azimuth in [-pi, pi), and no coordinates without
+    a return.
     """
     frames = [subject.example(name, seed=seed) for seed in range(max(len(subject.seeds(name)), 2))]
     try:
@@ -228,7 +232,7 @@ def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
 
 
 def directions_are_radians(subject: Subject, name: str) -> None:
-    """No direction is so large that it can only be degrees."""
+    """Check that no direction is so large that it must be in degrees."""
     along = make_sweep(subject, name, 64)
     if not along and any(info.kind == "float" for info in subject.fields(name).values()):
         return  # which may hold any number
@@ -250,8 +254,9 @@ def directions_are_radians(subject: Subject, name: str) -> None:
 
 
 def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
-    """Where the number of points is in the header, frames with one point have as sound a direction
-    as others.
+    """Check that frames with one point have a valid direction.
+
+    Applies if the number of points is in the header.
     """
     engine = codec(subject.sensor.frames[name])
     source = random.Random(subject.sensor.id)
@@ -289,8 +294,9 @@ def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
 
 
 def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
-    """A frame with an angle of exactly 360 degrees, where it is plausible, has the points of the
-    one with 0.
+    """Check that an angle of exactly 360 degrees gives the same points as 0.
+
+    Applies if such a frame is plausible.
     """
     for path, info in _angles_of_points(subject, name).items():
         full = _full_circle(info)
@@ -321,9 +327,9 @@ def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
 
 
 def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
-    """With the angle on the wire, points turn from the vendor's axis at its zero to the other one.
+    """Check that points turn with the angle as the vendor's axes declare.
 
-    Golden vectors with points in two quadrants prove the sense better. It is noted in any case.
+    Golden vectors with points in two quadrants prove the sense better. It is reported in any case.
     """
     for path, info in _angles_of_points(subject, name).items():
         zero = _zero(info)
@@ -352,8 +358,9 @@ def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
 
 
 def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
-    """Which way angles run, 1 counter-clockwise, that begin at the azimuth `zero` on one axis and
-    go to the other; 0: nobody can tell.
+    """Return the sense of angles that begin at azimuth `zero` on one axis.
+
+    1 is counter-clockwise, -1 clockwise, 0 unknown.
     """
     x, y, _ = axis_matrix(axes)
     along = np.abs([x, y]) @ [np.cos(zero), np.sin(zero), 0]
@@ -366,8 +373,9 @@ def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
 
 
 def angles_are_in_order(subject: Subject, name: str) -> None:
-    """Along the sweep of a sensor that rotates, the azimuths of each laser go one way, also across
-    the full circle.
+    """Check that along the sweep the azimuths of each ring have one direction.
+
+    This includes the crossing of the full circle. Applies to sensors that rotate.
     """
     frames = make_sweep(
         subject,
@@ -419,7 +427,7 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
 
 
 def counters_run_on(subject: Subject, name: str) -> None:
-    """Along the sweep no packet counts as lost, late or doubled, and time does not run back."""
+    """Check that along the sweep no packet is lost, late or doubled, or back in time."""
     if name != subject.sensor.data_frame:
         return
     frames = make_sweep(
@@ -434,7 +442,7 @@ def counters_run_on(subject: Subject, name: str) -> None:
     if subject.sensor.sequence is not None:
         stats = read(
             subject, name, frames, by_clock=False
-        ).stats  # the clock would make up for the counter
+        ).stats  # the clock would compensate for the counter
         said = (
             f"along the sweep {stats.lost} packets are lost, {stats.late} late, {stats.duplicates}"
             " doubled"
@@ -458,7 +466,7 @@ def counters_run_on(subject: Subject, name: str) -> None:
 
 
 def _zero(info: FieldInfo) -> int | None:
-    """The raw value of no angle, nearly; None where the field is no angle or has none."""
+    """Return the raw value nearest to a zero angle; None if there is none."""
     if (
         info.kind != "int"
         or info.const is not None
@@ -481,7 +489,7 @@ def _angles_of_points(subject: Subject, name: str) -> dict[str, FieldInfo]:
     angles = {path: info for path, info in subject.fields(name).items() if info.unit in FULL_TURNS}
     try:
         result = trace_points(subject, name)
-    except Exception:  # a property of its own says what fails
+    except Exception:  # another property reports the failure
         return angles
     if result is None:
         return angles
@@ -491,7 +499,7 @@ def _angles_of_points(subject: Subject, name: str) -> dict[str, FieldInfo]:
 
 
 def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
-    """The raw values of no angle and of the full circle; None where the field cannot hold both."""
+    """Return the raw values of 0 and of the full circle; None if the field lacks one."""
     zero = _zero(info)
     if zero is not None:
         circle = (FULL_TURNS[info.unit] - info.offset) / info.scale
@@ -511,11 +519,12 @@ def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
 def _with_values(
     subject: Subject, name: str, path: str, values: tuple[int, ...]
 ) -> list[PointCloud]:
-    """The points of an example with each of these values in a field; none where no example can
-    carry them all, with as many points.
+    """Return the points of an example with each of these values in a field.
+
+    Returns an empty list if no example can hold all of them with the same number of points.
 
     Raises:
-        SpecError: where `points` fails on them.
+        SpecError: if `points` fails.
     """
     for seed in range(1, 1 + subject.scale_rounds(BASES, least=4)):
         parsed = subject.sensor.parse(subject.example(name, seed=seed), frame=name)
@@ -543,8 +552,9 @@ def _with_values(
 
 
 def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
-    """Which way points turned with a field, 1 counter-clockwise; 0 where they did not: a rate, or
-    another angle than the azimuth.
+    """Return the sense in which points turn with a field.
+
+    1 is counter-clockwise, -1 clockwise; 0 if they do not turn, as for a rate or an elevation.
     """
     moved = (turned.azimuth - nought.azimuth + np.pi) % (2 * np.pi) - np.pi
     most = float(max(moved[np.isfinite(moved)], key=abs, default=0)) / (
@@ -556,8 +566,9 @@ def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
 
 
 def _with(subject: Subject, name: str, path: str, value: int, parsed: Any) -> bytes:
-    """Return a frame with every element of one field of `parsed` set, which changes it; no bytes if
-    no frame can carry the value.
+    """Return the frame with every element of one field set; changes `parsed`.
+
+    Returns no bytes if no frame can hold the value.
     """
     for holder, key, own in list(material.integers(parsed)):
         if own == path:
@@ -570,8 +581,9 @@ def _with(subject: Subject, name: str, path: str, value: int, parsed: Any) -> by
 
 
 def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Metres from points, (n, 3), to the nearest surface of a room, (n,): nothing of the
-    simulator's own geometry is used.
+    """Return the distances in metres, (n,), of points, (n, 3), to surfaces of a room.
+
+    Does not use the simulator's geometry.
     """
     found = np.full(len(xyz), np.inf)
     for body in (room.walls, *room.boxes):
@@ -585,9 +597,7 @@ def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def half_step(subject: Subject, name: str) -> float:
-    """Half a step of the coarsest range field, at least what a header or a code word may widen it
-    to.
-    """
+    """Return half a step of the coarsest range field in metres, at least `UNTOLD`."""
     fields = subject.fields(name).values()
     metres = [
         abs(info.scale) * float(factor(info.unit, "m") or 0)
@@ -600,7 +610,7 @@ def half_step(subject: Subject, name: str) -> float:
 
 
 def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
-    """Packets simulated in a room decode to points on its walls, within the steps of the format."""
+    """Check that packets simulated in a room decode to points on its walls."""
     room = make_room(len(subject.sensor.id))
     room = Room(room.walls, room.boxes)
     is_long = subject.sensor.frames[name].max_length > LONG_FRAME_BYTES
@@ -624,7 +634,7 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
         subject.picture[f"{name}: rate"] = "nothing tells it"
     known = len(cloud) - 2 * len(cloud) // len(
         block.frames
-    )  # directions of the last packet may ask for what follows
+    )  # directions of the last packet may depend on the next one
     valid = cloud.valid[:known]
     share = float(valid.mean()) if known else 0.0
     require(

@@ -1,5 +1,6 @@
-"""The pytest plugin: fixtures for tests of sensors. It imports nothing of the engine before one of
-them is asked for.
+"""The pytest plugin: fixtures for tests of sensors.
+
+The engine is imported only when a fixture is used.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the marker known."""
+    """Register the marker `lidarspec`."""
     config.addinivalue_line(
         "markers",
         "lidarspec(sensor): the sensor that the `sensor` fixture gives: an id, a Sensor or a file",
@@ -50,11 +51,10 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
 
 @pytest.fixture
 def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Served]]:
-    """A function that puts a simulated sensor on a real port until the test ends:
-    `lidarspec.testing.fixtures.virtual_port`.
+    """Put a simulated sensor on a real port until the test ends.
 
-    Its first argument is an id or a Sensor; without one it is the test's own `sensor`. What comes
-    back has a `path` to open.
+    The fixture is a function: `lidarspec.testing.fixtures.virtual_port`. Its first argument is an
+    id or a Sensor, by default the test's own `sensor`. Its result has a `path` to open.
     """
     from lidarspec.testing import fixtures as ports
 
@@ -70,8 +70,9 @@ def virtual_port(request: pytest.FixtureRequest) -> Iterator[Callable[..., Serve
 
 @pytest.fixture
 def bare_registry() -> Iterator[Registry]:
-    """An empty registry in the place of that of this environment: no installed plugin is seen, and
-    `add` adds one.
+    """Replace the registry of this environment by an empty one.
+
+    No installed plugin is visible; `add` adds one.
     """
     from lidarspec.plugins import Registry, standing_in
 

@@ -46,17 +46,19 @@ def _no_device(subject: Subject) -> str:
 
 @dataclass(frozen=True)
 class Property:
-    """Something that has to hold.
+    """A property that must hold.
 
     Attributes:
-        function: of the subject, and of a name where it holds for each frame, data frame, command
+        function: takes the subject, and a name if it is tested for each frame, data frame, command
             or vector.
         each: "sensor", "frame", "data", "command" or "vector".
-        rule: that a plain assertion in it falls under.
-        lacks: why it does not apply to a sensor, "" where it does.
-        unless: rules that say it better; where one of them is broken, this is not looked at.
+        rule: the rule of a plain assertion in it.
+        lacks: returns the reason why it does not apply to a sensor, "" if it does.
+        unless: rules that describe the fault better; if one of them is violated, the property is
+            not tested.
         depends_on: attributes of a sensor that decide the result; if a related model that is tested
-            too has the same ones, it is not tested again. Without any it is tested for each sensor.
+            too has equal ones, the property is not tested again. If empty, it is tested for each
+            sensor.
     """
 
     function: Callable[..., None]
@@ -68,7 +70,7 @@ class Property:
 
     @property
     def name(self) -> str:
-        """The name of the property: that of its function."""
+        """The name of its function."""
         return self.function.__name__
 
     def cases(self, subject: Subject) -> Iterable[tuple[str, ...]]:
@@ -99,8 +101,10 @@ class Property:
     def findings(
         self, subject: Subject, watch: Callable[[str], None] = lambda text: None
     ) -> list[Finding]:
-        """Return the findings of every case that fails; `watch` is called with the name of each
-        case before it begins.
+        """Return the findings of every case that fails.
+
+        Args:
+            watch: called with the name of each case before it begins.
         """
         found = []
         for case in self.cases(subject):
@@ -124,10 +128,10 @@ class Property:
         return found
 
 
-#: rules that a plugin breaks which fails at work.
+#: Rules that are violated by a plugin that fails on valid frames.
 FAILS = ("LS213", "LS214", "LS215", "LS414")
 
-#: attributes that decide how a stream is read.
+#: Attributes that decide the result of decoding a stream.
 READING = ("frames", "datagrams", "data_frame", "points", "clock", "sequence", "scan", "state")
 
 PROPERTIES = (
@@ -246,7 +250,7 @@ PROPERTIES = (
 
 
 def _gist(error: BaseException) -> str:
-    """The last line that says something."""
+    """Return the most informative line of an error."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     if lines:
         if "Traceback" in str(error):
@@ -262,8 +266,9 @@ def _rule_of(error: SpecError) -> str:
 
 
 def _unexpected_error(error: Exception, path: str, subject: Subject) -> Finding:
-    """The finding for an exception that nobody documented, at the plugin's own line where it comes
-    from one.
+    """Return the finding for an undocumented exception.
+
+    Its location is the plugin's own line if the exception was raised there.
     """
     spots = [spot for spot in traceback.extract_tb(error.__traceback__) if not _ours(spot.filename)]
     spot = spots[-1] if spots else None
@@ -279,7 +284,7 @@ def _unexpected_error(error: Exception, path: str, subject: Subject) -> Finding:
 
 
 def _ours(file: str) -> bool:
-    """Whether a file is the engine's, or a library's that it stands on."""
+    """Return whether a file belongs to the engine or one of its libraries."""
     package = Path(__file__).resolve().parents[1]
     return package in Path(file).parents or any(
         part in Path(file).parts for part in ("construct", "numpy", "hypothesis", "_pytest")

@@ -27,7 +27,7 @@ BATCH_SIZES = (1, 3)
 
 
 def a_clean_input_loses_nothing(subject: Subject) -> None:
-    """Frames back to back are found as they are, with every byte."""
+    """Check that frames back to back are found unchanged, with every byte."""
     sent = subject.conversation()
     data = material.delivery(subject.sensor, sent)
     found = [(item.frame, item.data) for item in subject.sensor.split(data)]
@@ -57,7 +57,7 @@ def _loss(sent: list[tuple[str, bytes]], found: list[tuple[str, bytes]]) -> Viol
 
 
 def the_same_bytes_give_the_same_points(subject: Subject) -> None:
-    """Decoding the same bytes twice gives the same points.
+    """Check that decoding the same bytes twice gives the same points.
 
     `points` is called for each run: the plan of a traced function would not call it again.
     """
@@ -75,7 +75,7 @@ def the_same_bytes_give_the_same_points(subject: Subject) -> None:
 
 
 def scans_do_not_depend_on_batches(subject: Subject) -> None:
-    """Scans are cut alike, with the same points, however many packets come at a time."""
+    """Check that scans do not depend on the number of packets that arrive at a time."""
     for rounds in (None, MORE_ROUNDS):
         data = material.delivery(subject.sensor, subject.conversation(rounds=rounds))
         found = subject.sensor.split(data)
@@ -96,7 +96,7 @@ def scans_do_not_depend_on_batches(subject: Subject) -> None:
 
 
 def _scans_in_batches(sensor: Sensor, found: list[Found], size: int) -> list[Scan]:
-    """Return the scans of frames that come `size` at a time."""
+    """Return the scans of frames that arrive `size` at a time."""
     stats = Decoder(sensor, stream=True).stats
     stream = PacketStream(sensor, sensor.data_frame, stats)
     starts = range(0, len(found), size)
@@ -107,5 +107,5 @@ def _scans_in_batches(sensor: Sensor, found: list[Found], size: int) -> list[Sca
 
 
 def _cut(scan: Scan) -> tuple[int, bool, bool]:
-    """Return how many points a scan has, and whether it is whole and complete."""
+    """Return the number of points of a scan, and whether it is whole and complete."""
     return len(scan), scan.whole, scan.complete

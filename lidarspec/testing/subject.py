@@ -1,9 +1,7 @@
-"""A sensor under test, and what it is fed: conversations out of its own examples, their edits, cuts
-and noise.
+"""A sensor under test, with its examples, their edits and truncated copies.
 
-A `Subject` has the sensor, its examples (drawn by the author's own strategies where there are some)
-and what was measured along the way. Everything that is drawn is seeded, so that what fails once
-fails again.
+A `Subject` has the sensor, its examples (drawn by the author's own strategies if there are any)
+and measured values. All random values are seeded, so that a failure can be repeated.
 """
 
 from __future__ import annotations
@@ -20,14 +18,14 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
-#: Bytes up to which a frame is cut at every byte.
+#: Maximum length in bytes of a frame that is cut at every byte.
 SHORT = 300
-#: Random places at which a longer frame is cut, beside both ends.
+#: Number of random offsets at which a longer frame is cut, besides both ends.
 SPOTS = 50
 
 
 def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
-    """Frames as the data link delivers them: datagrams, or one run of bytes."""
+    """Return frames as the data link delivers them: datagrams, or one run of bytes."""
     parts = [data for _, data in frames]
     if sensor.datagrams:
         return parts
@@ -35,23 +33,23 @@ def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
 
 
 def places(length: int, source: random.Random, spots: int = SPOTS) -> list[int]:
-    """Where to cut so many bytes: everywhere if they are few, else at the ends and at random."""
+    """Return offsets at which to cut: all of few, else both ends and random ones."""
     if length <= SHORT * spots // SPOTS:
         return list(range(length))
     ends = {0, 1, 2, 3, length - 2, length - 1} & set(range(length))
     return sorted({*ends, *source.sample(range(length), min(spots, length))})
 
 
-#: Bytes of the chunks that a stream is cut into, and their mean.
+#: Sizes in bytes of the chunks that a stream is cut into, and their mean.
 CHUNKS = (0, 1, 1, 2, 3, 7, 20, 100, 1000)
 MEAN_CHUNK = sum(CHUNKS) / len(CHUNKS)
 
 
 def pieces(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes]:
-    """Yield the bytes in chunks of random sizes, empty ones among them.
+    """Yield the bytes in chunks of random sizes, including empty ones.
 
     Args:
-        scale: by which the sizes are multiplied.
+        scale: factor of the sizes.
     """
     start = 0
     while start < len(data):
@@ -63,13 +61,14 @@ def pieces(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes
 def mutate(
     data: bytes, source: random.Random, words: Sequence[bytes] = (), spots: Sequence[int] = ()
 ) -> bytes:
-    """The bytes with a few of them changed, dropped, doubled or put in, or cut short.
+    """Return a copy of the bytes with a few random changes.
+
+    Bytes are changed, dropped, doubled, inserted, or overwritten.
 
     Args:
-        words: what is put in or written over as a whole, such as values at the edge of a range, or
-            pieces of other inputs.
-        spots: where half of the changes are made, such as the offsets of fields; without them
-            anywhere.
+        words: byte strings that are inserted or written over as a whole, such as values at the edge
+            of a range, or pieces of other inputs.
+        spots: offsets for half of the changes, such as those of fields; by default all are random.
     """
     found = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
@@ -97,8 +96,10 @@ def mutate(
 def integers(
     parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)
 ) -> Iterator[tuple[Any, Any, str]]:
-    """The integers, or the values of other types, of a parsed frame: (container, key in it, field
-    path).
+    """Yield the integers of a parsed frame: (container, key in it, field path).
+
+    Args:
+        kinds: the types of the values.
     """
     entries: Iterable[tuple[Any, Any]] = (
         parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
@@ -117,8 +118,9 @@ def integers(
 
 
 def physical(sensor: Sensor, name: str, data: bytes) -> Any:
-    """A parsed frame with its scaled numbers in units; None where one is too wide for a float to
-    hold exactly.
+    """Return a parsed frame with its scaled numbers in units.
+
+    Returns None if a number is too wide to be exact as a float.
     """
     fields = codec(sensor.frames[name]).schema.all_fields
     parsed = sensor.parse(data, frame=name)
@@ -139,7 +141,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
 
 
 def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
-    """The fields of a frame that hold a checksum, and so are not the caller's."""
+    """Return the fields of a frame that hold a checksum, which callers do not set."""
     engine = codec(sensor.frames[name])
     layout = getattr(engine, "tree", None)
     if layout is None or engine.schema.parts:
@@ -153,23 +155,22 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
 
 
-#: examples of each frame type that a property tries, and those for which numbers of rounds are
-#: stated.
+#: Default number of examples of each frame type for each property; numbers of rounds refer to it.
 USUAL_EXAMPLES = 40
-#: Rounds of a conversation with the usual number of examples.
+#: Default number of rounds of a conversation.
 USUAL_ROUNDS = 3
-#: Rounds of a conversation, at least.
+#: Minimum number of rounds of a conversation.
 LEAST_ROUNDS = 2
 EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", USUAL_EXAMPLES))
-#: sensors with more frame types than this are tried with less of each.
+#: Number of frame types above which fewer examples of each are used.
 MANY = 8
-#: bytes of the examples of one frame type that a property tries: of long frames fewer are tried.
+#: Maximum total bytes of the examples of one frame type that a property uses.
 EXAMPLE_BYTES = 300_000
-#: bytes after which no further round of a conversation begins.
+#: Number of bytes after which no further round of a conversation begins.
 CONVERSATION_BYTES = 500_000
-#: seeds of the examples that tell how long frames are.
+#: Number of examples that measure the length of frames.
 MEASURED_SEEDS = 3
-#: values that are drawn from a hypothesis strategy.
+#: Number of values that are drawn from a hypothesis strategy.
 POOL = 60
 
 
@@ -178,19 +179,19 @@ class Subject:
     """A sensor under test.
 
     Attributes:
-        sensor: it.
-        examples: how many examples of each frame type a property tries.
-        strategies: "frame.field" -> how its raw value is drawn: a hypothesis strategy, or a
-            function of `random.Random`.
-        vectors: the file of golden vectors, None where there is none.
-        family: the ids of the sensors that share that file; none where it is this sensor's alone.
-        tested: related models that are tested too; frame types that they share are not tested one
-            by one again.
-        measured: what was measured of frames, in words, by what it is of.
-        picture: what was measured of points, likewise: to be held against the manual.
-        traced: what `points` returns for traced columns of each data frame, as far as it could be
-            traced.
-        placed: data frames of which golden vectors place points in two quadrants.
+        sensor: the sensor.
+        examples: number of examples of each frame type for each property.
+        strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
+            `random.Random`.
+        vectors: the file of golden vectors, None if there is none.
+        family: the ids of the sensors that share that file; empty if it belongs to this sensor
+            alone.
+        tested: related models that are tested too; frame types that they share are not tested
+            separately again.
+        measured: measured values of frames as text, by what they describe.
+        picture: measured values of points, likewise, to be compared with the manual.
+        traced: the result of `points` for traced columns of each data frame that could be traced.
+        placed: data frames with golden vectors that place points in two quadrants.
         swept: packets along the `sweep` of each data frame, as far as a property needed them.
     """
 
@@ -212,7 +213,7 @@ class Subject:
 
     @property
     def frames(self) -> dict[str, Frame]:
-        """The frame types that are tested one by one."""
+        """The frame types that are tested separately."""
         tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
         return {
             name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
@@ -220,10 +221,10 @@ class Subject:
 
     @property
     def commands(self) -> list[str]:
-        """The commands that are tested one by one.
+        """The commands that are tested separately.
 
-        A related model that is tested too may have the same command with the same frames, links
-        and answers.
+        A command is left out if a related model that is tested too has the same one, with the same
+        frames, links and answers.
         """
         return [
             name
@@ -232,17 +233,17 @@ class Subject:
         ]
 
     def fields(self, frame: str) -> Mapping[str, FieldInfo]:
-        """The fields of a frame type, by path."""
+        """Return the fields of a frame type, by path."""
         return codec(self.sensor.frames[frame]).schema.all_fields
 
     def source(self, purpose: str = "") -> random.Random:
-        """Random numbers of this sensor's own for one purpose, the same in every run."""
+        """Return a random generator for one purpose, the same in every run."""
         return random.Random(f"{self.sensor.id} {purpose}")
 
     def seeds(self, name: str, share: float = 1.0) -> range:
-        """Return the seeds of the examples of a frame type that are tried.
+        """Return the seeds of the examples of a frame type that are used.
 
-        They are fewer for long frames, since each field takes its time, and if the sensor has many
+        There are fewer for long frames, since each field takes time, and if the sensor has many
         frame types.
         """
         few = 8 if self.sensor.frames[name].max_length > SHORT else 1
@@ -252,24 +253,26 @@ class Subject:
     def limit_to_bytes(
         self, name: str, number: int, total: int = EXAMPLE_BYTES, least: int = 1
     ) -> int:
-        """Return how many of `number` frames of a type are tried, so that they have at most `total`
-        bytes, or are the `least`.
+        """Return how many of `number` frames of a type to use.
+
+        Args:
+            total: maximum number of their bytes.
+            least: minimum number of frames.
         """
         return min(number, max(total // self.length(name), least))
 
     def length(self, name: str) -> int:
-        """Return how long frames of a type are: the longest of a few examples, in bytes."""
+        """Return the length in bytes of the longest of a few examples of a type."""
         return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
 
     def scale_rounds(self, rounds: int, least: int = 1) -> int:
-        """Return a number of rounds that is meant for the usual number of examples, scaled to
-        `examples`.
-        """
+        """Scale a number of rounds from the default number of examples to `examples`."""
         return max(rounds * self.examples // USUAL_EXAMPLES, least)
 
     def example(self, frame: str, *, seed: int = 0) -> bytes:
-        """The bytes of a valid frame with seeded content, drawn by the author's strategies where
-        there are some.
+        """Return the bytes of a valid frame with seeded content.
+
+        It is drawn by the author's strategies if there are any.
         """
         if (frame, seed) not in self._known:
             drawn = self.drawers(frame)
@@ -282,7 +285,7 @@ class Subject:
         return self._known[frame, seed]
 
     def drawers(self, frame: str) -> dict[str, Callable[[random.Random], int]]:
-        """How raw values of fields of this frame are drawn, by path, where the author says so."""
+        """Return the author's functions for raw values of fields of this frame, by path."""
         if frame not in self._drawers:
             mine = {
                 path.removeprefix(f"{frame}."): how
@@ -296,8 +299,9 @@ class Subject:
         return self._drawers[frame]
 
     def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
-        """Frames of all incoming types as the sensor could send them: (type, bytes), each where it
-        is looked for and believed.
+        """Return frames of all incoming types in a possible order, as (type, bytes).
+
+        Each has the frames before it that it needs to be accepted.
         """
         frames: list[tuple[str, bytes]] = []
         size = 0
@@ -314,7 +318,7 @@ class Subject:
                     number = 1
                 first = (
                     seed * 1000 + turn * number
-                )  # the lowest seeds, whose examples other properties use as well
+                )  # the lowest seeds, since other properties use their examples as well
                 if frame.after is not None:
                     frames.append((frame.after, self.example(frame.after, seed=first)))
                 frames += [
@@ -324,12 +328,12 @@ class Subject:
         return frames
 
     def stream(self, *, seed: int = 0, rounds: int | None = None) -> bytes:
-        """The bytes of a conversation."""
+        """Return the bytes of a conversation."""
         return b"".join(data for _, data in self.conversation(seed=seed, rounds=rounds))
 
 
 def _has_same_exchange(one: Sensor, other: Sensor, name: str) -> bool:
-    """Return whether a command of one sensor and its reply are those of another sensor too."""
+    """Return whether a command and its reply are equal in two sensors."""
     command = one.commands[name]
     if other.commands.get(name) != command:
         return False
@@ -343,7 +347,10 @@ def _has_same_exchange(one: Sensor, other: Sensor, name: str) -> bool:
 
 
 def _make_pool(strategy: Any) -> Callable[[random.Random], int]:
-    """Values of a hypothesis strategy, the same in every run."""
+    """Return a function that chooses from values of a hypothesis strategy.
+
+    The values are the same in every run.
+    """
     from hypothesis import HealthCheck, Phase, given, settings
 
     pool: list[int] = []

@@ -1,19 +1,18 @@
-"""Golden vectors: frames out of a manual or a capture, and what they mean, from a JSON file.
+"""Golden vectors: a JSON file of frames from a manual or a capture.
 
     [{"source": "manual 3.2, page 7", "frame": "data", "hex": "54 2c ...",
       "values": {"speed": 3600, "points[0].distance": 224},
       "units": {"start_angle": 324.27},
       "points": {"0": {"range": 0.224, "x": 0.18186, "y": 0.13078}}}]
 
-`values` are raw integers of the wire, `units` the same in the fields' units, `points` what becomes
-of single points (range, x, y, z, azimuth and elevation in radians, intensity, ring, or a further
-column under its name). All three may be left out: then the bytes have to be such a frame, and build
-again. `sensor` is the id, or a list of ids, of the sensors that an entry is of; where one sensor
-alone has the file, it may be left out. An entry with `command` is what is sent for a command with
-`args`, by name in units; `reply` is what answers it.
+`values` are raw integers, `units` physical values in the fields' units, `points` columns of single
+points (range, x, y, z, azimuth and elevation in radians, intensity, ring, or a further column). All
+three may be omitted: then the bytes have to be such a frame, and to be built again. `sensor` is the
+id, or a list of ids, of the sensors of an entry; it may be omitted if the file belongs to one
+sensor alone. An entry with `command` is the frame of a command with `args`, by name in units;
+`reply` is its reply.
 
-What the vectors leave open is looked at as well: a status that claims more than there is, and
-fields of the data that none pins down.
+Gaps in the vectors are checked as well: a status without vectors, and data fields without a value.
 """
 
 from __future__ import annotations
@@ -41,22 +40,22 @@ from lidarspec.testing.subject import SHORT, Subject, seals
 from lidarspec.transports.hexadecimal import parse_hex
 from lidarspec.trust import document
 
-#: what a point may differ by: metres and radians as manuals print them.
+#: Tolerance of points in metres and radians, as manuals print them.
 NEAR = 2e-4
-#: examples whose layouts are searched for checksums.
+#: Number of examples whose layouts are searched for checksums.
 LAYOUT_EXAMPLES = 8
-#: names of fields that hold a checksum.
+#: Names of fields that hold a checksum.
 CHECK = re.compile(
     r"(\w+_)?(crc|checksum|check_?sum|check|chk|chksum|cksum|cs|bcc|lrc|fcs|xor|sum)_?(8|16|32)?(_(lo|hi|low|high|lsb|msb))?"
 )
-#: How the remark on a checksum begins that cannot be checked, because it is not documented.
+#: Beginning of the remark on a checksum that cannot be checked, because it is not documented.
 NOT_CHECKED = "not checked"
-#: doubt at which a field of any other name can only be a checksum: one wrong guess in four thousand
-#: looks like that.
+#: Bits of evidence above which a field of any other name must be a checksum: one of 4096 wrong
+#: guesses reaches it.
 PROVEN = 12
-#: names of fields that say nothing, and have nothing to be pinned down to.
+#: Names of fields without a meaning, for which no vector is needed.
 IDLE = re.compile(r"reserved|unused|unknown|spare|padding|filler", re.IGNORECASE)
-#: more than any field of the wire holds.
+#: A number larger than any field.
 _HUGE = 1 << 65
 
 
@@ -82,7 +81,7 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str)
 
 
-#: the keys of an entry -> what may stand there, in words and as a test.
+#: Key of an entry -> description and test of its value.
 KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
     "sensor": (
         "an id, or a list of ids",
@@ -100,12 +99,10 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
 
 
 def vectors_hold(subject: Subject, only: str = "") -> None:
-    """Each golden vector parses to its values, builds again, and has its points where they are said
-    to be.
+    """Check that each golden vector has its values, its points, and is built again.
 
     Args:
-        only: the place of the one vector that is tried; by default all are, up to the first that
-            fails.
+        only: the key of one vector; by default all are checked, up to the first failure.
     """
     read_entries = _read_entries(subject)
     chosen = {only: read_entries[only]} if only else read_entries
@@ -141,8 +138,9 @@ def vectors_hold(subject: Subject, only: str = "") -> None:
 
 
 def lacking(subject: Subject) -> str:
-    """Why there are no vectors of this sensor; "" where there are, and where `vectors_hold` says
-    what is wrong with them.
+    """Return the reason why there are no vectors of this sensor.
+
+    Returns "" if there are any, or if `vectors_hold` reports their faults.
     """
     if subject.vectors is None:
         return "there is no file of golden vectors"
@@ -155,7 +153,10 @@ def lacking(subject: Subject) -> str:
 
 
 def places(subject: Subject) -> list[str]:
-    """Return the places of the sensor's vectors in their file; a single "" if it cannot be read."""
+    """Return the keys of the sensor's vectors in their file.
+
+    Returns a single "" if the file cannot be read.
+    """
     try:
         return list(_read_entries(subject))
     except Violation:
@@ -163,9 +164,9 @@ def places(subject: Subject) -> list[str]:
 
 
 def the_status_is_proven(subject: Subject) -> None:
-    """A sensor that is said to be proven by vectors has some.
+    """Check that a sensor with the status "vectors" has some.
 
-    A capture may be too large, or of others: the `source` of the sensor names it.
+    A capture may be too large, or not ours to publish: the `source` of the sensor names it.
     """
     missing = lacking(subject)
     status = subject.sensor.status
@@ -173,7 +174,7 @@ def the_status_is_proven(subject: Subject) -> None:
 
 
 def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
-    """Each field of a data frame with vectors has a nonzero value in a vector."""
+    """Check that each field of a data frame with vectors has a nonzero value in one."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     if not vectors:
         return
@@ -199,9 +200,7 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
 
 
 def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
-    """Points that the vectors place lie in two quadrants at least, and all points of their frames
-    within the sensor's reach.
-    """
+    """Check that the vectors place points in two quadrants and within the range."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     placed = [
         point
@@ -240,9 +239,10 @@ def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
 
 
 def every_checksum_is_checked(subject: Subject, name: str) -> None:
-    """No field outside a `Checksummed` is a checksum by its name, or by a search over the vectors.
+    """Check that no field outside a `Checksummed` is a checksum.
 
-    A field may have a remark that it is not checked, unless the search finds its algorithm.
+    A checksum is recognised by its name, or by a search over the vectors. A field may have a remark
+    that it is not checked, unless the search finds its algorithm.
     """
     sealing = _sealing_fields(subject, name)
     free = [
@@ -258,11 +258,11 @@ def every_checksum_is_checked(subject: Subject, name: str) -> None:
             for vector in entries(subject).values()
             if vector["frame"] == name
         ]
-    except Violation:  # said by `vectors_hold`
+    except Violation:  # reported by `vectors_hold`
         frames = []
     is_told = isinstance(
         codec(subject.sensor.frames[name]), CompiledCodec
-    )  # else nobody says which field a checksum would stand in
+    )  # otherwise the offset of a checksum has no field
     for match in _common(frames) if is_told and not sealing else []:
         path = _standing(subject, name, match, frames[0])
         if path in (named or free) and (named or match.doubt >= PROVEN):
@@ -280,8 +280,9 @@ def every_checksum_is_checked(subject: Subject, name: str) -> None:
 
 
 def _sealing_fields(subject: Subject, name: str) -> set[str]:
-    """Return the fields that hold a checksum in any of several examples, since a header may leave a
-    part out with its checksum.
+    """Return the fields that hold a checksum in any of several examples.
+
+    A header may remove a part together with its checksum.
     """
     if not any(isinstance(node, Sealed) for node in nodes(subject.sensor.frames[name].tree)):
         return set()
@@ -296,11 +297,10 @@ def _sealing_fields(subject: Subject, name: str) -> set[str]:
 def _fitting(
     subject: Subject, name: str, path: str, frames: list[bytes], frame: bytes
 ) -> list[Match]:
-    """Return the checksums that fit frames and stand in the field at `path` of one of them, as wide
-    as it is.
+    """Return the checksums that match frames and lie in the field at `path`.
 
-    If some are of the library, those that need a class of their own are left out: they fit because
-    these do.
+    If some are of the library, those that need a class of their own are left out: they match only
+    because these do.
     """
     engine = codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
@@ -327,7 +327,7 @@ def _needs_class(match: Match) -> bool:
 
 
 def _in_words(match: Match, length: int) -> str:
-    """A checksum that fits, what it covers, and the byte order of its field."""
+    """Describe a checksum, its coverage, and the byte order of its field."""
     if match.place.size > 1:
         order = f", in a field that is {match.order}-endian,"
     else:
@@ -340,8 +340,9 @@ def _in_words(match: Match, length: int) -> str:
 
 
 def _common(frames: list[bytes]) -> list[Match]:
-    """The checksums that fit all of some frames; long ones are searched one by one, for what stands
-    where checksums usually do.
+    """Return the checksums that match all frames.
+
+    Long frames are searched one by one, at the usual offsets only.
     """
     if max(map(len, frames), default=0) <= SHORT:
         return search(frames)
@@ -357,7 +358,7 @@ def _common(frames: list[bytes]) -> list[Match]:
 
 
 def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
-    """The field that a checksum stands in; "" where that cannot be told."""
+    """Return the field that holds a checksum; "" if it cannot be determined."""
     engine = codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
         layout = engine.tree.layout(frame)
@@ -376,7 +377,7 @@ def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
 
 
 def entries(subject: Subject) -> dict[str, Any]:
-    """Return the valid vectors of the sensor by their places in the file.
+    """Return the valid vectors of the sensor by their keys.
 
     Raises:
         Violation: if the file cannot be read.
@@ -389,8 +390,9 @@ def entries(subject: Subject) -> dict[str, Any]:
 
 
 def _read_entries(subject: Subject) -> dict[str, Any]:
-    """Return the vectors of the sensor by their places in the file; for an entry that is none, its
-    `Violation`.
+    """Return the vectors of the sensor by their keys.
+
+    An invalid entry is represented by its `Violation`.
     """
     if subject.vectors is None:
         return {}
@@ -412,10 +414,10 @@ def _read_entries(subject: Subject) -> dict[str, Any]:
 
 
 def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
-    """Return whether an entry is of the sensor; fill in the frame of one with a command.
+    """Return whether an entry belongs to the sensor; set the frame of a command.
 
     Raises:
-        Violation: for an entry that is no vector.
+        Violation: for an invalid entry.
     """
     require(isinstance(vector, dict), "LS702", "it is no object", place)
     unknown = sorted(vector.keys() - KEYS.keys())
@@ -445,8 +447,10 @@ def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
 
 
 def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
-    """Whether an entry is of the sensor; one that could be of nobody, or of any of several, is a
-    finding.
+    """Return whether an entry belongs to the sensor.
+
+    Raises:
+        Violation: if it names no sensor of several, or an unknown one.
     """
     named = vector.get("sensor", [])
     family = subject.family
@@ -467,7 +471,7 @@ def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
 
 
 def _parse_vector(subject: Subject, name: str, data: bytes, place: str) -> Any:
-    """The vector parsed; where its checksum is at fault, the ones that would fit are named."""
+    """Return the parsed vector; a wrong checksum is reported with those that match."""
     try:
         return subject.sensor.parse(data, frame=name)
     except WireError as error:
@@ -487,7 +491,7 @@ def _parse_vector(subject: Subject, name: str, data: bytes, place: str) -> Any:
 def _values(
     subject: Subject, name: str, data: bytes, parsed: Any, vector: Mapping[str, Any], place: str
 ) -> None:
-    """Hold the fields of a vector to its values, raw and in units."""
+    """Compare the fields of a vector with its raw and physical values."""
     fields = subject.fields(name)
     found = dict(leaves(parsed))
     wanted = [(path, value, False) for path, value in vector.get("values", {}).items()]
@@ -525,7 +529,7 @@ def _values(
 
 
 def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
-    """The rule that a wrong integer falls under: byte order, sign, or another value."""
+    """Return the rule of a wrong integer: byte order, sign, or another value."""
     if info is None or info.kind != "int" or not isinstance(wanted, int) or not info.bits:
         return "LS706"
     top = 1 << info.bits
@@ -541,7 +545,7 @@ def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
 def _points(
     subject: Subject, name: str, data: bytes, wanted: Mapping[str, Mapping[str, float]], place: str
 ) -> None:
-    """Hold single points of a vector's frame to where they are said to be."""
+    """Compare single points of a vector's frame with their expected columns."""
     cloud = read(subject, name, [data] * subject.sensor.frames[name].confirm).points()
     known = cloud.columns.keys() - {"time"}
     for index, columns in wanted.items():
