@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Frames
-from lidarspec.packets.clocks import ClockReference, told_seconds
+from lidarspec.packets.clocks import ClockReference, readings_of, told_seconds
 from lidarspec.sensor_operations import Sensor
 
 #: bytes of a file to search for a frame type that could tell the turn of the clock.
@@ -82,10 +82,13 @@ def _find_reference(
     assert sensor.clock is not None
     table = codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:
-        told = np.isfinite(told_seconds(sensor.clock, table))
+        told = told_seconds(sensor.clock, table)
+        readings = readings_of(sensor, table)
     except Exception:
         return None  # reported when the packets are decoded
-    if not told.any():
+    known = np.flatnonzero(np.isfinite(told))
+    if not len(known):
         return None
-    row = int(rows[told.argmax()])
-    return ClockReference(frames.data(row), max(int(frames.at[row]), 0))
+    first = known.item(0)
+    host_ns = max(frames.at.item(rows.item(first)), 0)
+    return ClockReference(readings.item(first), told.item(first), host_ns)

@@ -15,7 +15,6 @@ from lidarspec.expressions.graph import header_function
 from lidarspec.frames.arrays import alike, repeated
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
-from lidarspec.framing.frame_engine import codec
 from lidarspec.spec.fields import factor
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock
@@ -73,16 +72,18 @@ class Unwrapper:
 
 @dataclass(frozen=True)
 class ClockReference:
-    """A frame with the turn of a clock (`Clock.told`).
+    """The turn of a clock as a frame told it (`Clock.told`).
 
     It is found before the packets that it applies to.
 
     Attributes:
-        data: its bytes.
+        reading_ns: what the clock read in the frame.
+        told_s: the seconds since 1970 that the frame told.
         host_ns: when it arrived, ns since 1970; 0 if unknown.
     """
 
-    data: bytes
+    reading_ns: int
+    told_s: float
     host_ns: int
 
 
@@ -141,7 +142,7 @@ class Epoch:
             return repeated(0, len(times))
         row = int(np.isfinite(told).argmax())
         first = int(np.searchsorted(which, rows[row]))
-        reading = self._reading_of(frames, row)
+        reading = readings_of(self._sensor, frames).item(row)
         complete = self._complete(reading, told.item(row))
         self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
         if whole or not first:
@@ -152,17 +153,10 @@ class Epoch:
         self, reference: ClockReference, reading: int, time: int, host: int
     ) -> int:
         """Return the offset of times, from readings in a packet and the reference."""
-        table = codec(self._sensor.frames[self.frame]).table([reference.data])
-        told = told_seconds(self._clock, table)
-        reading_there = self._reading_of(table, 0)
-        passed = self._short(reading_there - reading)
+        passed = self._short(reference.reading_ns - reading)
         if host and reference.host_ns:
             passed += round((reference.host_ns - host - passed) / self._turn) * self._turn
-        return self._complete(reading_there, told.item(0)) - time - passed
-
-    def _reading_of(self, table: Table, row: int) -> int:
-        """Return what the clock reads in a frame that tells the turn."""
-        return clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_))).item(row)
+        return self._complete(reference.reading_ns, reference.told_s) - time - passed
 
     def _complete(self, reading: int, told: float) -> int:
         """Return the reading in the turn that is nearest to the seconds told."""
@@ -179,6 +173,11 @@ def told_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
     frames = Batch(table, np.zeros(len(table), np.bool_))
     seconds = np.asarray(clock.told[1](Fields(frames)), np.float64)
     return np.broadcast_to(seconds.reshape(-1), (len(table),))
+
+
+def readings_of(sensor: SensorDescription, table: Table) -> Times:
+    """Return what the clock reads in frames that tell its turn, (n,) ns."""
+    return clock_ns(sensor, Batch(table, np.zeros(len(table), np.bool_)))
 
 
 def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
