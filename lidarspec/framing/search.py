@@ -31,8 +31,6 @@ from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
 #: bytes from one change of what is looked for to the next, at which a piece ends there, and the
 #: next one is judged for what follows alone.
 MIN_STAY_BYTES = 1 << 12
-#: the last frames of a piece that show whether the next piece is regular.
-REGULAR_FRAMES = 64
 
 
 def leftmost(
@@ -213,11 +211,11 @@ def _rows_of(runs: Offsets) -> Offsets:
 
 
 def _remember_size(mode: SearchState, frames: Frames, since: int) -> None:
-    """Store the regularity of the last frames for the next piece.
+    """Store the regularity of the frames for the next piece.
 
     Only frames since the last change of the mode count.
     """
-    own = frames.starts[frames.starts.searchsorted(since) :][-REGULAR_FRAMES:]
+    own = frames.starts[frames.starts.searchsorted(since) :]
     if len(own):
         mode.size = frames.sizes.item(-1)
         mode.steady = own.item(-1) - own.item(0) == mode.size * (len(own) - 1)
