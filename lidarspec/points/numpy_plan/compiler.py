@@ -104,7 +104,7 @@ class Compiler:
         name = node.function.__name__
         if node.function in (np.cos, np.sin):
             return self._direction(node.function, node.args[0])
-        is_offset = node.function is np.add and any(map(_is_known, node.args))
+        is_offset = node.function is np.add and any(not isinstance(arg, Node) for arg in node.args)
         if node.function is np.multiply or is_offset:
             first, second = (self._factor(arg) for arg in node.args)
             return self.program.call(name, "single", node.function, first, second)
@@ -382,11 +382,6 @@ class Compiler:
             out.reshape(-1, *shape)[...] = deep(execution.part(execution.values(value)), depth)
 
         return self.program.step("computed plainly before", kind, run)
-
-
-def _is_known(value: Any) -> bool:
-    """Return whether a value is a number, an array, or rows of a table."""
-    return not isinstance(value, Node) or value.kind == "rows"
 
 
 def _constant(value: Any) -> Callable[[Run], Any]:
