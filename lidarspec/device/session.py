@@ -89,11 +89,13 @@ class Reply:
             for info in self.fields.values()
             if info.const is None and found_at(self.values, info.path) is not _MISSING
         ]
-        shown_fields = [
+        told = [
             f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}"
             for info in free[:SHOWN]
         ]
-        return f"Reply({self.command}, {self.frame}: {', '.join(shown_fields)}{', ...' * (len(free) > SHOWN)})"
+        return (
+            f"Reply({self.command}, {self.frame}: {', '.join(told)}{', ...' * (len(free) > SHOWN)})"
+        )
 
 
 class Pending:
