@@ -1,7 +1,7 @@
-"""What a notebook shows of our values: IPython asks a value for it, and the value asks what draws
-it, which stands above all values.
+"""The methods with which notebooks display values.
 
-Nothing of that is imported before somebody asks.
+IPython calls a method of the value, and the method calls a function of `lidarspec.view.notebook`.
+That module depends on all values, so it is only imported when a value is displayed.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ DRAWING = "lidarspec.view.notebook"
 
 
 def drawn(kind: str) -> Callable[[Any], str | None]:
-    """A method that gives what the function of this name in `lidarspec.view.notebook` makes of the
-    value; None where it shows as text.
+    """Return a method that displays a value with the function of this name.
+
+    The method returns None if the value is displayed as text.
     """
 
     def representation(value: Any) -> str | None:

@@ -1,9 +1,9 @@
-"""Errors, by whose fault they are.
+"""Exceptions, by fault.
 
-``SpecError`` is the plugin author's, ``WireError`` the bytes', ``UsageError`` the caller's,
-``SourceError`` the system's, ``CommandError`` the device's. Noise on a stream is none of them:
-decoders count it. Each error builds its own text from typed arguments, so that the place of a fault
-can be read from the exception as well as from the text.
+``SpecError`` is the fault of a plugin's author, ``WireError`` of the bytes, ``UsageError`` of the
+caller, ``SourceError`` of the system, ``CommandError`` of the device. Noise on a stream is not an
+error: decoders count it. Each exception builds its message from typed arguments, so that programs
+can read the details from its attributes.
 """
 
 from __future__ import annotations
@@ -17,18 +17,20 @@ from typing import Any, TypeVar
 
 
 class LidarSpecError(Exception):
-    """The base of every exception that lidarspec raises on purpose; any other one that leaves it is
-    a bug.
+    """The base of every exception that lidarspec raises on purpose.
+
+    Any other exception is a bug.
     """
 
 
 class SpecError(LidarSpecError):
-    """The description of a sensor is wrong or cannot be used: the fault of the plugin's author.
+    """A sensor's description is wrong: the fault of the plugin's author.
 
     Attributes:
-        path: field path or name of the place in the spec, "" where it concerns the whole.
-        reason: what is wrong there.
-        rule: the code under which `lidarspec check` explains it, "" where it has none of its own.
+        path: field path or name of the part of the spec, "" for the whole.
+        reason: the fault.
+        sensor: the id, "" if unknown.
+        rule: the code under which `lidarspec check` explains it, "" if there is none.
     """
 
     def __init__(self, reason: str, *, path: str = "", sensor: str = "", rule: str = "") -> None:
@@ -39,7 +41,7 @@ class SpecError(LidarSpecError):
         super().__init__(": ".join(part for part in (sensor, path, reason) if part))
 
 
-#: packages whose lines are not the plugin's, though it calls them.
+#: packages that a plugin calls; their lines are not the plugin's.
 _NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 
@@ -50,12 +52,13 @@ def struct_error(error: Exception, *, path: str, sensor: str = "") -> SpecError:
 
 
 class PluginError(SpecError):
-    """A function of a plugin raised, or returned what cannot be used; where a stream is read, it is
-    counted.
+    """A function of a plugin raised, or returned an unusable value.
+
+    In streams, such errors are counted.
 
     Attributes:
-        file, line: where in the plugin, "" and 0 where that is not known.
-        traceback: of what was raised, as text.
+        file, line: the place in the plugin, "" and 0 if unknown.
+        traceback: the traceback as text.
     """
 
     def __init__(
@@ -83,14 +86,14 @@ class PluginError(SpecError):
         sensor: str = "",
         function: Callable[..., Any] | None = None,
     ) -> PluginError:
-        """The error for what a plugin's function raised.
+        """Return the error for an exception of a plugin's function.
 
         Args:
-            what: the function in words, such as "points of data".
-            function: it; where nothing of the plugin's own was running, its first line is the
-                place.
+            what: a description of the function, such as "points of data".
+            function: the function; its first line is the place if no code of the plugin was
+                running.
         """
-        from traceback import format_exception  # where nothing fails, nobody waits for it
+        from traceback import format_exception  # only needed after a failure
 
         if isinstance(error, PluginError):
             return error
@@ -118,8 +121,9 @@ class PluginError(SpecError):
 
 
 def printable(text: str) -> str:
-    """The text with all spelled out (`\\x1b`) that would steer a terminal or turn the direction of
-    writing, but for ends of lines.
+    """Return text with escaped control characters (`\\x1b`), except ends of lines.
+
+    These are all characters that control a terminal or change the direction of writing.
     """
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
@@ -136,15 +140,16 @@ def printable(text: str) -> str:
 
 
 def shown_path(file: str) -> str:
-    """A path as it is typed in the folder that one is in; as it is where it lies elsewhere."""
+    """Return a path below the working directory relative to it, others unchanged."""
     if os.path.abspath(file).startswith(os.path.join(os.getcwd(), "")):
         return os.path.relpath(file)
     return file
 
 
 def raised_at(error: BaseException) -> tuple[str, int]:
-    """File and line of the plugin that an exception came out of: the innermost that is neither ours
-    nor a library's; "" and 0 for none.
+    """Return file and line of the plugin's code that raised.
+
+    That is the innermost frame that is neither ours nor a library's; "" and 0 if there is none.
     """
     from traceback import extract_tb
 
@@ -164,7 +169,7 @@ def raised_at(error: BaseException) -> tuple[str, int]:
 def plugin_errors(
     what: str, sensor: str, function: Callable[..., Any] | None = None
 ) -> Iterator[None]:
-    """Whatever a plugin's function raises within, as a `PluginError`."""
+    """Convert exceptions of a plugin's function to `PluginError`."""
     try:
         yield
     except Exception as error:
@@ -172,14 +177,14 @@ def plugin_errors(
 
 
 class WireError(LidarSpecError):
-    """Bytes that are not the frame they were taken for.
+    """Bytes that are not the expected frame.
 
     Attributes:
-        sensor, frame: ids, "" where not known.
-        offset: byte offset of the fault within the data given.
-        path: field path with array indices, "" where it concerns the whole frame.
-        expected, got: what the spec asks for, and what was there.
-        data: the bytes that were given.
+        sensor, frame: ids, "" if unknown.
+        offset: byte offset of the fault in the data.
+        path: field path with array indices, "" for the whole frame.
+        expected, got: the expected and the actual value.
+        data: the bytes.
     """
 
     def __init__(
@@ -212,7 +217,7 @@ class WireError(LidarSpecError):
 
 
 class UsageError(LidarSpecError):
-    """A call that cannot be carried out as it was made: the caller's fault."""
+    """An invalid call: the caller's fault."""
 
 
 class LibraryError(UsageError):
@@ -250,7 +255,7 @@ class LibraryError(UsageError):
         suggest(self, f"pip install 'lidarspec[{extra}]'")
 
 
-#: names that have what was typed as a part, which are suggested together at most.
+#: maximum number of suggested names that contain the typed one.
 SUGGESTED = 6
 
 
@@ -262,17 +267,18 @@ def did_you_mean(
     aliases: Mapping[str, str] = MappingProxyType({}),
     max_parts: int = SUGGESTED,
 ) -> str:
-    """A closing clause such as ``; did you mean 'speed'?``, or an empty text where nothing is
-    close.
+    """Return a clause such as ``; did you mean 'speed'?``, or "" without a close name.
 
-    Names that have this one as a part are meant before the one whose letters are the most alike.
+    Names that contain this one have priority over similar names.
 
     Args:
-        alike: the share of letters, from 0 to 1, that a name has to have in common.
-        aliases: other names of some of those, which are suggested in their place.
-        max_parts: the most names that contain `name` and are suggested together.
+        name: the unknown name.
+        known: the valid names.
+        alike: the minimum share of common letters, from 0 to 1.
+        aliases: alias -> the name to suggest in its place.
+        max_parts: the maximum number of suggested names that contain `name`.
     """
-    import difflib  # for the one call in many thousands that has to suggest something
+    import difflib  # imported here because suggestions are rare
 
     by_letters = {other.lower(): aliases.get(other, other) for other in (*known, *aliases)}
     parts = dict.fromkeys(
@@ -289,7 +295,7 @@ def did_you_mean(
 
 
 def format_names(names: Sequence[str]) -> str:
-    """Names in words: 'a', 'b' or 'c'."""
+    """Return names as text: 'a', 'b' or 'c'."""
     *others, last = map(repr, names)
     if others:
         return f"{', '.join(others)} or {last}"
@@ -301,26 +307,20 @@ _Failure = TypeVar("_Failure", bound=BaseException)
 
 
 def suggest(error: _Failure, command: str) -> _Failure:
-    """The error that is given, with the next command to type as a note; one that it has already
-    stays.
-    """
+    """Add the next command to type as a note; keep an existing one."""
     if not suggestion(error):
         error.add_note(_NEXT + command)
     return error
 
 
 def suggestion(error: BaseException) -> str:
-    """The next command to type that an error was given, "" where it has none."""
+    """Return the next command to type of an error, "" if it has none."""
     notes: Sequence[str] = getattr(error, "__notes__", ())
     return next((note.removeprefix(_NEXT) for note in notes if note.startswith(_NEXT)), "")
 
 
 def refuse_text(data: object) -> None:
-    """Nothing, where bytes are given.
-
-    Raises:
-        UsageError: for a text or a path where the bytes themselves are taken.
-    """
+    """Raise UsageError for a text or a path in place of bytes."""
     if isinstance(data, str | os.PathLike):
         raise UsageError(
             f"bytes are taken, not {type(data).__name__}: bytes.fromhex(...) of hexadecimal text,"
@@ -329,12 +329,12 @@ def refuse_text(data: object) -> None:
 
 
 class UnknownName(UsageError):
-    """A name that is not among those known; the message suggests the closest one, or lists all.
+    """An unknown name; the message suggests the closest known one, or lists all.
 
     Attributes:
-        alike: the share of letters that a suggested name has in common with the given one.
-        max_parts: the most names that contain the given one and are suggested together.
-        max_listed: the most names that are listed if none is suggested.
+        alike: the minimum share of letters that a suggested name has in common with it.
+        max_parts: the maximum number of suggested names that contain it.
+        max_listed: the maximum number of names to list if none is suggested.
     """
 
     what = "name"
@@ -399,7 +399,7 @@ class UnknownSensor(UnknownName):
 
 
 class UnknownFrame(UnknownName, KeyError):
-    """The sensor has no frame type of this name."""
+    """The sensor has no frame type with this name."""
 
     what = "frame"
     alike = 0.7
@@ -408,13 +408,13 @@ class UnknownFrame(UnknownName, KeyError):
 
 
 class UnknownField(UnknownName, AttributeError):  # type: ignore[misc]  # AttributeError.name is the same thing
-    """The frame has no field of this path."""
+    """The frame has no field with this path."""
 
     what = "field"
 
 
 class UnknownCommand(UnknownName):
-    """The sensor has no command of this name."""
+    """The sensor has no command with this name."""
 
     what = "command"
     alike = 0.8  # a wrong guess can stop a motor
@@ -422,20 +422,20 @@ class UnknownCommand(UnknownName):
 
 
 class UnknownOption(UnknownName):
-    """The sensor cannot be configured with this option."""
+    """The sensor has no option with this name."""
 
     what = "option"
 
 
 class UnknownFormat(UnknownName):
-    """No file format is known by this suffix."""
+    """There is no file format with this suffix."""
 
     what = "format"
-    alike = 0.6  # suffixes are short, and half of their letters say nothing
+    alike = 0.6  # suffixes are short, so half of their letters are often equal by chance
 
 
 class MissingField(UsageError):
-    """A frame was to be built without a value that only the caller can give."""
+    """A value is missing that only the caller can supply when a frame is built."""
 
     def __init__(self, path: str, *, place: str = "") -> None:
         self.path = path
@@ -443,7 +443,7 @@ class MissingField(UsageError):
 
 
 class OutOfRange(UsageError):
-    """A value that its field, or its command's argument, cannot take."""
+    """A value outside the range of its field or of a command's argument."""
 
     def __init__(
         self,
@@ -466,18 +466,18 @@ class OutOfRange(UsageError):
 
 
 class SourceError(LidarSpecError):
-    """A port, socket or file that cannot be opened, read or written: the system's fault."""
+    """A port, socket or file cannot be opened, read or written: the system's fault."""
 
 
 class SourceTimeout(SourceError, TimeoutError):
-    """A source that gave nothing, or took nothing, within its time."""
+    """A source sent no data, or accepted none, in time."""
 
 
 class WriteError(SourceError):
     """A recording cannot be written any further.
 
     Attributes:
-        reason: why, without the path.
+        reason: the reason without the path.
     """
 
     def __init__(self, path: str, reason: str, state: str) -> None:
@@ -490,26 +490,28 @@ class CommandError(LidarSpecError):
 
 
 class ReplyTimeout(CommandError, TimeoutError):
-    """The device gave no answer to a command within its time."""
+    """The device did not reply to a command in time."""
 
 
 @contextmanager
 def system_errors(place: object) -> Iterator[None]:
-    """What the system refuses within, an OSError, as the `SourceError` of a place, such as a path;
-    what can be none is refused at once.
+    """Convert OSError to `SourceError` with a place, such as a path.
+
+    Raises:
+        SourceError: also for an invalid path.
     """
     if "\0" in str(place):
         raise SourceError(f"{str(place)!r}: no path has a zero byte in it")
     try:
         yield
-    except LidarSpecError:  # what took too long is an OSError as well
+    except LidarSpecError:  # a timeout is an OSError too
         raise
     except OSError as error:
         raise SourceError(f"{place}: {failure_reason(place, error)}") from None
 
 
 def failure_reason(place: object, error: OSError) -> str:
-    """Return why the system refused a path; a missing folder is named."""
+    """Return the reason why the system refused a path, such as a missing folder."""
     folder = os.path.dirname(str(place))
     if isinstance(error, FileNotFoundError) and folder and not os.path.isdir(folder):
         return f"there is no folder {folder}"

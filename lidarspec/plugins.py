@@ -1,13 +1,14 @@
-"""Plugins: the hooks that they may have, how they are found, and the registry of what they add.
+"""Plugins: the hooks that they can implement, and the registry of installed ones.
 
-A distribution names its sensors in the entry-point group ``lidarspec.sensors``, one entry for each
-id and alias, so that asking for one sensor loads one plugin. The registry reads the aliases of a
-sensor from there. Modules with other hooks are in the group ``lidarspec`` and are loaded before any
-sensor is returned. A hook is a function of a name below, marked with ``@hookimpl``.
+A distribution names its sensors in the entry-point group ``lidarspec.sensors``, with one entry for
+each id and alias, so that a request for one sensor loads one plugin. The registry reads the aliases
+of a sensor from there. Modules with other hooks are in the group ``lidarspec`` and are loaded
+before any sensor is returned. A hook is a function with one of the names below, marked with
+``@hookimpl``.
 
-Each plugin is loaded on its own. One that cannot be imported, names a hook that does not exist or
-adds a sensor that cannot be, is named with its distribution and its error, rolled back, and
-disturbs no other.
+Each plugin is loaded on its own. If one cannot be imported, names an unknown hook or adds an
+invalid sensor, it is reported with its distribution and its error, and rolled back; the others are
+not affected.
 """
 
 from __future__ import annotations
@@ -65,41 +66,53 @@ hookimpl = pluggy.HookimplMarker(NAMESPACE)
 
 @hookspec
 def lidarspec_sensors() -> Iterable[Sensor]:  # type: ignore[empty-body]
-    """The sensors that the plugin adds."""
+    """Return the sensors that the plugin adds."""
 
 
 @hookspec(firstresult=True)
 def lidarspec_checksum(sensor: Sensor, frame: Frame) -> Checksum | None:
-    """The checksum algorithm of a frame type, or None to leave it as declared;
-    never field or span.
+    """Return the checksum algorithm of a frame type; None keeps the declared one.
+
+    A hook replaces the algorithm, never field or span.
     """
 
 
 @hookspec(firstresult=True)
 def lidarspec_points(sensor: Sensor, fields: Any) -> Points | None:
-    """The points of a batch of packets, or None to leave them to the sensor: a site's own
-    calibration, for example.
+    """Return the points of a batch of packets; None calls the sensor's own function.
+
+    A use is a calibration of a site.
     """
 
 
 @hookspec(firstresult=True)
 def lidarspec_source(url: str, sensor: Sensor | None) -> Any:
-    """A transport for a URL scheme that the package does not know, or None; `sensor`: whose packets
-    they are to be, where that is known.
+    """Return a transport for a URL scheme that the package does not support, or None.
+
+    Args:
+        url: the SOURCE.
+        sensor: the sensor that sends, if it is known.
     """
 
 
 @hookspec(firstresult=True)
 def lidarspec_link(source: str, link: Link, host: str | None) -> Any:
-    """The open transport of a link of a kind that the package does not know, over which commands
-    go, or None.
+    """Return the open transport of a link for commands, or None.
+
+    It is called for kinds of links that the package does not support.
+
+    Args:
+        source: the SOURCE of the data.
+        link: the declared link.
+        host: the address of the sensor, None if unknown.
     """
 
 
 @hookspec
 def lidarspec_verbs() -> Iterable[click.Command]:  # type: ignore[empty-body]
-    """The verbs of the command line that a module adds, which the entry-point group
-    `lidarspec.verbs` names.
+    """Return the command-line verbs that a module adds.
+
+    The entry-point group `lidarspec.verbs` names the module.
     """
 
 
@@ -130,7 +143,7 @@ def lidarspec_page(
 
 @hookspec
 def lidarspec_formats() -> Iterable[Any]:  # type: ignore[empty-body]
-    """File formats by suffix that the plugin adds."""
+    """Return the file formats by suffix that the plugin adds."""
 
 
 #: seconds after which a plugin that is being loaded is reported.
@@ -142,13 +155,13 @@ _hanging: dict[str, str] = {}
 HOOKS = tuple(name for name in globals() if name.startswith("lidarspec_"))
 
 
-#: who has a sensor: a distribution, and a module of it.
+#: the distribution and module of a sensor.
 Home = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
 class HookedPoints:
-    """A `points` function of a sensor that asks the hooks of installed plugins first."""
+    """A `points` function that calls the hooks of installed plugins first."""
 
     sensor: Sensor
     own: Callable[[Any], Points]
@@ -163,8 +176,14 @@ class HookedPoints:
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin that was found: where it comes from, the ids it adds, what kept it or one of its ids
-    out, and what it does besides.
+    """An installed plugin.
+
+    Attributes:
+        distribution, version, entry_point: its origin.
+        sensors: the ids that it adds.
+        error: the reason why it, or one of its ids, is not available; "" if there is none.
+        traceback: of the error.
+        remark: side effects of loading it.
     """
 
     distribution: str
@@ -189,20 +208,19 @@ class Plugin:
 class Registry:
     """The plugins of this environment, and the sensors with their hooks applied.
 
-    Several plugins may claim one name, an id or an alias. An entry point of this name, or a module
-    that is always loaded, counts before a sensor that merely has it. Of several distributions the
-    owner has it: whom the user's own settings name, else `lidarspec-VENDOR` for ids that begin with
-    this vendor, and for the aliases of such a sensor; of two modules of one distribution the first.
-    Where there is no owner, to ask for the name is an error. All else of a plugin that loses a name
-    stays.
+    Several plugins may claim one name, an id or an alias. An entry point with this name, or a
+    module that is always loaded, has priority over a sensor that merely has the name. Of several
+    distributions the owner gets the name: the distribution in the user's own settings, else
+    `lidarspec-VENDOR` for ids that begin with this vendor, and for the aliases of such a sensor. Of
+    two modules of one distribution, the first gets it. A request for a name without an owner is an
+    error. Everything else of a plugin that loses a name is kept.
 
-    Two threads may load the same sensor at the same time: it is then added twice, and is the same.
+    Two threads may load the same sensor at the same time: it is then added twice, with the same
+    result.
 
-    Args:
-        modules: entry points of modules with hooks; each is loaded at once.
-        offered: entry points of sensors, by id and alias; each is loaded when it is asked for.
-        owners: gives the distributions that the user names as owners, by id; asked where several
-            claim a name.
+    Args: modules: entry points of modules with hooks; each is loaded at once. offered: entry points
+        of sensors, by id and alias; each is loaded on request. owners: returns the distributions
+        that the user names as owners, by id; called if several claim a name.
     """
 
     def __init__(
@@ -217,7 +235,7 @@ class Registry:
         self._sensors: dict[Home, dict[str, Sensor]] = {}
         self._claims: dict[
             str, dict[Home, bool]
-        ] = {}  # name -> who claims it, and whether before being loaded
+        ] = {}  # name -> the claiming plugins, and whether each claims it before it is loaded
         self._ready: dict[str, Sensor] = {}
         self._offered: dict[Home, list[EntryPoint]] = {}
         self._tried: dict[EntryPoint, Plugin] = {}
@@ -232,17 +250,13 @@ class Registry:
 
     @property
     def plugins(self) -> list[Plugin]:
-        """Every plugin that was found; those that could not be loaded, or lost a name to another,
-        say why.
-        """
+        """All installed plugins, with the errors of those that failed or lost a name."""
         self._load_all()
         offered = [self._together(entries) for entries in self._offered.values()]
         return [self._judge(plugin) for plugin in (*self._modules, *offered)]
 
     def _judge(self, plugin: Plugin) -> Plugin:
-        """The plugin with the ids that it has, and the first name that another has, or that nobody
-        can be said to have.
-        """
+        """Return a plugin with the ids that it owns, and an error for a name that it lost."""
         home = plugin.home
         own = sorted(name for name in self._sensors.get(home, {}) if self._holder(name) == home)
         lost = [
@@ -263,11 +277,10 @@ class Registry:
         return replace(plugin, sensors=tuple(own))
 
     def add(self, plugin: Any, *, name: str) -> list[str]:
-        """Register one plugin (a module or object with hooks) and return the ids that it adds.
+        """Register a plugin, a module or object with hooks, and return the ids it adds.
 
-        Raises:
-            SpecError: for an unknown hook, a wrong signature, or a sensor that cannot be; nothing
-                is left registered.
+        Raises: SpecError: for an unknown hook, a wrong signature, or an invalid sensor; nothing is
+            left registered.
         """
         _check_hooks(plugin, name)
         try:
@@ -316,7 +329,7 @@ class Registry:
         return [sensor.id]
 
     def _together(self, entries: list[EntryPoint]) -> Plugin:
-        """What became of all sensors that a module offers."""
+        """Return the result of loading all sensors of a module."""
         tried = [self._tried[entry] for entry in entries]
         failed = next((plugin for plugin in tried if plugin.error), tried[0])
         return replace(failed, entry_point=f"{SENSORS} = {entries[0].module}")
@@ -338,7 +351,7 @@ class Registry:
                 self._claims.setdefault(name, {}).setdefault(home, claimed)
 
     def _holder(self, name: str) -> Home | None:
-        """Who has a name, of those who claim it; None where nobody can be said to."""
+        """Return the plugin that owns a name, None if there is no claim or no owner."""
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
         first = {normal(home[0]): home for home in reversed(homes)}
@@ -359,8 +372,9 @@ class Registry:
         return None
 
     def _alike(self, home: Home, name: str) -> set[str]:
-        """All names of the sensor that somebody claims this one for, as far as they are known
-        before it is loaded.
+        """Return all names of a plugin's sensor with this name.
+
+        Before it is loaded, these are the names of its entry points.
         """
         entries = self._offered.get(home, [])
         values = {entry.value for entry in entries if entry.name == name}
@@ -370,10 +384,10 @@ class Registry:
         )
 
     def _find(self, name: str) -> Sensor | None:
-        """The sensor that has a name; None where there is none, or it does not load.
+        """Return the sensor with a name, None if there is none or it does not load.
 
         Raises:
-            UsageError: where several distributions claim it, and none owns it.
+            UsageError: if several distributions claim it, and none owns it.
         """
         home = self._holder(name)
         if home is None:
@@ -395,7 +409,7 @@ class Registry:
         )
 
     def _found(self) -> dict[str, Sensor]:
-        """Every sensor that is loaded, by id, with those left out whose id is another's."""
+        """Return the loaded sensors by id, without those that lost their id."""
         return {
             name: one
             for home, own in self._sensors.items()
@@ -404,27 +418,29 @@ class Registry:
         }
 
     def names(self) -> list[str]:
-        """Every id and alias, sorted; what only has an entry point is not loaded for it."""
+        """Return every id and alias, sorted, without loading entry points."""
         return sorted(self._claims)
 
     def __contains__(self, name: str) -> bool:
-        """Whether there is a sensor of this id or alias."""
+        """Return whether there is a sensor with this id or alias."""
         if self.find(name) is not None:
             return True
         self._load_all()
         return self.find(name) is not None
 
     def find(self, name: str) -> Sensor | None:
-        """Return the sensor with an id or alias, else None; only the plugin whose entry point has
-        this name is loaded.
+        """Return the sensor with an id or alias, else None.
+
+        Only the plugin whose entry point has this name is loaded.
         """
         if self._holder(name) is None or self._find(name) is None:
             return None
         return self.sensor(name)
 
     def sensors(self) -> dict[str, Sensor]:
-        """Every sensor by id, sorted, with its hooks applied; those whose id several claim, and
-        nobody owns, are left out.
+        """Return every sensor by id, sorted, with its hooks applied.
+
+        Sensors with a claimed id that has no owner are left out.
         """
         self._load_all()
         return {name: self.sensor(name) for name in sorted(self._found())}
@@ -440,8 +456,9 @@ class Registry:
         return [plugin for plugin in map(self._judge, (*self._modules, *offered)) if plugin.error]
 
     def list_sensors(self) -> list[KnownSensor]:
-        """Return a row for each installed sensor, sorted by id; only plugins that the table does
-        not describe are loaded.
+        """Return a row for each installed sensor, sorted by id.
+
+        Only plugins that the table of known sensors does not describe are loaded.
         """
         described = describe_entry_points(itertools.chain.from_iterable(self._offered.values()))
         names = {(row.distribution, name) for row in described for name in row.names}
@@ -471,13 +488,14 @@ class Registry:
         return next(versions, None) or next(loaded, "")
 
     def sensor(self, name: str) -> Sensor:
-        """One sensor by id or alias, in capitals and with other hyphens too, with its hooks
-        applied.
+        """Return a sensor by id or alias, with its hooks applied.
+
+        Capitals and other separators are accepted too.
 
         Raises:
-            UnknownSensor: with a suggestion, or with what to install where there is no sensor at
-                all.
-            UsageError: where several distributions claim the name, and none owns it.
+            UnknownSensor: with a suggestion, or with the packages to install if there is no sensor
+                at all.
+            UsageError: if several distributions claim the name, and none owns it.
         """
         if name in self._ready:
             return self._ready[name]
@@ -490,7 +508,7 @@ class Registry:
             found = self._find(name)
         if found is not None and found.id != name:
             own = found
-            name = found.id  # whoever has the id has its aliases too
+            name = found.id  # the owner of an id owns its aliases too
             found = self._find(name)
             if found is None or found.id != own.id:
                 found = None
@@ -515,8 +533,9 @@ class Registry:
         return None
 
     def _failed_modules(self) -> dict[str, str]:
-        """Return the reasons why modules with hooks failed to load, by distribution: their sensors
-        are not known.
+        """Return the errors of modules with hooks that failed to load, by distribution.
+
+        Their sensors are unknown.
         """
         return {
             plugin.distribution: plugin.error
@@ -525,7 +544,7 @@ class Registry:
         }
 
     def apply_hooks(self, sensor: Sensor) -> Sensor:
-        """The sensor with the checksum and points hooks of all plugins applied to it."""
+        """Return a sensor with the checksum and points hooks of all plugins applied."""
         frames = {name: self._seal(sensor, frame) for name, frame in sensor.frames.items()}
         points = self._manager.hook.lidarspec_points
         if not points.get_hookimpls():
@@ -542,12 +561,13 @@ class Registry:
         return replace(sensor, frames=frames, points=ask(sensor.points), hooked=self.apply_hooks)
 
     def call(self, hook: str, **arguments: Any) -> Any:
-        """The result of another hook."""
+        """Call another hook and return its result."""
         return getattr(self._manager.hook, hook)(**arguments)
 
     def _seal(self, sensor: Sensor, frame: Frame) -> Frame:
-        """The frame with the checksum of the first hook that has one for it; a hook that fails is
-        named and passed over.
+        """Return a frame with the checksum of the first hook that returns one.
+
+        The failure of a hook is recorded, and the next hook is called.
         """
         arguments = {"sensor": sensor, "frame": frame}
         for hook in reversed(self._manager.hook.lidarspec_checksum.get_hookimpls()):
@@ -610,9 +630,7 @@ def _summarize_link(link: Link) -> KnownLink:
 
 
 def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
-    """Whether a distribution is `lidarspec-VENDOR`, of the vendor that one of the names begins
-    with.
-    """
+    """Return whether a distribution is `lidarspec-VENDOR` for the vendor of a name."""
     prefix, _, vendor = normal(distribution).partition("-")
     return (
         prefix == NAMESPACE
@@ -622,8 +640,9 @@ def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
 
 
 def named_owners() -> dict[str, str]:
-    """The distributions that the user's own settings name as the owners of ids; what is wrong there
-    is warned of.
+    """Return the owners of ids, as distributions, from the user's own settings.
+
+    Invalid settings are reported in a warning.
     """
     file = own_settings()
     try:
@@ -644,12 +663,13 @@ def named_owners() -> dict[str, str]:
 
 
 def _import_in_time(entry: EntryPoint) -> Any:
-    """Import an entry point, and return its module or object. An import that hangs is reported and
-    left alone in its thread.
+    """Import an entry point, and return its module or object.
+
+    An import that hangs is reported, and its thread keeps running.
 
     Raises:
-        SpecError: where it hangs.
-        BaseException: whatever the import fails with.
+        SpecError: if it hangs.
+        BaseException: any exception of the import.
     """
     if entry.module in _hanging:
         raise SpecError(_hanging[entry.module])
@@ -687,9 +707,7 @@ def _import_in_time(entry: EntryPoint) -> Any:
 
 
 def _describe_place(thread: threading.Thread) -> str:
-    """Return " at FILE, line NUMBER" for the line of a module that a thread is importing; "" if
-    there is none.
-    """
+    """Return " at FILE, line NUMBER" for the module that a thread imports, "" if none."""
     stack = traceback.extract_stack(sys._current_frames().get(thread.ident or 0))
     module_frames = [frame for frame in stack if frame.name == "<module>"]
     if not module_frames:
@@ -735,7 +753,7 @@ def _is_hook(function: Any) -> bool:
 
 
 def _check_hooks(plugin: Any, name: str) -> None:
-    """pluggy passes over a misspelt hook in silence; a name that begins like one has to be one."""
+    """Raise SpecError for a misspelt hook, which pluggy ignores silently."""
     for attribute in dir(plugin):
         function = getattr(plugin, attribute, None)
         if not _is_hook(function) and not (
@@ -750,22 +768,23 @@ def _check_hooks(plugin: Any, name: str) -> None:
             raise SpecError(f"{attribute} lacks @hookimpl", path=name)
 
 
-#: the registry of this environment, once it is asked for, and those that stand in for it.
+#: the registry of this environment after its first use, and substitutes for it.
 _registries: list[Registry] = []
 
 
 def registry() -> Registry:
-    """The registry of this environment."""
+    """Return the registry of this environment."""
     if not _registries:
         _registries.append(Registry(entry_points(GROUP), entry_points(SENSORS), named_owners))
     return _registries[-1]
 
 
 def try_plugins() -> list[Plugin]:
-    """Every plugin that was found: loaded in another process, and here where it neither hangs there
-    nor ends the process.
+    """Return every installed plugin, after loading each in another process.
+
+    Plugins that hang or end that process are not loaded in this one.
     """
-    if len(_registries) > 1:  # one stands in for what is installed
+    if len(_registries) > 1:  # a substitute is active
         return registry().plugins
     groups = [_modules(), entry_points(SENSORS)]
     entries = {(entry.distribution, entry.module): entry for group in groups for entry in group}
@@ -791,7 +810,7 @@ def try_plugins() -> list[Plugin]:
 
 
 def _modules() -> list[EntryPoint]:
-    """The entry points of modules with hooks, of each module the first."""
+    """Return the entry points of modules with hooks, the first one of each module."""
     found: dict[Home, EntryPoint] = {}
     for entry in entry_points(GROUP) + entry_points(VERBS) + entry_points(PAGE):
         found.setdefault((entry.distribution, entry.module), entry)
@@ -799,8 +818,9 @@ def _modules() -> list[EntryPoint]:
 
 
 def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
-    """Return the result of `_trial` for each plugin: from one process for all, or if anything is
-    wrong in it, from one for each.
+    """Return the result of `_trial` for each plugin.
+
+    One process loads all of them; if there is any problem, each gets its own process.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -812,7 +832,7 @@ def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
 
 
 def _trial(*homes: Home) -> tuple[str, str]:
-    """Why plugins cannot be loaded in this process, and what they do besides being loaded."""
+    """Load plugins in another process; return the failure, and the side effects."""
     import subprocess
 
     mark = f"{os.urandom(8).hex()}:"
@@ -832,7 +852,7 @@ def _trial(*homes: Home) -> tuple[str, str]:
             stderr=pipe,
             check=False,
         )
-    except subprocess.TimeoutExpired:  # something that it began holds its output
+    except subprocess.TimeoutExpired:  # a process that it started keeps its output open
         return hangs, ""
     output, complaints = (stream.decode(errors="replace") for stream in (done.stdout, done.stderr))
     printed, ended, threads = output.partition(mark)
@@ -846,15 +866,16 @@ def _trial(*homes: Home) -> tuple[str, str]:
             "",
         )
     text = " ".join((printed + complaints).split())
-    said = [f"it prints {shown(text)}"] * bool(text) + [f"it leaves a thread: {threads}"] * bool(
+    effects = [f"it prints {shown(text)}"] * bool(text) + [f"it leaves a thread: {threads}"] * bool(
         threads
     )
-    return "", "; ".join(said)
+    return "", "; ".join(effects)
 
 
 def load_alone() -> None:
-    """Load the plugins that the arguments name, print a mark and the threads that they leave, and
-    end the process, which is for this.
+    """Load the plugins in the arguments, print their threads, and end the process.
+
+    The process is started for this purpose. A mark precedes the threads.
     """
     import faulthandler
 
@@ -870,7 +891,7 @@ def load_alone() -> None:
     Registry(modules, offered)._load_all()
     left = [thread.name for thread in threading.enumerate() if thread not in before]
     print(mark, ", ".join(left), sep="", end="", flush=True)
-    os._exit(0)  # whatever is left behind
+    os._exit(0)  # also ends remaining threads
 
 
 def load_hooks(entry: EntryPoint) -> Registry:
@@ -902,7 +923,7 @@ def verb(entry: EntryPoint) -> click.Command:
 
 @contextlib.contextmanager
 def standing_in(other: Registry) -> Iterator[Registry]:
-    """As long as this context lasts, `other` is the registry of this environment."""
+    """Use `other` as the registry of this environment within the context."""
     registry()
     _registries.append(other)
     try:
@@ -912,15 +933,15 @@ def standing_in(other: Registry) -> Iterator[Registry]:
 
 
 def sensors() -> dict[str, Sensor]:
-    """Every installed sensor by id."""
+    """Return every installed sensor by id."""
     return registry().sensors()
 
 
 def sensor(name: str | Path | Sensor) -> Sensor:
-    """One sensor: an installed one by id or alias, or one out of a file, "./mysensor.py"
-    ("./mysensor.py:id" if it has several).
+    """Return one sensor, by id or alias, or from a file.
 
-    A sensor is given back as it is.
+    A file is "./mysensor.py", or "./mysensor.py:id" if it has several sensors. A sensor is returned
+    unchanged.
 
     Raises:
         UnknownSensor: with a suggestion.
@@ -935,12 +956,12 @@ def sensor(name: str | Path | Sensor) -> Sensor:
 
 
 def names_file(text: str) -> bool:
-    """Whether the name of a sensor is that of a file, which would be run, and not an id."""
+    """Return whether a sensor's name is a file, which would be executed, not an id."""
     return "/" in text or "\\" in text or text.endswith(".py")
 
 
 def file_and_id(text: str) -> tuple[Path, str]:
-    """The file of "FILE" or "FILE.py:id", and the id, "" where none is named."""
+    """Split "FILE" or "FILE.py:id" into the file and the id, "" without one."""
     from pathlib import Path
 
     path, colon, wanted = text.partition(".py:")
@@ -970,11 +991,12 @@ def _from_file(text: str) -> Sensor:
 
 
 def file_module(file: Path) -> ModuleType:
-    """A file as a module, which `sys.modules` has under a name of its own, as dataclasses, pickle
-    and typing expect it.
+    """Import a file as a module.
+
+    It gets a unique name in `sys.modules`, as dataclasses, pickle and typing require.
 
     Raises:
-        SourceError, SpecError: for one that is not there, or cannot be imported.
+        SourceError, SpecError: if it is missing or cannot be imported.
     """
     if not file.is_file():
         raise SourceError(f"{file}: no such file")
@@ -996,7 +1018,7 @@ def file_module(file: Path) -> ModuleType:
 
 @contextlib.contextmanager
 def _faults_of(file: Path) -> Iterator[None]:
-    """Whatever the code of a file raises, as a `SpecError` that names the file."""
+    """Convert exceptions of the code of a file to `SpecError` with its name."""
     try:
         yield
     except LidarSpecError:
@@ -1006,7 +1028,7 @@ def _faults_of(file: Path) -> Iterator[None]:
 
 
 def rebuilt(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
-    """An installed sensor, configured: what a pickled one is read back from."""
+    """Return an installed sensor with options; used to unpickle one."""
     known = sensor(sensor_id)
     return known.configure(**options) if options else known
 

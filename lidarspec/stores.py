@@ -1,5 +1,6 @@
-"""Files in stores, such as s3://bucket/drives/a.pcap: what fsspec reaches by URL, as files of this
-computer are by their paths.
+"""Files in stores, such as s3://bucket/drives/a.pcap.
+
+fsspec opens them by URL. Paths of local files are accepted too.
 """
 
 from __future__ import annotations
@@ -17,8 +18,7 @@ from typing import Any, BinaryIO, cast
 from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggest, system_errors
 from lidarspec.libraries import import_library
 
-#: what a URL of a store begins with, and the library that fsspec takes for it, where it has none of
-#: its own.
+#: scheme -> the library that fsspec requires for it; "" if it needs none.
 DRIVERS = {
     **dict.fromkeys(("file", "ftp", "memory"), ""),
     **dict.fromkeys(("s3", "s3a"), "s3fs"),
@@ -36,17 +36,17 @@ ENDS = 1 << 16
 
 
 def is_stored(path: object) -> bool:
-    """Whether a path is the URL of a file in a store."""
+    """bytes at the beginning and at the end that distinguish files of the same size."""
     scheme, mark, _ = str(path).partition("://")
     return bool(mark) and scheme in DRIVERS
 
 
 def system_of(url: str) -> Any:
-    """The file system of fsspec that a URL is of.
+    """Return the file system of fsspec for a URL.
 
     Raises:
-        UsageError: where fsspec, or its driver, is not installed.
-        SourceError: where the store cannot be reached.
+        UsageError: if fsspec, or its driver, is not installed.
+        SourceError: if the store cannot be reached.
     """
     fsspec = import_library("fsspec", "fsspec")
     scheme = url.partition("://")[0]
@@ -59,11 +59,11 @@ def system_of(url: str) -> Any:
 
 
 def file_of(path: str) -> BinaryIO:
-    """The open file of a path or URL, to be read.
+    """Open a path or URL for reading.
 
     Raises:
-        UsageError: where the library of a store is not installed.
-        SourceError: where it cannot be opened.
+        UsageError: if the library of a store is not installed.
+        SourceError: if it cannot be opened.
     """
     if not is_stored(path):
         with system_errors(path):
@@ -73,15 +73,17 @@ def file_of(path: str) -> BinaryIO:
         file = system.open(path, "rb")
         return (
             io.BytesIO(file.getbuffer()) if isinstance(file, io.BytesIO) else file
-        )  # of which all readers share one place
+        )  # all readers of a BytesIO would share one offset
 
 
 def found(pattern: str) -> list[tuple[str, str]]:
-    """The files of a path or URL, in which *, ? and ** stand for what they do in a shell: each with
-    its path below the fixed part.
+    """Return the files that match a path or URL with *, ? and **.
+
+    Returns:
+        (path, path below the fixed part of the pattern) of each file.
 
     Raises:
-        SourceError: where there is none.
+        SourceError: if there is none.
     """
     fixed = pattern
     while glob.has_magic(fixed):
@@ -104,10 +106,12 @@ def found(pattern: str) -> list[tuple[str, str]]:
 
 
 def files_in(folder: str) -> set[str]:
-    """What is in a folder and below, plainly spelt; nothing where there is no folder.
+    """Return the normalised paths of everything in a folder and below.
+
+    Empty if there is no folder.
 
     Raises:
-        SourceError: where the store cannot be reached.
+        SourceError: if the store cannot be reached.
     """
     if not is_stored(folder):
         return {
@@ -123,17 +127,22 @@ def files_in(folder: str) -> set[str]:
 
 
 def plain(path: object) -> str:
-    """One spelling of a path or URL, to be compared: memory:///a is memory://a, and ./a is a."""
+    """Return a normalised path or URL for comparison.
+
+    memory:///a and memory://a are equal, as are ./a and a.
+    """
     if is_stored(path):
         return str(path).partition("://")[2].lstrip("/")
     return Path(str(path)).as_posix().removeprefix("./")
 
 
 def stamp(path: str) -> dict[str, Any]:
-    """The `size` of a file, and when it was `modified` (or the store's tag for that).
+    """Return the `size` of a file and the time it was `modified`.
+
+    In a store, the time may be the store's tag instead.
 
     Raises:
-        SourceError: where there is none.
+        SourceError: if there is no such file.
     """
     if not is_stored(path):
         with system_errors(path):
@@ -154,7 +163,7 @@ def stamp(path: str) -> dict[str, Any]:
 
 
 def digest(path: str) -> str:
-    """A hash of the beginning and the end of a file."""
+    """Return a hash of the beginning and the end of a file."""
     with contextlib.closing(file_of(path)) as file:
         head = file.read(ENDS)
         file.seek(max(file.seek(0, os.SEEK_END) - ENDS, 0))
@@ -162,10 +171,10 @@ def digest(path: str) -> str:
 
 
 def put(local: Path, url: str) -> None:
-    """Put a file or folder into a store, where a file appears whole.
+    """Copy a file or folder to a store; a file appears there as a whole.
 
     Raises:
-        SourceError: where that fails.
+        SourceError: if that fails.
     """
     system = system_of(url)
     with _failures(url):
@@ -181,7 +190,7 @@ def take_away(path: str | Path) -> None:
     """Remove a file or folder, if there is one.
 
     Raises:
-        SourceError: where that fails.
+        SourceError: if that fails.
     """
     if is_stored(path):
         system = system_of(str(path))
@@ -197,7 +206,7 @@ def take_away(path: str | Path) -> None:
 
 @contextlib.contextmanager
 def _failures(url: str) -> Iterator[None]:
-    """What a store refuses within, in whatever way, as a `SourceError`."""
+    """Convert all exceptions of a store to `SourceError`."""
     try:
         yield
     except LidarSpecError:
@@ -207,7 +216,10 @@ def _failures(url: str) -> Iterator[None]:
 
 
 def _failure_reason(url: str, error: Exception) -> str:
-    """Return why a store failed; many drivers repeat only the URL or path of a missing file."""
+    """Return the reason of a store's failure.
+
+    Many drivers report only the URL or path of a missing file.
+    """
     text = str(error)
     if plain(text) != plain(url) and text.lstrip("/") != plain(url) and text:
         return text

@@ -1,8 +1,8 @@
-"""Whose files are believed, and what the others may say.
+"""Decide which files are trusted, and restrict the content of all others.
 
-Plugins that are installed and the user's own settings are believed; so is a folder that the user
-has allowed once. Whatever else is read is data: no code runs because a file names it, and paths in
-it lead to what lies beside it and nowhere else.
+Trusted are installed plugins, the user's own settings, and folders that the user has allowed. All
+other files are data: no code runs because a file names it, and paths in a file may only lead to
+files in its own folder.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from lidarspec.errors import UsageError, system_errors
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: bytes of a file that are read at most: of JSON, which has frames in it, and of TOML, where the
-#: time to read grows faster than the file.
+#: maximum size of a file in bytes. JSON may contain frames; reading TOML takes more than linear
+#: time.
 LARGEST = {"JSON": 1 << 22, "TOML": 1 << 18}
-#: a key of so many parts that reading it would take minutes.
+#: a key with so many parts that reading it would take minutes.
 _ENDLESS_KEY = re.compile(rb"(?:\.[^.=,\]\n]{0,80}){32}")
 #: the name of a settings file.
 FILE = "lidarspec.toml"
-#: the file of the folders that are allowed, a line each, and the variable that names one for a
-#: single run.
+#: the file with the allowed folders, one per line, and the variable that allows one for a single
+#: run.
 TRUSTED = "trusted"
 VARIABLE = "LIDARSPEC_TRUST"
 _WRITABLE_BY_ALL = stat.S_IWOTH
 
 
 def user_folder() -> Path:
-    """The folder of the user's own settings."""
+    """Return the folder of the user's own settings."""
     from pathlib import Path
 
     if os.name == "nt":
@@ -41,16 +41,16 @@ def user_folder() -> Path:
 
 
 def own_settings() -> Path:
-    """The user's own settings file, which need not be there."""
+    """Return the user's own settings file, which may be missing."""
     return user_folder() / FILE
 
 
 def foreign(path: Path) -> str:
-    """Why a file is not the user's own, such as "/tmp belongs to user 0"; "" where it is.
+    """Return the reason why a file is not the user's own, "" if it is.
 
-    It and its folder have to belong to the user, and nobody else may write there; a group may,
-    which is often the user's alone. Where a system has no such owners, the user's own is what lies
-    in the user's folder.
+    An example is "/tmp belongs to user 0". The file and its folder have to belong to the user, and
+    must not be writable by others. The group may write, because it is often the user's own. On
+    systems without such owners, all files in the user's folder are the user's own.
     """
     if not hasattr(os, "getuid"):
         home = os.path.expanduser("~")
@@ -66,11 +66,12 @@ def foreign(path: Path) -> str:
 
 
 def describe_sharing(status: os.stat_result, others: int) -> str:
-    """Why something is not the user's own, such as "belongs to user 0"; "" where it is, and on
-    Windows, where a user's folders are.
+    """Return the reason why a file is not the user's own, "" if it is.
+
+    An example is "belongs to user 0". On Windows it is always "".
 
     Args:
-        others: the bits of its mode that only its user may have.
+        others: the mode bits that only the user may have.
     """
     if os.name == "nt":
         return ""
@@ -83,7 +84,7 @@ def describe_sharing(status: os.stat_result, others: int) -> str:
 
 
 def is_trusted(folder: Path) -> bool:
-    """Whether the user has allowed what the files of a folder name."""
+    """Return whether the user has allowed a folder."""
     file = user_folder() / TRUSTED
     with system_errors(file):
         if file.is_file():
@@ -95,34 +96,36 @@ def is_trusted(folder: Path) -> bool:
 
 
 def trust(folder: str | Path) -> Path:
-    """The folder, by its whole path, whose files may from now on name Python files, and paths
-    anywhere.
+    """Allow the files of a folder to name Python files, and paths anywhere.
+
+    Returns:
+        The absolute path of the folder.
 
     Raises:
-        UsageError: where it is no folder of the user's own.
-        SourceError: where this cannot be written down.
+        UsageError: unless it is a folder of the user's own.
+        SourceError: if this cannot be stored.
     """
     from pathlib import Path
 
-    found = Path(folder).resolve()
-    if not found.is_dir() or len(str(found).splitlines()) > 1:
+    allowed = Path(folder).resolve()
+    if not allowed.is_dir() or len(str(allowed).splitlines()) > 1:
         raise UsageError(f"{folder} is no folder")
-    if reason := foreign(found / "."):
+    if reason := foreign(allowed / "."):
         raise UsageError(f"{reason}; whoever writes there could run programs as you")
     file = user_folder() / TRUSTED
-    if not is_trusted(found):
+    if not is_trusted(allowed):
         with system_errors(file):
             file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             with file.open("a", encoding="utf-8") as lines:
-                lines.write(f"{found}\n")
-    return found
+                lines.write(f"{allowed}\n")
+    return allowed
 
 
 def beside(folder: Path, value: object) -> Path:
-    """The file that a file in `folder` names: one in it or below it.
+    """Return the file that a file in `folder` names: one in it or below it.
 
     Raises:
-        UsageError: for any other path, and for what is no path or no regular file.
+        UsageError: for any other path, and unless it is a regular file.
     """
     if isinstance(value, str) and "\0" not in value:
         found = folder / value
@@ -134,13 +137,13 @@ def beside(folder: Path, value: object) -> Path:
 
 
 def document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
-    """What a TOML or JSON file holds.
+    """Return the content of a TOML or JSON file.
 
     Raises:
-        UsageError: where it is none, or none of a reasonable size.
-        SourceError: where it cannot be read.
+        UsageError: for an invalid or too large file.
+        SourceError: if it cannot be read.
     """
-    import json  # where only an installed sensor is looked for, nobody waits for these
+    import json  # imported here because finding an installed sensor does not need them
     import tomllib
 
     parse = json.loads if kind == "JSON" else tomllib.loads

@@ -1,7 +1,7 @@
-"""Identify the sensor that sends, and diagnose a source that delivers nothing usable.
+"""Identify the sensor of a source, and diagnose a source without usable data.
 
-In: a SOURCE, or bytes. Out: a verdict, and findings with the command that fixes them. Modules in
-reading order:
+Input: a SOURCE, or bytes. Output: a verdict, and findings with the command that fixes them. Modules
+in reading order:
 
 * `heard`: the bytes of one source.
 * `listen`: read some bytes from any source.

@@ -1,5 +1,6 @@
-"""Why nothing comes, or nothing that can be used: what is wrong with a source, one thing at a time,
-each with the command that mends it.
+"""Diagnose a source without data, or without usable data.
+
+Each finding has the command that fixes the problem.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ LOOPBACK = "lo"
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that was looked at.
+    """The result of one check.
 
     Attributes:
-        ok: whether it is as it should be.
-        text: what it is.
-        mend: the command that mends it; "" where there is none, or nothing to mend.
+        ok: whether there is no problem.
+        text: a description.
+        mend: the command that fixes it; "" if there is none, or no problem.
     """
 
     ok: bool
@@ -44,11 +45,11 @@ class Finding:
 def examine(
     source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN
 ) -> Iterator[Finding]:
-    """What is right and wrong with a source, in the order of looking.
+    """Check a source, and yield findings in the order of the checks.
 
     Args:
-        sensor: whose bytes are expected; found out where left out.
-        seconds: to listen for.
+        sensor: the expected sensor; by default it is detected.
+        seconds: time to listen.
     """
     text = resolve(source)
     address = live_address(text)
@@ -63,15 +64,15 @@ def examine(
 
 
 def computer() -> Iterator[Finding]:
-    """What is right and wrong with the ports of this computer, whatever is connected to them."""
-    found = ports.serial_ports()
-    if not found:
+    """Check the ports of this computer, whatever is connected to them."""
+    serial_ports = ports.serial_ports()
+    if not serial_ports:
         yield Finding(
             True,
             "there is no serial port: where one should be, its cable or driver is missing",
             "sudo dmesg | tail",
         )
-    for port in found:
+    for port in serial_ports:
         yield from _permission(port.path)
         yield from _in_use(port.path)
     for number in udp_ports():
@@ -83,7 +84,7 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
     if os.path.exists(path):
         name = path
     else:
-        name = path.rpartition("?")[0]  # what stands behind it chooses a sender
+        name = path.rpartition("?")[0]  # the option after it selects a sender
     if not os.path.exists(name):
         yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
     elif not os.access(name, os.R_OK):
@@ -91,11 +92,11 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
     elif os.path.getsize(name) == 0:
         yield Finding(False, f"{path} is empty")
     else:
-        tried = verdicts(path)
-        found = max(tried, key=lambda one: one.heard.size)
+        found_verdicts = verdicts(path)
+        found = max(found_verdicts, key=lambda one: one.heard.size)
         if found.heard.size:
             yield _verdict(path, found, sensor)
-        yield from _several(path, tried)
+        yield from _several(path, found_verdicts)
         for text in found.heard.warnings or [no_bytes(path, ())] * (not found.heard.size):
             yield Finding(False, text)
 
@@ -130,7 +131,7 @@ def _permission(port: str) -> Iterator[Finding]:
 
 
 def _rule(port: str) -> str:
-    """A udev rule that lets every user open ports of this kind."""
+    """Return a command for a udev rule that lets every user open such ports."""
     kind = os.path.basename(port).rstrip("0123456789")
     rule = f'KERNEL=="{kind}[0-9]*", MODE="0666"'
     return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.rules && sudo udevadm trigger"
@@ -200,7 +201,7 @@ def _buffer() -> Iterator[Finding]:
 
 
 def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Iterator[Finding]:
-    """Where packets do arrive while none comes to the ports."""
+    """Yield findings about interfaces, if packets arrive but none at the ports."""
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
     if host:
@@ -231,7 +232,7 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
 
 
 def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
-    """What comes, and whether it is what should come."""
+    """Check whether data arrives, and whether it is valid data of the sensor."""
     try:
         if sensor is not None:
             tried = [verdict(heard) for heard in heard_as(source, sensor, seconds)]
@@ -252,7 +253,7 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
 
 
 def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
-    """Senders whose frames are of one sensor, and would be mixed."""
+    """Yield a finding for several senders of one sensor's frames."""
     senders: dict[str, list[str]] = {}
     for one in found:
         if one.scores and one.heard.sender:
@@ -266,7 +267,7 @@ def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
 
 
 def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
-    """One finding on what was heard."""
+    """Return the finding about the data of one sender."""
     heard = found.heard
     ids = [score.sensor.id for score in found.scores]
     may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
@@ -318,7 +319,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
         )
     cut_off = (
         2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size
-    )  # the first frame, and the last
+    )  # the first and the last frame
     if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
         return Finding(
             False,
@@ -336,7 +337,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
 
 
 def _nothing(source: str, sensor: Sensor | None) -> Finding:
-    """Nothing was heard."""
+    """Return the finding for a source without data."""
     quoted = quote(source)
     if sensor is not None and sensor in started_first():
         start = next(name for name in sensor.on_open if sensor.commands[name].starts)

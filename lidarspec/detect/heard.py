@@ -1,5 +1,6 @@
-"""Bytes that were read from one source to find out which sensor sent them, and how the beginning of
-a file is read.
+"""The bytes that were read from one source to identify the sensor.
+
+Also reads the beginning of a file.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from lidarspec.errors import SourceError
 from lidarspec.transports.protocol import Chunk, Transport
 
-#: bytes of a file that are looked at.
+#: bytes of a file that are examined.
 LOOKED_AT = 1 << 17
-#: bytes that are looked at to tell text, and the least that are enough for it.
+#: bytes that are examined to recognise text, and the minimum for that.
 TEXT_BYTES = 1 << 12
 MIN_TEXT_BYTES = 16
 
@@ -23,16 +24,11 @@ MIN_TEXT_BYTES = 16
 class Heard:
     """Bytes that one sender of a source sent.
 
-    Attributes:
-        source: how to open it again.
-        chunks: datagrams, or pieces of a stream.
-        datagrams: whether they are datagrams.
-        baud: at which a serial port was read; None for another source, and for a port that has no
-            baud rate.
-        sender: address of the sender, where there are several.
-        failure: why it could not be opened.
-        warnings: what is to be said of the source, once it was read to its end.
-        ports: the UDP ports that datagrams of a capture were sent to.
+    Attributes: source: the SOURCE, to open it again. chunks: datagrams, or pieces of a stream.
+        datagrams: whether they are datagrams. baud: the baud rate at which a serial port was read;
+        None for other sources, and for a port without a baud rate. sender: address of the sender,
+        if there are several. failure: the reason why it could not be opened. warnings: warnings
+        about the source at its end. ports: the UDP ports that datagrams of a capture were sent to.
     """
 
     source: str
@@ -56,7 +52,7 @@ class Heard:
 
     @property
     def is_text(self) -> bool:
-        """Whether the bytes begin as lines of printable text, which only some sensors send."""
+        """Whether the bytes begin as lines of printable text, as some sensors send."""
         head = self.data[:TEXT_BYTES].removesuffix(b"\r")
         return (
             len(head) >= MIN_TEXT_BYTES
@@ -66,7 +62,7 @@ class Heard:
 
 
 def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
-    """The beginning of a file: what holds `most` bytes, or `number` chunks if these are fewer."""
+    """Return the start of a file: `most` bytes, or `number` chunks if that is less."""
     return [
         replace(chunk, data=chunk.data[:most])
         for chunk in leading(itertools.islice(opened.chunks(), number), most)
@@ -74,7 +70,7 @@ def beginning(opened: Transport, most: int, *, number: int | None = None) -> lis
 
 
 def leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:
-    """The first chunks, up to the one with which there are so many bytes."""
+    """Return the first chunks, until they have `most` bytes."""
     found = list[Chunk]()
     size = 0
     for chunk in chunks:

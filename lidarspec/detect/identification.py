@@ -121,7 +121,7 @@ def distinguish(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found
 
 
 def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
-    """Return the evidence that another model than the sensor sent some frames; "" if none."""
+    """Return the evidence that another model sent some frames, "" if there is none."""
     relatives = map(registry().find, sensor.relatives)  # loads only their plugins
     alike = [sensor, *(relative for relative in relatives if relative is not None)]
     result = distinguish(alike, {one.id: found for one in alike})
@@ -232,7 +232,7 @@ def _match_clock(sensor: Sensor, found: Sequence[Found]) -> str:
 
 @functools.lru_cache(maxsize=256)
 def _pace(sensor_id: str, sensor: Sensor) -> float | None:
-    """Return the simulated step of the sensor's clock per packet, ns; None if it does not advance.
+    """Return the simulated clock step per packet in ns, None if there is none.
 
     Args:
         sensor_id: not read; it is part of the key of the cache.
@@ -409,7 +409,7 @@ def _sensors_with_frames() -> list[Sensor]:
 
 
 def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
-    """Describe bytes that are frames of a sensor except for their checksums, all of them invalid.
+    """Describe frames that fit a sensor except for their checksums, all invalid.
 
     Returns:
         "" for all other bytes.
@@ -511,7 +511,7 @@ def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: boo
 
 
 def verdict(heard: Heard) -> Verdict:
-    """Identify the sensor by its frames, then by their clocks and names, then by the baud rate."""
+    """Identify the sensor by frames, then by clocks and names, then by the baud rate."""
     fitting = [
         score for score in scores(heard.chunks, datagrams=heard.datagrams) if score.share >= FITS
     ]
@@ -574,7 +574,7 @@ def verdicts(
 
 
 def best(tried: Sequence[Verdict]) -> Verdict:
-    """Return the verdict with the highest score; without any scores, the one on most bytes."""
+    """Return the verdict with the highest score, else the one on most bytes."""
     return max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
 
 
@@ -672,7 +672,7 @@ def find_declared_sensor(source: str | Path) -> Sensor | None:
 
 
 def simulated_sensor(source: str | Path) -> Sensor | None:
-    """Return the sensor of a source "sim:ID", without opening it; None for any other source."""
+    """Return the sensor of a source "sim:ID", None for any other source."""
     address = live_address(source)
     if address is None or address.scheme != "sim" or not address.place:
         return None
@@ -753,7 +753,7 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
 
 
 def _begins_alike(fault: WireError) -> bool:
-    """Return whether the invalid bytes have the constant bits at the start of the frame type.
+    """Return whether invalid bytes have the constant bits at the start of a frame.
 
     At least `MIN_CONSTANT_BITS` are required, since fewer may be equal by coincidence.
     """

@@ -48,7 +48,7 @@ EXAMPLE_PORT = 2368
 
 
 def bauds() -> list[int]:
-    """The baud rates that installed sensors declare, those of the most sensors first."""
+    """Return the declared baud rates of installed sensors, the most common first."""
     declared = [
         baud
         for sensor in sensors().values()
@@ -60,7 +60,7 @@ def bauds() -> list[int]:
 
 
 def udp_ports() -> list[int]:
-    """The UDP ports that data of installed sensors come to."""
+    """Return the UDP ports that installed sensors declare for data."""
     links = (data_link(sensor, Udp) for sensor in sensors().values())
     return sorted({port for link in links if link for port in link.ports})
 
@@ -204,12 +204,12 @@ def _read_chunks(opened: LiveTransport, seconds: float) -> list[Chunk]:
 
 def started_first() -> list[Sensor]:
     """Return the installed serial sensors that send nothing before a start command."""
-    told = [
+    started = [
         sensor
         for sensor in sensors().values()
         if any(sensor.commands[name].starts for name in sensor.on_open)
     ]
-    return [sensor for sensor in told if data_link(sensor, Serial)]
+    return [sensor for sensor in started if data_link(sensor, Serial)]
 
 
 def probe(source: str | Path) -> Iterator[Heard]:
@@ -242,7 +242,7 @@ def probe(source: str | Path) -> Iterator[Heard]:
 
 
 class _Probe:
-    """One conversation with a port."""
+    """Starts a sensor, reads its data, and stops it."""
 
     def __init__(self, sensor: Sensor, opened: LiveTransport) -> None:
         self._sensor = sensor
@@ -252,7 +252,7 @@ class _Probe:
         self._heard: list[bytes] = []
 
     def run(self) -> list[bytes]:
-        """Everything that was heard between start and stop."""
+        """Return all bytes received between start and stop."""
         try:
             started = self._request(self._sensor.on_open)
             self._turns(lambda: all(pending.done for pending in started), ANSWERED)

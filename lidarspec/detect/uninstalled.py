@@ -57,8 +57,9 @@ def _sync_text(constant: dict[int, int]) -> str:
 
 
 def recognize(heard: Heard) -> list[KnownSensor]:
-    """Return the sensors of the table that are not installed and whose bytes these may be; those of
-    a known port if no frame matches.
+    """Return the sensors of the table, not installed, that may have sent these bytes.
+
+    If no frame matches, these are the sensors with the destination port.
     """
     installed = set(registry().names())
     missing = [row for row in known_sensors() if row.id not in installed]
@@ -139,9 +140,7 @@ def describe(found: Sequence[KnownSensor]) -> str:
 
 
 def suggest_installation(error: WireError, heard: Heard) -> WireError:
-    """Return the error for bytes of no installed sensor, with the distributions to install if the
-    table has some.
-    """
+    """Add the distributions to install to the error for unknown bytes, if known."""
     missing = recognize(heard)
     if missing:
         error.add_note(describe(missing))

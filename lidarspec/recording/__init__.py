@@ -1,12 +1,10 @@
-"""Recordings: everything that came over a link, with its time.
+"""Recordings: all data of a link, with arrival times.
 
-In: chunks as they arrive. Out: a file that survives a crash; and of a file, its records. Modules in
-reading order:
+Input: chunks as they arrive. Output: a file that stays valid after a crash, and the records of a
+file. Modules in reading order:
 
-* `format`: the bytes of an .lsr file, packed and found again; a recording read, up to its damage or
-  past it.
-* `recorders`: `Recorder` and others, by the suffix of the file: everything, packets for Wireshark,
-  the bytes alone.
-* `switch`: a recorder that is switched on and off while a source is read.
-* `appending`: the thread that writes whole records, so that a slow disk holds nothing up.
+* `format`: reads and writes the bytes of .lsr files, also of damaged ones. * `recorders`:
+`Recorder` and others, by the suffix of the file: all data, packets for Wireshark, raw bytes. *
+`switch`: a recorder that is switched on and off while a source is read. * `appending`: the thread
+that writes whole records, so that a slow disk delays nothing.
 """

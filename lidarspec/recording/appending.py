@@ -1,11 +1,9 @@
-"""A file that grows by whole records, written by a thread of its own, so that a slow disk holds up
-no capture.
+"""Write whole records to a file in a thread, so that a disk delays no capture.
 
-A file that is overwritten stays until the new one has its first record.
+A file that is overwritten is kept until the new one has its first record.
 
-What is put in waits in memory. The thread writes it out every 0.2 s or 64 KiB, and has it put on
-the disk every second. Short writes are gone on with; what a full disk takes of a record that it
-does not take whole is cut off again.
+Records wait in memory. The thread writes them every 0.2 s or 64 KiB, and calls fsync every second.
+Incomplete writes are continued. If the disk is full, a partly written record is removed again.
 """
 
 from __future__ import annotations
@@ -25,36 +23,38 @@ from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError,
 from lidarspec.transports.protocol import Chunk
 from lidarspec.unfinished import path_while_written, remove_abandoned
 
-#: when what was put in is written out, and when the disk is asked to keep it.
+#: limits after which records are written to the file, and after which fsync is called.
 FLUSH_BYTES = 1 << 16
 FLUSH_SECONDS = 0.2
 DISK_SECONDS = 1.0
-#: bytes that may wait for a disk that does not keep up; what comes then is dropped and counted.
+#: bytes that may wait for a slow disk; further records are dropped and counted.
 BACKLOG = 1 << 26
-#: seconds that `sync` and `close` give a disk.
+#: seconds that `sync` and `close` wait for the disk.
 PATIENCE = 60.0
 
-#: (bytes, place) -> the length of the record that begins there; 0 or less where none does.
+#: (bytes, offset) -> the length of the record at this offset; 0 or less if there is none.
 Size = Callable[[bytes | bytearray, int], int]
 
 
 class RecordFile:
-    """A new file, opened at once; one that it is to replace stays in its place until `settle`.
+    """A new file; a file that it replaces is kept until `settle`.
 
     Args:
-        size_at: how long records are, since a piece of the file may be cut behind each; None where
-            it may be anywhere.
+        path: of the file.
+        size_at: returns the length of a record, because a partial write is cut after the last whole
+            record; None if it may be cut anywhere.
+        overwrite: whether the file may exist.
 
     Raises:
-        UsageError: where it exists, and is not to be overwritten.
-        SourceError: where it cannot be made.
+        UsageError: if it exists and must not be overwritten.
+        SourceError: if it cannot be made.
     """
 
     def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
         self._place = Path(os.path.realpath(path))
         self.replaces = (
             overwrite and self._place.is_file() and os.name != "nt"
-        )  # where open files keep their names
+        )  # systems that can rename open files
         self._opened = self._place
         if self.replaces:
             remove_abandoned(self._place)
@@ -74,7 +74,7 @@ class RecordFile:
         """Write whole records.
 
         Raises:
-            OSError: where not all of them are taken; the file then ends behind the last that is.
+            OSError: if a record could not be written; the file then ends after the last whole one.
         """
         written = 0
         try:
@@ -92,7 +92,7 @@ class RecordFile:
         self.size += written
 
     def _whole(self, records: bytes | bytearray, limit: int) -> int:
-        """The bytes of those records that end within the limit."""
+        """Return the total size of the records that end within a limit."""
         end = limit if self._size_at is None else 0
         while (
             self._size_at is not None and 0 < (size := self._size_at(records, end)) <= limit - end
@@ -102,21 +102,21 @@ class RecordFile:
 
     @property
     def is_settled(self) -> bool:
-        """Whether it stands in its place."""
+        """Whether the file has its final name."""
         return self._opened == self._place
 
     def settle(self) -> None:
-        """Take the place of the file that it replaces, if there is one and it stands there still.
+        """Replace the old file, if there is one and it still exists.
 
         Raises:
-            OSError: where that cannot be done.
+            OSError: if that fails.
         """
         if not self.is_settled:
             os.replace(self._opened, self._place)
             self._opened = self._place
 
     def keep(self) -> None:
-        """Returns when all of it is on the disk; pipes and devices have none."""
+        """Wait until all data is on the disk; does nothing for pipes and devices."""
         try:
             os.fsync(self._file.fileno())
         except OSError as error:
@@ -124,8 +124,9 @@ class RecordFile:
                 raise
 
     def close(self) -> None:
-        """Close the file; without `settle`, the one that it was to replace stays, and this one is
-        gone.
+        """Close the file.
+
+        Without `settle`, the old file is kept and the new one is removed.
         """
         with contextlib.suppress(OSError):
             self._file.close()
@@ -134,46 +135,47 @@ class RecordFile:
 
 
 class Log(Protocol):
-    """Where everything that arrives and is sent is taken down: a file, or what stands in its place.
+    """A recorder of all data that arrives and is sent: a file or a substitute.
 
     Attributes:
-        error: what went wrong with it, None where nothing did.
+        error: the failure of the recording; None if there was none.
     """
 
     @property
     def error(self) -> SourceError | None: ...
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Take what was received, or sent, with its arrival time."""
+        """Record received or sent data with its time."""
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Take down what happened to the line, such as "disconnect" or "reconnect"; now, unless
-        `at` says when.
+        """Record an event of the line, such as "disconnect" or "reconnect".
+
+        Args:
+            at: the time, ns since 1970; by default now.
         """
 
     def close(self) -> None:
-        """End it.
+        """End the recording.
 
         Raises:
-            SourceError: where it could not be written.
+            SourceError: if it could not be written.
         """
 
 
 class Appender:
-    """Takes records for a file, from any thread, and is a context manager; kinds of recordings are
-    made of it.
+    """Base of recorders: collects records from any thread for a file.
 
-    Nothing that goes wrong with the file is raised while records are taken: the capture goes on. It
-    is kept in `error`, and raised once, by the next `sync` or by `close`; the file is then valid to
-    its last whole record.
+    It is a context manager. Errors of the file are not raised while records are added, so that the
+    capture continues. The error is kept in `error`, and raised once, by the next `sync` or by
+    `close`. The file is then valid up to its last whole record.
 
     Args:
         path, size_at, overwrite: as in `RecordFile`.
 
     Attributes:
-        records, bytes: taken so far, and the bytes of the wire in them.
-        dropped: those that came while the disk did not keep up, or after it failed.
-        error: what went wrong with the file, None where nothing did.
+        records, bytes: the number of records so far, and of the data bytes in them.
+        dropped: the number of records dropped while the disk was too slow, or after it failed.
+        error: the failure of the file; None if there was none.
     """
 
     def __init__(self, path: str | Path, size_at: Size | None, *, overwrite: bool) -> None:
@@ -189,24 +191,24 @@ class Appender:
         self._closing = False
         self._taken = 0
         self._asked = 0
-        self._kept = 0  # pieces: in memory or further, asked to be on the disk, and there
+        self._kept = 0  # counts of records added, requested to be on the disk, and on the disk
         self._file = RecordFile(self.path, size_at, overwrite=overwrite)
         self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
         self._thread.start()
         atexit.register(self._finish)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Take what was received, or sent, with its arrival time."""
+        """Record received or sent data with its time."""
         raise NotImplementedError
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Take down what happened to the line, where the format has a place for that."""
+        """Record an event of the line, if the format supports events."""
 
     def sync(self) -> None:
-        """Returns when everything taken so far is on the disk.
+        """Wait until everything recorded so far is on the disk.
 
         Raises:
-            SourceError: where it cannot be.
+            SourceError: if that is not possible.
         """
         with self._changed:
             target = self._asked = self._taken
@@ -220,7 +222,7 @@ class Appender:
         self._complain()
 
     def keep_up(self) -> None:
-        """Returns when there is room for more: for sources that can wait for the disk.
+        """Wait until there is room for more records; for sources that can wait.
 
         Raises:
             SourceError: as `sync`.
@@ -229,17 +231,19 @@ class Appender:
             self.sync()
 
     def close(self) -> None:
-        """Write what is left, and close the file; a second call does nothing.
+        """Write the waiting records and close the file; a second call does nothing.
 
         Raises:
-            SourceError: where the file could not be written, unless `sync` has said so already.
+            SourceError: if the file could not be written, unless `sync` has raised it already.
         """
         self._finish()
         self._complain()
 
     def discard(self) -> bool:
-        """Take away a closed file that got no record; False where one that it was to replace stays
-        in its place.
+        """Remove a closed file without records.
+
+        Returns:
+            False if a file that it would have replaced was kept.
         """
         if not self._file.replaces:
             with contextlib.suppress(OSError):
@@ -266,8 +270,10 @@ class Appender:
         )
 
     def _put(self, record: bytes, size: int | None = None) -> None:
-        """Let a record wait for the thread, with so many bytes of the wire in it; what has none is
-        not counted.
+        """Queue a record for the thread.
+
+        Args:
+            size: the number of data bytes in it; None if it is not counted as a record.
         """
         with self._changed:
             if self.error or self._closing or len(self._waiting) + len(record) > BACKLOG:
@@ -287,7 +293,7 @@ class Appender:
                 self._changed.notify_all()
 
     def _make_drop_record(self, dropped: int) -> bytes:
-        """The record that tells that so many were dropped, where the format has one."""
+        """Return the record of an event of dropped records, if the format has one."""
         return b""
 
     def _complain(self) -> None:
@@ -303,9 +309,7 @@ class Appender:
         atexit.unregister(self._finish)
 
     def _work(self) -> None:
-        """The thread: what waits is written, and put on the disk when that is due, until the end or
-        a failure.
-        """
+        """Write the waiting records until the end or a failure; runs in the thread."""
         try:
             due = time.monotonic() + DISK_SECONDS
             while not (self._closing and not self._waiting and self._kept == self._taken):

@@ -2,29 +2,24 @@
 
 A recording is a sequence of records, each complete in itself. The first one describes it in JSON.
 
-    offset  size  of a record, little-endian
-    0       4     mark b"\xb5LS\x1e"
-    4       1     kind: 0 header, 1 received, 2 sent, 3 event
-    5       1     flags: 1 a datagram, 2 the line was interrupted before it, 4 it had fallen silent
-    6       1     a, bytes of addresses
-    7       2     n, bytes of data
-    9       8     arrival time, ns since 1970, signed; the least number: nobody knows
-    17      a     sender, receiver: each a length byte, that many bytes of address,
-                  and, if there are any, the port in 2 bytes
-    17+a    n     data
-    17+a+n  4     CRC-32 (zlib) of everything before
+    offset  size  of a record, little-endian 0       4     mark b"\xb5LS\x1e" 4       1     kind: 0
+    header, 1 received, 2 sent, 3 event 5       1     flags: 1 a datagram, 2 the line was
+    interrupted before it, 4 the line was silent before it 6       1     a, bytes of addresses 7 2
+    n, bytes of data 9       8     arrival time, ns since 1970, signed; the lowest number: unknown
+    17      a     sender, receiver: each a length byte, that many bytes of address, and, if there
+    are any, the port in 2 bytes 17+a    n     data 17+a+n  4     CRC-32 (zlib) of everything before
 
-An event is a JSON object, with its name as "event": "disconnect", "reconnect", "dropped" (so many
-"records"), or "clock": the wall clock was set, and is "ahead_ns" ahead of the arrival times, which
-go on evenly. What a reader does not know it passes over.
+An event is a JSON object, with its name as "event": "disconnect", "reconnect", "dropped" ("records"
+has their number), or "clock": the wall clock was set, and is "ahead_ns" ahead of the arrival times,
+which continue evenly. Readers skip unknown kinds of records.
 
-Theory of operation: a length is at most what its one or two bytes can say, so no record claims more
-than 66 kB, and none is believed before its checksum passes. The reader keeps a window of the file
-that holds one record and what was read with it. It stops at the first damaged record, or salvages
-what lies behind it; what a killed process leaves behind is whole records and at most one that is
-not. A time is found by bisection (`Recording.seek`): arrival times do not go back, and from
-anywhere in the file the next mark with a good checksum is a record. So no index is kept, which a
-crash could lose, and every recording can be sought in.
+Theory of operation: a length has one or two bytes, so no record is longer than 66 kB, and a record
+is only used if its checksum is valid. The reader keeps a window of the file with one record and the
+rest of the last block. It stops at the first damaged record, or salvages the records after it. A
+killed process leaves whole records and at most one incomplete one. A time is found by bisection
+(`Recording.seek`): arrival times do not go back, and from any offset the next mark with a valid
+checksum is a record. So there is no index that a crash could destroy, and every recording can be
+searched.
 """
 
 from __future__ import annotations
@@ -59,7 +54,7 @@ HEADER, RECEIVED, SENT, EVENT = range(4)
 DATAGRAM = 1
 GAP = 2
 QUIET = 4
-#: most bytes of data in one record.
+#: maximum data bytes in one record.
 LARGEST = 0xFFFF
 _HEAD = struct.Struct("<4sBBBHq")
 _CRC = struct.Struct("<I")
@@ -73,11 +68,11 @@ DIRECTIONS: dict[int, Direction] = {RECEIVED: "in", SENT: "out", EVENT: "event"}
 
 @dataclass(frozen=True)
 class Header:
-    """What a recording says of itself.
+    """The description of a recording, in its first record.
 
     Attributes:
-        sensor, options: id and options of the sensor; "" where it was recorded raw.
-        source: the SOURCE that it came from.
+        sensor, options: id and options of the sensor; "" for a raw recording.
+        source: the SOURCE that was recorded.
         datagrams: whether the link carried datagrams.
         baud: of a serial port.
         versions: of lidarspec and of the sensor's distribution.
@@ -98,25 +93,21 @@ class Header:
     version: int = VERSION
 
     def to_json(self) -> bytes:
-        """The header as it stands in the file; an option that JSON does not know stands as its
-        text.
-        """
+        """Return the header as JSON; options that JSON does not support become text."""
         return json.dumps(
             {item.name: getattr(self, item.name) for item in fields(self)}, default=_plain
         ).encode()
 
     def known_sensor(self, folder: Path) -> Sensor:
-        """The installed sensor that it names, with the options of then, as far as anybody may give
-        them.
+        """Return the installed sensor that it names, with the recorded options.
 
         Args:
-            folder: where the recording is; of paths in it those alone are opened that lead to a
-                file there.
+            folder: of the recording; only files in this folder are opened as options.
 
         Raises:
-            UsageError: where it names none, or one with an option that only the caller should give,
-                such as a file elsewhere.
-            UnknownSensor: where that one is not installed.
+            UsageError: if it names no sensor, or if an option has to be given by the caller, such
+                as a file in another folder.
+            UnknownSensor: if the sensor is not installed.
         """
         if not _ID.fullmatch(self.sensor):
             raise UsageError(
@@ -142,10 +133,10 @@ _BLANK = Header()
 
 
 def read_header(data: bytes) -> Header:
-    """The header that bytes stand for; names that this version does not know are passed over.
+    """Parse a header; unknown names are ignored.
 
     Raises:
-        WireError: for bytes that are none.
+        WireError: for an invalid header.
     """
     try:
         values = json.loads(data)
@@ -178,13 +169,13 @@ class Record:
     """One entry of a recording.
 
     Attributes:
-        direction: "in" received, "out" sent, "event" something that happened to the line.
-        data: the bytes; of an event its JSON.
-        at: arrival time, ns since 1970; None where nobody knows it.
-        sender, receiver: addresses and ports of a datagram, where known.
+        direction: "in" received, "out" sent, "event" an event of the line.
+        data: the bytes; JSON for an event.
+        at: arrival time, ns since 1970; None if unknown.
+        sender, receiver: addresses and ports of a datagram, None if unknown.
         datagram: whether `data` is a whole datagram.
         gap: whether the line was interrupted before it.
-        quiet: whether it had fallen silent before it.
+        quiet: whether the line was silent before it.
     """
 
     direction: Direction
@@ -206,10 +197,10 @@ def pack_record(
     sender: Address | None = None,
     receiver: Address | None = None,
 ) -> bytes:
-    """The bytes of a record.
+    """Return the bytes of a record.
 
     Raises:
-        UsageError: for more data, a longer address or another port or time than a record can hold.
+        UsageError: for data or an address that is too long, or an invalid port or time.
     """
     if sender or receiver:
         addresses = _endpoint(sender) + _endpoint(receiver)
@@ -229,8 +220,10 @@ def pack_record(
 
 
 def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
-    """The length that a record claims; 0 where its first bytes are not all there, -1 where it is
-    none.
+    """Return the length in the head of a record.
+
+    Returns:
+        0 if the head is incomplete, -1 if it is not a record.
     """
     mark = bytes(buffer[start : start + len(MARK)])
     if mark != MARK[: len(mark)]:
@@ -242,31 +235,29 @@ def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
 
 
 class Recording(Closing):
-    """A recording, read in order: an iterable of `Record`s that goes on where the last loop
-    stopped, and a context manager.
+    """A recording, read in order; a context manager.
 
-    Memory is bounded by a block and a record.
+    It is an iterable of `Record`s, which continues after the last one read. Memory is limited to a
+    block and a record.
 
     Args:
         path: the file; "-" is standard input.
-        file: it, where it is open already, or is read in another way than as it stands; closed with
-            this one.
-        salvage: look for the next good record behind a damaged place, even the header, instead of
-            stopping there.
+        file: the open or decompressed file; it is closed with the recording.
+        salvage: continue with the next valid record after damage, even of the header, instead of
+            stopping.
 
     Attributes:
-        header: what it says of itself.
-        records: good records so far, the header and events among them.
-        damaged: places so far that hold no good record; a record that is not whole at the end is
-            one.
-        leftover: bytes in damaged places; without `salvage` all that are behind the last good
-            record.
-        is_cut: whether the last damaged place is a record that the file ends in.
+        header: the header.
+        records: number of valid records so far, including the header and events.
+        damaged: number of damaged places so far, including an incomplete record at the end.
+        leftover: number of bytes in damaged places; without `salvage`, all bytes after the last
+            valid record.
+        is_cut: whether the last damaged place is an incomplete record at the end of the file.
         offset: file offset of the next record, or of the damage that ended the reading.
 
     Raises:
-        SourceError: where the file cannot be opened, is no recording, or one of a later format.
-        WireError: where its header is damaged, and `salvage` is not asked for.
+        SourceError: if the file cannot be opened, is not a recording, or has a later format.
+        WireError: if its header is damaged, without `salvage`.
     """
 
     def __init__(
@@ -296,14 +287,16 @@ class Recording(Closing):
         return self._records
 
     def seek(self, at: int) -> bool:
-        """Go on close before the first record that was received at a time, ns since 1970, or later,
-        a few blocks away at most.
+        """Continue shortly before the first record received at a time or later.
 
-        Damaged places that are passed over are not counted.
+        At most a few blocks before it are read. Skipped damage is not counted.
+
+        Args:
+            at: ns since 1970.
 
         Returns:
-            False where that is behind here, where nobody knows when records arrived, and for a
-            pipe: it then goes on where it was.
+            False, without moving, if that record is before the current one, if arrival times are
+            unknown, or for a pipe.
         """
         here = low = self.offset
         if not self._file.seekable():
@@ -321,8 +314,9 @@ class Recording(Closing):
         return low > here
 
     def _find_received(self, start: int, stop: int) -> tuple[int, int] | None:
-        """Time and offset of the first record between two places that was received, and when is
-        known.
+        """Return time and offset of the first received record between two offsets.
+
+        Records without a time are ignored.
         """
         self._go(start)
         while self.offset < stop and self._holds(1):
@@ -344,7 +338,7 @@ class Recording(Closing):
         self.offset = offset
 
     def _begin(self) -> Iterator[Record]:
-        """Read the header; the records behind it."""
+        """Read the header and return the records after it."""
         with system_errors(self.path):
             magic = self._file.read(len(MAGIC))
             if magic != MAGIC:
@@ -376,7 +370,7 @@ class Recording(Closing):
             yield from (record for kind, record in pairs if kind in DIRECTIONS)
 
     def _pairs(self) -> Iterator[tuple[int, Record]]:
-        """Kind and content of every good record."""
+        """Yield kind and content of every valid record."""
         while self._holds(1):
             if (size := self._good()) > 0:
                 kind, record = _unpack_record(self._window[self._place : self._place + size])
@@ -391,7 +385,7 @@ class Recording(Closing):
             self.leftover += self._next_mark()
 
     def _good(self) -> int:
-        """The length of the record in place; 0 where it is damaged or not whole."""
+        """Return the length of the current record, 0 if it is damaged or incomplete."""
         self._holds(_HEAD.size)
         size = size_at(self._window, self._place)
         self.is_cut = size == 0 or (size > 0 and not self._holds(size))
@@ -407,9 +401,7 @@ class Recording(Closing):
         return 0
 
     def _holds(self, number: int) -> bool:
-        """Whether so many bytes are in the window from the place on, after reading more where it
-        takes that.
-        """
+        """Return whether the window has a number of bytes, after reading more if needed."""
         while len(self._window) - self._place < number:
             block = self._file.read(_BLOCK)
             if not block:
@@ -423,12 +415,12 @@ class Recording(Closing):
         self.offset += number
 
     def _next_mark(self) -> int:
-        """Go to the next mark, or to the end; the bytes passed over."""
+        """Go to the next mark or the end; return the number of skipped bytes."""
         before = self.offset
         self._skip(1)
         while (found := self._window.find(MARK, self._place)) < 0:
             left = len(self._window) - self._place
-            keep = min(len(MARK) - 1, left)  # which a mark may begin with
+            keep = min(len(MARK) - 1, left)  # possible beginning of a mark
             self._skip(left - keep)
             if not self._holds(keep + 1):
                 self._skip(keep)
@@ -437,7 +429,7 @@ class Recording(Closing):
         return self.offset - before
 
     def _rest(self) -> int:
-        """The bytes from the place to the end of the file."""
+        """Return the number of bytes up to the end of the file."""
         if self._file.seekable():
             return self._file.seek(0, os.SEEK_END) - self.offset
         left = len(self._window) - self._place
@@ -469,8 +461,10 @@ def _endpoint(address: Address | None) -> bytes:
 
 @lru_cache(maxsize=256)
 def _endpoints(data: bytes) -> list[Address | None] | None:
-    """Sender and receiver as they stand in a record; None where they are not two, or do not fill
-    their place.
+    """Return the sender and receiver in a record.
+
+    Returns:
+        None unless there are exactly two, which fill the bytes.
     """
     found: list[Address | None] = []
     place = 0

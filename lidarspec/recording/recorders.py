@@ -1,9 +1,7 @@
-"""Recorders: what arrives over a link, and what is sent, taken at the speed of the capture and
-brought into a file.
+"""Recorders: write received and sent data to a file while it is captured.
 
-The suffix of the file says which: .lsr holds everything, .pcap and .pcapng packets for Wireshark,
-.bin the bytes alone. All of them grow by whole records, which a thread of their own writes
-(`appending`).
+The suffix selects the format: .lsr for all data, .pcap and .pcapng for packets that Wireshark
+opens, .bin for raw bytes. All of them grow by whole records, written by a thread (`appending`).
 """
 
 from __future__ import annotations
@@ -44,47 +42,45 @@ from lidarspec.spec.links import Udp
 from lidarspec.transports.protocol import Chunk, Transport
 
 SUFFIXES = (".lsr", *WRITINGS, ".bin")
-#: bytes between frames that make one packet at most.
+#: maximum bytes between frames in one packet.
 LARGEST_GAP = 1 << 16
 
 
 @dataclass(frozen=True)
 class MadeFor:
-    """What makes a recorder of the open transport and the sensor, as it is read: configured with
-    what was learned of it.
+    """A factory of a recorder, called with the open transport and the sensor.
+
+    The sensor is configured with the options that it reported.
     """
 
     make: Callable[[Transport, Sensor | str | None], Log]
 
 
-#: a file, a recorder, or what makes one when the source is open.
+#: a file, a recorder, or a factory that is called when the source is open.
 RecordTo = str | Path | Appender | Callable[[Transport], Log] | MadeFor
 
 
 class Recorder(Appender):
     """Writes an .lsr recording, from any thread; a context manager.
 
-    Nothing that goes wrong with the file is raised by `write`: the capture goes on. It is kept in
-    `error`, and raised once, by the next `sync` or by `close`; the file is then valid to its last
-    whole record.
+    `write` does not raise errors of the file, so that the capture continues. The error is kept in
+    `error`, and raised once, by the next `sync` or by `close`. The file is then valid up to its
+    last whole record.
 
     Args:
         path: the file, new unless `overwrite`.
         sensor: the sensor, or its id; left out for a raw recording.
         source: the SOURCE that is recorded.
-        datagrams: whether each chunk is a datagram; by default what the sensor's link says.
+        datagrams: whether each chunk is a datagram; by default as the sensor's link declares.
         baud: of a serial port.
 
-    Attributes:
-        header: what the recording says of itself.
-        records, bytes: received and sent so far, and the bytes in them.
-        dropped: records and events that came while the disk did not keep up, or after it failed.
-        error: what went wrong with the file, None where nothing did.
+    Attributes: header: the header of the recording. records, bytes: the number of records so far,
+        and of the data bytes in them. dropped: the number of records and events dropped while the
+        disk was too slow, or after it failed. error: the failure of the file; None if there was
+        none.
 
-    Raises:
-        UsageError: where the file exists, or the sensor is not installed and nothing else says what
-            the link carries.
-        SourceError: where it cannot be made.
+    Raises: UsageError: if the file exists, or if the sensor is not installed and `datagrams` is not
+        given. SourceError: if it cannot be made.
     """
 
     def __init__(
@@ -107,8 +103,9 @@ class Recorder(Appender):
             raise
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Take what was received or sent, with its arrival time; more than 65,535 bytes of a stream
-        become several records.
+        """Record received or sent data with its time.
+
+        More than 65,535 bytes of a stream become several records.
         """
         kind = RECEIVED if direction == "in" else SENT
         for start in range(0, len(chunk.data) or 1, LARGEST):
@@ -124,8 +121,10 @@ class Recorder(Appender):
             )
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Take down what happened to the line, such as "disconnect" or "reconnect"; now, unless
-        `at` says when.
+        """Record an event of the line, such as "disconnect" or "reconnect".
+
+        Args:
+            at: the time, ns since 1970; by default now.
         """
         self._put(_event(name, time.time_ns() if at is None else at, details))
 
@@ -134,11 +133,11 @@ class Recorder(Appender):
 
 
 class PcapRecorder(Appender):
-    """Writes the datagrams that are received as a capture that Wireshark opens.
+    """Writes received datagrams as a capture that Wireshark opens.
 
     Args:
         path: the file, new unless `overwrite`.
-        port: that datagrams went to where they do not say it.
+        port: the destination port of datagrams without a known one.
     """
 
     def __init__(self, path: str | Path, *, port: int = 0, overwrite: bool = False) -> None:
@@ -148,11 +147,10 @@ class PcapRecorder(Appender):
         self._put(self._writing.head(ETHERNET))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Take a datagram that was received; one that was sent is none of the sensor's, and is left
-        out.
+        """Record a received datagram; sent ones are left out.
 
         Raises:
-            UsageError: for addresses that are none.
+            UsageError: for invalid addresses.
         """
         if direction == "in":
             datagram = Datagram(
@@ -167,11 +165,11 @@ class PcapRecorder(Appender):
 class FrameRecorder(Appender):
     """Writes a byte stream as a capture with one packet for each frame, link type USER0.
 
-    What is no frame becomes packets too, so that they hold every byte that was received, in order.
+    Bytes outside of frames become packets too, so that the file has all received bytes in order.
 
     Args:
         path: the file, new unless `overwrite`.
-        sensor: whose frames they are.
+        sensor: the sensor whose frames are found.
     """
 
     def __init__(self, path: str | Path, sensor: Sensor, *, overwrite: bool = False) -> None:
@@ -184,7 +182,7 @@ class FrameRecorder(Appender):
         self._put(self._writing.head(USER_LINKS[0]))
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Take bytes that were received; those that were sent are left out."""
+        """Record received bytes; sent ones are left out."""
         if direction == "in":
             self._at = chunk.at or self._at
             if chunk.gap:
@@ -220,28 +218,28 @@ class FrameRecorder(Appender):
 
 
 class RawRecorder(Appender):
-    """Writes the bytes that are received, and nothing else."""
+    """Writes the received bytes, and nothing else."""
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
         super().__init__(path, None, overwrite=overwrite)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Take bytes that were received."""
+        """Record received bytes; sent ones are left out."""
         if direction == "in":
             self._put(chunk.data, len(chunk.data))
 
 
 def declared_port(sensor: Sensor | None) -> int:
-    """The first port that the datagrams of a sensor go to; 0 where nobody knows one."""
+    """Return the first declared port of a sensor's datagrams, 0 if there is none."""
     links = sensor.links.values() if sensor is not None else ()
     return next((port for link in links if isinstance(link, Udp) for port in link.ports), 0)
 
 
 def check_suffix(path: str | Path) -> str:
-    """The suffix of a file to record in.
+    """Return the suffix of a file to record to.
 
     Raises:
-        UnknownFormat: where it is none that can be recorded in.
+        UnknownFormat: for a suffix that is not supported.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
@@ -258,20 +256,20 @@ def recorder(
     baud: int | None = None,
     overwrite: bool = False,
 ) -> Appender:
-    """The open recorder for a file, by its suffix: .lsr, .pcap, .pcapng or .bin.
+    """Open the recorder for a file, by its suffix: .lsr, .pcap, .pcapng or .bin.
 
     Args:
         path: the new file.
-        sensor: whose bytes these are, as far as it is known; a capture of a byte stream needs it.
-        source: where they come from, for the header of an .lsr.
+        sensor: the sensor, if known; a capture of a byte stream requires it.
+        source: the source of the data, for the header of an .lsr.
         datagrams: whether chunks are datagrams, or pieces of a stream.
         baud: of a serial line, for the header of an .lsr.
-        overwrite: take the place of a file that exists.
+        overwrite: replace an existing file.
 
     Raises:
         UnknownFormat: for another suffix.
-        UsageError: where the file exists, or cannot hold what the source gives.
-        SourceError: where it cannot be made.
+        UsageError: if the file exists, or cannot contain the data of the source.
+        SourceError: if it cannot be made.
     """
     suffix = check_suffix(path)
     if suffix in WRITINGS and not datagrams:
@@ -349,8 +347,9 @@ def _event(name: str, at: int, details: dict[str, Any]) -> bytes:
 
 
 def _record_size(data: bytes | bytearray, at: int) -> int:
-    """The length of the record that begins there in a piece of a recording, or of the magic bytes,
-    which the first piece begins with.
+    """Return the length of the record at an offset of a piece of a recording.
+
+    The first piece begins with the magic bytes, which count as a record.
     """
     if data.startswith(MAGIC, at):
         return len(MAGIC)

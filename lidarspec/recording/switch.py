@@ -20,12 +20,12 @@ class RecordingSwitch:
     Any thread may switch: one change at a time is made.
 
     Args:
-        source: as the user called it.
+        source: as the user typed it.
         folder: for the files.
 
     Attributes:
-        trouble: why the last change did not do what was asked, "" if it did.
-        written: closed files, and the bytes of the wire in them.
+        trouble: the failure of the last change, "" if it succeeded.
+        written: closed files, and the number of data bytes in them.
     """
 
     def __init__(self, source: str, folder: Path) -> None:
@@ -39,7 +39,7 @@ class RecordingSwitch:
         self.written: list[tuple[str, int]] = []
 
     def attach(self, opened: Transport) -> Log:
-        """Itself, as the recorder of an open transport: what `open(record=...)` calls."""
+        """Return itself, as the recorder of an open transport, for `open(record=...)`."""
         self._opened = opened
         return self
 
@@ -52,14 +52,14 @@ class RecordingSwitch:
             self._change(on=self._recorder is None)
 
     def set(self, *, on: bool) -> None:
-        """Start a file, or end it; does nothing if that is done already."""
+        """Start or end a file; does nothing if it is in that state already."""
         with self._changing:
             if on == (self._recorder is None):
                 self._change(on=on)
 
     @property
     def recording(self) -> tuple[str, int] | None:
-        """The name of the file that is being written, and the bytes of the wire in it."""
+        """The name of the current file and the number of data bytes in it, or None."""
         current = self._recorder
         if current is None:
             return None
@@ -67,26 +67,26 @@ class RecordingSwitch:
 
     @property
     def error(self) -> SourceError | None:
-        """What went wrong with the file that is being written."""
+        """The failure of the current file; None if there is none."""
         if self._recorder is not None:
             return self._recorder.error
         return None
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Record what arrived or was sent, while it is on."""
+        """Record received or sent data if the switch is on."""
         if (current := self._recorder) is not None:
             current.write(chunk, direction)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record that something happened, while it is on."""
+        """Record an event if the switch is on."""
         if (current := self._recorder) is not None:
             current.event(name, at, **details)
 
     def close(self) -> None:
-        """End the file that is being written.
+        """End the current file.
 
         Raises:
-            SourceError: where it could not be written.
+            SourceError: if it could not be written.
         """
         with self._changing:
             self._end()
