@@ -84,7 +84,7 @@ Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Piece:
+class FilePiece:
     """Some scans of a file, and where they go.
 
     Attributes:
@@ -189,7 +189,7 @@ def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor
     return configured
 
 
-def survey(piece: Piece) -> list[Piece]:
+def survey(piece: FilePiece) -> list[FilePiece]:
     """The piece, with the number of its scans, and what follows it, if anything does."""
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
@@ -201,7 +201,7 @@ def survey(piece: Piece) -> list[Piece]:
     return [replace(piece, count=count, is_last=False), following]
 
 
-def convert_piece(piece: Piece) -> Record:
+def convert_piece(piece: FilePiece) -> Record:
     """What the manifest says of a piece, once its points are written, or it has failed."""
     counts: Record = {"first_scan": piece.first, "scans": 0, "points": 0}
     try:
@@ -223,14 +223,14 @@ def convert_piece(piece: Piece) -> Record:
         return piece.describe_failure(error)
 
 
-def _count_scans(piece: Piece, scans: Iterator[Scan], counts: Record) -> Iterator[Scan]:
+def _count_scans(piece: FilePiece, scans: Iterator[Scan], counts: Record) -> Iterator[Scan]:
     for scan in scans:
         counts["scans"] += 1
         counts["points"] += len(scan) if piece.every_point else int(scan.points.valid.sum())
         yield scan
 
 
-def _write(piece: Piece, scans: Iterable[Scan]) -> None:
+def _write(piece: FilePiece, scans: Iterable[Scan]) -> None:
     """Write scans to where the piece goes, which appears whole."""
     if not is_stored(piece.output):
         with system_errors(piece.output):
@@ -252,7 +252,7 @@ def pieces(
     every_point: bool,
     size: int,
     select: Selection,
-) -> list[Piece]:
+) -> list[FilePiece]:
     """The files of some paths, patterns and URLs, each as one piece.
 
     Raises:
@@ -265,7 +265,7 @@ def pieces(
     else:
         name = sensor or ""
         options = {}
-    made: dict[str, Piece] = {}
+    made: dict[str, FilePiece] = {}
     for source, below in (pair for pattern in sources for pair in found(str(pattern))):
         if to:
             target = f"{folder.rstrip('/')}/{below.rpartition('.')[0] or below}.{to}"
@@ -276,7 +276,9 @@ def pieces(
                 f"{made[target].source} and {source} would both become {target}: convert them to"
                 " two folders"
             )
-        made[target] = Piece(source, name, options, target if to else "", every_point, size, select)
+        made[target] = FilePiece(
+            source, name, options, target if to else "", every_point, size, select
+        )
     return list(made.values())
 
 
@@ -367,7 +369,7 @@ class Manifest:
         """Whether a file was in the folder at the beginning."""
         return plain(path) in self._outputs
 
-    def done(self, piece: Piece) -> Record | None:
+    def done(self, piece: FilePiece) -> Record | None:
         """What was said of a piece that need not be made again."""
         record = self._records.get((piece.source, piece.target), {}).get(piece.number)
         if (
@@ -389,7 +391,7 @@ class Manifest:
             and (now["modified"] == record["modified"] or digest(source) == record["digest"])
         )
 
-    def find_records(self, piece: Piece) -> list[Record]:
+    def find_records(self, piece: FilePiece) -> list[Record]:
         """What was said of all pieces of a file, none where one is missing."""
         records = list[Record]()
         for number in itertools.count():
@@ -400,7 +402,7 @@ class Manifest:
                 return records
         return []
 
-    def clear(self, piece: Piece) -> None:
+    def clear(self, piece: FilePiece) -> None:
         """Remove the outputs of a file that has changed or is converted differently now."""
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
@@ -563,17 +565,17 @@ def convert(
 
 
 def _run(
-    executor: Executor, todo: Iterable[Piece], done: Callable[[Piece], Record | None]
+    executor: Executor, todo: Iterable[FilePiece], done: Callable[[FilePiece], Record | None]
 ) -> Iterator[tuple[Record, bool]]:
     """What became of each piece, as it is done; those of which something is known already are not
     made again.
     """
-    ended = queue.SimpleQueue[tuple[Piece, Future[Any]]]()
+    ended = queue.SimpleQueue[tuple[FilePiece, Future[Any]]]()
     tasks = deque((survey if _is_large(piece) else convert_piece, piece) for piece in todo)
     running = 0
     ahead = 1 if isinstance(executor, _Here) else AHEAD
 
-    def hand_over(function: Callable[[Piece], Any], piece: Piece) -> None:
+    def hand_over(function: Callable[[FilePiece], Any], piece: FilePiece) -> None:
         executor.submit(function, piece).add_done_callback(
             lambda future: ended.put((piece, future))
         )
@@ -604,7 +606,7 @@ def _run(
             yield record, True
 
 
-def _is_large(piece: Piece) -> bool:
+def _is_large(piece: FilePiece) -> bool:
     """Whether a file is larger than a piece, and is cut; what cannot be looked at is not."""
     if piece.select.is_counted:
         return False
@@ -680,11 +682,11 @@ def read(
     return frames.from_map(_partition, cut, meta=_partition(replace(cut[0], count=1)).iloc[:0])
 
 
-def _cut(piece: Piece) -> list[Piece]:
+def _cut(piece: FilePiece) -> list[FilePiece]:
     """All pieces of a file."""
     if not _is_large(piece):
         return [piece]
-    found = list[Piece]()
+    found = list[FilePiece]()
     following = [piece]
     while following:
         first, *following = survey(following[0])
@@ -692,7 +694,7 @@ def _cut(piece: Piece) -> list[Piece]:
     return found
 
 
-def _partition(piece: Piece) -> Any:
+def _partition(piece: FilePiece) -> Any:
     """The points of a piece as a pandas dataframe."""
     with piece.open_scans() as scans:
         made = tables(piece.iter_numbered(scans), every_point=piece.every_point)

@@ -18,7 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.captures.pcap import CaptureReader, Datagram, StreamReader
-from lidarspec.captures.records import LARGEST_BLOCK, Damaged, Form, Passed, Times, records
+from lidarspec.captures.records import (
+    LARGEST_BLOCK,
+    DamagedRecordError,
+    Form,
+    Passed,
+    Times,
+    records,
+)
 from lidarspec.captures.source import Source, Truncated
 from lidarspec.frames.layout import rows_at
 from lidarspec.framing.results import Frames, Indices
@@ -200,7 +207,7 @@ def _windows(storage: NDArray[np.uint8], starts: Indices, width: int) -> NDArray
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class CapturedDatagrams:
     """n datagrams in the order of their arrival.
 
     Attributes:
@@ -236,12 +243,12 @@ class Batch:
             return rows_at(self.buffer, self.starts, size).tobytes()
         return b"".join(map(self.data, range(len(self))))
 
-    def of(self, origin: Origin) -> Batch:
+    def of(self, origin: Origin) -> CapturedDatagrams:
         """Return the datagrams from one address, or from one port of it."""
         if all(name in origin for name in self.names):
             return self
         wanted = np.array([name in origin for name in self.names], np.bool_)[self.senders]
-        return Batch(
+        return CapturedDatagrams(
             self.buffer,
             self.starts[wanted],
             self.sizes[wanted],
@@ -250,7 +257,7 @@ class Batch:
             self.names,
         )
 
-    def parts(self, size: int) -> Iterator[Batch]:
+    def parts(self, size: int) -> Iterator[CapturedDatagrams]:
         """Split the batch into parts of about `size` bytes."""
         ends = np.cumsum(self.sizes)
         start = 0
@@ -260,7 +267,7 @@ class Batch:
                 start + 1,
             )
             own = slice(start, stop)
-            yield Batch(
+            yield CapturedDatagrams(
                 self.buffer,
                 self.starts[own],
                 self.sizes[own],
@@ -297,7 +304,7 @@ class CaptureBatches(CaptureReader):
 
     largest = LARGEST
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self) -> Iterator[CapturedDatagrams]:
         """Yield the datagrams of the file, one batch for each buffer that was read."""
         known: list[RecordKind] = []
         with self._count_end():
@@ -310,7 +317,7 @@ class CaptureBatches(CaptureReader):
                     continue
                 if len(starts) <= 1:
                     starts = np.array([self._source.at])
-                found = _Records(self, self._source, form, starts, known)
+                found = _RecordBlock(self, self._source, form, starts, known)
                 ended = found.read()
                 place = self._source.place
                 if len(batch := found.batch()):
@@ -318,7 +325,7 @@ class CaptureBatches(CaptureReader):
                     yield batch
                 if self._source.place != place:
                     continue  # the consumer of the batch called `skip`
-                if isinstance(ended, Damaged):
+                if isinstance(ended, DamagedRecordError):
                     self._skip_damage(form)
                 elif ended is not None:
                     raise ended
@@ -329,7 +336,7 @@ class StreamBatches(StreamReader, CaptureBatches):
     """Reads the packets of a capture of a byte stream in batches."""
 
 
-class _Records:
+class _RecordBlock:
     """The whole records in the buffer; if there are none, the next record alone."""
 
     def __init__(
@@ -371,7 +378,7 @@ class _Records:
                 self._source.at = int(self._starts[index])
                 try:
                     self._read_single(index)
-                except (Damaged, Truncated) as ended:
+                except (DamagedRecordError, Truncated) as ended:
                     self._kinds = self._kinds[:index]
                     return ended
                 if self._form.sections != self._section:
@@ -394,7 +401,7 @@ class _Records:
             self._known[kind] for kind in np.argsort(-counts, kind="stable")[:MOST_KNOWN].tolist()
         ]
 
-    def batch(self) -> Batch:
+    def batch(self) -> CapturedDatagrams:
         """Return the datagrams of these records."""
         if self._only is not None and not self._singles:
             return self._uniform(self._only)
@@ -420,14 +427,16 @@ class _Records:
             buffer = np.empty(0, np.uint8)
         if self._singles:
             buffer = self._append_singles(buffer, columns, known, names)
-        return Batch(buffer, columns[0], columns[1], columns[2], columns[3], tuple(names))
+        return CapturedDatagrams(
+            buffer, columns[0], columns[1], columns[2], columns[3], tuple(names)
+        )
 
-    def _uniform(self, kind: RecordKind) -> Batch:
+    def _uniform(self, kind: RecordKind) -> CapturedDatagrams:
         """Return the batch if all records are of one kind."""
         number = len(self._at)
         self._reader.stats.packets += number - self._matched_singles
         sizes, senders = (np.broadcast_to(np.intp(fact), number) for fact in (kind.size, 0))
-        return Batch(
+        return CapturedDatagrams(
             self._buffer,
             self._starts[:number] + kind.start,
             sizes,

@@ -112,7 +112,7 @@ class NoDatagramError(Exception):
         self.name = name
 
 
-class Fragment(NamedTuple):
+class IpFragment(NamedTuple):
     """The position of a fragment in the whole packet.
 
     Attributes:
@@ -142,7 +142,7 @@ class IpPacket(NamedTuple):
     protocol: int
     body: bytes
     body_offset: int = 0
-    fragment: Fragment | None = None
+    fragment: IpFragment | None = None
     variable_offsets: tuple[int, ...] = ()
 
 
@@ -396,7 +396,7 @@ def _skip_extensions(protocol: int, body: bytes) -> tuple[int, int]:
     return protocol, offset
 
 
-def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> Fragment | None:
+def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> IpFragment | None:
     """Return the fragment that header fields describe; None for a whole packet.
 
     Raises:
@@ -407,7 +407,7 @@ def _make_fragment(ident: int, *, start: int, size: int, more: bool) -> Fragment
     is_cut_in_eights = not more or size % 8 == 0
     if not size or not is_cut_in_eights or start + size > _MAX_PACKET_BYTES:
         raise NoDatagramError("malformed")
-    return Fragment(ident, start, more)
+    return IpFragment(ident, start, more)
 
 
 class _PartialPacket:
@@ -473,7 +473,7 @@ class Reassembly:
         self._partials: OrderedDict[tuple[bytes, bytes, int], _PartialPacket] = OrderedDict()
         self._held_bytes = 0
 
-    def add(self, packet: IpPacket, fragment: Fragment, arrival_ns: int) -> IpPacket | None:
+    def add(self, packet: IpPacket, fragment: IpFragment, arrival_ns: int) -> IpPacket | None:
         """Add a fragment; return the whole packet if this was the last one missing.
 
         Args:

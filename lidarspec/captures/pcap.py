@@ -31,7 +31,7 @@ from lidarspec.captures.ip import (
 )
 from lidarspec.captures.records import (
     CapturedPacket,
-    Damaged,
+    DamagedRecordError,
     Form,
     Passed,
     is_capture,
@@ -209,7 +209,7 @@ class CaptureReader(Closing):
             while self._source.begin_record():
                 try:
                     datagram = self.to_datagram(form.read())
-                except Damaged:
+                except DamagedRecordError:
                     self._skip_damage(form)
                     continue
                 if datagram is not None:

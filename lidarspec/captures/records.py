@@ -76,7 +76,7 @@ _SECOND = 1_000_000_000
 _FURTHEST = 4_000_000_000
 
 
-class Damaged(Exception):
+class DamagedRecordError(Exception):
     """A record is invalid, and the start of the next one is unknown."""
 
 
@@ -227,9 +227,9 @@ class PcapRecords:
             raise Truncated
         seconds, fraction, captured, original = self._head.unpack(head)
         if captured > LARGEST_PACKET or not any(head):  # a hole in a file reads as zeros
-            raise Damaged
+            raise DamagedRecordError
         if not self._is_sure(captured, original) and self._is_false(captured, original):
-            raise Damaged
+            raise DamagedRecordError
         self._began = seconds if self._began is None else self._began
         self._source.skip(self._head.size)
         return CapturedPacket(
@@ -361,7 +361,7 @@ class PcapngBlocks:
             raise Truncated
         if head[:4] == _SECTION:
             if head[8:] not in _ORDERS:
-                raise Damaged
+                raise DamagedRecordError
             self.order = _ORDERS[head[8:]]
             self._interfaces = []
             self._knows_all = True
@@ -369,7 +369,7 @@ class PcapngBlocks:
         kind, length = struct.unpack_from(self.order + "II", head)
         if self._is_false(kind, length):
             self._knows_all = self._knows_all and kind != _INTERFACE
-            raise Damaged
+            raise DamagedRecordError
         if length > LARGEST_BLOCK:
             self._source.skip(length)
             return Passed.NO_PACKET
@@ -377,7 +377,7 @@ class PcapngBlocks:
         if kind == _INTERFACE:
             if len(body) < 8 or len(self._interfaces) == _MOST_INTERFACES:
                 self._knows_all = False
-                raise Damaged
+                raise DamagedRecordError
             self._interfaces.append(_interface(self.order, body))
         if kind in _PACKETS:
             return _block_packet(self.order, kind, body, self._interfaces) or Passed.MALFORMED
@@ -491,7 +491,7 @@ def _find_timed_packet(source: Source, form: Form, stop: int) -> tuple[int, int]
     while resume(source, form) and source.begin_record() and source.record < stop:
         try:
             packet = form.read()
-        except Damaged:
+        except DamagedRecordError:
             continue
         except Truncated:
             break

@@ -22,7 +22,7 @@ from lidarspec.drafting.draft import (
     write,
 )
 from lidarspec.errors import UsageError, WireError, suggest
-from lidarspec.exports import EXPORTS, Refused, export as exported, select_frame
+from lidarspec.exports import EXPORTS, ExportError, export as exported, select_frame
 from lidarspec.libraries import import_library
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.testing.check import Report, reports, target
@@ -232,6 +232,6 @@ def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> 
     chosen = sensor if frame is None else select_frame(sensor, frame)
     try:
         text = exported(chosen, kind)
-    except Refused as refused:
+    except ExportError as refused:
         raise suggest(refused, f"lidarspec show {sensor.id}") from None
     emit(text.removesuffix("\n"), output)

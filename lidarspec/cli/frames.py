@@ -19,8 +19,8 @@ from lidarspec.detect.heard import Heard
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, values
 from lidarspec.explaining.listing import LINED, Line, list_differences
-from lidarspec.explaining.pieces import Piece, explain_piece, pieces
-from lidarspec.explaining.wording import Span, number
+from lidarspec.explaining.pieces import InputPiece, explain_piece, pieces
+from lidarspec.explaining.wording import TextSpan, number
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import selection as scans
 from lidarspec.sensor_operations import Sensor
@@ -49,7 +49,7 @@ def parse(
     """
     with open_input(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id)
-        wanted = Selection(sensor, count=count)
+        wanted = FrameSelection(sensor, count=count)
         found = wanted.frames(pieces(sensor, chunks, datagrams=given.datagrams))
         first = next(found, None)
         if first is None:
@@ -68,13 +68,13 @@ def parse(
             note(f"{wanted.unframed} bytes are in no frame; lidarspec explain names them")
 
 
-def _fields(sensor: Sensor, piece: Piece) -> dict[str, Any]:
+def _fields(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
     """Return a frame as a JSON object."""
     facts = {"frame": piece.frame, "offset": piece.offset, "size": len(piece.data)}
     return {**facts, "fields": plain(sensor.parse(piece.data, piece.frame))}
 
 
-def _tables(sensor: Sensor, frames: Iterable[Piece], output: str | None) -> Iterator[str]:
+def _tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | None) -> Iterator[str]:
     for index, piece in enumerate(frames):
         found = values(piece.data, sensor, piece.frame).values()
         rows = [
@@ -152,7 +152,7 @@ def explain(
         if diff is not None:
             _compare(sensor, given, found, diff, frame, as_json=as_json, output=output)
             return
-        wanted = Selection(sensor, frame, count=count, bad=bad, at=at, stretch=stretch)
+        wanted = FrameSelection(sensor, frame, count=count, bad=bad, at=at, stretch=stretch)
         parts = wanted.parts(found)
         if as_json:
             listed = ({"offset": piece.offset, **part.to_dict()} for piece, part in parts)
@@ -164,7 +164,7 @@ def explain(
 
 def listing(
     sensor: Sensor,
-    parts: Iterable[tuple[Piece, Explanation]],
+    parts: Iterable[tuple[InputPiece, Explanation]],
     at: int | None = None,
     *,
     every: bool = False,
@@ -179,7 +179,7 @@ def listing(
     """
     for index, (piece, part) in enumerate(parts):
         yield from [()] * bool(index)
-        title = Span(_title(sensor, piece, part.frame), "title")
+        title = TextSpan(_title(sensor, piece, part.frame), "title")
         if at is None:
             place = ""
         else:
@@ -191,11 +191,15 @@ def listing(
             verdict = f": {part.verdict}"
         else:
             verdict = ""
-        yield (title, Span(f"; byte {at} is in {place}" if place else ""), Span(verdict, "bad"))
+        yield (
+            title,
+            TextSpan(f"; byte {at} is in {place}" if place else ""),
+            TextSpan(verdict, "bad"),
+        )
         yield from part.lines(every=every)
 
 
-class Selection:
+class FrameSelection:
     """Selects the pieces of an input to show, and counts the others.
 
     Args:
@@ -234,7 +238,7 @@ class Selection:
         self._ended = False
         self.valid = self.damaged = self.unframed = self.others = 0
 
-    def frames(self, found: Iterable[Piece]) -> Iterator[Piece]:
+    def frames(self, found: Iterable[InputPiece]) -> Iterator[InputPiece]:
         """Yield the valid frames."""
         for piece in found:
             if piece.is_valid:
@@ -245,7 +249,7 @@ class Selection:
             else:
                 self.unframed += len(piece.data)
 
-    def parts(self, found: Iterable[Piece]) -> Iterator[tuple[Piece, Explanation]]:
+    def parts(self, found: Iterable[InputPiece]) -> Iterator[tuple[InputPiece, Explanation]]:
         """Yield the selected pieces with their explanations, as they are found.
 
         Raises:
@@ -265,7 +269,7 @@ class Selection:
                 return
         self._ended = True
 
-    def _within(self, piece: Piece) -> Iterator[tuple[Piece, Explanation]]:
+    def _within(self, piece: InputPiece) -> Iterator[tuple[InputPiece, Explanation]]:
         try:
             for part, what in explain_piece(self._sensor, piece, self._frame):
                 if self._bad and what.is_filler:
@@ -340,7 +344,7 @@ def _stretch(text: str | None) -> tuple[float, float]:
 def _compare(
     sensor: Sensor,
     given: Heard,
-    found: Iterator[Piece],
+    found: Iterator[InputPiece],
     diff: str,
     frame: str | None,
     *,
@@ -365,7 +369,7 @@ def _compare(
             second = pieces(sensor, chunks, datagrams=heard.datagrams, frame=frame)
             other = next(
                 (piece for piece in second if piece.frame == first.frame),
-                Piece(0, heard.data, first.frame),
+                InputPiece(0, heard.data, first.frame),
             )
     (_, before), (_, after) = (
         next(explain_piece(sensor, piece, frame)) for piece in (first, other)
@@ -383,7 +387,7 @@ def _compare(
     else:
         emit_lines(
             [
-                (Span(f"{sensor.id} {before.frame}", "title"),),
+                (TextSpan(f"{sensor.id} {before.frame}", "title"),),
                 *list_differences(differing, (len(before.data), len(after.data))),
             ],
             output,
@@ -415,7 +419,7 @@ def _sensor(
     return named_sensor(fault.sensor), []
 
 
-def _title(sensor: Sensor, piece: Piece, frame: str) -> str:
+def _title(sensor: Sensor, piece: InputPiece, frame: str) -> str:
     where = f" at byte {piece.offset}" if piece.offset else ""
     return (
         f"{sensor.id} {frame or 'skipped'}{where}, {len(piece.data)}"

@@ -140,7 +140,7 @@ def colour_option(function: Function) -> Function:
     )(function)
 
 
-class Number(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
+class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions of click have no types
     """A type of option for one or two numbers with a syntax of their own.
 
     Args:
@@ -249,25 +249,25 @@ def _distances(text: str) -> tuple[float, float]:
 
 
 #: Seconds, from "10s", "500ms", "2min", "1h" or a bare number.
-DURATION = Number("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
+DURATION = NumberType("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
 #: A number from 0 to 1, from "1%" or "0.01".
-SHARE = Number("share", _share, "share, such as 1% or 0.01")
+SHARE = NumberType("share", _share, "share, such as 1% or 0.01")
 #: An offset in bytes, from "940" or "0x3ac".
-OFFSET = Number("offset", _offset, "offset of a byte, such as 940 or 0x3ac")
+OFFSET = NumberType("offset", _offset, "offset of a byte, such as 940 or 0x3ac")
 #: A number of bytes, from "256MB" or "1GB".
-BYTES = Number("size", _bytes, "size from 1MB on, such as 256MB or 1GB")
+BYTES = NumberType("size", _bytes, "size from 1MB on, such as 256MB or 1GB")
 #: A factor above 0; 0 for "max".
-SPEED = Number("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")
+SPEED = NumberType("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")
 #: A begin and an end, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
-SLICE = Number(
+SLICE = NumberType(
     "slice",
     lambda text: _between(text, _moment),
     "slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:",
 )
 #: A first and a last index, from "5:10".
-INDICES = Number("indices", _indices, "slice of whole numbers, such as 5:10, 5: or :10")
+INDICES = NumberType("indices", _indices, "slice of whole numbers, such as 5:10, 5: or :10")
 #: A minimum and a maximum range in metres, from "0.5m:30m".
-DISTANCES = Number("distances", _distances, "span of distances, such as 0.5m:30m, 50cm: or :30")
+DISTANCES = NumberType("distances", _distances, "span of distances, such as 0.5m:30m, 50cm: or :30")
 
 #: Argument of `Selection` -> its option.
 SELECTING: dict[str, Callable[[Any], Any]] = {

@@ -32,7 +32,7 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Slice
 from lidarspec.sensor_operations import Sensor
 from lidarspec.view.feed import LOOK_S, Feed
-from lidarspec.view.meter import Reading, format_figure
+from lidarspec.view.meter import MeterReading, format_figure
 
 #: Width and decimals of the columns of points.
 POINTS = {
@@ -228,7 +228,7 @@ def _plain(value: Any) -> Any:
 
 
 #: Name and unit of each figure, the width of its column (0: only in the summary), and its text.
-FIGURES: tuple[tuple[str, str, int, Callable[[Reading], str]], ...] = (
+FIGURES: tuple[tuple[str, str, int, Callable[[MeterReading], str]], ...] = (
     ("speed", "Hz", 6, lambda r: format_figure(r.speed_hz, "{:.2f}")),
     ("packets", "/s", 8, lambda r: format_figure(r.packet_rate_hz, "{:.1f}")),
     ("points", "/scan", 7, lambda r: format_figure(r.points, "{:.0f}")),
@@ -246,14 +246,14 @@ WIDTHS = [6, *(width for _, _, width, _ in COLUMNS), 6]
 
 
 @dataclass
-class Lines:
+class StatsPrinter:
     """Prints a row of figures, or a JSON object, for each interval."""
 
     device: Device
     as_json: bool
     printed: int = 0
 
-    def interval(self, at: float | None, reading: Reading) -> None:
+    def interval(self, at: float | None, reading: MeterReading) -> None:
         """Print the figures of one interval, which ended `at` seconds after the beginning."""
         if self.as_json:
             self._emit({"kind": "interval", "at_s": at, **self._figures(reading)})
@@ -271,7 +271,7 @@ class Lines:
         )
         sys.stdout.flush()
 
-    def summary(self, reading: Reading) -> None:
+    def summary(self, reading: MeterReading) -> None:
         """Print the figures of the whole input."""
         if self.as_json:
             self._emit(
@@ -290,7 +290,7 @@ class Lines:
             if text(reading) != "-":
                 say(f"  {name:<8} {text(reading):>10} {unit}")
 
-    def _figures(self, reading: Reading) -> dict[str, Any]:
+    def _figures(self, reading: MeterReading) -> dict[str, Any]:
         facts = {"source": str(self.device.source), "sensor": self.device.sensor.id}
         return {
             **facts,
@@ -348,7 +348,11 @@ def stats(
             say(f"{source}:")
         with open_device(source, sensor_id, period=LOOK_S) as device:
             found = _print_stats(
-                source, Feed(device, select=selection), Lines(device, as_json), interval, lasting
+                source,
+                Feed(device, select=selection),
+                StatsPrinter(device, as_json),
+                interval,
+                lasting,
             )
             worst = max(found.error_rate, found.loss_rate or 0.0)
             if max_errors is not None and worst > max_errors:
@@ -362,7 +366,9 @@ def stats(
         raise click.exceptions.Exit(FINDINGS)
 
 
-def _print_stats(source: str, feed: Feed, lines: Lines, interval: float, lasting: float) -> Reading:
+def _print_stats(
+    source: str, feed: Feed, lines: StatsPrinter, interval: float, lasting: float
+) -> MeterReading:
     """Print the lines and the summary of one source, and return the summary.
 
     Args:
@@ -384,7 +390,7 @@ def _print_stats(source: str, feed: Feed, lines: Lines, interval: float, lasting
     return found
 
 
-def _summary(feed: Feed, start: float) -> Reading:
+def _summary(feed: Feed, start: float) -> MeterReading:
     """Return the figures of the whole input.
 
     Args:
@@ -396,7 +402,12 @@ def _summary(feed: Feed, start: float) -> Reading:
 
 
 def _by_the_clock(
-    feed: Feed, lines: Lines, interval: float, start: float, lasting: float, patience: Patience
+    feed: Feed,
+    lines: StatsPrinter,
+    interval: float,
+    start: float,
+    lasting: float,
+    patience: Patience,
 ) -> None:
     """Print a line for each interval of the clock."""
     edge = last = start
@@ -410,7 +421,7 @@ def _by_the_clock(
         last = now
 
 
-def _by_the_packets(feed: Feed, lines: Lines, interval: float, lasting: float) -> None:
+def _by_the_packets(feed: Feed, lines: StatsPrinter, interval: float, lasting: float) -> None:
     """Print a line for each interval of the packets' time, at least one batch long."""
     start: int | None = None
     edges = 0

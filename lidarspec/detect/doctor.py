@@ -18,7 +18,7 @@ from lidarspec.errors import LidarSpecError, UsageError, printable, suggestion
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports import ports
-from lidarspec.transports.addresses import Address, with_option
+from lidarspec.transports.addresses import SourceAddress, with_option
 from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.protocol import no_bytes
@@ -28,7 +28,7 @@ LOOPBACK = "lo"
 
 
 @dataclass(frozen=True)
-class Finding:
+class Diagnosis:
     """The result of one check.
 
     Attributes:
@@ -44,7 +44,7 @@ class Finding:
 
 def examine(
     source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN
-) -> Iterator[Finding]:
+) -> Iterator[Diagnosis]:
     """Check a source, and yield findings in the order of the checks.
 
     Args:
@@ -63,11 +63,11 @@ def examine(
         yield from _examine_bytes(text, sensor, seconds)
 
 
-def computer() -> Iterator[Finding]:
+def computer() -> Iterator[Diagnosis]:
     """Check the ports of this computer, whatever is connected to them."""
     serial_ports = ports.serial_ports()
     if not serial_ports:
-        yield Finding(
+        yield Diagnosis(
             True,
             "there is no serial port: where one should be, its cable or driver is missing",
             "sudo dmesg | tail",
@@ -80,17 +80,17 @@ def computer() -> Iterator[Finding]:
     yield from _buffer()
 
 
-def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
+def _file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
     if os.path.exists(path):
         name = path
     else:
         name = path.rpartition("?")[0]  # the option after it selects a sender
     if not os.path.exists(name):
-        yield Finding(False, f"{path}: no such file or port", "lidarspec ports")
+        yield Diagnosis(False, f"{path}: no such file or port", "lidarspec ports")
     elif not os.access(name, os.R_OK):
-        yield Finding(False, f"{path}: this user may not read it", f"sudo chmod a+r {path}")
+        yield Diagnosis(False, f"{path}: this user may not read it", f"sudo chmod a+r {path}")
     elif os.path.getsize(name) == 0:
-        yield Finding(False, f"{path} is empty")
+        yield Diagnosis(False, f"{path} is empty")
     else:
         found_verdicts = verdicts(path)
         found = max(found_verdicts, key=lambda one: one.heard.size)
@@ -98,36 +98,36 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Finding]:
             yield _verdict(path, found, sensor)
         yield from _several(path, found_verdicts)
         for text in found.heard.warnings or [no_bytes(path, ())] * (not found.heard.size):
-            yield Finding(False, text)
+            yield Diagnosis(False, text)
 
 
 def _serial(
-    source: str, address: Address, sensor: Sensor | None, seconds: float
-) -> Iterator[Finding]:
+    source: str, address: SourceAddress, sensor: Sensor | None, seconds: float
+) -> Iterator[Diagnosis]:
     port = address.place
     if os.name == "posix" and not os.path.exists(port):
-        yield Finding(
+        yield Diagnosis(
             False,
             f"{port}: no such port; it is not plugged in, or its driver is missing",
             "lidarspec ports",
         )
         return
     problems = [finding for finding in (*_permission(port), *_in_use(port)) if not finding.ok]
-    yield from problems or [Finding(True, f"{port} is there, and may be opened")]
+    yield from problems or [Diagnosis(True, f"{port} is there, and may be opened")]
     if not problems:
         yield from _examine_bytes(source, sensor, seconds)
 
 
-def _permission(port: str) -> Iterator[Finding]:
+def _permission(port: str) -> Iterator[Diagnosis]:
     if not ports.is_allowed(port):
         group = ports.group(port)
         text = f"{port}: this user may not open it"
-        by_group = Finding(
+        by_group = Diagnosis(
             False,
             f"{text}; the group {group} may, from the next login on",
             f"sudo usermod -aG {group} $USER",
         )
-        yield by_group if group else Finding(False, f"{text}; nobody but root may", _rule(port))
+        yield by_group if group else Diagnosis(False, f"{text}; nobody but root may", _rule(port))
 
 
 def _rule(port: str) -> str:
@@ -137,12 +137,14 @@ def _rule(port: str) -> str:
     return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.rules && sudo udevadm trigger"
 
 
-def _in_use(port: str) -> Iterator[Finding]:
+def _in_use(port: str) -> Iterator[Diagnosis]:
     for user in ports.users(port):
-        yield Finding(False, f"{port} is in use by {user}", f"kill {user.pid}")
+        yield Diagnosis(False, f"{port} is in use by {user}", f"kill {user.pid}")
 
 
-def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+def _udp(
+    source: str, address: SourceAddress, sensor: Sensor | None, seconds: float
+) -> Iterator[Diagnosis]:
     numbers = _udp_numbers(address, sensor)
     host = address.host_and_port()[0]
     busy = [finding for number in numbers for finding in _port_in_use(number)]
@@ -162,7 +164,7 @@ def _udp(source: str, address: Address, sensor: Sensor | None, seconds: float) -
         yield from _interfaces(numbers, host, rates)
 
 
-def _udp_numbers(address: Address, sensor: Sensor | None) -> list[int]:
+def _udp_numbers(address: SourceAddress, sensor: Sensor | None) -> list[int]:
     port = address.host_and_port()[1]
     given = address.options.get("port", "")
     if given:
@@ -175,21 +177,21 @@ def _udp_numbers(address: Address, sensor: Sensor | None) -> list[int]:
     return udp_ports()
 
 
-def _port_in_use(number: int) -> Iterator[Finding]:
+def _port_in_use(number: int) -> Iterator[Diagnosis]:
     users = ports.udp_users(number)
     if users is None:
         return
     for user in users:
-        yield Finding(False, f"UDP port {number} is in use by {user}", f"kill {user.pid}")
+        yield Diagnosis(False, f"UDP port {number} is in use by {user}", f"kill {user.pid}")
     if not users:
-        yield Finding(
+        yield Diagnosis(
             False,
             f"UDP port {number} is in use by a program of another user",
             f"sudo ss -ulpn 'sport = :{number}'",
         )
 
 
-def _buffer() -> Iterator[Finding]:
+def _buffer() -> Iterator[Diagnosis]:
     limit = Path("/proc/sys/net/core/rmem_max")
     try:
         granted = int(limit.read_text(encoding="ascii"))
@@ -197,28 +199,28 @@ def _buffer() -> Iterator[Finding]:
         return
     for text in shortfall(BUFFER, min(granted, BUFFER)):
         said, _, command = text.partition("; next: ")
-        yield Finding(False, said.replace("the system gave", "the system gives at most"), command)
+        yield Diagnosis(False, said.replace("the system gave", "the system gives at most"), command)
 
 
-def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Iterator[Finding]:
+def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Iterator[Diagnosis]:
     """Yield findings about interfaces, if packets arrive but none at the ports."""
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
     if host:
         text = f"only packets to {host} are listened to; a sensor may send to another address"
-        yield Finding(True, text, f"lidarspec doctor udp://:{numbers[0]}")
+        yield Diagnosis(True, text, f"lidarspec doctor udp://:{numbers[0]}")
     for name, rate in active.items():
         text = (
             f"{name} receives {rate:.0f} packets/s, none of them on port {listed}: another port,"
             " another address, or a firewall"
         )
-        yield Finding(False, text, f"sudo tcpdump -ni {name} udp")
+        yield Diagnosis(False, text, f"sudo tcpdump -ni {name} udp")
         if ports.filters_senders(name):
             text = (
                 f"{name} drops senders whose addresses it does not reach, as a sensor with its"
                 " factory address is (rp_filter)"
             )
-            yield Finding(
+            yield Diagnosis(
                 False,
                 text,
                 f"sudo sysctl -w net.ipv4.conf.all.rp_filter=2 net.ipv4.conf.{name}.rp_filter=2",
@@ -228,10 +230,10 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
             "no network interface receives anything: cable, power of the sensor, or an interface"
             " that is down"
         )
-        yield Finding(False, text, "ip -br address")
+        yield Diagnosis(False, text, "ip -br address")
 
 
-def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Finding]:
+def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Diagnosis]:
     """Check whether data arrives, and whether it is valid data of the sensor."""
     try:
         if sensor is not None:
@@ -242,7 +244,7 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
             tried += verdicts(source, seconds=seconds)
     except LidarSpecError as error:
         command = suggestion(error)
-        yield Finding(
+        yield Diagnosis(
             False,
             str(error),
             "" if "doctor" in command and not isinstance(error, UsageError) else command,
@@ -252,7 +254,7 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
     yield from _several(source, tried)
 
 
-def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
+def _several(source: str, found: Sequence[Verdict]) -> Iterator[Diagnosis]:
     """Yield a finding for several senders of one sensor's frames."""
     senders: dict[str, list[str]] = {}
     for one in found:
@@ -261,31 +263,31 @@ def _several(source: str, found: Sequence[Verdict]) -> Iterator[Finding]:
     for name, several in senders.items():
         if len(several) > 1:
             command = f"lidarspec view {quote(with_option(source, 'src', several[0]))} -s {name}"
-            yield Finding(
+            yield Diagnosis(
                 False, f"{' and '.join(several)} all send frames of {name}: choose one", command
             )
 
 
-def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
+def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
     """Return the finding about the data of one sender."""
     heard = found.heard
     ids = [score.sensor.id for score in found.scores]
     may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
     quoted = quote(source)
     if not heard.size and heard.warnings:
-        return Finding(
+        return Diagnosis(
             False, heard.warnings[0], f"lidarspec detect {quote(source.partition('?')[0])}"
         )
     if not heard.size:
         return _nothing(source, sensor)
     if found.fault:
-        return Finding(False, found.fault, f"lidarspec crc {quoted}")
+        return Diagnosis(False, found.fault, f"lidarspec crc {quoted}")
     if not found.scores:
         if heard.baud is not None and len(bauds()) > 1:
             at = " at any baud rate"
         else:
             at = ""
-        return Finding(
+        return Diagnosis(
             False,
             f"{heard.size} bytes came, and no frame of an installed sensor{at}",
             f"lidarspec detect {quoted}",
@@ -295,7 +297,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     else:
         at = ""
     if sensor is not None and sensor.id not in ids:
-        return Finding(
+        return Diagnosis(
             False,
             f"it sends frames of {ids[0]}{at}, not of {sensor.id}",
             f"lidarspec view {quoted} -s {ids[0]}",
@@ -307,12 +309,12 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
             command = f"lidarspec view {quoted} -s {other}"
         else:
             command = f"lidarspec detect {quoted}"
-        return Finding(False, f"it sends frames of {other} ({why}){at}, not of {name}", command)
+        return Diagnosis(False, f"it sends frames of {other} ({why}){at}, not of {name}", command)
     score = next(score for score in found.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)
     if heard.baud is not None and link and heard.baud not in link.bauds:
         again = quote(with_option(source, "baud", heard.baud))
-        return Finding(
+        return Diagnosis(
             False,
             f"{name} sends{at}, and {link.baud} is declared",
             f"lidarspec view {again} -s {name}",
@@ -321,7 +323,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
         2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size
     )  # the first and the last frame
     if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
-        return Finding(
+        return Diagnosis(
             False,
             f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable,"
             " ground or baud rate",
@@ -329,25 +331,25 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Finding:
     device = "".join(
         f", {role} {text}" for role, text in read_info(score.sensor, score.found).items()
     )
-    return Finding(
+    return Diagnosis(
         True,
         f"{name} sends{at}: {score.data_frames} data frames, {score.share:.0%} of the bytes in"
         f" frames{printable(device)}",
     )
 
 
-def _nothing(source: str, sensor: Sensor | None) -> Finding:
+def _nothing(source: str, sensor: Sensor | None) -> Diagnosis:
     """Return the finding for a source without data."""
     quoted = quote(source)
     if sensor is not None and sensor in started_first():
         start = next(name for name in sensor.on_open if sensor.commands[name].starts)
         text = f"nothing came; {sensor.id} sends nothing before it is started"
-        return Finding(False, text, f"lidarspec send {quoted} {start} -s {sensor.id}")
+        return Diagnosis(False, text, f"lidarspec send {quoted} {start} -s {sensor.id}")
     address = live_address(source)
     if sensor is None and address is not None and address.scheme == "serial":
         text = (
             "nothing came: a sensor that has to be started first, no power, or its transmit line is"
             " not on our receive line"
         )
-        return Finding(False, text, f"lidarspec detect {quoted} --start")
-    return Finding(False, "nothing came within the time of listening")
+        return Diagnosis(False, text, f"lidarspec detect {quoted} --start")
+    return Diagnosis(False, "nothing came within the time of listening")

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.captures.bulk import Batch
+from lidarspec.captures.bulk import CapturedDatagrams
 from lidarspec.detect.identification import read_info
 from lidarspec.device.first_frames import FirstFrames, find_first_frames, is_searched
 from lidarspec.device.senders import Senders, frame_senders
@@ -217,7 +217,9 @@ def decode_chunks(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
     return _set_arrival(found, np.array(ends), np.array(times))
 
 
-def _decode_stream(decoder: Decoder, packets: Batch, size: int) -> Iterator[list[Frames]]:
+def _decode_stream(
+    decoder: Decoder, packets: CapturedDatagrams, size: int
+) -> Iterator[list[Frames]]:
     """Yield the frames that the packets of a byte stream complete.
 
     Each frame has the arrival time of the packet that holds its last byte.

@@ -1,8 +1,8 @@
 """A `Device` for asyncio.
 
 `AsyncDevice` calls the methods of a `Device` in threads of its own, so that the event loop is never
-blocked. An item that a thread has found stays in a `_Feed` until a call fetches it: a cancelled
-call loses nothing.
+blocked. An item that a thread has found stays in a `_ThreadedIterator` until a call fetches it: a
+cancelled call loses nothing.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class AsyncDevice:
         self._device: Device | None = None
         self._reading = ThreadPoolExecutor(1, "reader of a device")
         self._sending = ThreadPoolExecutor(1, "sender of a device")
-        self._feeds: dict[tuple[str, ...], _Feed[Any]] = {}
+        self._feeds: dict[tuple[str, ...], _ThreadedIterator[Any]] = {}
         self._newest: Scan | None = None
 
     @property
@@ -154,14 +154,16 @@ class AsyncDevice:
     ) -> None:
         await self.close()
 
-    def _get_feed(self, method: str, *arguments: str) -> _Feed[Any]:
+    def _get_feed(self, method: str, *arguments: str) -> _ThreadedIterator[Any]:
         """Return the feed of an iterator of the device; later calls continue with the same one."""
         key = (method, *arguments)
         if key not in self._feeds:
-            self._feeds[key] = _Feed(getattr(self.device, method)(*arguments, wait=_WAIT_S))
+            self._feeds[key] = _ThreadedIterator(
+                getattr(self.device, method)(*arguments, wait=_WAIT_S)
+            )
         return self._feeds[key]
 
-    async def _fetch(self, feed: _Feed[T]) -> AsyncIterator[T]:
+    async def _fetch(self, feed: _ThreadedIterator[T]) -> AsyncIterator[T]:
         """Yield the items of a feed until it ends."""
         while True:
             while feed.items:
@@ -183,7 +185,7 @@ class AsyncDevice:
             raise self.device.make_timeout_error()
 
 
-class _Feed(Generic[T]):
+class _ThreadedIterator(Generic[T]):
     """The items of an iterator, found in a thread and fetched in the event loop.
 
     Args:

@@ -20,7 +20,7 @@ from dataclasses import replace
 from enum import Enum
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.appending import Log
+from lidarspec.recording.appending import TrafficLog
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 
@@ -184,7 +184,7 @@ class Capture:
         queue: BoundedQueue,
         *,
         link: str = "data",
-        log: Log | None = None,
+        log: TrafficLog | None = None,
         clock: HostClock | None = None,
     ) -> None:
         self.transport = transport
@@ -208,7 +208,7 @@ class Capture:
             self._thread.join(5.0)
         self.transport.close()
 
-    def record(self, log: Log | None) -> None:
+    def record(self, log: TrafficLog | None) -> None:
         """Record from now on, and discard the events in the queue.
 
         All events that come out of the queue afterwards are recorded.

@@ -28,7 +28,7 @@ from lidarspec.packets.imu import ImuSamples, joined
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
-from lidarspec.recording.appending import Log
+from lidarspec.recording.appending import TrafficLog
 from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Sieve
@@ -79,7 +79,7 @@ class Device(Closing):
         self._first_frames: list[Found] = []
         self._is_checked = not sensor.relatives and "model" not in sensor.info
         self._contradiction = ""
-        self._own_recorders: list[Log] = []
+        self._own_recorders: list[TrafficLog] = []
         self._input = self._open_input(backend, record, overflow, period, learns=start)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorders)
         if start:
@@ -189,7 +189,7 @@ class Device(Closing):
         """
         reader = self._get_reader(frame)
         ahead = self._take_ahead()
-        pace = _Pace(wait)
+        pace = _TurnTimer(wait)
         for arrival in self._iter_arrivals(wait, ahead):
             packets = None
             if arrival is not None and arrival is ahead and frame is None:
@@ -250,7 +250,7 @@ class Device(Closing):
             raise UsageError(f"{self.sensor.id}: no frame says what an IMU felt")
         reader = self._get_reader(None)
         ahead = self._take_ahead()
-        pace = _Pace(wait)
+        pace = _TurnTimer(wait)
         for arrival in self._iter_arrivals(wait, ahead):
             if arrival is not None and arrival is not ahead:
                 reader.add_imu(arrival, reader.add(arrival))
@@ -455,7 +455,7 @@ class Device(Closing):
     def _iter_scans(self, wait: float | None) -> Iterator[Scan | None]:
         reader = self._get_reader(None)
         ahead = self._take_ahead()
-        pace = _Pace(wait)
+        pace = _TurnTimer(wait)
         stream = self._make_scan_stream()
         for arrival in self._iter_arrivals(wait, ahead):
             if arrival is not None:
@@ -536,7 +536,7 @@ class Device(Closing):
         ]
 
 
-class _Pace:
+class _TurnTimer:
     """Tells an iterator when its caller is due for a turn.
 
     Args:
@@ -614,9 +614,9 @@ def _make_recorder(
     record: RecordTo | None,
     source: str | Path,
     opened: LiveTransport,
-    own_recorders: list[Log],
+    own_recorders: list[TrafficLog],
     sensor: Sensor,
-) -> Log | None:
+) -> TrafficLog | None:
     """Return the recorder that was asked for.
 
     It is added to `own_recorders` if the device has to close it.
@@ -629,7 +629,7 @@ def _make_recorder(
     return log
 
 
-def _close(source: Input | Transport, recorders: list[Log]) -> None:
+def _close(source: Input | Transport, recorders: list[TrafficLog]) -> None:
     """Close everything; recordings are closed even if the source fails."""
     try:
         source.close()

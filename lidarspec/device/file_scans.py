@@ -153,7 +153,7 @@ class FileScans(Closing):
         state = (self._input.decoder, self._input.senders, reader, self._reader, self._stream)
         content = io.BytesIO()
         try:
-            _Writer(content, self._sensor, self._input.decoder, opened.file).dump(state)
+            _StatePickler(content, self._sensor, self._input.decoder, opened.file).dump(state)
         except (pickle.PicklingError, TypeError, AttributeError):
             return None
         return content.getvalue()
@@ -201,7 +201,7 @@ def _walk(
         _walk(part, (*name, key), found, seen)
 
 
-class _Writer(pickle.Pickler):
+class _StatePickler(pickle.Pickler):
     """Pickles the state of a reader."""
 
     def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:

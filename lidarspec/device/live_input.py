@@ -34,7 +34,7 @@ from lidarspec.errors import (
 )
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
-from lidarspec.recording.appending import Log
+from lidarspec.recording.appending import TrafficLog
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Address
 from lidarspec.spec.links import Http, Link, Udp
@@ -81,7 +81,7 @@ class LiveInput(Input):
         *,
         backend: str = "auto",
         policy: str = "drop_oldest",
-        record: Callable[[Sensor], Log | None] = lambda sensor: None,
+        record: Callable[[Sensor], TrafficLog | None] = lambda sensor: None,
         learns: bool = False,
         period: float = PERIOD,
     ) -> None:

@@ -204,7 +204,7 @@ def _physical(info: FieldInfo, value: Any) -> Any:
 
 
 @dataclass(eq=False)
-class _Request:
+class _PendingCommand:
     """A command in progress.
 
     Attributes:
@@ -249,11 +249,11 @@ class _Owed:
 
 
 @dataclass(eq=False)
-class _Line:
+class _LinkQueue:
     """The state of one link; nothing is sent before `quiet`."""
 
-    queue: deque[_Request] = field(default_factory=deque)
-    current: _Request | None = None
+    queue: deque[_PendingCommand] = field(default_factory=deque)
+    current: _PendingCommand | None = None
     owed: list[_Owed] = field(default_factory=list)
     quiet: int = 0
 
@@ -304,7 +304,7 @@ class Session:
         self.host: str | None = None
         self.unanswered: dict[str, CommandError] = {}
         self._count = 0
-        self._lines: dict[str, _Line] = {}
+        self._lines: dict[str, _LinkQueue] = {}
         self._beats: dict[str, _Beat] = {}
         self._out: list[Outgoing] = []
 
@@ -348,8 +348,8 @@ class Session:
             expected = Expected(tables, values, command.refusal)
         else:
             expected = None
-        self._lines.setdefault(command.link, _Line()).queue.append(
-            _Request(name, command, data, expected, wait, pending)
+        self._lines.setdefault(command.link, _LinkQueue()).queue.append(
+            _PendingCommand(name, command, data, expected, wait, pending)
         )
         if command.every:
             self._beats[name] = _Beat(arguments, now + _ns(command.every), pending)
@@ -474,13 +474,13 @@ class Session:
                 line.quiet = now + _ns(request.command.settle)
                 request.pending.settle(Reply(request.name, None, None, False, now))
 
-    def _send(self, request: _Request, now: int) -> None:
+    def _send(self, request: _PendingCommand, now: int) -> None:
         command = request.command
         request.sent.append(now)
         self._out.append(Outgoing(command.link, request.data, command.lines))
         self.started = (self.started or command.starts) and not command.stops
 
-    def _take(self, line: _Line, item: Found, now: int) -> None:
+    def _take(self, line: _LinkQueue, item: Found, now: int) -> None:
         """Use a frame as the reply to the current request, or as a late reply."""
         values = self.sensor.parse(item.data, item.frame)
         current = line.current
@@ -511,7 +511,7 @@ class Session:
         ):
             current.wrong = f"{item.frame} with {', '.join(differs)}"
 
-    def _is_refusal(self, line: _Line, item: Found, values: Any, now: int) -> bool:
+    def _is_refusal(self, line: _LinkQueue, item: Found, values: Any, now: int) -> bool:
         """Return whether a frame refuses the oldest request without a reply.
 
         The frame does not tell which request it refuses.
@@ -538,11 +538,13 @@ class Session:
             return False
         return True
 
-    def _give_up(self, line: _Line, request: _Request, error: CommandError) -> None:
+    def _give_up(self, line: _LinkQueue, request: _PendingCommand, error: CommandError) -> None:
         self._close(line, request, answers=0, since=request.sent[-1])
         request.pending.settle(error)
 
-    def _close(self, line: _Line, request: _Request, *, answers: int, since: int) -> None:
+    def _close(
+        self, line: _LinkQueue, request: _PendingCommand, *, answers: int, since: int
+    ) -> None:
         """Free the link; each sending without a reply may still get a late one."""
         line.current = None
         line.quiet = since + _ns(request.command.settle)
@@ -599,7 +601,7 @@ def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
     return ", ".join(reasons)
 
 
-def _silence(sensor: Sensor, request: _Request) -> CommandError:
+def _silence(sensor: Sensor, request: _PendingCommand) -> CommandError:
     """Return the error for a request without a reply."""
     place = f"{sensor.id} {request.name}"
     if request.wrong:

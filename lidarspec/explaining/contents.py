@@ -37,7 +37,7 @@ from lidarspec.transports.files import (
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
 from lidarspec.view.feed import Feed
-from lidarspec.view.meter import Reading
+from lidarspec.view.meter import MeterReading
 
 #: bytes, and packets, that are looked at from the beginning of a file, and bytes of a sensor that
 #: are decoded.
@@ -88,7 +88,7 @@ class Content:
     sensors: tuple[str, ...] = ()
     share: float | None = None
     options: str = ""
-    reading: Reading | None = None
+    reading: MeterReading | None = None
 
     @property
     def command(self) -> str:
@@ -303,7 +303,7 @@ def _content(path: str, one: Verdict) -> Content:
     )
 
 
-def _reading(source: str, sensor: Sensor) -> Reading | None:
+def _reading(source: str, sensor: Sensor) -> MeterReading | None:
     """How a sensor was doing at the beginning of a file; None where its frames cannot be read."""
     try:
         with Device(source, sensor) as device:

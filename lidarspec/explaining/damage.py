@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.explaining.wording import Value
+from lidarspec.explaining.wording import FieldValue
 from lidarspec.frames.arrays import counted
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import CompiledCodec, codec
@@ -170,7 +170,7 @@ def _rows(
 
 
 def describe_damage(
-    frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, Value]]
+    frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, FieldValue]]
 ) -> Iterator[str]:
     """Yield a sentence for each single change that would explain the damage.
 
@@ -193,7 +193,9 @@ def describe_damage(
         yield f"{explains}: {_place(change, before, values(change.repair(data)))}"
 
 
-def _place(change: Change, before: Mapping[str, Value], after: Mapping[str, Value]) -> str:
+def _place(
+    change: Change, before: Mapping[str, FieldValue], after: Mapping[str, FieldValue]
+) -> str:
     kind, offset, value = change
     if kind == "inserted byte":
         return f"byte {offset}, 0x{value:02x}"

@@ -18,7 +18,7 @@ from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.damage import describe_damage
 from lidarspec.explaining.frame_rows import FrameRows
 from lidarspec.explaining.listing import Line, Listing, text
-from lidarspec.explaining.wording import Difference, Point, Row, Span, Value
+from lidarspec.explaining.wording import Difference, FieldValue, Point, Row, TextSpan
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
@@ -69,7 +69,7 @@ class Explanation:
         return "\n".join(text(line) for line in self.lines())
 
     @property
-    def fields(self) -> dict[str, Value]:
+    def fields(self) -> dict[str, FieldValue]:
         """All values in wire order, by path with array indices, e.g. "points[1].intensity"."""
         return {value.path: value for row in self.rows for value in row.values}
 
@@ -102,7 +102,7 @@ class Explanation:
         """
         return [
             *Listing(self.rows, every=every).lines(),
-            *((Span("note: ", "note"), Span(note)) for note in self.notes),
+            *((TextSpan("note: ", "note"), TextSpan(note)) for note in self.notes),
         ]
 
     def differences(self, other: Explanation) -> list[Difference]:
@@ -139,7 +139,7 @@ class Explanation:
         }
         return {**head, "rows": [row.to_dict() for row in self.rows]}
 
-    def _bytes_of(self, value: Value | None) -> bytes:
+    def _bytes_of(self, value: FieldValue | None) -> bytes:
         if value is None:
             return b""
         return self.data[value.start : value.start + len(value.masks)]
@@ -177,7 +177,7 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
     return Explanation(sensor.id, name, data, rows, fault, notes)
 
 
-def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, Value]:
+def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, FieldValue]:
     """Return all values of one frame of this type in wire order, by path with array indices."""
     return FrameRows(sensor.frames[frame], data).values()
 

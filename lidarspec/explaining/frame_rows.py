@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from lidarspec.errors import WireError
-from lidarspec.explaining.wording import Row, Value
+from lidarspec.explaining.wording import FieldValue, Row
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import plain_fields
@@ -95,7 +95,7 @@ class FrameRows:
         if self._is_whole_text and self._end < len(self._data):
             yield Row(self._end, self._data[self._end :], "(end)", (), (), right=True)
 
-    def values(self) -> dict[str, Value]:
+    def values(self) -> dict[str, FieldValue]:
         """Return every value by its path."""
         return {value.path: value for row in self.rows() for value in row.values}
 
@@ -124,7 +124,7 @@ class FrameRows:
     def _row(self, path: str, group: Sequence[WireField]) -> Row:
         start = group[0].start
         end = group[-1].end
-        values: list[Value] = []
+        values: list[FieldValue] = []
         remarks: list[str] = []
         right = True
         for each in group:
@@ -158,10 +158,10 @@ class FrameRows:
         return ""
 
 
-def _value(each: WireField, info: FieldInfo) -> Value:
+def _value(each: WireField, info: FieldInfo) -> FieldValue:
     size = each.end - each.start
     is_number = isinstance(each.raw, int | float)
-    return Value(
+    return FieldValue(
         each.path,
         each.raw,
         float(info.physical(each.raw)) if is_number else None,

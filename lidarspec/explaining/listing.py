@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from lidarspec.explaining.wording import Difference, Row, Span, Value, bit_picture, number
+from lidarspec.explaining.wording import Difference, FieldValue, Row, TextSpan, bit_picture, number
 from lidarspec.frames.wire_table import format_hex
 
 #: bytes in a line, spaces of a level of nesting, and the widest columns of bits and of names.
@@ -26,7 +26,7 @@ COMPARED = 4
 FIXED = 3
 FOLDED = 24
 
-Line = tuple[Span, ...]
+Line = tuple[TextSpan, ...]
 
 
 def text(line: Line) -> str:
@@ -47,7 +47,7 @@ def fold(line: Line, width: int) -> Line:
         for word in re.findall(r"\s*\S+", span.text):
             breaks = column + len(word) > width and column > indent
             part = f"\n{' ' * indent}{word.lstrip()}" if breaks else word
-            spans.append(Span(part, span.role))
+            spans.append(TextSpan(part, span.role))
             if breaks:
                 column = len(part) - 1
             else:
@@ -100,7 +100,7 @@ class Listing:
             around = parents(row.path)
             for depth, path in enumerate(around):
                 if path not in above[depth : depth + 1]:
-                    yield self._line(row.offset, Span(""), _indent_path(path, depth), [])
+                    yield self._line(row.offset, TextSpan(""), _indent_path(path, depth), [])
             above = around
             yield from self._row(row, len(around), drawn=self._drawn[index])
 
@@ -111,25 +111,25 @@ class Listing:
         role = "hex" if row.right else "bad"
         yield self._line(
             row.offset,
-            Span(parts[0].hex(" "), role),
+            TextSpan(parts[0].hex(" "), role),
             _indent_path(row.path, depth),
             row.spans(drawn=drawn),
         )
         for row_number, part in enumerate(parts[1:], 1):
             yield (
-                Span(f"{row.offset + row_number * self._bytes:04x}  ", "offset"),
-                Span(part.hex(" "), role),
+                TextSpan(f"{row.offset + row_number * self._bytes:04x}  ", "offset"),
+                TextSpan(part.hex(" "), role),
             )
         for value, picture in zip(row.values, _bits(row), strict=True) if drawn else ():
-            words = [Span(str(value) or value.raw.hex(" "))]
-            words += [Span(f" ({value.bits})", "docs")] * (
+            words = [TextSpan(str(value) or value.raw.hex(" "))]
+            words += [TextSpan(f" ({value.bits})", "docs")] * (
                 len(value.masks) - value.masks.count(0) > 1 and bool(value.bits)
             )
-            words += [Span(f"; {value.docs}", "docs")] if value.docs else []
+            words += [TextSpan(f"; {value.docs}", "docs")] if value.docs else []
             if value.bits:
-                drawing = Span(bit_picture(*picture), "bits")
+                drawing = TextSpan(bit_picture(*picture), "bits")
             else:
-                drawing = Span(picture[0].hex(" "), role)
+                drawing = TextSpan(picture[0].hex(" "), role)
             yield self._line(
                 value.start,
                 drawing,
@@ -137,12 +137,12 @@ class Listing:
                 words,
             )
 
-    def _line(self, offset: int, left: Span, name: str, words: Sequence[Span]) -> Line:
-        padded = Span(f"{left.text:<{self._left}}  ", left.role)
+    def _line(self, offset: int, left: TextSpan, name: str, words: Sequence[TextSpan]) -> Line:
+        padded = TextSpan(f"{left.text:<{self._left}}  ", left.role)
         return (
-            Span(f"{offset:04x}  ", "offset"),
+            TextSpan(f"{offset:04x}  ", "offset"),
             padded,
-            Span(f"{name:<{self._paths}}  ", "name"),
+            TextSpan(f"{name:<{self._paths}}  ", "name"),
             *words,
         )
 
@@ -185,7 +185,7 @@ def list_differences(differences: list[Difference], sizes: tuple[int, int]) -> I
     differing = (
         f"{bits} bit{'s' * (bits != 1)} in {fields} field{'s' * (fields != 1)} of {length} differ"
     )
-    yield (Span(differing if fields else f"{length}, all alike", "note"),)
+    yield (TextSpan(differing if fields else f"{length}, all alike", "note"),)
 
 
 def _lines(difference: Difference) -> Iterator[Line]:
@@ -202,7 +202,11 @@ def _lines(difference: Difference) -> Iterator[Line]:
     else:
         moved = ""
     values = f"{_format_value(old)} -> {_format_value(new)}{change}{moved}"
-    yield (Span(f"{old.start:04x}  ", "offset"), Span(f"{difference.path}  ", "name"), Span(values))
+    yield (
+        TextSpan(f"{old.start:04x}  ", "offset"),
+        TextSpan(f"{difference.path}  ", "name"),
+        TextSpan(values),
+    )
     masks = difference.masks
     for start in range(0, len(masks), COMPARED):
         part = slice(start, start + COMPARED)
@@ -213,9 +217,9 @@ def _lines(difference: Difference) -> Iterator[Line]:
             ):
                 bits = bit_picture(data[part], masks[part])
                 yield (
-                    Span(f"{'':6}{sign} "),
-                    Span(f"{data[part].hex(' '):<{3 * COMPARED - 1}}  ", "hex"),
-                    Span(bits, role),
+                    TextSpan(f"{'':6}{sign} "),
+                    TextSpan(f"{data[part].hex(' '):<{3 * COMPARED - 1}}  ", "hex"),
+                    TextSpan(bits, role),
                 )
 
 
@@ -225,10 +229,10 @@ def _missing(group: list[Difference], which: str) -> Line:
         names = paths[0]
     else:
         names = f"{paths[0]} to {paths[-1]}"
-    return (Span(f"{'':6}{names}  ", "name"), Span(f"in the {which} frame alone"))
+    return (TextSpan(f"{'':6}{names}  ", "name"), TextSpan(f"in the {which} frame alone"))
 
 
-def _format_value(value: Value) -> str:
+def _format_value(value: FieldValue) -> str:
     text = str(value)
     return text or (
         format_hex(value.raw, 0) if isinstance(value.raw, bytes) else str(number(value.raw))

@@ -34,7 +34,7 @@ NEAREST = "?"
 
 
 @dataclass(frozen=True)
-class Piece:
+class InputPiece:
     """A frame of the input, or bytes that are in no frame.
 
     Attributes:
@@ -59,14 +59,14 @@ class Piece:
         """The offset after its last byte."""
         return self.offset + len(self.data)
 
-    def part(self, start: int, end: int, frame: str = "") -> Piece:
+    def part(self, start: int, end: int, frame: str = "") -> InputPiece:
         """Return the bytes from `start` to `end` as a piece of the input."""
-        return Piece(self.offset + start, self.data[start:end], frame)
+        return InputPiece(self.offset + start, self.data[start:end], frame)
 
 
 def pieces(
     sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: str | None = None
-) -> Iterator[Piece]:
+) -> Iterator[InputPiece]:
     """Yield the frames of the input and the bytes between them, in order, as they are found.
 
     A datagram that is not a frame is a piece of its own. An input that is not longer than a frame
@@ -99,14 +99,14 @@ def pieces(
         )
         return
     try:
-        yield Piece(0, whole, identify(sensor, whole, frame=frame))
+        yield InputPiece(0, whole, identify(sensor, whole, frame=frame))
     except LidarSpecError:
         found = list(
             _split_input(
                 sensor if frame is None else _prefer_frame(sensor, frame), head, datagrams=datagrams
             )
         )
-        yield from found if any(piece.frame for piece in found) else [Piece(0, whole, NEAREST)]
+        yield from found if any(piece.frame for piece in found) else [InputPiece(0, whole, NEAREST)]
 
 
 def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
@@ -118,7 +118,9 @@ def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
     )
 
 
-def _split_input(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) -> Iterator[Piece]:
+def _split_input(
+    sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool
+) -> Iterator[InputPiece]:
     decoder = sensor.decoder(stream=not datagrams)
     held = bytearray()
     start = 0
@@ -131,25 +133,25 @@ def _split_input(sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool) ->
             held += chunk.data
             found += decoder.feed(chunk.data)
         if decoder.joins:  # a joined message has no contiguous bytes in the input
-            yield from (Piece(item.offset, item.data, item.frame) for item in found)
+            yield from (InputPiece(item.offset, item.data, item.frame) for item in found)
             continue
         end = start
         for item in found:
             if item.offset > end:
-                yield Piece(end, bytes(held[end - start : item.offset - start]), "", datagrams)
-            yield Piece(item.offset, item.data, item.frame)
+                yield InputPiece(end, bytes(held[end - start : item.offset - start]), "", datagrams)
+            yield InputPiece(item.offset, item.data, item.frame)
             end = item.offset + len(item.data)
         left = len(held) - (end - start) - decoder.stats.pending
         if left and (datagrams or chunk is None or left > MAX_HELD_BYTES):
-            yield Piece(end, bytes(held[end - start : end - start + left]), "", datagrams)
+            yield InputPiece(end, bytes(held[end - start : end - start + left]), "", datagrams)
             end += left
         del held[: end - start]
         start = end
 
 
 def explain_piece(
-    sensor: Sensor, piece: Piece, frame: str | None = None
-) -> Iterator[tuple[Piece, Explanation]]:
+    sensor: Sensor, piece: InputPiece, frame: str | None = None
+) -> Iterator[tuple[InputPiece, Explanation]]:
     """Yield a piece with its explanation.
 
     A piece without a frame is split into damaged frames and the bytes between them.
@@ -173,7 +175,7 @@ def explain_piece(
         yield _explain_skipped(sensor, piece.part(end, len(piece.data)))
 
 
-def _explain_skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
+def _explain_skipped(sensor: Sensor, piece: InputPiece) -> tuple[InputPiece, Explanation]:
     is_filler = not piece.data.translate(None, bytes(sensor.fillers))
     remark = "filler" if is_filler else "in no frame"
     return piece, Explanation(
@@ -181,7 +183,7 @@ def _explain_skipped(sensor: Sensor, piece: Piece) -> tuple[Piece, Explanation]:
     )
 
 
-def _iter_damaged(sensor: Sensor, piece: Piece) -> Iterator[Piece]:
+def _iter_damaged(sensor: Sensor, piece: InputPiece) -> Iterator[InputPiece]:
     """Yield the damaged frames in the bytes of a piece, in order."""
     data = piece.data
     end = 0

@@ -21,7 +21,7 @@ HEXDUMP_LINES_BEFORE = 2
 DEGREES_PER_TURN = 360
 
 
-class Span(NamedTuple):
+class TextSpan(NamedTuple):
     """A piece of a line with its role, which decides its colour.
 
     The roles are "", "offset", "hex", "name", "bits", "docs", "good", "bad", "point", "note" and
@@ -77,7 +77,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Value:
+class FieldValue:
     """One field of a row.
 
     Attributes:
@@ -178,7 +178,7 @@ class Row:
     offset: int
     data: bytes
     path: str
-    values: tuple[Value, ...] = ()
+    values: tuple[FieldValue, ...] = ()
     remarks: tuple[str, ...] = ()
     right: bool = True
     points: tuple[Point, ...] = ()
@@ -189,7 +189,7 @@ class Row:
         """Values in their units, remarks, documentation and points, in one line."""
         return "".join(text for text, _ in self.spans())
 
-    def spans(self, *, drawn: bool = False) -> list[Span]:
+    def spans(self, *, drawn: bool = False) -> list[TextSpan]:
         """Return the meaning in pieces with their roles.
 
         Args:
@@ -211,7 +211,7 @@ class Row:
         )
         parts = [part for part in parts if part[1]]
         return [
-            Span(separator * (index > 0) + text, role)
+            TextSpan(separator * (index > 0) + text, role)
             for index, (separator, text, role) in enumerate(parts)
         ]
 
@@ -279,8 +279,8 @@ class Difference:
     """
 
     path: str
-    before: Value | None
-    after: Value | None
+    before: FieldValue | None
+    after: FieldValue | None
     first: bytes
     second: bytes
 

@@ -37,7 +37,7 @@ EXPORTS: dict[str, str] = {
 }
 
 
-class Refused(UsageError):
+class ExportError(UsageError):
     """An export that cannot say what the spec says, with the reason."""
 
 
@@ -94,7 +94,7 @@ def _line(text: str) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Message:
+class ExportedFrame:
     """One frame type: its name, what the sensor says of it, and its tree."""
 
     name: str
@@ -112,7 +112,7 @@ class Message:
         }
 
 
-def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
+def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ...]:
     """All frame types of a sensor, in their order.
 
     Args:
@@ -123,14 +123,14 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[Message, ...]:
             on the wire in a form of its own.
     """
     if not sensor.frames:
-        raise Refused(f"{sensor.id}: has no frames yet: configure it first")
+        raise ExportError(f"{sensor.id}: has no frames yet: configure it first")
     formed = [
         f"{name} in {frame.wire}"
         for name, frame in sensor.frames.items()
         if frame.wire is not None and on_wire
     ]
     if formed:
-        raise Refused(
+        raise ExportError(
             f"{sensor.id}: no other language recodes what stands on the wire: {', '.join(formed)}"
         )
     return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
@@ -158,16 +158,16 @@ def find_held_formulas(node: tree.Node) -> dict[str, tree.Formula]:
     }
 
 
-def _message(sensor: Sensor, name: str, frame: Frame) -> Message:
+def _message(sensor: Sensor, name: str, frame: Frame) -> ExportedFrame:
     try:
         root = frame.tree
         for node in tree.nodes(root):
             _check(node)
-    except (Refused, SpecError) as refused:
-        raise Refused(f"{sensor.id} {name}: {refused}") from None
+    except (ExportError, SpecError) as refused:
+        raise ExportError(f"{sensor.id} {name}: {refused}") from None
     if not isinstance(root, tree.Struct | tree.Sealed):
-        raise Refused(f"{sensor.id} {name}: the frame is no struct")
-    return Message(name, frame, root)
+        raise ExportError(f"{sensor.id} {name}: the frame is no struct")
+    return ExportedFrame(name, frame, root)
 
 
 def _check(node: tree.Node) -> None:
@@ -177,9 +177,9 @@ def _check(node: tree.Node) -> None:
         *([node.condition] if isinstance(node, tree.Check) else []),
     ):
         if isinstance(formula, tree.Untraced):
-            raise Refused(formula.reason)
+            raise ExportError(formula.reason)
         if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):
-            raise Refused(
+            raise ExportError(
                 f"{element}: an element of an array decides on what follows, and this language"
                 " keeps none"
             )
@@ -187,6 +187,6 @@ def _check(node: tree.Node) -> None:
         reason = node.reason
         if not node.inside:
             reason = f"{node.kind} is Python code, which no other language runs"
-        raise Refused(f"{node.info.path}: {reason}")
+        raise ExportError(f"{node.info.path}: {reason}")
     if isinstance(node, tree.Sealed):
         _ = node.algorithm

@@ -22,7 +22,7 @@ from textwrap import indent
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Message, Refused, beginning, c_fields, messages
+from lidarspec.exports import ExportedFrame, ExportError, beginning, c_fields, messages
 from lidarspec.exports.c_fields import (
     CLayout,
     Entry,
@@ -97,7 +97,7 @@ def checksum(algorithm: Checksum, name: str) -> str:
     is_counting = isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
     if isinstance(algorithm, ZeroPadded):
         if isinstance(inner, Fold15):
-            raise Refused(
+            raise ExportError(
                 "a folded sum that is padded with zeros:"
                 " which bytes count depends on how many there are in all"
             )
@@ -142,7 +142,9 @@ def _make_body(algorithm: Checksum) -> _Body:
                 " ? total + ((uint64_t)byte << 8) : (total << 1) + byte;"
             )
             return _Body(begin, step, "((total & 0x7fff) + (total >> 15)) & 0x7fff")
-    raise Refused(f"the checksum {type(algorithm).__name__} is Python code, which C does not run")
+    raise ExportError(
+        f"the checksum {type(algorithm).__name__} is Python code, which C does not run"
+    )
 
 
 def _make_word_xor_body(algorithm: WordXor) -> _Body:
@@ -305,7 +307,7 @@ def _format_checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, alg
     held = [access for path in seal.fields for access in accesses(layout, path)]
     for path in seal.fields:
         if [access.depth for access in held if access.info.path == path] != [entry.depth]:
-            raise Refused(f"{path}: a checksum that stands in several places")
+            raise ExportError(f"{path}: a checksum that stands in several places")
     return _CHECKSUM.format(
         name=name.removesuffix("_ok"),
         parameters=parameters(entry.depth),
@@ -502,7 +504,7 @@ def header(sensor: Sensor) -> str:
 
 
 def _iter_definitions(
-    message: Message,
+    message: ExportedFrame,
     prefix: str,
     taken: dict[str, tuple[str, str, str]],
     algorithms: Mapping[Checksum, str],

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from lidarspec.exports import Message, Refused, find_references
+from lidarspec.exports import ExportedFrame, ExportError, find_references
 from lidarspec.frames.wire_table import Extent, meaning, unit_text
 from lidarspec.spec import tree
 
@@ -85,7 +85,7 @@ def quote_bytes(data: bytes) -> str:
     return '"' + "".join(f"\\{byte:03o}" for byte in data) + '"'
 
 
-class Condition(NamedTuple):
+class CCondition(NamedTuple):
     """A C expression, and whether it depends on nothing in arrays."""
 
     text: str
@@ -111,7 +111,7 @@ class Entry:
     start: Extent
     size: Extent
     depth: int = 0
-    conditions: tuple[Condition, ...] = ()
+    conditions: tuple[CCondition, ...] = ()
     loops: tuple[str, ...] = ()
     part: tree.Part | None = None
 
@@ -197,7 +197,7 @@ class CLayout:
         Refused: where an entry cannot be found without reading all elements before it.
     """
 
-    def __init__(self, message: Message, name: Callable[[str, str], str]) -> None:
+    def __init__(self, message: ExportedFrame, name: Callable[[str, str], str]) -> None:
         self.message = message
         self.name = name
         self.entries: list[Entry] = []
@@ -226,7 +226,7 @@ class CLayout:
             Refused: where 64-bit integers cannot hold what it may come to.
         """
         if tree.width(value) > tree.MOST_BITS:
-            raise Refused("a formula that may pass what a 64-bit integer holds")
+            raise ExportError("a formula that may pass what a 64-bit integer holds")
         return tree.write(
             value,
             lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})",
@@ -270,8 +270,8 @@ class CLayout:
                     return sizes[0][1]
                 arguments = format_size_arguments(entry.node, entry.depth)
                 return Extent(0, (f"(int64_t){self.extent_name(entry)}({arguments})",))
-            case tree.Parts():
-                raise Refused(
+            case tree.PartSequence():
+                raise ExportError(
                     f"{entry.path}: parts of sizes of their own, of which none has a place without"
                     " reading those before it"
                 )
@@ -339,13 +339,13 @@ class CLayout:
     def _element(self, entry: Entry, node: tree.Repeat) -> Extent:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
         if size.terms and any(node.axis in ref.info.axes for ref in find_references(node.element)):
-            raise Refused(
+            raise ExportError(
                 f"{node.axis}: its elements differ in size, so that none has a place of its own"
                 " without reading those before it"
             )
         return size
 
-    def _cases(self, entry: Entry) -> list[tuple[Condition, Entry]]:
+    def _cases(self, entry: Entry) -> list[tuple[CCondition, Entry]]:
         """The alternatives of a part, each with its condition."""
         node = entry.node
         is_fixed = not any(
@@ -366,7 +366,7 @@ class CLayout:
                 *((f"{key} == {value}", case) for value, case in node.cases),
                 (others, node.default),
             ]
-        return [(Condition(text, is_fixed), replace(entry, node=case)) for text, case in cases]
+        return [(CCondition(text, is_fixed), replace(entry, node=case)) for text, case in cases]
 
 
 #: unit -> the SI unit that it is a multiple of, as part of a C name; factor and offset.

@@ -2,10 +2,11 @@
 
 A row has four bytes, and each field is a box. A repeated part is drawn once, with its count.
 
-A diagram is made in two steps. `_Cells` converts a frame tree to boxes in wire order (`Cell`), and
-to groups that are repeated or optional (`Group`). `_Sheet` draws them from top to bottom. A box
-that crosses the end of a row continues in the next row. A group starts a new row and has a bracket
-beside it. A field that is too long, or that has no fixed length, is drawn as a cut row.
+A diagram is made in two steps. `_ItemBuilder` converts a frame tree to boxes in wire order
+(`Cell`), and to groups that are repeated or optional (`BoxGroup`). `_Sheet` draws them from top to
+bottom. A box that crosses the end of a row continues in the next row. A group starts a new row and
+has a bracket beside it. A field that is too long, or that has no fixed length, is drawn as a cut
+row.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from xml.sax.saxutils import escape, quoteattr
 
-from lidarspec.exports import Message, messages
+from lidarspec.exports import ExportedFrame, messages
 from lidarspec.frames.wire_table import (
     INDICES,
     Extent,
@@ -55,7 +56,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Group:
+class BoxGroup:
     """Boxes that are repeated together, or optional together.
 
     Attributes:
@@ -69,10 +70,10 @@ class Group:
     optional: bool = False
 
 
-Item = Cell | Group
+Item = Cell | BoxGroup
 
 
-def byte_order(message: Message) -> str:
+def byte_order(message: ExportedFrame) -> str:
     """Return the byte order of all numbers of a frame type.
 
     Returns "" if they differ, or if all numbers have a single byte.
@@ -88,7 +89,7 @@ def byte_order(message: Message) -> str:
 
 
 @dataclass
-class _Cells:
+class _ItemBuilder:
     """Converts the tree of a frame type to items.
 
     Attributes:
@@ -118,7 +119,7 @@ class _Cells:
                 return tuple(self._make_block_cells(node, start))
             case tree.Repeat():
                 return (self._make_repeat_group(node, start, depth),)
-            case tree.Parts():
+            case tree.PartSequence():
                 kinds = [
                     (kind.name, self.visit(kind.element, Extent(0, ("i",)), depth + 1))
                     for kind in node.kinds
@@ -126,13 +127,15 @@ class _Cells:
                 if len(kinds) == 1:
                     items = kinds[0][1]
                 else:
-                    items = tuple(Group(name, items, optional=True) for name, items in kinds)
-                return (Group(f"{node.name}: {describe_end(node)}", items),)
+                    items = tuple(BoxGroup(name, items, optional=True) for name, items in kinds)
+                return (BoxGroup(f"{node.name}: {describe_end(node)}", items),)
             case tree.When() | tree.Select():
                 parts = (
                     (label, self.visit(branch, start, depth)) for label, branch in branches(node)
                 )
-                return tuple(Group(label, items, optional=True) for label, items in parts if items)
+                return tuple(
+                    BoxGroup(label, items, optional=True) for label, items in parts if items
+                )
         return ()
 
     def _iter_struct_items(self, node: tree.Struct, start: Extent, depth: int) -> Iterator[Item]:
@@ -238,10 +241,10 @@ class _Cells:
         tooltip = "; ".join(filter(None, description))
         return Cell(name or "(constant)", bits, detail, tooltip, role, start)
 
-    def _make_repeat_group(self, node: tree.Repeat, start: Extent, depth: int) -> Group:
+    def _make_repeat_group(self, node: tree.Repeat, start: Extent, depth: int) -> BoxGroup:
         step = extent(node.element, node.name).times(INDICES[depth % len(INDICES)])
         count = node.count if isinstance(node.count, int) else phrase(node.count)
-        return Group(
+        return BoxGroup(
             f"{node.name} \u00d7\u00a0{count}", self.visit(node.element, start + step, depth + 1)
         )
 
@@ -294,7 +297,9 @@ def svg(sensor: Sensor) -> str:
             f", integers {order}-endian" if order else ""
         )
         sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
-        sheet.items(_Cells(message.seals, mixed=not order).visit(message.root, Extent(), 0), 0)
+        sheet.items(
+            _ItemBuilder(message.seals, mixed=not order).visit(message.root, Extent(), 0), 0
+        )
         sheet.close()
     return sheet.document(f"{sensor.id}: packet diagrams")
 
@@ -351,7 +356,7 @@ class _Sheet:
     def items(self, items: Sequence[Item], depth: int) -> None:
         """Draw boxes and groups one after another."""
         for item in items:
-            if isinstance(item, Group):
+            if isinstance(item, BoxGroup):
                 self._draw_group(item, depth)
             elif item.bits == 0 or item.bits > MAX_DRAWN_BITS:
                 self._draw_cut_row(item)
@@ -387,7 +392,7 @@ class _Sheet:
             self.top = self.top + ROW_HEIGHT
             self.used = 0
 
-    def _draw_group(self, group: Group, depth: int) -> None:
+    def _draw_group(self, group: BoxGroup, depth: int) -> None:
         """Draw a group in rows of its own, with a bracket at the right."""
         self._end_row()
         self.deepest = max(self.deepest, depth + 1 + _depth(group))
@@ -465,9 +470,9 @@ class _Sheet:
             )
 
 
-def _depth(group: Group) -> int:
+def _depth(group: BoxGroup) -> int:
     """Return the depth of the groups nested in a group."""
-    return max((1 + _depth(item) for item in group.items if isinstance(item, Group)), default=0)
+    return max((1 + _depth(item) for item in group.items if isinstance(item, BoxGroup)), default=0)
 
 
 def _draw_outline(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:

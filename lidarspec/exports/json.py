@@ -13,7 +13,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from lidarspec.exports import Message, messages
+from lidarspec.exports import ExportedFrame, messages
 from lidarspec.frames.wire_table import frame_size
 from lidarspec.spec import Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Address, Count
@@ -111,7 +111,7 @@ def _clock(sensor: Sensor) -> dict[str, Any] | None:
     return {"fields": fields, "wraps_at": sensor.clock.wraps_at}
 
 
-def _frame(message: Message) -> dict[str, Any]:
+def _frame(message: ExportedFrame) -> dict[str, Any]:
     frame = message.frame
     return {
         **facts(frame, "direction", "data"),
@@ -183,7 +183,7 @@ def node_data(node: tree.Node) -> dict[str, Any]:
                 "count": formula_data(node.count),
                 "element": node_data(node.element),
             }
-        case tree.Parts():
+        case tree.PartSequence():
             return _parts(node)
         case tree.When():
             branches = {"then": node_data(node.then), "else": node_data(node.otherwise)}
@@ -209,7 +209,7 @@ def node_data(node: tree.Node) -> dict[str, Any]:
             return {"kind": "nothing", "name": node.name}
 
 
-def _parts(node: tree.Parts) -> dict[str, Any]:
+def _parts(node: tree.PartSequence) -> dict[str, Any]:
     """Parts: what says where the last one is, and what each kind is; `following` is the bytes of
     the next part.
     """

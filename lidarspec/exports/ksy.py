@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lidarspec.exports import Message, Refused, beginning, messages
+from lidarspec.exports import ExportedFrame, ExportError, beginning, messages
 from lidarspec.frames.wire_table import meaning, unit_text
 from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
@@ -101,7 +101,7 @@ def format_reference(scope: Scope, ref: tree.Ref) -> str:
             return (
                 "_parent." * up + ".".join(map(identifier, names)) + ".to_i" * (ref.info.bits == 1)
             )
-    raise Refused(f"{ref.path} cannot be reached in Kaitai")
+    raise ExportError(f"{ref.path} cannot be reached in Kaitai")
 
 
 _OPERATIONS = {
@@ -147,7 +147,7 @@ def block_type(
         Refused: for an integer that is too wide for Kaitai.
     """
     if any(part.bits.width > WIDEST for part in block.parts):
-        raise Refused(f"{block.info.path}: an integer of more than {WIDEST} bits")
+        raise ExportError(f"{block.info.path}: an integer of more than {WIDEST} bits")
     ordered = _in_order(block)
     if ordered is None:
         calculated = {
@@ -289,7 +289,7 @@ def ksy(sensor: Sensor) -> str:
     main = next((message for message in frames if message.frame.data), frames[0])
     types = {identifier(message.name): _frame(sensor, message) for message in frames}
     if len(types) < len(frames):
-        raise Refused(
+        raise ExportError(
             f"{sensor.id}: two frame types have one name in Kaitai, where names are in lower case"
         )
     name = identifier(beginning(sensor))
@@ -304,11 +304,11 @@ def ksy(sensor: Sensor) -> str:
     return yaml(document)
 
 
-def _frame(sensor: Sensor, message: Message) -> Attribute:
+def _frame(sensor: Sensor, message: ExportedFrame) -> Attribute:
     try:
         return _Types(message.seals).struct(message.root, ())
-    except Refused as refused:
-        raise Refused(f"{sensor.id} {message.name}: {refused}") from None
+    except ExportError as refused:
+        raise ExportError(f"{sensor.id} {message.name}: {refused}") from None
 
 
 @dataclass
@@ -328,7 +328,7 @@ class _Type:
         ids = [part["id"] for part in self.seq if "id" in part] + list(self.instances)
         twice = next((name for name in ids if ids.count(name) > 1), None)
         if twice:
-            raise Refused(
+            raise ExportError(
                 f"{path or 'the frame'} has two members that are called {twice!r} in Kaitai"
             )
         return {name: part for name, part in vars(self).items() if part or name == "seq"}
@@ -385,7 +385,7 @@ class _Types:
                 self._switch(kaitai, node.name, number(node.key, scope), cases, scope, **more)
             case tree.Repeat():
                 self._repeat(kaitai, node, scope, **more)
-            case tree.Parts():
+            case tree.PartSequence():
                 self._parts(kaitai, node, scope, **more)
             case tree.Block() if (plain := inline(node, more)) is not None:
                 kaitai.seq.append(plain[0] | self._doc(node.info))
@@ -397,10 +397,10 @@ class _Types:
             case _:
                 self._add_typed(kaitai, node.name, node, scope, **more)
 
-    def _parts(self, kaitai: _Type, node: tree.Parts, scope: Scope, **more: Any) -> None:
+    def _parts(self, kaitai: _Type, node: tree.PartSequence, scope: Scope, **more: Any) -> None:
         """Add parts; those of one kind, since Kaitai chooses a type before it reads it."""
         if len(node.kinds) > 1:
-            raise Refused(
+            raise ExportError(
                 f"{node.axis}: parts that are told apart by their constants, which Kaitai cannot do"
             )
         (kind,), name = node.kinds, identifier(node.name)
@@ -492,7 +492,7 @@ class _Types:
             return head | kind | self._doc(node.info)
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
         if node.kind == "float" and node.size not in FLOATS:
-            raise Refused(
+            raise ExportError(
                 f"{node.info.path}: a float of {node.size} bytes, and Kaitai knows those of 4 and 8"
             )
         if node.size > 1:

@@ -16,7 +16,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from lidarspec.exports import Message, Refused, messages
+from lidarspec.exports import ExportedFrame, ExportError, messages
 from lidarspec.frames.schema import schema
 from lidarspec.frames.wire_table import meaning, unit_text
 from lidarspec.spec import Command, Sensor
@@ -31,7 +31,7 @@ from lidarspec.spec.tree import (
     Node,
     Number,
     Opaque,
-    Parts,
+    PartSequence,
     Repeat,
     Sealed,
     Select,
@@ -55,7 +55,7 @@ def pyi(sensor: Sensor) -> str:
     frames = messages(sensor, on_wire=False)
     names = {message.name: camel(message.name) for message in frames}
     if len(set(names.values())) < len(names):
-        raise Refused(f"{sensor.id}: two frame types have one class name")
+        raise ExportError(f"{sensor.id}: two frame types have one class name")
     classes = _Classes({camel(sensor.id)})
     for message in frames:
         names[message.name] = classes.add(
@@ -153,7 +153,7 @@ class _Classes:
                 return self.add(node, owner + camel(name), f"`{name}` of `{owner}`.")
             case Repeat():
                 return f"list[{self._type(owner, name, node.element)}]"
-            case Parts():
+            case PartSequence():
                 types = [
                     self._type(owner, name + camel(kind.name), kind.element) for kind in node.kinds
                 ]
@@ -166,7 +166,7 @@ class _Classes:
                 return "None"
 
 
-def _sensor(sensor: Sensor, frames: tuple[Message, ...], names: dict[str, str]) -> str:
+def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, str]) -> str:
     """The class of the sensor: what `parse`, `build`, `example` and `command` take and give."""
     parses = "\n".join(
         f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, {PARSING})'
@@ -198,7 +198,7 @@ class {camel(sensor.id)}(Sensor):
 {rest}'''
 
 
-def _build(message: Message) -> str:
+def _build(message: ExportedFrame) -> str:
     """The signature that builds a frame: its fields by name, numbers raw or with `units` physical;
     constants and sums are filled in.
     """

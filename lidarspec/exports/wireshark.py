@@ -2,7 +2,7 @@
 
 A dissector has two parts. ``wireshark.lua``, beside this module, is the same for all sensors: it
 finds frames, measures and checks them, and fills Wireshark's tree. This module writes the part
-that depends on the sensor: a Lua table for each node of a frame tree (`_Writer`). A table has the
+that depends on the sensor: a Lua table for each node of a frame tree (`_TableWriter`). A table has the
 kind of the node, the Wireshark field that shows it, a `keep` entry if later formulas use its value,
 and a `skip` entry with the number of bytes to skip when a frame is only measured.
 
@@ -18,7 +18,13 @@ from importlib import resources
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import Message, Refused, find_held_formulas, find_references, messages
+from lidarspec.exports import (
+    ExportedFrame,
+    ExportError,
+    find_held_formulas,
+    find_references,
+    messages,
+)
 from lidarspec.frames.layout_tree import prefix_of
 from lidarspec.framing.frame_engine import codec
 from lidarspec.spec import (
@@ -125,7 +131,7 @@ SUMMED = 4
 Table = dict[str, Any]
 
 
-class _Writer:
+class _TableWriter:
     """Writes the tables of one frame type.
 
     Attributes:
@@ -135,7 +141,7 @@ class _Writer:
         types: type family of each Wireshark field, by its filter name.
     """
 
-    def __init__(self, message: Message, prefix: str) -> None:
+    def __init__(self, message: ExportedFrame, prefix: str) -> None:
         self.message = message
         self.prefix = prefix
         lengths = {path for node in tree.nodes(message.root) for path in find_held_formulas(node)}
@@ -168,7 +174,7 @@ class _Writer:
                 }
             case tree.Repeat():
                 return self._repeat(node, path)
-            case tree.Parts():
+            case tree.PartSequence():
                 return self._parts(node)
             case tree.When():
                 then = self.node(node.then, path)
@@ -321,7 +327,7 @@ class _Writer:
             "element": element,
         }
 
-    def _parts(self, node: tree.Parts) -> Table:
+    def _parts(self, node: tree.PartSequence) -> Table:
         kinds = []
         for kind in node.kinds:
             magic = [
@@ -462,9 +468,9 @@ def _algorithm(algorithm: Checksum) -> Table:
             return {"algorithm": "fold15"}
         case ZeroPadded():
             if isinstance(algorithm.algorithm, ZeroPadded):
-                raise Refused("a checksum padded twice")
+                raise ExportError("a checksum padded twice")
             return {**_algorithm(algorithm.algorithm), "pad": algorithm.to}
-    raise Refused(
+    raise ExportError(
         f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run"
     )
 
@@ -579,7 +585,7 @@ def dissector(sensor: Sensor) -> str:
     title = f"{sensor.vendor} {sensor.model}"
     link = sensor.links.get("data")
     if isinstance(link, Udp) and link.assembled is not None:
-        raise Refused(
+        raise ExportError(
             f"{sensor.id}: messages in several datagrams, which the dissector does not join"
         )
     # The dissector shows the first type that matches. Incoming types come first, so bytes that
@@ -609,7 +615,7 @@ def dissector(sensor: Sensor) -> str:
     return "\n".join([head, f"local sensor = {lua(about)}\n", walker])
 
 
-def _frame(message: Message, name: str) -> dict[str, Any]:
+def _frame(message: ExportedFrame, name: str) -> dict[str, Any]:
     prefix = codec(message.frame).prefix
     return {
         "name": message.name,
@@ -618,7 +624,7 @@ def _frame(message: Message, name: str) -> dict[str, Any]:
         "judged": True if message.frame.plausible else None,
         "sent": None if message.frame.direction == "in" else True,
         "magic": [[offset, mask, value] for offset, (mask, value) in sorted(prefix.items())],
-        "root": _Writer(message, f"{name}.{message.name}").node(message.root),
+        "root": _TableWriter(message, f"{name}.{message.name}").node(message.root),
     }
 
 

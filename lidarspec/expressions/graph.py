@@ -5,7 +5,7 @@ what is done to them.
 returned, with the `Tape` of its steps. A step is a `Node`: a field, a state column, an elementwise
 call, or one of the steps that know packets by name (`on`, `shifted`, `latest`). Every node carries
 the plain result for two sample packets, so shapes and axes need no rules of their own. What cannot
-be noted down (a branch on data, reductions, attributes of arrays) is `Untraceable`, with the
+be noted down (a branch on data, reductions, attributes of arrays) is `UntraceableError`, with the
 reason.
 
 Whoever works with a graph goes through it with `traverse`, and computes it with `compute`: the
@@ -40,7 +40,7 @@ from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import ELEMENTWISE, Along
 
 
-class Untraceable(Exception):
+class UntraceableError(Exception):
     """Something that only plain evaluation can do; the text says what."""
 
 
@@ -186,7 +186,7 @@ class Traced(NDArrayOperatorsMixin):
         if kwargs.get("out") is not None:
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
-            raise Untraceable(f"np.{ufunc.__name__}.{method} takes several values together")
+            raise UntraceableError(f"np.{ufunc.__name__}.{method} takes several values together")
         return self.apply_function(
             (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
         )
@@ -195,7 +195,7 @@ class Traced(NDArrayOperatorsMixin):
         self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any
     ) -> Traced:
         if function not in ELEMENTWISE:
-            raise Untraceable(f"np.{function.__name__} is not elementwise")
+            raise UntraceableError(f"np.{function.__name__} is not elementwise")
         return self.apply_function(
             (lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args
         )
@@ -230,7 +230,7 @@ class Traced(NDArrayOperatorsMixin):
         if sample.array.size > self.node.sample.array.size:
             if not self.node.sample.array.size:
                 return np.nan
-            raise Untraceable("an array shorter than the one that it is put on")
+            raise UntraceableError("an array shorter than the one that it is put on")
         if (
             sample.axes == self.node.sample.axes
             and sample.array.shape == self.node.sample.array.shape
@@ -283,16 +283,16 @@ class Traced(NDArrayOperatorsMixin):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        raise Untraceable(f".{name} of a column")
+        raise UntraceableError(f".{name} of a column")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        raise Untraceable("a column is made an array")
+        raise UntraceableError("a column is made an array")
 
     def __bool__(self) -> bool:
         raise SpecError(NO_TRUTH, rule="LS213")
 
     def __len__(self) -> int:
-        raise Untraceable("the length of a column")
+        raise UntraceableError("the length of a column")
 
     def __getitem__(self, index: Any) -> Traced:
         """An element of a field that is an array: a field by itself."""
@@ -477,10 +477,10 @@ class Expression:
             Untraceable: if it is made of more than fields of the frame that stand side by side.
         """
         if node.fields is None:
-            raise Untraceable("made of more than fields of the frame")
+            raise UntraceableError("made of more than fields of the frame")
         infos = tuple(schema.fields[source.path] for source in node.fields)
         if len({info.axes for info in infos}) != 1:
-            raise Untraceable("made of fields of different arrays")
+            raise UntraceableError("made of fields of different arrays")
         return cls(node, infos)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
@@ -530,7 +530,7 @@ class HeaderFunction:
     def __init__(self, function: Callable[[Any], Any], made: Made) -> None:
         self._function = function
         self._made = made
-        self._terms: list[_Term] | None = None
+        self._terms: list[_ResultPart] | None = None
         self._is_tried = False
 
     def __call__(self, batch: Batch) -> list[NDArray[np.int64]]:
@@ -544,11 +544,11 @@ class HeaderFunction:
             ]
         return [term(table) for term in self._terms]
 
-    def _apart(self, batch: Batch, table: Rows) -> list[_Term] | None:
+    def _apart(self, batch: Batch, table: Rows) -> list[_ResultPart] | None:
         try:
             traced, _ = trace(self._function, sample_of(batch, table.groups[0]))
             return [
-                _Term(Expression.of(term.node, table.schema), self._made)
+                _ResultPart(Expression.of(term.node, table.schema), self._made)
                 for term in _several(traced)
             ]
         except Exception:  # the function itself says so, if anything is wrong
@@ -561,7 +561,7 @@ def _several(terms: Any) -> Sequence[Any]:
     return (terms,)
 
 
-class _Term:
+class _ResultPart:
     """A part of what a function gives.
 
     Raises:
@@ -570,7 +570,7 @@ class _Term:
 
     def __init__(self, expression: Expression, made: Made) -> None:
         if any(info.axes or info.optional for info in expression.fields):
-            raise Untraceable("not every packet has its fields once")
+            raise UntraceableError("not every packet has its fields once")
         self._expression = expression
         self._made = made
         self._known: dict[tuple[Any, ...], NDArray[np.int64]] = {}

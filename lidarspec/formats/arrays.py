@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.formats.rows import NAMES, Rows, write_rows
+from lidarspec.formats.rows import NAMES, PointRows, write_rows
 from lidarspec.formats.writing import Spool, picture, written
 from lidarspec.libraries import import_library
 from lidarspec.points.cloud import units_of
@@ -104,7 +104,9 @@ def write_npy(
     mmap_mode="r")``.
     """
     write_rows(
-        path, Rows(scans, _structured, every_point=every_point, is_picture=organized), _npy_header
+        path,
+        PointRows(scans, _structured, every_point=every_point, is_picture=organized),
+        _npy_header,
     )
 
 
@@ -114,7 +116,7 @@ def _structured(types: Mapping[str, Any]) -> np.dtype[Any]:
     )
 
 
-def _npy_header(rows: Rows) -> bytes:
+def _npy_header(rows: PointRows) -> bytes:
     """As long for any number of rows, since NumPy leaves room for it."""
     header = io.BytesIO()
     shape = {

@@ -31,7 +31,7 @@ TOPICS = {CLOUD: "/points", SCAN: "/scan", RAW: "/packets"}
 CHUNK = 1 << 20
 
 
-class Log:
+class BagWriter:
     """The messages of one log.
 
     Args:
@@ -77,7 +77,7 @@ def write_mcap(
 ) -> None:
     """Write an MCAP file as ROS 2 records it, which Foxglove, `ros2 bag` and PlotJuggler read."""
     mcap = import_library("mcap.writer", "ros")
-    held = Log("ROS2_HUMBLE")
+    held = BagWriter("ROS2_HUMBLE")
     channels = dict[str, int]()
     with path.open("wb") as file:
         log = mcap.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
@@ -98,7 +98,7 @@ def write_ros1(
     path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
 ) -> None:
     """Write a bag as `rosbag record` does."""
-    held = Log("ROS1_NOETIC")
+    held = BagWriter("ROS1_NOETIC")
     _record(
         import_library("rosbags.rosbag1", "ros").Writer(path),
         held,
@@ -127,14 +127,14 @@ def write_ros2(
         bag = Path(folder) / "scans"
         log = rosbag2.Writer(bag, version=8, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
         try:
-            held = Log("ROS2_HUMBLE")
+            held = BagWriter("ROS2_HUMBLE")
             _record(log, held, held.messages(scans, packets, every_point=every_point))
         except sqlite3.Error as error:
             raise OSError(str(error)) from None
         (bag if storage == "mcap" else bag / "scans.db3").rename(path)
 
 
-def _record(log: Any, held: Log, every: Iterable[Message]) -> None:
+def _record(log: Any, held: BagWriter, every: Iterable[Message]) -> None:
     """Write messages by a writer of rosbags."""
     connections = dict[str, Any]()
     with log:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
-from lidarspec.formats.rows import Rows, room, write_rows
+from lidarspec.formats.rows import PointRows, room, write_rows
 from lidarspec.formats.writing import Spool
 from lidarspec.libraries import import_library
 from lidarspec.scans.scan import Scan
@@ -94,13 +94,13 @@ def _refuse_size(size: int) -> None:
         )
 
 
-def _pcd_rows(scans: Iterable[Scan], *, every_point: bool) -> Rows:
-    return Rows(
+def _pcd_rows(scans: Iterable[Scan], *, every_point: bool) -> PointRows:
+    return PointRows(
         scans, lambda types: _packed(types, _PCD_TYPES), every_point=every_point, is_picture=True
     )
 
 
-def _pcd_header(rows: Rows, data: str = "binary") -> bytes:
+def _pcd_header(rows: PointRows, data: str = "binary") -> bytes:
     width, height = rows.shape or (rows.length, 1)
     types = [rows.dtype[name] for name in rows.dtype.names or ()]
     lines = [
@@ -129,12 +129,12 @@ def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """
     write_rows(
         path,
-        Rows(scans, lambda types: _packed(types, _PLY_TYPES), every_point=every_point),
+        PointRows(scans, lambda types: _packed(types, _PLY_TYPES), every_point=every_point),
         _ply_header,
     )
 
 
-def _ply_header(rows: Rows) -> bytes:
+def _ply_header(rows: PointRows) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
@@ -163,7 +163,7 @@ def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None
     1.
     """
     row = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
-    write_rows(path, Rows(scans, lambda types: row, every_point=every_point), lambda rows: b"")
+    write_rows(path, PointRows(scans, lambda types: row, every_point=every_point), lambda rows: b"")
 
 
 PCD = Format(".pcd", "a point cloud of PCL, binary", write_pcd, ("organized",))

@@ -1,9 +1,9 @@
 """Recordings of Rerun, .rrd: scans as coloured points on the sensor's and on the host's time,
 figures beside them.
 
-A `Log` is also what `view --rerun` shows in Rerun's viewer. Everything of a sensor stands under its
-id, so that the recordings of several can be opened together: its points, where it is mounted, what
-is known of it, and under `statistics` how it is doing.
+A `RerunRecording` is also what `view --rerun` shows in Rerun's viewer. Everything of a sensor
+stands under its id, so that the recordings of several can be opened together: its points, where it
+is mounted, what is known of it, and under `statistics` how it is doing.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ HOST = "host_time"
 NUMBER = "scan"
 
 
-class Log:
+class RerunRecording:
     """One recording, a context manager; it goes to a file (`save`), or where its `stream` is told
     to (`spawn`, `connect_grpc`).
 
@@ -64,7 +64,7 @@ class Log:
         self._waiting = 0
         self._copy: _Copy | None = None
 
-    def __enter__(self) -> Log:
+    def __enter__(self) -> RerunRecording:
         return self
 
     def __exit__(
@@ -271,7 +271,7 @@ class _Colours:
 
 def write_rerun(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write a recording."""
-    with Log() as log:
+    with RerunRecording() as log:
         log.save(path)
         for scan in scans:
             log.scan(scan, every_point=every_point)

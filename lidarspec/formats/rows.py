@@ -26,7 +26,7 @@ FIGURES = 20
 PIECE = 1 << 20
 
 
-class Rows:
+class PointRows:
     """The points of scans as structured rows of one type, (n,) a scan.
 
     Args:
@@ -107,7 +107,7 @@ class Rows:
         )
 
 
-def write_rows(path: Path, rows: Rows, header: Callable[[Rows], bytes]) -> None:
+def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]) -> None:
     """Write rows behind a header, which is made again when they are counted: its length must not
     depend on their number.
     """

@@ -36,7 +36,7 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
             if in_array:
                 raise NotCompilable(path, "a checksum inside an array")
             _ = node.algorithm
-        case tree.Parts() if in_array:
+        case tree.PartSequence() if in_array:
             raise NotCompilable(path, "parts inside an array")
         case tree.Block():
             for part in node.parts:
@@ -49,7 +49,7 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
     for info in tree.infos(node):
         _check_traced(info.rebuilt)
         _check_traced(info.default)
-    if isinstance(node, tree.Parts):
+    if isinstance(node, tree.PartSequence):
         for kind in node.kinds:
             _check_part(kind, path)
         return

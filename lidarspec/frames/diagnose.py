@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Condition, Layout, set_bits
-from lidarspec.frames.layout_tree import TooLong, Unknown, Unlike, Walk
+from lidarspec.frames.layout_tree import HeaderWalk, TooLong, Unknown, Unlike
 from lidarspec.frames.wire_fields import Examined, WireField
 from lidarspec.spec.tree import format_hex, format_values
 
@@ -243,7 +243,7 @@ def _ending(examined: Examined, cut_off: WireField | None) -> Fault:
 
 def _open_part(examined: Examined) -> Examined | None:
     """Return the last of the parts that have no end; None if there are none."""
-    if isinstance(examined.known, Walk):
+    if isinstance(examined.known, HeaderWalk):
         for axis, region in examined.known.open_regions.items():
             if axis not in examined.known.regions and region.start <= len(examined.data):
                 return examined.broken_part(axis)

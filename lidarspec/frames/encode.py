@@ -2,8 +2,8 @@
 
 The values are completed first: fields that count elements or bytes follow from what is counted.
 Then the values of the header fields select the layout, every value is stored at its place, and
-lengths, constants and checksums are written last. A part of a frame (`Parts`) is encoded like a
-frame, and copied into the frame around it.
+lengths, constants and checksums are written last. A part of a frame (`PartSequence`) is encoded
+like a frame, and copied into the frame around it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from lidarspec.spec.tree import (
     Kind,
     Node,
     Number,
-    Parts,
+    PartSequence,
     Read,
     Repeat,
     Sealed,
@@ -171,7 +171,7 @@ class _Encoder:
             return evaluate(info.rebuilt, self.read)
         return evaluate(info.default, self.read)
 
-    def _encode_parts(self, node: Parts) -> list[bytes]:
+    def _encode_parts(self, node: PartSequence) -> list[bytes]:
         """Return the bytes of parts, and fill in the fields that count or measure them."""
         given = member(self._given, node.axis, None)
         if given is None:
@@ -511,7 +511,7 @@ def _find_count(
     raise UsageError(f"{axis}: no value of {field} gives {length}")
 
 
-def kind_of(node: Parts, part: Mapping[str, Any]) -> Kind:
+def kind_of(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     """Return the kind of a part that is given by its values.
 
     It is the first that has all fields of these, and no other constant; else the first.

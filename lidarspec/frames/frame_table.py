@@ -218,11 +218,11 @@ class Rows:
     def parts(self, axis: str, kind: str = "") -> tuple[Rows, NDArray[np.intp]]:
         node = self.schema.parts[axis]
         wanted = next(number for number, one in enumerate(node.kinds) if one.name == kind)
-        found = list[_Piece]()
+        found = list[_PartRows]()
         for group, buffer, walked in self.walks(axis):
             rounds = (piece for pieces in walked.rounds for piece in pieces if piece.kind == wanted)
             found += [
-                _Piece(buffer, piece.layout, piece.spots, group.where[piece.owners])
+                _PartRows(buffer, piece.layout, piece.spots, group.where[piece.owners])
                 for piece in rounds
             ]
         counts = np.zeros(len(self), np.intp)
@@ -260,7 +260,7 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class _Piece:
+class _PartRows:
     """Parts of one layout that were found in one round.
 
     `spots` are their offsets in the buffer, (k,). `frames` are the indices of their frames, (k,).
@@ -272,13 +272,13 @@ class _Piece:
     frames: NDArray[np.intp]
 
 
-def _group_by_layout(pieces: Sequence[_Piece], ranks: Sequence[NDArray[np.intp]]) -> list[Group]:
+def _group_by_layout(pieces: Sequence[_PartRows], ranks: Sequence[NDArray[np.intp]]) -> list[Group]:
     """Return the parts of all pieces as groups of one layout each.
 
     Args:
         ranks: for each piece, the indices of its parts in the table of parts.
     """
-    members: dict[int, dict[int, list[tuple[_Piece, NDArray[np.intp]]]]] = {}
+    members: dict[int, dict[int, list[tuple[_PartRows, NDArray[np.intp]]]]] = {}
     for piece, own in zip(pieces, ranks, strict=True):
         members.setdefault(id(piece.layout), {}).setdefault(id(piece.buffer), []).append(
             (piece, own)
@@ -289,7 +289,7 @@ def _group_by_layout(pieces: Sequence[_Piece], ranks: Sequence[NDArray[np.intp]]
     ]
 
 
-def _gather_parts(parts: Sequence[tuple[_Piece, NDArray[np.intp]]]) -> Group:
+def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> Group:
     """Return pieces of one layout in one buffer as a group, in stream order."""
     where = np.concatenate([own for _, own in parts])
     spots = np.concatenate([piece.spots for piece, _ in parts])

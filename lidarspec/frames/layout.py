@@ -542,7 +542,7 @@ def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np
 
 
 @dataclass(frozen=True, eq=False)
-class Refused:
+class Refusal:
     """The result for a header that leads to no layout.
 
     Attributes:

@@ -5,7 +5,7 @@ A count, condition or key in a struct makes the layout depend on header fields, 
 selectors. If it needs another selector, it raises `Unknown`.
 
 `HeaderTree` is a decision tree that caches the results. Each inner node is a selector, each branch
-is a value of it, and each leaf is a `Layout`, or a `Refused` with the reason why there is none.
+is a value of it, and each leaf is a `Layout`, or a `Refusal` with the reason why there is none.
 `HeaderTree.classify` sorts many candidates through the tree at once, so the struct is walked only
 once for each distinct header.
 """
@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import by_value
 from lidarspec.frames.compilability import NotCompilable, check_compilable
-from lidarspec.frames.layout import Condition, Layout, Leaf, Refused, Seal
-from lidarspec.frames.parts import CONSTANT, FAILED, Kind, Measure, Region, Rule
+from lidarspec.frames.layout import Condition, Layout, Leaf, Refusal, Seal
+from lidarspec.frames.parts import CONSTANT, FAILED, Measure, PartKind, PartRule, Region
 from lidarspec.frames.schema import ByPath, without_indices
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
@@ -86,10 +86,10 @@ def layout_of(
         NotCompilable: where construct alone can tell what comes next.
         Exception: whatever a formula raises on these values.
     """
-    return walk_layout(Walk(values, limit, given or {}), root)
+    return walk_layout(HeaderWalk(values, limit, given or {}), root)
 
 
-def walk_layout(walk: Walk, root: tree.Node) -> Layout:
+def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
     """Return the layout that a walk leads to.
 
     Raises:
@@ -103,7 +103,7 @@ def walk_layout(walk: Walk, root: tree.Node) -> Layout:
 
 def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     """The constants whose place depends on no header field: offset -> (mask, value)."""
-    walk = Walk({}, limit)
+    walk = HeaderWalk({}, limit)
     with contextlib.suppress(
         Exception
     ):  # whatever an expression of the struct raises: what comes before counts
@@ -111,15 +111,15 @@ def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     return walk.constants
 
 
-def _unknown(leaf: Leaf | Measure, _: Walk) -> int:
+def _unknown(leaf: Leaf | Measure, _: HeaderWalk) -> int:
     raise Unknown(leaf)
 
 
-Asked = Callable[[Leaf | Measure, "Walk"], int]
+Asked = Callable[[Leaf | Measure, "HeaderWalk"], int]
 
 
 @dataclass
-class Walk:
+class HeaderWalk:
     """One walk through a tree: the values of header fields, how far it came, and what it found."""
 
     values: Mapping[str, int]
@@ -215,7 +215,7 @@ class Walk:
                 self._field(node, path, shape, strides)
             case tree.Repeat():
                 self._array(node, path, shape, strides)
-            case tree.Parts():
+            case tree.PartSequence():
                 self._parts(node, path)
             case tree.When():
                 self.branches[node] = node.then if self._value(node.condition) else node.otherwise
@@ -272,10 +272,10 @@ class Walk:
             self.constants.update({offset + size * index: byte for index in range(count)})
         self.cursor = start + size * count
 
-    def _parts(self, node: tree.Parts, path: str) -> None:
+    def _parts(self, node: tree.PartSequence, path: str) -> None:
         """Visit parts; their size follows from the header or is requested like a field."""
         given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
-        rule = Rule(
+        rule = PartRule(
             *(
                 None if formula is None else self._count(formula, path)
                 for formula in (node.count, node.size, node.within)
@@ -506,7 +506,7 @@ class HeaderNode:
     least: int = 0
     value_classes: _ValueClasses | None = None
     children: dict[int, HeaderNode] = field(default_factory=dict)
-    result: Layout | Refused | None = None
+    result: Layout | Refusal | None = None
 
     def meant(self, value: int) -> int:
         """Return the representative of all values with the same layout as `value`."""
@@ -525,7 +525,7 @@ class HeaderNode:
 #: what reads the field of a node in some of the candidates: the indices of those that have it, None
 #: for all; and its values.
 Reader = Callable[[HeaderNode, NDArray[np.intp]], tuple[NDArray[np.intp] | None, NDArray[Any]]]
-Group = tuple[Layout | Refused, NDArray[np.intp]]
+Group = tuple[Layout | Refusal, NDArray[np.intp]]
 
 
 @dataclass(frozen=True)
@@ -599,7 +599,7 @@ class _ValueClasses:
             firsts, lasts = zip(*spans, strict=True)
             # Why a frame with too many parts is refused depends on its parts, not on the number
             # alone.
-            if any(isinstance(node, tree.Parts) for node, _ in asking):
+            if any(isinstance(node, tree.PartSequence) for node, _ in asking):
                 rises = None
             else:
                 rises = max(firsts) + low + 1
@@ -649,7 +649,7 @@ def _counts(node: tree.Node, formula: tree.Formula) -> bool:
     bytes is refused as well.
     """
     is_number = isinstance(node, tree.Repeat | tree.Blob) or (
-        isinstance(node, tree.Parts) and formula is node.count
+        isinstance(node, tree.PartSequence) and formula is node.count
     )
     return is_number and _rises(formula)
 
@@ -669,7 +669,7 @@ def _with_value(formula: tree.Formula, value: int) -> int:
     return int(tree.evaluate(formula, lambda _: value))
 
 
-class _Places:
+class _CandidateSet:
     """Candidates in a buffer, as given to `HeaderTree.classify`.
 
     Frames have at most `limit` bytes.
@@ -781,20 +781,20 @@ class HeaderTree:
             stops: where their bytes end, and no more will come; by default with those of the
                 buffer, and more may come.
         """
-        places = _Places(buffer, offsets, stops, self.limit)
+        places = _CandidateSet(buffer, offsets, stops, self.limit)
         groups: list[Group] = []
         for result, which in self.group_by_layout(len(offsets), places.read, places):
             groups.append((result, which))
-            if isinstance(result, Refused) and result.constants:
+            if isinstance(result, Refusal) and result.constants:
                 wrong = places.wrong(result.constants, which)
                 groups[-1] = result, which[~wrong]
                 places.refuted.append(which[wrong])
         return groups + [
-            (Refused(by_constant=True), which) for which in places.refuted if len(which)
+            (Refusal(by_constant=True), which) for which in places.refuted if len(which)
         ]
 
     def group_by_layout(
-        self, number: int, read: Reader, places: _Places | None = None
+        self, number: int, read: Reader, places: _CandidateSet | None = None
     ) -> list[Group]:
         """Group candidates by layout, as `classify` does.
 
@@ -888,7 +888,7 @@ class HeaderTree:
             self._root = HeaderNode()
             self._size = 0
 
-    def layout(self, frame: bytes) -> Layout | Refused | None:
+    def layout(self, frame: bytes) -> Layout | Refusal | None:
         """The layout of one frame, or None where its header is not all there."""
         return self._end(frame, self._root).result
 
@@ -940,7 +940,7 @@ class HeaderTree:
             is_all: there are no more bytes of this frame.
         """
 
-        def asked(leaf: Leaf | Measure, walk: Walk) -> int:
+        def asked(leaf: Leaf | Measure, walk: HeaderWalk) -> int:
             nonlocal node
             node.leaf, node.before, node.value_classes, node.constants = (
                 leaf,
@@ -959,7 +959,9 @@ class HeaderTree:
         if is_all and len(data) < node.least:
             return node
         self._size += not node.least  # it is known, where it was cut off before
-        walk = Walk(node.values, self.limit, self._given, asked, len(data) if is_all else None)
+        walk = HeaderWalk(
+            node.values, self.limit, self._given, asked, len(data) if is_all else None
+        )
         try:
             node.result = walk_layout(walk, self.root)
         except Unknown:
@@ -968,24 +970,24 @@ class HeaderTree:
             node.constants = self._behind(walk)
             node.least = walk.cursor
         except TooLong:
-            node.result = Refused(constants=self._behind(walk))
+            node.result = Refusal(constants=self._behind(walk))
         except Unlike:
-            node.result = Refused(by_constant=True)
+            node.result = Refusal(by_constant=True)
         except SpecError:
             raise
         except Exception as error:
-            node.result = Refused(PluginError.of(error, "struct"))
+            node.result = Refusal(PluginError.of(error, "struct"))
         above = node.above
         if (
             above is not None
             and above.value_classes is not None
-            and isinstance(node.result, Refused)
+            and isinstance(node.result, Refusal)
             and not node.result.error
         ):
             above.value_classes = above.value_classes.refused([*node.values.values()][-1])
         return node
 
-    def _behind(self, walk: Walk) -> dict[int, tuple[int, int]]:
+    def _behind(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
         """Return the constants found by a walk, without the common prefix.
 
         Candidates are known to have the constants that all frames begin with.
@@ -1003,11 +1005,13 @@ class HeaderTree:
 
 
 @functools.lru_cache(maxsize=256)
-def kinds_of(node: tree.Parts, given: tuple[tuple[str, int], ...], limit: int) -> tuple[Kind, ...]:
+def kinds_of(
+    node: tree.PartSequence, given: tuple[tuple[str, int], ...], limit: int
+) -> tuple[PartKind, ...]:
     """What the parts of frames can be in which fields around them have these values."""
     values = dict(given)
     return tuple(
-        Kind(kind, HeaderTree(kind.root, limit, values), prefix_of(kind.root, limit))
+        PartKind(kind, HeaderTree(kind.root, limit, values), prefix_of(kind.root, limit))
         for kind in node.kinds
     )
 

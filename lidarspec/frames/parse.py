@@ -19,7 +19,7 @@ from construct import Container, ListContainer
 from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text, struct_error
 from lidarspec.frames import diagnose
 from lidarspec.frames.compilability import NotCompilable
-from lidarspec.frames.layout import Layout, Leaf, Refused
+from lidarspec.frames.layout import Layout, Leaf, Refusal
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.parts import Region
 from lidarspec.frames.plain import parse_plain, plain_fault
@@ -36,7 +36,7 @@ from lidarspec.spec.tree import (
     FieldInfo,
     Node,
     Number,
-    Parts,
+    PartSequence,
     Repeat,
     Sealed,
     Select,
@@ -321,7 +321,7 @@ def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
             return functools.partial(
                 _read_lists, _make_reader(node.element, path, layout, count * length), count, length
             )
-        case Parts():
+        case PartSequence():
             return functools.partial(_read_parts, layout.regions[node.axis])
         case When() | Select():
             return _make_reader(layout.branches[node], path, layout, count)
@@ -550,7 +550,7 @@ def _read_rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContaine
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
 
 
-def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | Refused | None:
+def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | Refusal | None:
     """Return the layout that the header of this frame leads to.
 
     Returns None if the type is not compiled, or if the header is incomplete.

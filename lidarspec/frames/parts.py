@@ -23,7 +23,7 @@ from lidarspec.frames.layout import (
     Bytes2D,
     Layout,
     Leaf,
-    Refused,
+    Refusal,
     Word,
     equal,
     marks,
@@ -57,7 +57,7 @@ class Layouts(Protocol):
 
     def classify(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
-    ) -> list[tuple[Layout | Refused, Offsets]]:
+    ) -> list[tuple[Layout | Refusal, Offsets]]:
         """Return the candidates at these offsets, grouped by layout.
 
         Candidates with an incomplete header are left out.
@@ -75,7 +75,7 @@ class Layouts(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Kind:
+class PartKind:
     """A kind of parts.
 
     Attributes:
@@ -104,21 +104,21 @@ class Kind:
 
     def further(self, layout: Layout) -> tuple[Word, ...]:
         """Return the constants of a layout that are not in `prefix`."""
-        cached = layout.notes.get(Kind)
+        cached = layout.notes.get(PartKind)
         if cached is None:
             constants = {
                 offset: constant
                 for offset, constant in layout.constants.items()
                 if self.prefix.get(offset) != constant
             }
-            cached = layout.notes[Kind] = words(marks(constants))
+            cached = layout.notes[PartKind] = words(marks(constants))
         further: tuple[Word, ...] = cached
         return further
 
 
 @dataclass(frozen=True)
-class Rule:
-    """The values of the formulas of a `tree.Parts` for one header.
+class PartRule:
+    """The values of the formulas of a `tree.PartSequence` for one header.
 
     Attributes:
         count: the number of parts.
@@ -132,7 +132,7 @@ class Rule:
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class PartRound:
     """Parts of one layout that were found in one round.
 
     Attributes:
@@ -160,7 +160,7 @@ class Walked:
 
     status: NDArray[np.uint8]
     sizes: Offsets
-    rounds: Sequence[Sequence[Piece]]
+    rounds: Sequence[Sequence[PartRound]]
     errors: tuple[PluginError, ...] = ()
 
 
@@ -178,10 +178,10 @@ class Region:
         size: the bytes of all parts; None if they are not measured yet.
     """
 
-    node: tree.Parts
-    kinds: tuple[Kind, ...]
+    node: tree.PartSequence
+    kinds: tuple[PartKind, ...]
     start: int
-    rule: Rule
+    rule: PartRule
     limit: int
     given: Mapping[str, int]
     size: int | None = None
@@ -208,7 +208,7 @@ class Region:
         Args:
             stops: the offset after the last byte of each frame; by default the end of the buffer.
         """
-        return _Walk(self, buffer, offsets + self.start, stops).run()
+        return _PartWalk(self, buffer, offsets + self.start, stops).run()
 
     def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], Walked]:
         """Return a buffer with whole frames, given as rows of bytes, and their parts."""
@@ -223,7 +223,7 @@ class Region:
             and all(layout.sound(data) for _, layout, data in self.listed(frame))
         )
 
-    def listed(self, frame: bytes) -> list[tuple[Kind, Layout, bytes]]:
+    def listed(self, frame: bytes) -> list[tuple[PartKind, Layout, bytes]]:
         """Return kind, layout and bytes of each part of one frame."""
         _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
         pieces = ((piece, int(piece.spots[0])) for pieces in walked.rounds for piece in pieces)
@@ -233,7 +233,7 @@ class Region:
         ]
 
 
-class _Walk:
+class _PartWalk:
     """A search for the parts of frames in a buffer.
 
     Args:
@@ -262,7 +262,7 @@ class _Walk:
 
     def run(self) -> Walked:
         """Find all parts, round by round."""
-        rounds = list[list[Piece]]()
+        rounds = list[list[PartRound]]()
         active = np.arange(len(self._starts))
         while len(active := self._select_unfinished(active, len(rounds))):
             rounds.append(self._find_next_parts(active))
@@ -286,13 +286,13 @@ class _Walk:
             active = active[self._announced[active] != 0]
         return active
 
-    def _find_next_parts(self, active: Offsets) -> list[Piece]:
+    def _find_next_parts(self, active: Offsets) -> list[PartRound]:
         """Find the next part of each frame.
 
         Its kind is the first one with matching constants. In a truncated part, the constants are
         compared up to its end.
         """
-        pieces = list[Piece]()
+        pieces = list[PartRound]()
         for number, kind in enumerate(self._region.kinds):
             if not len(active):
                 break
@@ -310,7 +310,7 @@ class _Walk:
                 self._buffer, self._ends[own], self._stops_of(own)
             ):
                 has_header[which] = True
-                if isinstance(layout, Refused):
+                if isinstance(layout, Refusal):
                     self._set_refusal(layout, own[which])
                     continue
                 owners = own[which]
@@ -320,7 +320,7 @@ class _Walk:
                     owners = owners[matches]
                 owners = self._check_bounds(layout, self._check_declared_sizes(layout, owners))
                 if len(owners):
-                    pieces.append(Piece(number, layout, owners, self._ends[owners]))
+                    pieces.append(PartRound(number, layout, owners, self._ends[owners]))
                     self._advance(kind, layout, owners)
             self._status[own[~has_header]] = CUT_OFF
             if len(others) == 1:
@@ -343,7 +343,7 @@ class _Walk:
             return right_at(self._buffer, self._ends[which], constants, self._stops_of(which))
         return None
 
-    def _set_refusal(self, refused: Refused, which: Offsets) -> None:
+    def _set_refusal(self, refused: Refusal, which: Offsets) -> None:
         if refused.error:
             self._status[which] = FAILED
         elif refused.by_constant:
@@ -383,7 +383,7 @@ class _Walk:
         which = which[self._status[which] == FOUND]
         return which
 
-    def _advance(self, kind: Kind, layout: Layout, which: Offsets) -> None:
+    def _advance(self, kind: PartKind, layout: Layout, which: Offsets) -> None:
         """Move to the end of the parts of one layout, and read the size of the next part."""
         formula = kind.node.following
         spots = self._ends[which]
@@ -399,7 +399,7 @@ class _Walk:
         self._announced[which] = announced
         self._status[which[announced < 0]] = LENGTH
 
-    def _evaluate(self, kind: Kind, layout: Layout, formula: tree.Formula, spot: int) -> int:
+    def _evaluate(self, kind: PartKind, layout: Layout, formula: tree.Formula, spot: int) -> int:
         """Return the value of a formula in one part, -1 if it fails."""
         part = self._buffer[spot : spot + layout.size].tobytes()
 

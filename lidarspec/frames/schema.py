@@ -26,7 +26,7 @@ from lidarspec.spec.tree import (
     Number,
     Op,
     Opaque,
-    Parts,
+    PartSequence,
     Repeat,
     Select,
     Struct,
@@ -112,7 +112,7 @@ class Schema:
 
     fields: Mapping[str, FieldInfo]
     arrays: Mapping[str, Formula | None]
-    parts: Mapping[str, Parts] = field(default_factory=dict)
+    parts: Mapping[str, PartSequence] = field(default_factory=dict)
     inside: Mapping[str, FieldInfo] = field(default_factory=dict)
 
     @cached_property
@@ -224,7 +224,7 @@ def schema(root: Node) -> Schema:
     structs = {
         node.path: node.docs for node in nodes(root) if isinstance(node, Struct) and node.docs
     }
-    parts = {node.axis: node for node in nodes(root) if isinstance(node, Parts)}
+    parts = {node.axis: node for node in nodes(root) if isinstance(node, PartSequence)}
     inside: dict[str, FieldInfo] = {}
     for node in parts.values():
         for kind in node.kinds:
@@ -290,7 +290,7 @@ def _walk(
             _add(fields, node.info)
         case Block():
             _block(node, fields, arrays, optional=optional)
-        case Parts():
+        case PartSequence():
             return
     for child in children(node):
         _walk(child, fields, arrays, optional=optional or isinstance(node, When | Select))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.frames.compilability import NotCompilable
-from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Refused
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Refusal
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, frame_layouts, prefix_of
 from lidarspec.frames.parts import Measure
 from lidarspec.spec.description import Frame
@@ -169,10 +169,10 @@ class FormCoder(Coder):
             return size
         return None
 
-    def refusal(self, struct: bytes) -> Refused | None:
+    def refusal(self, struct: bytes) -> Refusal | None:
         """Return why the header of a struct leads to no layout; None if that is not known."""
         result = self.tree.header(struct).result
-        if isinstance(result, Refused):
+        if isinstance(result, Refusal):
             return result
         return None
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from lidarspec.frames.layout import Layout, Leaf, Seal
-from lidarspec.frames.layout_tree import Unknown, Walk, walk_layout
-from lidarspec.frames.parts import FOUND, Kind, Measure, Region
+from lidarspec.frames.layout_tree import HeaderWalk, Unknown, walk_layout
+from lidarspec.frames.parts import FOUND, Measure, PartKind, Region
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField
 
@@ -106,7 +106,7 @@ class Examined:
 
     root: tree.Node
     data: bytes
-    known: Layout | Walk
+    known: Layout | HeaderWalk
     failure: Exception | None
     limit: int
     start: int = 0
@@ -138,7 +138,7 @@ class Examined:
                 computed = int(seal.computed(rows)[0])
                 yield PlacedSeal(seal, self.prefix, self.start, stored, computed)
         axes = [*self.known.regions]
-        if isinstance(self.known, Walk):
+        if isinstance(self.known, HeaderWalk):
             axes += [axis for axis in self.known.open_regions if axis not in axes]
         for axis in axes:
             for part in self.parts_of(axis):
@@ -148,7 +148,7 @@ class Examined:
         """Return the place of the parts at a path; None if it is not known."""
         if axis in self.known.regions:
             return self.known.regions[axis]
-        if isinstance(self.known, Walk):
+        if isinstance(self.known, HeaderWalk):
             return self.known.open_regions.get(axis)
         return None
 
@@ -186,14 +186,14 @@ def examine(
         start, prefix, is_bounded: of a part, as of `Examined`.
     """
 
-    def read(leaf: Leaf | Measure, walk: Walk) -> int:
+    def read(leaf: Leaf | Measure, walk: HeaderWalk) -> int:
         value = leaf.of(data)
         if value is None:
             raise Unknown(leaf)
         walk.values = {**walk.values, leaf.info.path: value}
         return value
 
-    walk = Walk({}, limit, given or {}, read)
+    walk = HeaderWalk({}, limit, given or {}, read)
     try:
         layout = walk_layout(walk, root)
     except Exception as failure:  # an expression of the struct may raise anything
@@ -226,7 +226,7 @@ def _examine_parts(around: Examined, axis: str) -> ExaminedParts:
 
 
 def _examine_part(
-    around: Examined, region: Region, axis: str, index: int, kind: Kind, start: int, end: int
+    around: Examined, region: Region, axis: str, index: int, kind: PartKind, start: int, end: int
 ) -> Examined:
     prefix = f"{around.prefix}.{axis}[{index}]".strip(".")
     is_bounded = around.is_bounded or end < len(around.data)
@@ -241,7 +241,7 @@ def _examine_part(
     )
 
 
-def _likely_kind(region: Region, data: bytes) -> Kind:
+def _likely_kind(region: Region, data: bytes) -> PartKind:
     """Return the kind of part that bytes begin like; the last one if they begin like none."""
     for kind in region.kinds:
         known = [
@@ -279,7 +279,7 @@ class _Cursor:
                     yield from self.visit(child, below, f"{shown}.{name}".strip("."))
             case tree.Repeat():
                 yield from self._array(node, path, shown)
-            case tree.Parts():
+            case tree.PartSequence():
                 yield from self._parts(node)
             case tree.When() | tree.Select():
                 branch = self._known.branches.get(node)
@@ -308,7 +308,7 @@ class _Cursor:
                 self._is_over = True
                 return
 
-    def _parts(self, node: tree.Parts) -> Iterator[WireField]:
+    def _parts(self, node: tree.PartSequence) -> Iterator[WireField]:
         region = self._examined.region(node.axis)
         if region is not None:
             for part in self._examined.parts_of(node.axis):

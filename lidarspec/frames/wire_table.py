@@ -117,7 +117,7 @@ def extent(node: tree.Node, shown: str = "") -> Extent:
             return extent(node.body, shown)
         case tree.Repeat():
             return extent(node.element, _element(shown)[0]).times(_count(node))
-        case tree.Parts():
+        case tree.PartSequence():
             return _length(node.within, shown)
         case tree.When() | tree.Select():
             sizes = {
@@ -173,7 +173,7 @@ def _rows(
             says = "; ".join(filter(None, (condition, f"{_count(node)} elements of {size}")))
             yield WireRow(str(start), str(size.times(_count(node))), "array", shown, "", says)
             yield from _rows(node.element, element, start + size.times(index), condition, seals)
-        case tree.Parts():
+        case tree.PartSequence():
             element, _ = _element(shown)
             yield WireRow(
                 str(start),
@@ -273,7 +273,7 @@ def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     return [*cases, (f"for other values of {key}", node.default)]
 
 
-def describe_end(node: tree.Parts) -> str:
+def describe_end(node: tree.PartSequence) -> str:
     """What says where the last one of some parts is, in words."""
     if node.count is not None:
         return f"{phrase(node.count)} parts of sizes of their own"

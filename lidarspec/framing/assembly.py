@@ -41,7 +41,7 @@ class _Fragment:
 
 
 @dataclass
-class _Message:
+class _PartialMessage:
     """An incomplete message.
 
     It has fragments by their index, the offset of the first one in the input, and its time of
@@ -98,7 +98,7 @@ class Assembly:
         if isinstance(layouts, NotCompilable):
             raise rule.wrong(str(layouts))
         self._layouts = layouts
-        self._waiting: dict[Hashable, _Message] = {}
+        self._waiting: dict[Hashable, _PartialMessage] = {}
         self._done: deque[Hashable] = deque(maxlen=WAITING)
         self._dropped = 0
 
@@ -204,7 +204,7 @@ class Assembly:
         if known is None:
             while len(self._waiting) >= WAITING:
                 self._lose(next(iter(self._waiting)))
-            known = self._waiting[fragment.key] = _Message(fragment.count, place, time)
+            known = self._waiting[fragment.key] = _PartialMessage(fragment.count, place, time)
         known.parts[fragment.index] = fragment.payload
         if known.size > self._longest:
             self._lose(fragment.key)

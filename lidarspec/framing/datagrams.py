@@ -50,10 +50,10 @@ def sorted_datagrams(
     steady = steady_datagrams(framing, buffer, starts, sizes, mode)
     if steady is not None and steady.is_sound:
         return Piece(steady, len(buffer))
-    return _Batch(framing, buffer, array_of(starts), sizes, steady).sorted(mode)
+    return _DatagramBatch(framing, buffer, array_of(starts), sizes, steady).sorted(mode)
 
 
-class _Batch:
+class _DatagramBatch:
     """Some datagrams, judged once for each of the frames that may have been announced.
 
     Args:

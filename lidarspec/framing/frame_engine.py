@@ -18,7 +18,7 @@ from lidarspec.errors import PluginError
 from lidarspec.frames.arrays import alike, counted, repeated
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.frame_table import Group, Rows
-from lidarspec.frames.layout import Layout, Refused, Sums, rows_at
+from lidarspec.frames.layout import Layout, Refusal, Sums, rows_at
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.wire_coder import FormCoder, frame_coder
 from lidarspec.framing.frame_codec import Codec
@@ -98,7 +98,7 @@ class CompiledCodec(Codec):
         short = list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
         left = list[LayoutGroup]()
         for layout, which in groups:
-            if isinstance(layout, Refused):
+            if isinstance(layout, Refusal):
                 if layout.error:
                     status[which] = PLUGIN
                 elif layout.by_constant:
@@ -253,7 +253,7 @@ class CompiledCodec(Codec):
         )
         groups = []
         for layout, which in known:
-            if isinstance(layout, Refused):
+            if isinstance(layout, Refusal):
                 continue
             if len(which) == len(frames):
                 starts = frames.starts

@@ -241,7 +241,7 @@ class Conditions:
         self, plausible: Callable[[Any], Any] | None, schema: Schema, layout: Layout
     ) -> None:
         self._parts = [] if plausible is None else _parts(plausible, schema, layout)
-        self._tables: dict[tuple[Any, ...], _Table] = {}
+        self._tables: dict[tuple[Any, ...], _LookupTable] = {}
 
     def met(self, layout: Layout) -> list[Check]:
         """What the struct asks of the values of frames of a layout, as rows of bytes."""
@@ -328,7 +328,7 @@ class AllOf:
 
 
 @dataclass(frozen=True, eq=False)
-class _Table:
+class _LookupTable:
     """For which values of some bytes, taken as one integer, a condition holds.
 
     Attributes:
@@ -375,7 +375,7 @@ class Lookup:
         shape, strides: of the arrays that they are in.
     """
 
-    table: _Table
+    table: _LookupTable
     offset: int
     shape: tuple[int, ...]
     strides: tuple[int, ...]
@@ -414,7 +414,7 @@ class Lookup:
         return self.table.holds(values)
 
 
-def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _Table:
+def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
     """A condition on so many bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(
@@ -428,8 +428,8 @@ def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _Table:
         )
         true = np.flatnonzero(listed)
         if len(true) and true[-1] - true[0] == len(true) - 1:
-            return _Table(dtype, (int(true[0]), int(true[-1])), listed)
-    return _Table(dtype, None, listed, _bits(listed))
+            return _LookupTable(dtype, (int(true[0]), int(true[-1])), listed)
+    return _LookupTable(dtype, None, listed, _bits(listed))
 
 
 def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import repeated
 from lidarspec.frames.frame_table import Group, Rows, Table
-from lidarspec.frames.layout import Refused, Sums, marks, rows_at
+from lidarspec.frames.layout import Refusal, Sums, marks, rows_at
 from lidarspec.frames.wire_coder import FormCoder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Frames
@@ -128,7 +128,7 @@ class TextCodec(Codec):
 
     def _group(
         self, structs: Sequence[bytes]
-    ) -> tuple[list[Group], list[tuple[Refused, NDArray[np.intp]]]]:
+    ) -> tuple[list[Group], list[tuple[Refusal, NDArray[np.intp]]]]:
         """Return structs by layout, and the indices of refused structs by refusal.
 
         Structs with no layout of their size are left out.
@@ -137,9 +137,9 @@ class TextCodec(Codec):
         starts = np.cumsum(sizes) - sizes
         joined = np.frombuffer(b"".join(structs), np.uint8)
         groups = list[Group]()
-        refused = list[tuple[Refused, NDArray[np.intp]]]()
+        refused = list[tuple[Refusal, NDArray[np.intp]]]()
         for layout, which in self._coder.tree.classify(joined, starts, starts + sizes):
-            if isinstance(layout, Refused):
+            if isinstance(layout, Refusal):
                 refused.append((layout, which))
                 continue
             fitting = which[sizes[which] == layout.size]

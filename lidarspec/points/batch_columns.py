@@ -40,7 +40,7 @@ MIN_OWN_POINTS = 1 << 14
 BLOCK_POINTS = 1 << 16
 
 
-class Block(NamedTuple):
+class PointBlock(NamedTuple):
     """Points of a batch, from `start` to `stop`, and their columns computed so far."""
 
     start: int
@@ -91,7 +91,7 @@ class BatchColumns(ColumnSource):
         else:
             self.grid = grid_of(self._plan.shape, self._plan.axes)
         self._computed: dict[str, NDArray[Any]] = {}
-        self._blocks: list[Block] = []
+        self._blocks: list[PointBlock] = []
 
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         if any(name in self._main_columns for name in names):
@@ -122,7 +122,7 @@ class BatchColumns(ColumnSource):
             return pieces[0]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-    def _block_at(self, index: int) -> Block:
+    def _block_at(self, index: int) -> PointBlock:
         """Return the block of points around an index. Blocks do not overlap."""
         place = bisect.bisect(self._blocks, index, key=lambda block: block.start)
         if place and index < self._blocks[place - 1].stop:
@@ -134,7 +134,7 @@ class BatchColumns(ColumnSource):
         width = self._plan.width
         start = index // width * width
         length = max(BLOCK_POINTS // width, 1) * width
-        block = Block(start, min(start + length, limit), {})
+        block = PointBlock(start, min(start + length, limit), {})
         self._blocks.insert(place, block)
         return block
 

@@ -18,7 +18,7 @@ from lidarspec.display import drawn
 from lidarspec.errors import UnknownName, UsageError
 from lidarspec.libraries import import_library
 from lidarspec.points.column_sources import ColumnSource, LazyColumns, Stretch, Stretches
-from lidarspec.points.conventions import TYPES, UNITS, Floats, Grid, Grids, Kind, whole_columns
+from lidarspec.points.conventions import TYPES, UNITS, ExtraType, Floats, Grid, Grids, whole_columns
 from lidarspec.points.table_types import STRUCTURED, arrow_schema, structured_type
 
 #: names of the columns that a cloud can have, in the order in which files list them.
@@ -389,7 +389,7 @@ class CloudColumns(ColumnSource):
             self.extra = cloud.lazy.source.extra
         else:
             self.extra = {
-                name: Kind(column.dtype, cloud.units.get(name, ""))
+                name: ExtraType(column.dtype, cloud.units.get(name, ""))
                 for name, column in cloud.extra.items()
             }
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.points.conventions import Grid, Grids, Kind, whole_columns
+from lidarspec.points.conventions import ExtraType, Grid, Grids, whole_columns
 
 
 class ColumnSource:
@@ -36,7 +36,7 @@ class ColumnSource:
     grid: Grid = Grid()
     grids: Grids | None = None
     nominal: bool = False
-    extra: Mapping[str, Kind] = {}
+    extra: Mapping[str, ExtraType] = {}
     is_level: bool = False
 
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:

@@ -216,14 +216,14 @@ def whole_columns(grid: Grid, first: int, number: int) -> Grid:
     return Grid()
 
 
-class Kind(NamedTuple):
+class ExtraType(NamedTuple):
     """What a further column of points holds: its type, and its unit, "" for a plain number."""
 
     dtype: np.dtype[Any]
     unit: str
 
     @classmethod
-    def of(cls, extra: Extra, values: Any) -> Kind:
+    def of(cls, extra: Extra, values: Any) -> ExtraType:
         """What is declared, and else follows from the field that the values are."""
         is_own = isinstance(values, Column) and not values.frame
         if is_own:

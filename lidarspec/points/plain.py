@@ -25,7 +25,7 @@ from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
 from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud, organised
 from lidarspec.points.column_sources import ColumnSource
-from lidarspec.points.conventions import Kind
+from lidarspec.points.conventions import ExtraType
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.sensor import SensorDescription
 
@@ -151,9 +151,9 @@ def parts_of(result: Points) -> dict[str, Any]:
     return {name: value for name, value in parts.items() if value is not None}
 
 
-def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, Kind]:
+def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
     """What the further columns of points hold, by name; `parts`: those of the result."""
-    return {name: Kind.of(extra, parts[name]) for name, extra in result.extra.items()}
+    return {name: ExtraType.of(extra, parts[name]) for name, extra in result.extra.items()}
 
 
 def _flattened(
@@ -224,7 +224,7 @@ def flat(
 def make_cloud(
     flat: dict[str, NDArray[Any]],
     turn: NDArray[np.float64] | None,
-    kinds: Mapping[str, Kind],
+    kinds: Mapping[str, ExtraType],
     **facts: Any,
 ) -> PointCloud:
     """A cloud from flat columns.

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from lidarspec.expressions import graph
 from lidarspec.expressions.columns import Batch, of_points
-from lidarspec.expressions.graph import Node, Traced, Untraceable, is_full, only_field
+from lidarspec.expressions.graph import Node, Traced, UntraceableError, is_full, only_field
 from lidarspec.frames.frame_table import Group
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf
 from lidarspec.points.conventions import (
@@ -101,7 +101,7 @@ class Plan:
         result, self.tape = graph.trace(function, sample)
         self._schema = schema = sample.table.schema
         if not isinstance(result, Polar | Cartesian):
-            raise Untraceable(f"points that are {type(result).__name__}")
+            raise UntraceableError(f"points that are {type(result).__name__}")
         self.function = function
         self.layout = layout
         self.nominal = result.nominal
@@ -123,12 +123,12 @@ class Plan:
         self.programs: dict[tuple[str, ...], Maker] = {}
         self.kernels: dict[tuple[str, ...], Maker] = {}
         if 0 in self.shape:
-            raise Untraceable("packets without points")
+            raise UntraceableError("packets without points")
         self.exact = isinstance(result, Cartesian)
         if not any(
             is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])
         ):
-            raise Untraceable(
+            raise UntraceableError(
                 f"not every point has {'coordinates' if self.exact else 'a range'} of its own"
             )
         self.positive = list[Node]()
@@ -337,7 +337,7 @@ class Plan:
 _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDictionary()
 
 
-def plan_for(function: PointsFunction, batch: Batch, group: Group) -> Plan | Untraceable:
+def plan_for(function: PointsFunction, batch: Batch, group: Group) -> Plan | UntraceableError:
     """Return the plan for frames of a group's layout, or the reason why there is none.
 
     The layout keeps it.
@@ -346,7 +346,7 @@ def plan_for(function: PointsFunction, batch: Batch, group: Group) -> Plan | Unt
     if function not in notes:
         try:
             notes[function] = Plan(function, graph.sample_of(batch, group), group.layout)
-        except Untraceable as reason:
+        except UntraceableError as reason:
             notes[function] = reason
-    plan: Plan | Untraceable = notes[function]
+    plan: Plan | UntraceableError = notes[function]
     return plan

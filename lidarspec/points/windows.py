@@ -42,7 +42,7 @@ _DIVISIONS = {np.true_divide, np.mod}
 
 
 @dataclass(frozen=True)
-class Window:
+class FieldWindow:
     """The bytes of a field in its element, little-endian.
 
     They are `size` bytes from `offset` of the frame on. Tables are indexed by one or two bytes.
@@ -57,24 +57,24 @@ class Window:
         return np.dtype(f"<u{self.size}")
 
 
-def window(leaf: Leaf) -> Window | None:
+def window(leaf: Leaf) -> FieldWindow | None:
     """Return the window of a field.
 
     Returns None if it takes more than two bytes, or if it is an array inside a bit block.
     """
     if leaf.wire is not None:
         if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu":
-            return Window(leaf.offset, leaf.wire.itemsize)
+            return FieldWindow(leaf.offset, leaf.wire.itemsize)
         return None
     if len(leaf.shape) > len(leaf.strides):
         return None
     start, stop = leaf.held
     if stop - start <= 2:
-        return Window(start, stop - start)
+        return FieldWindow(start, stop - start)
     return None
 
 
-def raw_values(leaf: Leaf, seen: Window) -> NDArray[Any]:
+def raw_values(leaf: Leaf, seen: FieldWindow) -> NDArray[Any]:
     """The raw values of a field for every value of its window: (256,) or (65536,)."""
     codes = np.arange(1 << (8 * seen.size)).astype(seen.dtype)
     frames = np.zeros((len(codes), leaf.size), np.uint8)

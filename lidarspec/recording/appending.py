@@ -134,7 +134,7 @@ class RecordFile:
                 self._opened.unlink()
 
 
-class Log(Protocol):
+class TrafficLog(Protocol):
     """A recorder of all data that arrives and is sent: a file or a substitute.
 
     Attributes:

@@ -22,7 +22,7 @@ from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
 from lidarspec.plugins import registry, sensor as named_sensor
-from lidarspec.recording.appending import Appender, Log
+from lidarspec.recording.appending import Appender, TrafficLog
 from lidarspec.recording.format import (
     DATAGRAM,
     EVENT,
@@ -53,11 +53,11 @@ class MadeFor:
     The sensor is configured with the options that it reported.
     """
 
-    make: Callable[[Transport, Sensor | str | None], Log]
+    make: Callable[[Transport, Sensor | str | None], TrafficLog]
 
 
 #: a file, a recorder, or a factory that is called when the source is open.
-RecordTo = str | Path | Appender | Callable[[Transport], Log] | MadeFor
+RecordTo = str | Path | Appender | Callable[[Transport], TrafficLog] | MadeFor
 
 
 class Recorder(Appender):
@@ -298,7 +298,7 @@ def recorder(
 
 def recorder_for(
     target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport
-) -> tuple[Log, bool]:
+) -> tuple[TrafficLog, bool]:
     """Return the recorder for a target, and whether it was made here.
 
     A recorder that was made here has to be closed by the caller of this function.

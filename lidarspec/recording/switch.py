@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidarspec.errors import LidarSpecError, SourceError
-from lidarspec.recording.appending import Appender, Log
+from lidarspec.recording.appending import Appender, TrafficLog
 from lidarspec.recording.recorders import recorder
 from lidarspec.transports.protocol import Chunk, Transport
 
@@ -38,7 +38,7 @@ class RecordingSwitch:
         self.trouble = ""
         self.written: list[tuple[str, int]] = []
 
-    def attach(self, opened: Transport) -> Log:
+    def attach(self, opened: Transport) -> TrafficLog:
         """Return itself, as the recorder of an open transport, for `open(record=...)`."""
         self._opened = opened
         return self

@@ -27,7 +27,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.faults import Faults, FaultyLink
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Scene, make_room
-from lidarspec.simulation.simulator import Rest, Simulation, simulation
+from lidarspec.simulation.simulator import FrameSimulation, Rest, simulation
 from lidarspec.spec.description import Answer, Command, Frame
 from lidarspec.spec.links import is_datagram
 from lidarspec.spec.sensor import with_frames
@@ -232,7 +232,7 @@ class _Stream:
     """
 
     def __init__(
-        self, made: Simulation, frame: str, scene: Scene, began: float, shake: float
+        self, made: FrameSimulation, frame: str, scene: Scene, began: float, shake: float
     ) -> None:
         self._made = made
         self._scene = scene
@@ -498,7 +498,7 @@ class SimulatedDevice:
     def _begin(self, at: float, frame: str) -> None:
         self._stream = _Stream(self._simulation(frame), frame, self._scene, at, self.faults.shake)
 
-    def _simulation(self, frame: str) -> Simulation:
+    def _simulation(self, frame: str) -> FrameSimulation:
         made = simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
         if not made.interval:
             raise SpecError(

@@ -769,7 +769,7 @@ def _sizes(table: Rows) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class PacketBlock:
     """Packets in a row: their bytes, and (n + 1,) int64 ns from the first one to each, and to the
     one after them.
     """
@@ -778,7 +778,7 @@ class Block:
     times: NDArray[np.int64]
 
 
-class Simulation:
+class FrameSimulation:
     """A data frame type of a sensor, ready to be simulated.
 
     Args:
@@ -825,7 +825,7 @@ class Simulation:
 
     def block(
         self, start: int, count: int, scene: Scene, since: float = 0.0, shake: float = 0.0
-    ) -> Block:
+    ) -> PacketBlock:
         """The packets from number `start` on.
 
         Args:
@@ -849,7 +849,7 @@ class Simulation:
             self._measurement.fill(table, numbers, scene, seconds)
         if self._rest is not None:
             self._rest.fill(table, shake, [start])
-        return Block(self._maker.seal(table)[:count], times[: count + 1])
+        return PacketBlock(self._maker.seal(table)[:count], times[: count + 1])
 
     def _with_points(self, table: Rows) -> Rows:
         """What points are made of: frames, or the parts in them."""
@@ -884,11 +884,11 @@ class Simulation:
 
 
 @functools.lru_cache(maxsize=64)
-def simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> Simulation:
+def simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> FrameSimulation:
     """The simulation of a data frame type; kept, since it takes a while to find out how a sensor
     carries its ranges.
     """
-    return Simulation(sensor, frame, blocked=blocked)
+    return FrameSimulation(sensor, frame, blocked=blocked)
 
 
 def simulate(

@@ -638,7 +638,7 @@ class Kind:
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class PartSequence:
     """Frames within the frame, one after another.
 
     Attributes:
@@ -751,7 +751,7 @@ Node = (
     | Struct
     | Sealed
     | Repeat
-    | Parts
+    | PartSequence
     | When
     | Select
     | Empty
@@ -770,7 +770,7 @@ def children(node: Node) -> tuple[Node, ...]:
             return (node.body,)
         case Repeat():
             return (node.element,)
-        case Parts():
+        case PartSequence():
             return tuple(kind.element for kind in node.kinds)
         case When():
             return (node.then, node.otherwise)
@@ -796,7 +796,7 @@ def formulas(node: Node) -> tuple[Formula, ...]:
             return (node.size,)
         case Repeat():
             return (node.count,)
-        case Parts():
+        case PartSequence():
             found = (node.count, node.size, node.within, *map(node.following, node.kinds))
             return tuple(formula for formula in found if formula is not None)
         case When():
@@ -816,7 +816,7 @@ def size(node: Node) -> Formula | None:
             return node.size
         case Repeat():
             return combine("*", node.count, size(node.element))
-        case Parts():
+        case PartSequence():
             return Ref(node.total.path, node.total)
         case When():
             return _sum_alternatives(
@@ -938,20 +938,24 @@ class Scope:
                 return self.parent["_root"]
             return self
         if name not in self.names:
-            raise Untraceable(f"an expression asks for {name!r}, which is not a field before it")
+            raise UntraceableExpressionError(
+                f"an expression asks for {name!r}, which is not a field before it"
+            )
         part = self.names[name]
         if isinstance(part, Scope):
             return part
         self.asked.append(part)
         if name in self.ambiguous:
-            raise Untraceable(f"an expression asks for {name!r}, which has several forms")
+            raise UntraceableExpressionError(
+                f"an expression asks for {name!r}, which has several forms"
+            )
         return Symbol(part)
 
     def __getattr__(self, name: str) -> Any:
         return self[name]
 
     def __len__(self) -> int:
-        raise Untraceable("an expression asks for the length of an array")
+        raise UntraceableExpressionError("an expression asks for the length of an array")
 
 
 class Outside(Scope):
@@ -974,7 +978,7 @@ class Outside(Scope):
         return found
 
 
-class Untraceable(Exception):
+class UntraceableExpressionError(Exception):
     """Raised if an expression cannot be converted to a formula."""
 
 
@@ -987,7 +991,7 @@ class Symbol:
         self.formula = formula
 
     def __bool__(self) -> bool:
-        raise Untraceable("a Python function decides on the values of fields")
+        raise UntraceableExpressionError("a Python function decides on the values of fields")
 
     __index__ = __int__ = __float__ = __len__ = __iter__ = __bool__
 
@@ -1001,7 +1005,7 @@ class Symbol:
         return self
 
     def __getattr__(self, name: str) -> Any:
-        raise Untraceable(f"an expression asks for {name!r} of a number")
+        raise UntraceableExpressionError(f"an expression asks for {name!r} of a number")
 
     def __getitem__(self, key: object) -> Any:
         known = self.formula
@@ -1009,7 +1013,7 @@ class Symbol:
             path = f"{known.path}[{key}]"
             info = element_of(known.info, path, {known.info.axes[0]: key})
             return Symbol(Ref(path, info or known.info))
-        raise Untraceable("an expression takes an element of an array, or a byte")
+        raise UntraceableExpressionError("an expression takes an element of an array, or a byte")
 
 
 def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
@@ -1020,20 +1024,20 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
         if not isinstance(known, Ref) or not known.info.labels:
             continue
         if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
-            raise Untraceable("an expression takes the name of a value for a number")
+            raise UntraceableExpressionError("an expression takes the name of a value for a number")
         if pair[one] in known.info.labels:  # construct replaces this number by its name
             return Symbol(int(symbol == "!="))
         pair[one] = _find_label_value(known, pair[one]) if isinstance(pair[one], str) else pair[one]
     wrong = next((part for part in pair if not isinstance(part, int | Ref | Op)), None)
     if wrong is not None:
-        raise Untraceable(f"an expression with {wrong!r}")
+        raise UntraceableExpressionError(f"an expression with {wrong!r}")
     return Symbol(
         calculate(symbol, *(int(part) if isinstance(part, bool) else part for part in pair))
     )
 
 
 def _raise_no_integer(sign: str) -> Any:
-    raise Untraceable(f"an expression with {sign!r}, which need not give an integer")
+    raise UntraceableExpressionError(f"an expression with {sign!r}, which need not give an integer")
 
 
 _SYMBOLS = {
@@ -1077,4 +1081,4 @@ def _find_label_value(ref: Ref, label: str) -> int:
     for value, name in ref.info.labels.items():
         if name == str(label):
             return value
-    raise Untraceable(f"{ref.path} has no value named {label!r}")
+    raise UntraceableExpressionError(f"{ref.path} has no value named {label!r}")

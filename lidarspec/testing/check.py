@@ -1,9 +1,9 @@
 """Check a sensor, a file or a distribution with every property and every rule.
 
-A name is resolved to a `Target`: its sensors, the errors of sensors that do not load, and the
+A name is resolved to a `CheckTarget`: its sensors, the errors of sensors that do not load, and the
 modules that declare them. The source of these modules is parsed for two purposes: to find mistakes
 that are valid Python but do something unintended, and to find the lines of fields, frames,
-functions, commands and sensors, so that a finding names file and line (`Places`). Then each
+functions, commands and sensors, so that a finding names file and line (`SourceTexts`). Then each
 sensor's declaration is checked, and its properties in the order of `properties`. Acknowledged
 findings are left out of the `Report`.
 """
@@ -48,7 +48,7 @@ SAID = (
 
 
 @dataclass(eq=False)
-class Target:
+class CheckTarget:
     """The sensors to check.
 
     Attributes:
@@ -68,7 +68,7 @@ class Target:
     family: tuple[str, ...] = ()
 
 
-def target(text: str | Path) -> Target:
+def target(text: str | Path) -> CheckTarget:
     """Return the target of a name.
 
     The name is a file, a sensor of a file ("FILE.py:id"), the id or alias of an installed sensor, a
@@ -99,11 +99,11 @@ def target(text: str | Path) -> Target:
         if plugin.distribution in {home.distribution for home in homes}
         for one in plugin.sensors
     ]
-    return Target([sensor], _rivals([sensor]), files, _vectors(files), tuple(family))
+    return CheckTarget([sensor], _rivals([sensor]), files, _vectors(files), tuple(family))
 
 
-def _file(file: Path, wanted: str) -> Target:
-    found = Target(files=[file], vectors=_vectors([file]))
+def _file(file: Path, wanted: str) -> CheckTarget:
+    found = CheckTarget(files=[file], vectors=_vectors([file]))
     try:
         found.sensors = _load_sensors(file_module(file), str(file))
         found.family = tuple(sensor.id for sensor in found.sensors[1:] and found.sensors)
@@ -125,7 +125,7 @@ def _file(file: Path, wanted: str) -> Target:
     return found
 
 
-def _folder(folder: Path) -> Target:
+def _folder(folder: Path) -> CheckTarget:
     """Return the target of the distribution with its source in a folder."""
     file = folder / "pyproject.toml"
     project = document(file).get("project")
@@ -160,8 +160,8 @@ def _entries(distribution: str) -> list[EntryPoint]:
     return [entry for entry in entries if _normal(entry.distribution) == _normal(distribution)]
 
 
-def _distribution(entries: list[EntryPoint]) -> Target:
-    found = Target()
+def _distribution(entries: list[EntryPoint]) -> CheckTarget:
+    found = CheckTarget()
     for entry in entries:
         try:
             sensors = _load_sensors(entry.load(), entry.value)
@@ -332,7 +332,7 @@ def _normal(name: str) -> str:
 Spot = tuple[str, int]
 
 
-class Places:
+class SourceTexts:
     """The locations of declarations in the source of some modules.
 
     Fields are found by their names, everything else by kind and name.
@@ -579,7 +579,7 @@ class Report:
 
 
 def reports(
-    target: Target,
+    target: CheckTarget,
     name: str,
     *,
     examples: int = EXAMPLES,
@@ -604,7 +604,7 @@ def reports(
     trees = {
         str(file): ast.parse(file.read_text(encoding="utf-8"), str(file)) for file in target.files
     }
-    places = Places(trees)
+    places = SourceTexts(trees)
     known = {sensor.id: sensor for sensor in target.sensors}
     mistakes = [
         places.locate(finding, known.get(finding.sensor)) for finding in target.findings
@@ -651,7 +651,10 @@ def _watch_case(watch: Callable[[str, int], None], sensor_id: str, done: int, ca
 
 
 def _report(
-    subject: Subject, places: Places, mistakes: list[Finding], watch: Callable[[str, int], None]
+    subject: Subject,
+    places: SourceTexts,
+    mistakes: list[Finding],
+    watch: Callable[[str, int], None],
 ) -> Report:
     sensor: Sensor = subject.sensor
     report = Report(sensor.id, list(mistakes))

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import pytest
 
 from lidarspec.sensor_operations import Sensor
-from lidarspec.testing.check import Report, Target, reports, target
+from lidarspec.testing.check import CheckTarget, Report, reports, target
 from lidarspec.testing.subject import EXAMPLES
 
 #: The rule about an id that another installed plugin has.
@@ -43,7 +43,7 @@ def assert_conformance(
     """
     __tracebackhide__ = True
     if isinstance(sensor, Sensor):
-        found = Target([sensor])
+        found = CheckTarget([sensor])
     else:
         found = target(sensor)
     made = list(

@@ -17,7 +17,7 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
 from lidarspec.expressions.columns import Batch, Fields
-from lidarspec.expressions.graph import Traced, Untraceable
+from lidarspec.expressions.graph import Traced, UntraceableError
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.schema import without_indices
 from lidarspec.framing.examples import draw_always, header, random_frame
@@ -481,7 +481,7 @@ def _points(subject: Subject, name: str) -> Findings:
     """Yield the findings of `points`: whether it can be traced, and its source fields."""
     try:
         result = trace_points(subject, name)
-    except Untraceable as reason:
+    except UntraceableError as reason:
         yield "LS208", str(reason), f"{name}.points"
         return
     except Exception:  # another property reports the failure

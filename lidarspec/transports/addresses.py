@@ -27,7 +27,7 @@ _DISCARD_PORT = 9
 
 
 @dataclass(frozen=True)
-class Address:
+class SourceAddress:
     """The parts of a live SOURCE.
 
     Attributes:
@@ -43,7 +43,7 @@ class Address:
     options: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def parse(cls, text: str, *, scheme: str = "") -> Address:
+    def parse(cls, text: str, *, scheme: str = "") -> SourceAddress:
         """Return the address that a text stands for.
 
         Args:

@@ -51,7 +51,7 @@ DATAGRAM = "datagram"
 STREAM = "stream"
 
 
-class Log(NamedTuple):
+class LogKind(NamedTuple):
     """A kind of log.
 
     Attributes:
@@ -68,18 +68,18 @@ class Log(NamedTuple):
 
 #: first bytes -> kind of log; a log of several files is a folder with metadata.yaml.
 LOGS = {
-    b"#ROSBAG V": Log("a ROS 1 bag", "rosbags.rosbag1", "Reader", "ros1"),
-    b"\x89MCAP0\r\n": Log(
+    b"#ROSBAG V": LogKind("a ROS 1 bag", "rosbags.rosbag1", "Reader", "ros1"),
+    b"\x89MCAP0\r\n": LogKind(
         "an MCAP file, as ROS 2 bags are", "rosbags.rosbag2.storage_mcap", "McapReader"
     ),
-    b"SQLite format 3\0": Log(
+    b"SQLite format 3\0": LogKind(
         "an SQLite database, as ROS 2 bags are", "rosbags.rosbag2.storage_sqlite3", "Sqlite3Reader"
     ),
 }
-FOLDER = Log("a ROS 2 bag", "rosbags.rosbag2", "Reader")
+FOLDER = LogKind("a ROS 2 bag", "rosbags.rosbag2", "Reader")
 
 
-def log_of(path: str, head: bytes = b"") -> Log | None:
+def log_of(path: str, head: bytes = b"") -> LogKind | None:
     """Return the kind of a log by its first bytes or its folder, None for other files."""
     if os.path.isdir(path):
         if os.path.isfile(os.path.join(path, "metadata.yaml")):
@@ -101,7 +101,7 @@ class BagTransport(Transport):
 
     datagrams = True
 
-    def __init__(self, path: str, log: Log, *, sender: str | None = None) -> None:
+    def __init__(self, path: str, log: LogKind, *, sender: str | None = None) -> None:
         self._path = path
         self._kind = log
         self.warnings: list[str] = []

@@ -9,7 +9,7 @@ from pathlib import Path
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Http, Link, Tcp, Udp
-from lidarspec.transports.addresses import Address
+from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.outlets import LOCALHOST, Line, Outlet, PtyLine, TcpLine, UdpLine
 
 
@@ -157,7 +157,7 @@ def _declared_port(link: Link) -> int:
 
 def _parse_host_and_port(place: str) -> tuple[str, int | None]:
     """Return the host, by default this computer, and the port; 0 for any free TCP port."""
-    address = Address.parse(place)
+    address = SourceAddress.parse(place)
     address.check(())
     if address.scheme == "tcp" and address.place.endswith(":0"):
         host, _ = replace(address, place=address.place.removesuffix(":0")).host_and_port()

@@ -18,7 +18,7 @@ from pathlib import Path
 from shlex import quote
 from typing import BinaryIO
 
-from lidarspec.captures.bulk import Batch, CaptureBatches, StreamBatches
+from lidarspec.captures.bulk import CaptureBatches, CapturedDatagrams, StreamBatches
 from lidarspec.captures.containers import HEAD, damage, head, opened, refuse_container, unpacked
 from lidarspec.captures.pcap import CaptureStats, is_stream_capture
 from lidarspec.captures.records import is_capture
@@ -311,7 +311,7 @@ class CaptureTransport(FileTransport):
             )
         self._warn(reader.stats)
 
-    def batches(self) -> Iterator[Batch]:
+    def batches(self) -> Iterator[CapturedDatagrams]:
         """Yield the datagrams of the capture in batches of arrays.
 
         Raises:

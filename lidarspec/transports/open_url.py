@@ -18,7 +18,7 @@ from lidarspec.plugins import registry
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.stores import is_stored
-from lidarspec.transports.addresses import Address, resolve_host
+from lidarspec.transports.addresses import SourceAddress, resolve_host
 from lidarspec.transports.base import source_error
 from lidarspec.transports.files import open_file
 from lidarspec.transports.protocol import LiveTransport, Transport
@@ -95,16 +95,16 @@ def is_live(source: str | Path) -> bool:
     return live_address(resolve(source)) is not None
 
 
-def live_address(source: str | Path) -> Address | None:
+def live_address(source: str | Path) -> SourceAddress | None:
     """Return scheme, place and options of a SOURCE, None for files and standard input."""
     text = str(source)
     if is_port(text):
-        return Address.parse(text, scheme="serial")
+        return SourceAddress.parse(text, scheme="serial")
     scheme = _SCHEME.match(text)
     is_file = scheme is None or is_stored(text) or os.path.exists(text)
     if is_file:
         return None
-    return Address.parse(text)
+    return SourceAddress.parse(text)
 
 
 def is_port(text: str) -> bool:
@@ -141,7 +141,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
         control = ""
     if live_address(control) is not None:
         return live(control)
-    control_host, port = Address(control, "", control).host_and_port()
+    control_host, port = SourceAddress(control, "", control).host_and_port()
     remote_host = control_host or host
     if isinstance(link, Tcp) and remote_host:
         return live(f"tcp://{_bracket(remote_host)}:{port or link.port}")
@@ -189,7 +189,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     )
 
 
-def _open(address: Address, sensor: Sensor | None) -> Transport:
+def _open(address: SourceAddress, sensor: Sensor | None) -> Transport:
     """Open a SOURCE with a scheme, with the package or a plugin."""
     if address.scheme in SCHEMES:
         module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")

@@ -129,7 +129,7 @@ class Line:
         self.unplug()
 
 
-class _Backlog:
+class _SendBuffer:
     """Bytes that wait until a slow reader has room for them.
 
     Args:
@@ -340,7 +340,7 @@ class TcpLine(Line):
 
     def __init__(self, host: str, port: int, *, sole: bool = False) -> None:
         self._sole = sole
-        self._clients: dict[socket.socket, _Backlog] = {}
+        self._clients: dict[socket.socket, _SendBuffer] = {}
         self._listener: socket.socket | None = listen(host, port)
         self.has_listener = False
         self.port = int(self._listener.getsockname()[1])
@@ -419,7 +419,7 @@ class TcpLine(Line):
             client, _ = listener.accept()
             client.setblocking(False)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._clients[client] = _Backlog(client.send, _MAX_CONNECTION_BACKLOG_BYTES)
+            self._clients[client] = _SendBuffer(client.send, _MAX_CONNECTION_BACKLOG_BYTES)
             self.has_listener = True
 
     def _read(self, client: socket.socket) -> bytes:
@@ -465,7 +465,7 @@ class PtyLine(Line):
     def __init__(self, link: str | Path | None = None) -> None:
         self._link = None if link is None else Path(link)
         self._master = -1
-        self._backlog = _Backlog(self._write, _MAX_PTY_BACKLOG_BYTES)
+        self._backlog = _SendBuffer(self._write, _MAX_PTY_BACKLOG_BYTES)
         self.path = ""
         self.plug()
 

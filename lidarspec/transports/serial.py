@@ -22,7 +22,7 @@ import serial
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial
-from lidarspec.transports.addresses import Address
+from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.base import (
     StreamTransport,
     data_link,
@@ -190,7 +190,7 @@ class SerialTransport(StreamTransport):
         return data
 
 
-def connect(address: Address, sensor: Sensor | None = None) -> SerialTransport:
+def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTransport:
     """Open the port of a serial SOURCE.
 
     Examples are "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0" and "COM4".

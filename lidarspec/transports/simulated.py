@@ -14,7 +14,7 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import FAULTS, faults_of
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial, is_datagram
-from lidarspec.transports.addresses import Address
+from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.base import source_error
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
@@ -140,7 +140,7 @@ class SimulatedTransport(LiveTransport):
         return [Chunk(data, at) for data in unread]
 
 
-def connect(address: Address, sensor: Sensor | None = None) -> SimulatedTransport:
+def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTransport:
     """Return the open transport of ``sim:ID?rate=2&errors=0.01``.
 
     Args:

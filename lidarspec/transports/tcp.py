@@ -10,7 +10,7 @@ from shlex import quote
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Tcp
-from lidarspec.transports.addresses import Address
+from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.base import (
     StreamTransport,
     data_link,
@@ -101,7 +101,7 @@ class TcpTransport(StreamTransport):
         )
 
 
-def connect(address: Address, sensor: Sensor | None = None) -> TcpTransport:
+def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTransport:
     """Open the connection of a TCP SOURCE: "tcp://192.168.1.200:2111".
 
     Args:

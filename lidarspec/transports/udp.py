@@ -34,7 +34,7 @@ from shlex import quote
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Udp, is_datagram
-from lidarspec.transports.addresses import Address, parse_origin, resolve_host, with_option
+from lidarspec.transports.addresses import SourceAddress, parse_origin, resolve_host, with_option
 from lidarspec.transports.base import (
     disconnected_error,
     sensor_option,
@@ -80,7 +80,7 @@ class _Vector(ctypes.Structure):
     _fields_ = (("base", ctypes.c_void_p), ("size", ctypes.c_size_t))
 
 
-class _Message(ctypes.Structure):
+class _MessageHeader(ctypes.Structure):
     _fields_ = (
         ("name", ctypes.c_void_p),
         ("name_size", ctypes.c_uint32),
@@ -92,17 +92,17 @@ class _Message(ctypes.Structure):
     )
 
 
-class _Datagram(ctypes.Structure):
-    _fields_ = (("message", _Message), ("size", ctypes.c_uint))
+class _ReceivedDatagram(ctypes.Structure):
+    _fields_ = (("message", _MessageHeader), ("size", ctypes.c_uint))
 
 
 #: Index of the first datagram's size in the array of headers, and the step to the next datagram, in
 #: units of c_uint.
-_SIZE_INDEX = _Datagram.size.offset // ctypes.sizeof(ctypes.c_uint)
-_SIZE_STEP = ctypes.sizeof(_Datagram) // ctypes.sizeof(ctypes.c_uint)
+_SIZE_INDEX = _ReceivedDatagram.size.offset // ctypes.sizeof(ctypes.c_uint)
+_SIZE_STEP = ctypes.sizeof(_ReceivedDatagram) // ctypes.sizeof(ctypes.c_uint)
 #: The same for the size of its control messages, in units of c_size_t.
-_CONTROL_SIZE_INDEX = _Message.control_size.offset // ctypes.sizeof(ctypes.c_size_t)
-_CONTROL_SIZE_STEP = ctypes.sizeof(_Datagram) // ctypes.sizeof(ctypes.c_size_t)
+_CONTROL_SIZE_INDEX = _MessageHeader.control_size.offset // ctypes.sizeof(ctypes.c_size_t)
+_CONTROL_SIZE_STEP = ctypes.sizeof(_ReceivedDatagram) // ctypes.sizeof(ctypes.c_size_t)
 
 
 class Slots:
@@ -131,8 +131,8 @@ class Slots:
         self._name_bytes = memoryview(self._names).cast("B")
         self._control_bytes = memoryview(self._control).cast("B")
         self._vectors = (_Vector * SLOT_COUNT)()
-        self._headers = ctypes.create_string_buffer(SLOT_COUNT * ctypes.sizeof(_Datagram))
-        self._datagrams = (_Datagram * SLOT_COUNT).from_buffer(self._headers)
+        self._headers = ctypes.create_string_buffer(SLOT_COUNT * ctypes.sizeof(_ReceivedDatagram))
+        self._datagrams = (_ReceivedDatagram * SLOT_COUNT).from_buffer(self._headers)
         # Access to ctypes fields by name is too slow to do for each datagram.
         self._sizes = memoryview(self._headers).cast("B").cast("I")
         self._control_sizes = memoryview(self._headers).cast("B").cast("P")
@@ -508,7 +508,7 @@ def _convert_time(seconds: int, nanoseconds: int, now: int, wall: int) -> int:
     return now - min(max(wall - seconds * 1_000_000_000 - nanoseconds, 0), MAX_KERNEL_DELAY_NS)
 
 
-def connect(address: Address, sensor: Sensor | None = None) -> UdpTransport:
+def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTransport:
     """Open the sockets of a UDP SOURCE.
 
     Examples are "udp://", "udp://:2368" and
@@ -581,7 +581,7 @@ def _buffer_size(found: socket.socket) -> int:
     )
 
 
-def _ports(address: Address) -> list[int]:
+def _ports(address: SourceAddress) -> list[int]:
     text = address.options.get("port", "")
     ports = [part for part in text.split(",") if part]
     if any(not part.isdecimal() or not 0 < int(part) < 65536 for part in ports):

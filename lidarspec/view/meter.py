@@ -24,7 +24,7 @@ Seconds = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Reading:
+class MeterReading:
     """Figures over some time; None if they are not known.
 
     Attributes:
@@ -62,7 +62,7 @@ class Reading:
         return asdict(self)
 
 
-NOTHING = Reading(
+NOTHING = MeterReading(
     seconds=None,
     speed_hz=None,
     scans=0,
@@ -121,7 +121,9 @@ class Tally:
         if np.isfinite(rate_hz):
             self._rates.append(rate_hz)
 
-    def reading(self, counters: Counters, *, seconds: float | None, counts_losses: bool) -> Reading:
+    def reading(
+        self, counters: Counters, *, seconds: float | None, counts_losses: bool
+    ) -> MeterReading:
         """Return the figures up to now.
 
         Args:
@@ -134,7 +136,7 @@ class Tally:
             name: total - self._totals_before[name] for name, total in totals(counters).items()
         }
         good_bytes = change["bytes_in"] - change["skipped"]
-        return Reading(
+        return MeterReading(
             seconds=duration,
             speed_hz=float(np.median(self._rates)) if self._rates else None,
             scans=self.scans,
@@ -201,13 +203,13 @@ class Meter:
         for tally in (self._recent, self._all):
             tally.add_scan(len(scan), valid, scan.rate_hz)
 
-    def reading(self, counters: Counters, seconds: float | None = None) -> Reading:
+    def reading(self, counters: Counters, seconds: float | None = None) -> MeterReading:
         """Return the figures since the last reading, and begin the next one."""
         reading = self._recent.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
         self._recent = Tally(counters)
         return reading
 
-    def summary(self, counters: Counters, seconds: float | None = None) -> Reading:
+    def summary(self, counters: Counters, seconds: float | None = None) -> MeterReading:
         """Return the figures from the beginning."""
         return self._all.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
 

@@ -7,7 +7,7 @@ import sys
 import time
 
 from lidarspec.errors import UsageError, suggest, system_errors
-from lidarspec.formats.rerun import Log
+from lidarspec.formats.rerun import RerunRecording
 from lidarspec.view.feed import LOOK_S, Feed
 
 #: seconds between two readings of the figures, by the time of the scans.
@@ -29,7 +29,7 @@ def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
         UsageError: where no viewer can be opened, or Rerun's SDK is not installed.
         SourceError: where the file cannot be written.
     """
-    with system_errors(target or "Rerun's viewer"), Log(ramp) as log:
+    with system_errors(target or "Rerun's viewer"), RerunRecording(ramp) as log:
         _open(log, target)
         read_at = time.monotonic()
         last = None
@@ -48,7 +48,7 @@ def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
                     last = scan.stamp_ns
 
 
-def _open(log: Log, target: str) -> None:
+def _open(log: RerunRecording, target: str) -> None:
     if target.startswith(SCHEMES):
         log.stream.connect_grpc(target)
     elif target:

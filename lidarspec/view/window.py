@@ -17,7 +17,7 @@ from lidarspec.recording.switch import RecordingSwitch
 from lidarspec.scans.scan import Scan
 from lidarspec.view.canvas import ALARM, GOOD, PLAIN, STRONG, Cells
 from lidarspec.view.feed import Feed
-from lidarspec.view.meter import NOTHING, Reading, format_figure
+from lidarspec.view.meter import NOTHING, MeterReading, format_figure
 from lidarspec.view.polar import picture
 from lidarspec.view.screen import Screen
 from lidarspec.view.window_parts import (
@@ -137,7 +137,7 @@ class Window:
         self.choice = Choice(ramp)
         self._scan: Scan | None = None
         self._look: Look | None = None
-        self._reading: Reading | None = None
+        self._reading: MeterReading | None = None
         self._read_at = time.monotonic()
         if duration is None:
             self._end = math.inf
@@ -307,7 +307,7 @@ class Window:
             figures.insert(0, Figure("calibration", "nominal", ALARM))
         return figures
 
-    def _lost_figure(self, reading: Reading) -> Figure:
+    def _lost_figure(self, reading: MeterReading) -> Figure:
         lost = self._device.stats.lost
         if lost:
             return Figure("lost", str(lost), ALARM)

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.captures.bulk import Batch, CaptureBatches, StreamBatches
+from lidarspec.captures.bulk import CaptureBatches, CapturedDatagrams, StreamBatches
 from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import (
     USER_LINKS,
@@ -51,7 +51,7 @@ def in_batches(file: BinaryIO | Path, kind: type[CaptureBatches] = CaptureBatche
     return [row for batch in reader.batches() for row in rows(batch)], reader.stats
 
 
-def rows(batch: Batch) -> list[tuple[bytes, int, tuple[str, int]]]:
+def rows(batch: CapturedDatagrams) -> list[tuple[bytes, int, tuple[str, int]]]:
     return [
         (batch.data(i), int(batch.at[i]), batch.names[batch.senders[i]]) for i in range(len(batch))
     ]
@@ -365,7 +365,7 @@ def long_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def address(batch: Batch) -> int:
+def address(batch: CapturedDatagrams) -> int:
     return int(batch.buffer.__array_interface__["data"][0])
 
 
@@ -399,7 +399,7 @@ def test_a_reader_that_is_done_is_gone_at_once_with_its_buffers(long_capture: Pa
     ],
 )
 def test_whoever_holds_a_view_of_a_buffer_keeps_it(
-    hold: Callable[[Batch], object], long_capture: Path
+    hold: Callable[[CapturedDatagrams], object], long_capture: Path
 ) -> None:
     held, copies, places = [], [], []
     for batch in CaptureBatches(long_capture).batches():

@@ -16,7 +16,7 @@ import lidarspec as ls
 from lidarspec.cli.options import DURATION
 from lidarspec.simulation.faults import faults_of
 from lidarspec.spec.fields import duration
-from lidarspec.transports.addresses import Address
+from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.simulated import connect
 from tests.cli.running import process, ran
 from tests.lines import SLACK
@@ -149,7 +149,7 @@ def test_a_duration_reads_the_same_as_an_option_and_in_a_source(text: str) -> No
         DURATION.convert(text, None, None) == duration(text) == faults_of({"unplug": text}).unplug
     )
     assert connect(
-        Address.parse(f"sim:ldrobot-stl27l?unplug={text}")
+        SourceAddress.parse(f"sim:ldrobot-stl27l?unplug={text}")
     ).device.faults.unplug == duration(text)
 
 

@@ -11,7 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import explain
 from lidarspec.explaining.listing import fold, list_differences, parents, text
-from lidarspec.explaining.wording import Span, bit_picture
+from lidarspec.explaining.wording import TextSpan, bit_picture
 from tests.cli.running import EXAMPLE, printed, process, ran
 from tests.representatives import load_sensor
 
@@ -132,10 +132,10 @@ def test_damaged_frames_in_a_stream_are_explained_beside_the_others() -> None:
 
 def test_long_lines_are_folded_below_their_text() -> None:
     line = (
-        Span("0000  "),
-        Span("aa  "),
-        Span("name  "),
-        Span("some words that are too many for it"),
+        TextSpan("0000  "),
+        TextSpan("aa  "),
+        TextSpan("name  "),
+        TextSpan("some words that are too many for it"),
     )
     assert (
         text(fold(line, 44))

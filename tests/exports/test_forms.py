@@ -19,7 +19,7 @@ from construct import Bytes, Const, Struct
 
 import lidarspec as ls
 from lidarspec import Sensor
-from lidarspec.exports import EXPORTS, Refused, UnknownExport, export, select_frame
+from lidarspec.exports import EXPORTS, ExportError, UnknownExport, export, select_frame
 from lidarspec.exports.diagram import BIT_WIDTH, LEFT_MARGIN, ROW_BITS
 from lidarspec.frames.schema import schema
 from lidarspec.spec import Command, Frame
@@ -246,7 +246,7 @@ def test_a_type_checker_takes_the_stubs_and_finds_misspelt_fields(tmp_path: Path
 
 @pytest.mark.parametrize("kind", ["ksy", "svg", "json", "pyi"])
 def test_python_code_is_refused_with_the_reason(kind: str) -> None:
-    with pytest.raises(Refused, match="angle: Decimal"):
+    with pytest.raises(ExportError, match="angle: Decimal"):
         export(SHAPES["shape-text"], kind)
 
 

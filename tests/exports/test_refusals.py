@@ -9,7 +9,7 @@ import pytest
 from construct import Array, Bytes, Const, Int8ub, Int16ub, Struct, Switch, this
 
 from lidarspec import Sensor, UsageError
-from lidarspec.exports import Refused, UnknownExport, export, messages
+from lidarspec.exports import ExportError, UnknownExport, export, messages
 from lidarspec.spec import Checksum, Checksummed, Frame
 from lidarspec.spec.tree import Op, Ref, Repeat, nodes
 from tests.exports.oddities import SENSOR
@@ -58,7 +58,7 @@ def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_refused_with_the_reason(kind: str, sensor: Sensor, reason: str) -> None:
-    with pytest.raises(Refused) as caught:
+    with pytest.raises(ExportError) as caught:
         export(sensor, kind)
     assert reason in str(caught.value)
     assert isinstance(caught.value, UsageError)
@@ -66,14 +66,14 @@ def test_refused_with_the_reason(kind: str, sensor: Sensor, reason: str) -> None
 
 def test_c_has_no_place_for_elements_that_differ_in_size_and_no_number_for_all_products() -> None:
     chain = with_frame("parts" / Array(3, Struct("n" / Int8ub, "data" / Bytes(this.n))))
-    with pytest.raises(Refused, match="parts: its elements differ in size"):
+    with pytest.raises(ExportError, match="parts: its elements differ in size"):
         export(chain, "c")
     assert "parts" in export(chain, "wireshark")
     wide = with_frame(
         *(f"f{number}" / Int16ub for number in range(4)),
         "x" / Bytes(this.f0 * this.f1 * this.f2 * this.f3),
     )
-    with pytest.raises(Refused, match="64-bit"):
+    with pytest.raises(ExportError, match="64-bit"):
         export(wide, "c")
 
 

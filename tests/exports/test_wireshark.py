@@ -14,7 +14,7 @@ import pytest
 import lidarspec
 from lidarspec import Sensor
 from lidarspec.captures.pcap import CaptureReader
-from lidarspec.exports import Refused, export
+from lidarspec.exports import ExportError, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import subject as material
 from lidarspec.testing.subject import Subject
@@ -66,14 +66,14 @@ def test_a_dissector_has_a_field_for_every_field_of_every_frame(name: str) -> No
 
 def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
     for name, reason in REFUSED.items():
-        with pytest.raises(Refused, match=reason):
+        with pytest.raises(ExportError, match=reason):
             export(SHAPED[name], "wireshark")
 
 
 @pytest.mark.slow
 def test_installed_sensors_that_wireshark_cannot_be_told_are_refused_with_the_reason() -> None:
     for name, reason in recoded(installed_sensors().values()).items():
-        with pytest.raises(Refused, match=reason):
+        with pytest.raises(ExportError, match=reason):
             export(installed_sensors()[name], "wireshark")
 
 

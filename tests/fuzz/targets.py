@@ -23,7 +23,7 @@ import numpy as np
 
 import lidarspec as ls
 from lidarspec import Sensor
-from lidarspec.batch import MANIFEST, Manifest, Piece
+from lidarspec.batch import MANIFEST, FilePiece, Manifest
 from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, StreamReader
 from lidarspec.device.settings import FILE as SETTINGS, devices
@@ -424,7 +424,7 @@ def _manifest(folder: Path) -> Target:
     """
     results = folder / "results"
     source = folder / "drive.bin"
-    piece = Piece(str(source), STL, {}, str(results / "drive.ply"), True, 10**9)
+    piece = FilePiece(str(source), STL, {}, str(results / "drive.ply"), True, 10**9)
 
     def run(data: bytes) -> None:
         results.mkdir(exist_ok=True)

@@ -54,7 +54,7 @@ from lidarspec.spec import (
     take,
 )
 from lidarspec.testing import frames
-from lidarspec.testing.check import Target, reports
+from lidarspec.testing.check import CheckTarget, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declared import check_declaration
 from lidarspec.testing.findings import Violation, left_over
@@ -121,7 +121,7 @@ def run(folder: Path, *words: str, **variables: str) -> subprocess.CompletedProc
 def codes(sensor: Sensor) -> set[str]:
     return {
         finding.code
-        for report in reports(Target([sensor]), sensor.id, examples=6)
+        for report in reports(CheckTarget([sensor]), sensor.id, examples=6)
         for finding in report.findings
     }
 
@@ -213,7 +213,7 @@ def test_work_with_a_long_frame_is_limited_in_bytes(
 def test_progress_names_each_case_before_it_begins() -> None:
     seen: list[tuple[str, int, int]] = []
     (sensor,) = no_example.lidarspec_sensors()
-    list(reports(Target([sensor]), sensor.id, watch=lambda *told: seen.append(told)))
+    list(reports(CheckTarget([sensor]), sensor.id, watch=lambda *told: seen.append(told)))
     assert seen[0] == ("broken-one: declaration", 0, len(PROPERTIES))
     assert seen[1] == ("broken-one: examples_are_valid_and_repeat data", 0, len(PROPERTIES))
 
@@ -351,7 +351,7 @@ def test_what_is_acknowledged_keeps_nothing_from_being_tried() -> None:
         samples=Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul))
     )
     bare = sound.sensor(sound.frame(coded), acknowledged={"LS201": "a code"})
-    (report,) = reports(Target([bare]), "bare", examples=1)
+    (report,) = reports(CheckTarget([bare]), "bare", examples=1)
     assert "LS201" not in {finding.code for finding in report.findings}
     assert "the_simulated_sensor_answers" not in report.skipped
 

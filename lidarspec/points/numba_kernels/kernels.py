@@ -29,7 +29,7 @@ from lidarspec.errors import UsageError
 from lidarspec.frames.layout import Bytes2D, span
 from lidarspec.libraries import import_library
 from lidarspec.points.numba_kernels.cache import Kept, is_kept
-from lidarspec.points.numba_kernels.source import Text, written
+from lidarspec.points.numba_kernels.source import KernelText, written
 from lidarspec.points.plan import Maker, Plan, PointsFunction, Values
 
 THREADS = "LIDARSPEC_THREADS"
@@ -49,7 +49,7 @@ class Kernel(Maker):
         width: points of a frame.
     """
 
-    def __init__(self, text: Text, width: int) -> None:
+    def __init__(self, text: KernelText, width: int) -> None:
         self._text = text
         self._width = width
         self._numbers = np.array(text.wanted.numbers, np.int64)

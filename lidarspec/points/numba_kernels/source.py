@@ -3,12 +3,12 @@
 The columns of a plan become one loop over packets, blocks and points.
 
 Each value is computed in the loop in which it varies: what a packet has once outside the loop over
-its blocks, and so on (`writer.Writer`). `Expressions` writes a traced expression so, in float64 or
-float32; what has no text of its own is computed by NumPy before, and given to the kernel. Where
-sines and cosines of each point's own angle are left, the points of a few packets go through scratch
-arrays into a second, flat loop, which computes several at a time (`Later`, `Assembly`). Lengths and
-places stand in the text as numbers where all frames have the same, else they are arguments, so that
-one kernel serves all lengths.
+its blocks, and so on (`writer.KernelWriter`). `Expressions` writes a traced expression so, in
+float64 or float32; what has no text of its own is computed by NumPy before, and given to the
+kernel. Where sines and cosines of each point's own angle are left, the points of a few packets go
+through scratch arrays into a second, flat loop, which computes several at a time (`Later`,
+`KernelAssembly`). Lengths and places stand in the text as numbers where all frames have the same,
+else they are arguments, so that one kernel serves all lengths.
 """
 
 from __future__ import annotations
@@ -31,7 +31,14 @@ from lidarspec.expressions.graph import (
 )
 from lidarspec.frames.layout import Leaf
 from lidarspec.points.conventions import returned_range
-from lidarspec.points.numba_kernels.writer import TEMPLATES, Value, Wanted, Writer, is_cheap, line
+from lidarspec.points.numba_kernels.writer import (
+    TEMPLATES,
+    KernelWriter,
+    Value,
+    Wanted,
+    is_cheap,
+    line,
+)
 from lidarspec.points.plan import Plan
 from lidarspec.points.windows import every_value, is_number, possible, window
 from lidarspec.spec.vocabulary import LookUp, side_by_side
@@ -111,7 +118,7 @@ class Trig:
     angle: int
 
 
-class Expressions(Writer):
+class Expressions(KernelWriter):
     """Writes traced expressions into the loops, each value where it varies."""
 
     def double(self, value: Any, depth: int = 0) -> Value:
@@ -459,7 +466,7 @@ _TYPES = {"float32": "SINGLES", "float64": "DOUBLES", "int64": "PLACES"}
 
 
 @dataclass(frozen=True, eq=False)
-class Text:
+class KernelText:
     """A kernel.
 
     Attributes:
@@ -473,7 +480,7 @@ class Text:
     columns: Mapping[str, np.dtype[Any]]
 
 
-class Assembly:
+class KernelAssembly:
     """The stores of a kernel, in its loops and in the flat one after them."""
 
     def __init__(self, writer: Expressions) -> None:
@@ -527,7 +534,7 @@ class Assembly:
         ]
 
 
-def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
+def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> KernelText:
     """The kernel of some columns of a plan.
 
     Args:
@@ -535,7 +542,7 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
     """
     expressions = {name: plan.expressions[name] for name in names}
     writer = Expressions(plan.layout, plan.shape, plan.tables, varying)
-    assembly = Assembly(writer)
+    assembly = KernelAssembly(writer)
     writer.both = _both(expressions.values())
     made = {name: _made(writer, plan, name, value) for name, value in expressions.items()}
     columns = {
@@ -556,7 +563,7 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Text:
         if name not in places:
             assembly.column(name, value)
     turns = assembly.turns()
-    return Text(HEAD + _function(writer, assembly, turns, columns), writer.wanted, columns)
+    return KernelText(HEAD + _function(writer, assembly, turns, columns), writer.wanted, columns)
 
 
 def _both(expressions: Iterable[Any]) -> set[Node]:
@@ -587,7 +594,10 @@ def _made(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
 
 
 def _function(
-    writer: Writer, assembly: Assembly, turns: list[str], columns: Mapping[str, np.dtype[Any]]
+    writer: KernelWriter,
+    assembly: KernelAssembly,
+    turns: list[str],
+    columns: Mapping[str, np.dtype[Any]],
 ) -> str:
     """The signature and the loops."""
     width = writer.number(writer.width)
@@ -636,7 +646,7 @@ def _function(
     return head + "".join(f"    {text}\n" for text in body)
 
 
-def _loops(writer: Writer, width: str) -> list[str]:
+def _loops(writer: KernelWriter, width: str) -> list[str]:
     """What is done for a packet: its own values, then the loops over its arrays."""
     lines = [*writer.lines[1]]
     depth = 0
@@ -653,6 +663,6 @@ def _loops(writer: Writer, width: str) -> list[str]:
     return lines
 
 
-def _spot(writer: Writer, width: str) -> list[str]:
+def _spot(writer: KernelWriter, width: str) -> list[str]:
     """Where a point stands among those under way, and among all."""
     return [f"k = (p - begin) * {width} + {writer.place(writer.shape)}", "o = start + k"]

@@ -2,11 +2,11 @@
 
 Each is written in the loop in which it varies.
 
-A `Value` is text and the loop at which it varies. `Writer` keeps the lines of each loop, the
+A `Value` is text and the loop at which it varies. `KernelWriter` keeps the lines of each loop, the
 arguments that the kernel is to be called with, and what it has written before, so that nothing is
 computed twice. A field is an expression of its bytes (`integer`); a function of one field is looked
-up in a table by them, or computed, where the table is a straight line (`Line`). `TEMPLATES` are
-NumPy's functions of numbers.
+up in a table by them, or computed, where the table is a straight line (`LinearTable`). `TEMPLATES`
+are NumPy's functions of numbers.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def integer(leaf: Leaf, byte: Any) -> str | None:
 
 
 @dataclass(frozen=True)
-class Line:
+class LinearTable:
     """A table that is a straight line of the raw value from `low` to `high`.
 
     Its value is `other` for all other raw values.
@@ -152,7 +152,7 @@ class Line:
         return found
 
 
-def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
+def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None:
     """Return the line that a table by a field's window follows, in float32.
 
     It is equal if `exact`, else within a unit in the last place.
@@ -186,12 +186,12 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> Line | None:
         short = some.astype(np.float32) * np.float32(slope) + np.float32(start)
         apart = np.abs(short.astype(np.float64) - wanted)
         if (apart <= (0 if exact else np.spacing(np.abs(wanted)))).all():
-            return Line(slope, start, *limits, other, exact=False)
+            return LinearTable(slope, start, *limits, other, exact=False)
         long = (some * slope + start).astype(np.float32)
         if (
             np.abs(long.astype(np.float64) - wanted) <= (0 if exact else np.spacing(np.abs(wanted)))
         ).all():
-            return Line(slope, start, *limits, other, exact=True)
+            return LinearTable(slope, start, *limits, other, exact=True)
     return None
 
 
@@ -267,7 +267,7 @@ def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
     return None
 
 
-class Writer:
+class KernelWriter:
     """Writes values into the loops.
 
     Args:

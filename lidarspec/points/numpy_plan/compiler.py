@@ -22,7 +22,7 @@ from lidarspec.frames.arrays import deep
 from lidarspec.frames.layout import Leaf, elements
 from lidarspec.points.numpy_plan.program import TYPES, Program, Read, Run
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import CHEAP, Window, every_value, window
+from lidarspec.points.windows import CHEAP, FieldWindow, every_value, window
 from lidarspec.spec.vocabulary import row_numbers
 
 TURN_RAD = 2 * np.pi
@@ -227,7 +227,7 @@ class Compiler:
             index,
         )
 
-    def _table(self, node: Node, leaf: Leaf, seen: Window, kind: str) -> NDArray[Any]:
+    def _table(self, node: Node, leaf: Leaf, seen: FieldWindow, kind: str) -> NDArray[Any]:
         """Return the values of an expression for each value of its window."""
         name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info, key(node))
         if name not in self._tables:

@@ -303,7 +303,7 @@ class _Builder:
                 reason = "an expression takes the name of a value for a number"
             else:
                 return value.formula
-        except tree.Untraceable as untraceable:
+        except tree.UntraceableExpressionError as untraceable:
             reason = str(untraceable)
         except Exception as error:
             reason = f"a Python function of other fields ({type(error).__name__}: {error})"
@@ -436,7 +436,7 @@ class _Builder:
             return tree.Opaque(place.name, place.info, "GreedyRange", reason, (element,))
         return tree.Repeat(place.name, axis, tree.calculate("//", place.room, size), element)  # type: ignore[arg-type]
 
-    def _parts(self, con: Partition, place: _Context) -> tree.Parts:
+    def _parts(self, con: Partition, place: _Context) -> tree.PartSequence:
         info = place.info
         scope = place.scope
         axis = axis_path(place.info)
@@ -473,7 +473,9 @@ class _Builder:
         )
         known = scope.names[place.name] = tree.Scope(scope, info.path, self._asked)
         known.add("size", tree.Ref(total.path, total))
-        return tree.Parts(place.name, axis, tuple(kinds), count, size, within, tuple(outer), total)
+        return tree.PartSequence(
+            place.name, axis, tuple(kinds), count, size, within, tuple(outer), total
+        )
 
     def _alone(
         self, case: Construct, following: Any, place: _Context

@@ -8,14 +8,14 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from lidarspec.cli.read import FIGURES
 from lidarspec.device.device import Device
-from lidarspec.view.meter import Reading
+from lidarspec.view.meter import MeterReading
 
 #: states of a device in which nothing comes.
 LOST = ("disconnected", "silent")
 
 
 def status(
-    name: str, device: Device, reading: Reading, said: Sequence[str], more: Mapping[str, str]
+    name: str, device: Device, reading: MeterReading, said: Sequence[str], more: Mapping[str, str]
 ) -> DiagnosticStatus:
     """How a device is doing.
 

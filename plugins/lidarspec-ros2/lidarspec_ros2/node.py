@@ -33,7 +33,7 @@ from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestio
 from lidarspec.explaining.assignments import arguments
 from lidarspec.explaining.explanation import reply_text
 from lidarspec.view.feed import LOOK_S, Feed
-from lidarspec.view.meter import Reading
+from lidarspec.view.meter import MeterReading
 from lidarspec_ros2.diagnostics import LOST, status
 from lidarspec_ros2.packets import PacketLog
 from lidarspec_ros2.parameters import NAMED, NODE_NAME, PARAMETERS, Parameter, Settings
@@ -238,7 +238,7 @@ class LidarNode(LifecycleNode):
         if self._was_lost:
             self.trigger_activate()
 
-    def _tell(self, device: Device, topics: Topics, reading: Reading) -> None:
+    def _tell(self, device: Device, topics: Topics, reading: MeterReading) -> None:
         """Say how the sensor is doing."""
         if device is not self._device:  # which is closed
             return

@@ -19,7 +19,7 @@ from lidarspec.device.settings import find_device
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
-from lidarspec.recording.appending import Log
+from lidarspec.recording.appending import TrafficLog
 from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.planes import Planes
 from lidarspec.scans.selection import Selection
@@ -286,7 +286,7 @@ class Settings:
         device = find_device(self["source"])
         return given if given != Mount() else None if device is None else device.mount
 
-    def device(self, record: Callable[[Transport], Log]) -> Device:
+    def device(self, record: Callable[[Transport], TrafficLog]) -> Device:
         """The open device.
 
         Args:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarspec import Decoder, Sensor, WireError
 from lidarspec.explaining.explanation import Explanation
-from lidarspec.explaining.pieces import Piece, explain_piece
+from lidarspec.explaining.pieces import InputPiece, explain_piece
 from lidarspec.framing.results import Frames, Numbers, array_of
 from lidarspec.scans.provenance import PointOrigin
 
@@ -83,7 +83,7 @@ class Taken:
 
 
 @dataclass(frozen=True)
-class _Input:
+class _DecoderInput:
     """What the decoder was given at once.
 
     Attributes:
@@ -145,7 +145,7 @@ class Backlog:
         self._lock = threading.Lock()
         self._is_stream = True
         self._joins_datagrams = False
-        self._inputs = deque[_Input]()
+        self._inputs = deque[_DecoderInput]()
         self._input_size = 0
         self._results = deque[_Result]()
         self._frame_count = 0
@@ -159,7 +159,7 @@ class Backlog:
         with self._lock:
             self._is_stream = decoder.stream
             self._joins_datagrams = decoder.joins
-            added = _Input(decoder.stats.bytes_in, buffer, starts, sizes)
+            added = _DecoderInput(decoder.stats.bytes_in, buffer, starts, sizes)
             self._inputs.append(added)
             self._input_size += added.size
             self._drop_old()
@@ -240,7 +240,7 @@ class Backlog:
         and of the bytes between them.
         """
         parts = list(
-            explain_piece(self.sensor, Piece(piece.offset, piece.data, "", piece.datagram))
+            explain_piece(self.sensor, InputPiece(piece.offset, piece.data, "", piece.datagram))
         )
         frames = [explanation for _, explanation in parts if explanation.frame]
         rows = []

@@ -28,7 +28,7 @@ Client = tuple[str, int]
 
 
 @dataclass
-class Waiting:
+class PendingConnection:
     """A connection that has not brought the token yet."""
 
     transport: asyncio.Transport
@@ -45,7 +45,7 @@ class Connections:
     def __init__(self, report: Callable[[str], None]) -> None:
         self._report = report
         self._has_reported = False
-        self._waiting: dict[Client, Waiting] = {}  # the oldest first
+        self._waiting: dict[Client, PendingConnection] = {}  # the oldest first
         self._admitted: dict[Client, asyncio.Transport] = {}
 
     def protocol_class(self) -> type[asyncio.Protocol]:
@@ -104,7 +104,7 @@ class Connections:
         if len(self._waiting) + len(self._admitted) >= MAX_CONNECTIONS:
             transport.abort()
             return
-        self._waiting[client] = Waiting(transport)
+        self._waiting[client] = PendingConnection(transport)
 
     def _make_room(self) -> None:
         # Connections that became sockets do not say when they are lost.

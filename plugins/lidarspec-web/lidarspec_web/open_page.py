@@ -31,8 +31,8 @@ from lidarspec_web.page_requests import (
     MESSAGES_AT_ONCE,
     MESSAGES_PER_S,
     Lane,
+    PageRequest,
     RateLimit,
-    Request,
     Workers,
 )
 
@@ -289,9 +289,9 @@ class OpenPage:
         self, word: str, work: Callable[[], dict[str, Any] | None], command: str = ""
     ) -> None:
         """Answer a question that takes a while, after those before it."""
-        self._questions.add(Request(word, command, work))
+        self._questions.add(PageRequest(word, command, work))
 
-    def _finish(self, request: Request, result: dict[str, Any] | Exception | None) -> None:
+    def _finish(self, request: PageRequest, result: dict[str, Any] | Exception | None) -> None:
         """Answer a request that was done in a thread."""
         if isinstance(result, LidarSpecError):
             self._refuse(request.word, result, request.command)
@@ -362,7 +362,7 @@ class OpenPage:
 
     def _send_command(self, request: Mapping[str, Any]) -> None:
         name, arguments = _command(request)
-        self._commands.add(Request("send", name, lambda: self._answers.sent(name, arguments)))
+        self._commands.add(PageRequest("send", name, lambda: self._answers.sent(name, arguments)))
 
     def _record(self, request: Mapping[str, Any]) -> None:
         switch = self._broadcast.switch

@@ -59,7 +59,7 @@ class RateLimit:
 
 
 @dataclass(frozen=True)
-class Request:
+class PageRequest:
     """A request that takes a while.
 
     Attributes:
@@ -84,18 +84,18 @@ class Lane:
     def __init__(
         self,
         executor: Executor,
-        finish: Callable[[Request, dict[str, Any] | Exception | None], None],
+        finish: Callable[[PageRequest, dict[str, Any] | Exception | None], None],
     ) -> None:
         self._executor = executor
         self._finish = finish
-        self._requests = asyncio.Queue[Request]()
+        self._requests = asyncio.Queue[PageRequest]()
 
     @property
     def is_full(self) -> bool:
         """Whether no further request is to be added for now."""
         return self._requests.qsize() >= MAX_WAITING
 
-    def add(self, request: Request) -> None:
+    def add(self, request: PageRequest) -> None:
         """Add a request behind those that wait."""
         self._requests.put_nowait(request)
 
