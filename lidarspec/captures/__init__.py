@@ -1,15 +1,12 @@
-"""Captures of other tools: what stands in pcap and pcapng files.
+"""Captures of other tools: the contents of pcap and pcapng files.
 
-In: a capture, as a file or a pipe. Out: UDP datagrams with times and addresses, one by one or by
-the hundred; of a captured byte stream,
-its pieces. Whatever gives no datagram is counted, and no bytes raise past the first four. Modules
-in reading order:
+Input: a capture, as a file or a pipe. Output: UDP datagrams with times and addresses, one by one or
+in batches; for a captured byte stream, its pieces. Packets without a datagram are counted. No
+content after the first four bytes raises an exception. Modules in reading order:
 
-* `source`: the bytes of a file or pipe, in buffers that are lent out.
-* `records`: the two file formats: their records, one by one and many alike.
-* `ip`: from a captured frame to the payload of a datagram: link layers, IP, fragments.
-* `pcap`: both joined: a reader that gives datagrams, and a writer.
-* `containers`: what a file is by its first bytes: compressed, and read as what is in it; or of a
-  kind that is refused by its name.
-* `bulk`: the datagrams of a capture as arrays, where they stand in a buffer.
+* `source`: the bytes of a file or pipe, in buffers that callers share. * `records`: the records of
+the two file formats, one by one and in patterns. * `ip`: the payload of a captured frame: link
+layers, IP, fragments. * `pcap`: combines both: a reader of datagrams, and a writer. * `containers`:
+the kind of a file by its first bytes; decompresses files and refuses unsupported kinds. * `bulk`:
+the datagrams of a capture as arrays of offsets.
 """

@@ -1,10 +1,11 @@
-"""What a file is by its first bytes: compressed, and read as what is in it, or of a kind that holds
-no bytes as a sensor sent them.
+"""Detect the kind of a file by its first bytes, and decompress it.
 
-Nothing is unpacked as a whole: `Unpacking` is a file that unpacks as it is read. Where the packed
-bytes end too early or are damaged it ends, and says so in `damage`; everything before was read, but
-for what cannot be told from the damage: at most `STEP` bytes, or a block of bzip2. The table of a
-zip archive stands at its end, so that one is read from a file and not from a pipe.
+Files without raw sensor data are refused with a message that names their kind.
+
+Nothing is decompressed as a whole: `Unpacking` is a file that decompresses as it is read. If the
+compressed bytes are truncated or damaged, it ends there, and `damage` has the reason. All data
+before the damage is read, except for at most `STEP` bytes, or a block of bzip2. The table of a zip
+archive is at its end, so archives can be read from files but not from pipes.
 """
 
 from __future__ import annotations
@@ -25,21 +26,25 @@ from lidarspec.libraries import import_library
 from lidarspec.recording.format import MAGIC
 from lidarspec.stores import file_of
 
-#: bytes that say what a file is.
+#: bytes at the start that determine the kind of a file.
 HEAD = 512
-#: bytes that are unpacked in one step, and by one reading of a file; of a pipe, it gives what has
-#: come.
+#: maximum bytes decompressed in one step, and by one read of a file; a pipe returns the bytes that
+#: have arrived.
 STEP = 1 << 13
 FILLED = 1 << 20
-#: a capture may be compressed and lie in a zip archive; what is packed more often is none.
+#: maximum nesting of compression: a compressed capture in a zip archive.
 DEEPEST = 2
-#: files of an archive that a message names.
+#: maximum number of files of an archive in a message.
 NAMED = 6
 
 
 class Packing(NamedTuple):
-    """A way of compressing: its name, the module whose `open` unpacks it, and the command that
-    does.
+    """A compression format.
+
+    Attributes:
+        name: of the format.
+        module: its `open` decompresses.
+        command: the shell command that decompresses.
     """
 
     name: str
@@ -48,7 +53,7 @@ class Packing(NamedTuple):
 
 
 ZIP = Packing("zip", "zipfile", "unzip {}")
-#: how compressed files begin.
+#: first bytes of compressed files.
 PACKINGS = {
     rb"\x1f\x8b\x08[\x00-\x1f]": Packing("gzip", "gzip", "gunzip -k {}"),
     rb"BZh[1-9]1AY&SY": Packing("bzip2", "bz2", "bunzip2 -k {}"),
@@ -58,8 +63,7 @@ PACKINGS = {
     ),
     rb"PK\x03\x04": ZIP,
 }
-#: how files begin that hold no bytes as a sensor sent them, or these in a shape of their own; what
-#: they are, and what takes the bytes out.
+#: first bytes of unsupported files: their kind, and the command that extracts the data.
 CONTAINERS = {
     rb"\x04\x22\x4d\x18": ("compressed by lz4", "unlz4 {}"),
     rb"7z\xbc\xaf\x27\x1c": ("a 7z archive", "7z x {}"),
@@ -95,8 +99,11 @@ _REFUSED = CONTAINERS | {
 
 
 class Damage(NamedTuple):
-    """Where unpacking ended too early, in words, and how many packed bytes were not read: 0 where
-    there are none.
+    """The reason why decompression ended early.
+
+    Attributes:
+        text: a message.
+        unread: number of compressed bytes that were not read.
     """
 
     text: str
@@ -104,15 +111,15 @@ class Damage(NamedTuple):
 
 
 class Unpacking(io.RawIOBase):
-    """What is in a compressed file, unpacked as it is read; never seekable.
+    """The content of a compressed file, decompressed as it is read; never seekable.
 
     Args:
         name: of the file, for messages.
-        packed: it, which is closed with this one, unless it is standard input.
-        file: what unpacks it.
+        packed: the compressed file, which is closed with this one unless it is standard input.
+        file: the decompressor.
 
     Attributes:
-        damage: why it ended too early, else None.
+        damage: the reason why it ended early, else None.
     """
 
     def __init__(self, name: str, packed: BinaryIO, file: Any) -> None:
@@ -152,7 +159,7 @@ class Unpacking(io.RawIOBase):
             self.damage = Damage(f"{self.name} is cut off{self._read}", 0)
         except (
             Exception
-        ) as error:  # each library has its own for damaged bytes, and bz2 and gzip take OSError
+        ) as error:  # each library raises its own for damaged bytes, and bz2 and gzip raise OSError
             if isinstance(error, OSError) and error.errno is not None:
                 raise
             place = self._packed.tell() if self._packed.seekable() else 0
@@ -169,7 +176,7 @@ class Unpacking(io.RawIOBase):
 
 
 def damage(file: BinaryIO) -> Damage | None:
-    """Why a file ended too early that was unpacked while it was read; None where it did not."""
+    """Return the reason why a decompressed file ended early, None if it did not."""
     raw = getattr(file, "raw", None)
     if isinstance(raw, Unpacking):
         return raw.damage
@@ -177,10 +184,10 @@ def damage(file: BinaryIO) -> Damage | None:
 
 
 def opened(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
-    """The open file, or what is compressed in it.
+    """Open a file, decompressed if it is compressed.
 
     Raises:
-        SourceError, UsageError: as `unpacked`; where it cannot be opened.
+        SourceError, UsageError: as `unpacked`, and if it cannot be opened.
     """
     with system_errors(os.fspath(path)), ExitStack() as undo:
         file = undo.enter_context(closing(file_of(os.fspath(path))))
@@ -190,16 +197,17 @@ def opened(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
 
 
 def unpacked(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
-    """An open file itself, or where it is compressed one that unpacks it as it is read, and closes
-    it.
+    """Return an open file, decompressed as it is read if it is compressed.
+
+    Closing the result closes the file.
 
     Args:
         name: of the file, for messages.
-        member: which file of a zip archive; "" for the one capture or recording that is in it.
+        member: the file of a zip archive; "" for the only capture or recording in it.
 
     Raises:
-        SourceError: for an archive that cannot be unpacked, or holds no capture.
-        UsageError: for one that holds several; where a library is missing.
+        SourceError: for an archive that cannot be decompressed, or contains no capture.
+        UsageError: for an archive with several captures, or if a library is missing.
     """
     for _ in range(DEEPEST):
         packing = _packing(head(file))
@@ -223,7 +231,7 @@ def _packing(start: bytes) -> Packing | None:
 
 
 def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
-    """One file of a zip archive."""
+    """Open one file of a zip archive."""
     if not file.seekable():
         raise SourceError(
             f"{name} is a zip archive, and its table stands at its end: give its file, not a pipe"
@@ -238,7 +246,7 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
         return archive.open(_chosen(name, archive, names, member))
     except (UsageError, SourceError):
         raise
-    except Exception as error:  # of a damaged one, too, zipfile raises what it will
+    except Exception as error:  # for damaged archives zipfile raises many types
         if isinstance(error, zipfile.BadZipFile):
             command = f"zip -FF {quote(name)} --out mended.zip"
         else:
@@ -249,8 +257,9 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
 
 
 def _chosen(name: str, archive: zipfile.ZipFile, names: list[str], member: str) -> str:
-    """The member that is asked for, or the only one, or the only one that is a capture or
-    recording.
+    """Return the requested member, or the only one, or the only readable one.
+
+    Readable are captures and recordings.
     """
     if member:
         if member not in names:
@@ -274,20 +283,21 @@ def _chosen(name: str, archive: zipfile.ZipFile, names: list[str], member: str) 
 
 
 def _is_readable(archive: zipfile.ZipFile, member: str) -> bool:
-    """Whether a member begins as a capture or a recording, compressed or not."""
+    """Return whether a member begins like a capture, a recording or a compressed file."""
     with archive.open(member) as file:
         start = file.read(HEAD)
     return is_capture(start) or start.startswith(MAGIC) or _packing(start) is not None
 
 
 def refuse_container(path: str, start: bytes) -> None:
-    """Nothing, for a file that is read as the bytes it holds.
+    """Raise SourceError for an unsupported kind of file.
 
     Args:
-        start: its first `HEAD` bytes, or all, as they are unpacked.
+        path: of the file, for the message.
+        start: its first `HEAD` bytes, decompressed.
 
     Raises:
-        SourceError: where it begins as a file of another kind, which is named.
+        SourceError: with the kind of the file, and the command that extracts the data.
     """
     for beginning, (what, command) in _REFUSED.items():
         if re.match(beginning, start, re.DOTALL):
@@ -303,7 +313,7 @@ def refuse_container(path: str, start: bytes) -> None:
 
 
 def head(file: BinaryIO) -> bytes:
-    """How a file begins; of a pipe what is there first. It stays there."""
+    """Return the first bytes of a file or pipe, without consuming them."""
     if isinstance(file, io.BufferedReader):
         return file.peek(HEAD)[:HEAD]
     start = file.read(HEAD)

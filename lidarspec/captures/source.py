@@ -24,8 +24,8 @@ from lidarspec.errors import SourceError
 
 #: initial size of a buffer, and the largest step of `skip`, in bytes.
 SMALLEST = 1 << 16
-#: bytes behind the filled part that callers may read, whatever their values are, so that they can
-#: compare records in words of several bytes.
+#: bytes after the filled part that callers may read, with any value, so that they can compare
+#: records in words of several bytes.
 SLACK = 256
 #: the number of lent buffers that are remembered for reuse.
 MOST_KEPT = 2
@@ -61,12 +61,12 @@ class Source:
         self._adopt(np.empty(_first_size(file, largest) + SLACK, np.uint8), 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """What is pickled goes on at the same place of the file."""
+        """Return the state for pickling: the copy continues at the same offset."""
         return _source_at, (self._file, self._largest, self.place)
 
     @property
     def stop(self) -> int:
-        """How much of `storage` is filled."""
+        """The number of filled bytes of `storage`."""
         return len(self._data)
 
     @property
@@ -81,7 +81,7 @@ class Source:
         return _source_at(self._file, SMALLEST, place)
 
     def go(self, place: int) -> None:
-        """Go on from a place of a file that can be sought."""
+        """Continue at an offset of a seekable file."""
         self._file.seek(place)
         self._lent = None  # the new buffer has not been lent
         self._adopt(np.empty_like(self.storage), 0)
@@ -89,7 +89,7 @@ class Source:
 
     @property
     def size(self) -> int | None:
-        """Bytes of the file; None where it cannot be sought."""
+        """The size of the file in bytes, None if it is not seekable."""
         if not self._file.seekable():
             return None
         here = self._file.tell()
@@ -108,10 +108,10 @@ class Source:
         return self._has(1)
 
     def take(self, size: int) -> bytes:
-        """The next `size` bytes; the caller sees to it that `size` is bounded.
+        """Return the next `size` bytes; the caller limits `size`.
 
         Raises:
-            Truncated: fewer are left.
+            Truncated: if fewer are left.
         """
         if not self._has(size):
             raise Truncated
@@ -119,10 +119,10 @@ class Source:
         return bytes(self._data[self.at - size : self.at])
 
     def skip(self, size: int) -> None:
-        """Passes over `size` bytes, however many.
+        """Skip any number of bytes.
 
         Raises:
-            Truncated: fewer are left.
+            Truncated: if fewer are left.
         """
         while size:
             step = min(size, SMALLEST)
@@ -204,7 +204,7 @@ class Source:
 
 
 def _source_at(file: BinaryIO, largest: int, place: int) -> Source:
-    """The bytes of a file that can be sought, from a place on."""
+    """Return a source of a seekable file that starts at an offset."""
     file.seek(place)
     source = Source(file, largest=largest)
     source.record = source._passed = place

@@ -1,22 +1,15 @@
 """File formats of scans, by the suffix of the file.
 
-In: scans. Out: a file, which appears under its name only when it is whole. `write` is all that is
-asked for; `formats` knows the plugins'
-formats, too. Modules in reading order:
+Input: scans. Output: a file, which gets its name only when it is complete. `write` is the function
+for callers. `formats` includes the formats of plugins. Modules in reading order:
 
-* `writing`: what formats have in common.
-* `text`: .csv, .csv.gz and .xyz, a row a point.
-* `arrays`: .npz, an array a column; .npy, a structured array; .zarr, a folder with an array a
-  column.
-* `tables`: .parquet, .arrow and .feather, for data tools.
-* `rows`: points as rows of bytes behind a header.
-* `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
-* `las`: .las and .laz, for surveyors' tools.
-* `e57`: .e57, a header and points for each scan.
-* `messages`: ROS's messages of scans, packets and IMU samples.
-* `bags`: .mcap, .bag, .rosbag2 and .db3, a message a scan.
-* `foxglove`: .foxglove.mcap, with Foxglove's messages.
-* `rerun`: .rrd, for Rerun's viewer.
+* `writing`: functions shared by the formats. * `text`: .csv, .csv.gz and .xyz, one row per point. *
+`arrays`: .npz, one array per column; .npy, a structured array; .zarr, a folder with one array per
+column. * `tables`: .parquet, .arrow and .feather, for data tools. * `rows`: points as rows of bytes
+after a header. * `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin. * `las`: .las and .laz, for
+surveying tools. * `e57`: .e57, with a header and points for each scan. * `messages`: ROS messages
+of scans, packets and IMU samples. * `bags`: .mcap, .bag, .rosbag2 and .db3, one message per scan. *
+`foxglove`: .foxglove.mcap, with Foxglove messages. * `rerun`: .rrd, for the Rerun viewer.
 """
 
 from __future__ import annotations
@@ -54,8 +47,8 @@ from lidarspec.plugins import registry
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Format
 
-#: the places in a path of a scan's number, and of its stamp's date, hour, minute and second, of
-#: which these are the letters of an ISO text.
+#: placeholders of a path for date, hour, minute and second of a scan's stamp, as parts of an ISO
+#: text; `PLACE` also matches the number of a scan.
 MOMENT = {"%F": slice(10), "%H": slice(11, 13), "%M": slice(14, 16), "%S": slice(17, 19)}
 PLACE = re.compile(rf"%0?\d?d|{'|'.join(MOMENT)}")
 ARRAYS = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR)
@@ -66,10 +59,12 @@ BUILT_IN = {known.suffix: known for known in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
 
 
 def formats() -> dict[str, Format]:
-    """Every format by suffix, those of plugins too; lidarspec's own come first.
+    """Return every format by suffix, including those of plugins.
+
+    The package's own formats have priority.
 
     Raises:
-        SpecError: where a plugin's hook fails.
+        SpecError: if a plugin's hook fails.
     """
     try:
         added = [found for plugin in registry().call("lidarspec_formats") for found in plugin]
@@ -81,8 +76,9 @@ def formats() -> dict[str, Format]:
 
 
 def format_of(path: str | Path) -> Format:
-    """The format that a file name asks for by its suffix; plugins are asked only where it is not
-    one of our own.
+    """Return the format of a file name.
+
+    Plugins are only loaded if the suffix is not one of the package's own.
 
     Raises:
         UnknownFormat: with a suggestion.
@@ -91,7 +87,7 @@ def format_of(path: str | Path) -> Format:
 
 
 def _longest(path: str | Path, known: Mapping[str, Format]) -> Format | None:
-    """The format with the longest of the suffixes that a name ends with, such as .csv.gz."""
+    """Return the format with the longest suffix of a name, such as .csv.gz."""
     name = Path(path).name.lower()
     return max(
         (found for suffix, found in known.items() if name.endswith(suffix)),
@@ -105,11 +101,13 @@ def _unknown(path: str | Path, known: Mapping[str, Format]) -> NoReturn:
 
 
 def write_imu(path: str | Path, samples: ImuSamples) -> None:
-    """Write what an IMU felt to a .csv or .npz file: time_ns, and six columns in rad/s and m/s2.
+    """Write IMU samples to a .csv or .npz file.
+
+    The columns are time_ns, and six columns in rad/s and m/s2.
 
     Raises:
         UnknownFormat: for another suffix.
-        SourceError: where the file cannot be written.
+        SourceError: if the file cannot be written.
     """
     path = Path(path)
     known = {format.suffix: format for format in (CSV, NPZ)}
@@ -122,8 +120,9 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
 
 
 def targets(path: str | Path) -> list[str]:
-    """The files that `write` may replace: that of the path, or those that there are already under
-    such names with numbers and times.
+    """Return the existing files that `write` may replace.
+
+    For a path without placeholders, it is that path, existing or not.
     """
     path = Path(path)
     if not PLACE.search(str(path)):
@@ -145,22 +144,21 @@ def write(
     """Write scans to a file in the format of its suffix, or to several.
 
     Args:
-        path: the file; what it held is replaced once the new content is whole, and stays if that
-            fails. With places in it, consecutive scans for which it is the same share a file, and
-            folders are made where there are none: "scans/%05d.pcd", the number of the scan from 0
-            on, has a file for each; "drive/date=%F/hour=%H/%M.parquet" one for each minute, by the
-            stamp, in UTC; %S is the second.
-        every_point: also the points without a valid return.
-        organized: every point of a scan in rows and columns, (rows, columns), missing ones as nan:
-            of one scan a file, unless the format keeps scans apart.
-        packets: what the sensor sent, to stand beside the points in a log of ROS.
+        path: the file. An old file is replaced when the new one is complete, and kept if writing
+            fails. The path may have placeholders: consecutive scans with the same path share a
+            file, and missing folders are made. "scans/%05d.pcd" has the number of the scan, from 0,
+            so each scan gets a file. "drive/date=%F/hour=%H/%M.parquet" has a file for each minute
+            of the stamps, in UTC; %S is the second.
+        every_point: also write points without a valid return.
+        organized: write every point of a scan in rows and columns, missing ones as nan. Each file
+            then has one scan, unless the format stores scans separately.
+        packets: the raw packets, to be written beside the points to a ROS log.
 
     Raises:
-        UnknownFormat: for a suffix that is none.
-        UsageError: where a file that is written would be begun again, since the time in its name
-            came again; where points are to be organised or packets to stand beside them, and the
-            format, the sensor or the number of scans is not for that.
-        SourceError: where the file cannot be written.
+        UnknownFormat: for an unknown suffix.
+        UsageError: if a file would be started again because its time occurs again; and if the
+            format, the sensor or the number of scans does not support `organized` or `packets`.
+        SourceError: if the file cannot be written.
     """
     path = Path(path)
     chosen = format_of(path)
@@ -184,10 +182,10 @@ def write(
 
 
 def check_holds(path: str | Path, what: str) -> None:
-    """Nothing, where the format of a file has a place for something (see `Format.holds`).
+    """Raise UsageError unless a format has a feature of `Format.holds`.
 
     Raises:
-        UsageError: where it has none; it names the formats that have.
+        UsageError: with the formats that have it.
     """
     if what not in format_of(path).holds:
         having = ", ".join(suffix for suffix, known in formats().items() if what in known.holds)
@@ -198,7 +196,11 @@ def check_holds(path: str | Path, what: str) -> None:
 
 
 def _organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterator[Scan]:
-    """Scans, while they are organised; `alone`: where there is one."""
+    """Yield scans, and check that they are organized.
+
+    Args:
+        alone: whether only one scan is allowed.
+    """
     for number, scan in enumerate(scans):
         if scan.points.shape is None:
             raise UsageError(
@@ -217,7 +219,7 @@ def _organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterator[Sc
 
 
 def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Scan]]]:
-    """Each file, and the scans that go into it."""
+    """Yield each file, and the scans for it."""
     begun = set[str]()
     for name, group in itertools.groupby(
         enumerate(scans), lambda numbered: _placed(str(path), *numbered)
@@ -240,7 +242,10 @@ def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Sc
 
 
 def _placed(path: str, number: int, scan: Scan) -> str:
-    """A path with number and time in their places; another percent sign stays."""
+    """Return a path with the number and time of a scan in place of the placeholders.
+
+    Other percent signs are kept.
+    """
     moment = str(np.datetime64(scan.stamp_ns, "ns"))
     return PLACE.sub(
         lambda place: moment[MOMENT[place[0]]] if place[0] in MOMENT else place[0] % number, path

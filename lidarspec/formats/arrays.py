@@ -1,9 +1,8 @@
-"""Arrays: NumPy's .npz, one a column, with a stamp a scan; .npy, one structured array; and Zarr, a
-folder of compressed ones.
+"""Write NumPy arrays (.npz, .npy) and Zarr folders.
 
-How long an array is stands before it, and is known at the end alone: until then each column of an
-.npz grows in a file of its own, without a name, in the same folder. Those of Zarr, as xarray and
-Dask open them, grow by whole chunks.
+The size of an array precedes its data, but is only known at the end: until then each column of an
+.npz is written to an unnamed file in the same folder. The arrays of Zarr, as xarray and Dask open
+them, grow by whole chunks.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from lidarspec.points.table_types import structured_type
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: numbers of a chunk of Zarr, and of one of those that have a number a scan.
+#: values in a chunk of Zarr: of point columns, and of scan columns.
 ROWS = 1 << 18
 SCANS = 1 << 12
-#: what there is of each scan: type and unit, as xarray reads it.
+#: the columns with a value per scan: type and unit, as xarray reads it.
 OF_SCANS: dict[str, tuple[DTypeLike, str]] = {
     "stamp_ns": (np.int64, "nanoseconds since 1970-01-01"),
     "rate_hz": (np.float64, "Hz"),
@@ -38,7 +37,11 @@ OF_SCANS: dict[str, tuple[DTypeLike, str]] = {
 
 
 def put(archive: zipfile.ZipFile, name: str, column: Spool, height: int | None = None) -> None:
-    """Put a column into an archive, as NumPy reads it; of a picture as so many rows."""
+    """Add a column to an archive as a NumPy array.
+
+    Args:
+        height: number of rows of an organized column; None for a flat one.
+    """
     with archive.open(f"{name}.npy", "w", force_zip64=True) as target:
         lengths = (column.length,) if height is None else (height, column.length // height)
         shape = {"descr": column.dtype.str, "fortran_order": False, "shape": lengths}
@@ -47,11 +50,11 @@ def put(archive: zipfile.ZipFile, name: str, column: Spool, height: int | None =
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
-    """Write the columns that all scans have, `scan` for each point, and for each scan `stamp_ns`,
-    `rate_hz` and `complete`.
+    """Write the columns that all scans have, and the columns of scans.
 
-    The unit of a sensor's further column stands in NAME.unit. With `organized` the columns of the
-    one scan that there is are (rows, columns), several returns of a place side by side.
+    Each point has `scan`, and each scan has `stamp_ns`, `rate_hz` and `complete`. The unit of an
+    additional column is in NAME.unit. With `organized`, the columns of the only scan are (rows,
+    columns), with several returns side by side.
     """
     height: int | None = None
     with contextlib.ExitStack() as files:
@@ -83,25 +86,24 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
             numbers.add(np.full(len(cloud), number))
             for name, kept in of_scans.items():
                 kept.add(np.array([getattr(scan, name)]))
-        told = {f"{name}.unit": column(f"<U{len(unit)}") for name, unit in units.items()}
-        for unit, kept in zip(units.values(), told.values(), strict=True):
+        unit_columns = {f"{name}.unit": column(f"<U{len(unit)}") for name, unit in units.items()}
+        for unit, kept in zip(units.values(), unit_columns.values(), strict=True):
             kept.add(np.array([unit]))
         with zipfile.ZipFile(path, "w") as archive:
             for name, kept in {**columns, "scan": numbers}.items():
                 put(archive, name, kept, height)
-            for name, kept in {**of_scans, **told}.items():
+            for name, kept in {**of_scans, **unit_columns}.items():
                 put(archive, name, kept)
 
 
 def write_npy(
     path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
 ) -> None:
-    """Write one structured array with PCL's layout, as `PointCloud.to_structured` makes it: what
-    the sensor lacks is 0.
+    """Write one structured array with PCL's layout, as `PointCloud.to_structured`.
 
-    Where there are several scans, their number is a further column, `scan`; with `organized` the
-    one that there is is (rows, columns). Such a file can be mapped: ``np.load(path,
-    mmap_mode="r")``.
+    Missing columns are 0. If there are several scans, the column `scan` has their number. With
+    `organized`, the array of the only scan is (rows, columns). The file can be memory-mapped:
+    ``np.load(path, mmap_mode="r")``.
     """
     write_rows(
         path,
@@ -117,7 +119,7 @@ def _structured(types: Mapping[str, Any]) -> np.dtype[Any]:
 
 
 def _npy_header(rows: PointRows) -> bytes:
-    """As long for any number of rows, since NumPy leaves room for it."""
+    """Return the header; NumPy pads it, so its length does not depend on the size."""
     header = io.BytesIO()
     shape = {
         "descr": np.lib.format.dtype_to_descr(rows.dtype),
@@ -129,7 +131,7 @@ def _npy_header(rows: PointRows) -> bytes:
 
 
 class _ZarrColumn:
-    """An array that grows by whole chunks, so that none is compressed twice."""
+    """An array that grows by whole chunks, so that no chunk is compressed twice."""
 
     def __init__(
         self, group: Any, name: str, dtype: DTypeLike, *, unit: str = "", along: str = "points"
@@ -147,7 +149,7 @@ class _ZarrColumn:
         self._length = 0
 
     def add(self, values: NDArray[Any] | None, length: int) -> None:
-        """Append values; without any, nan or 0 as often as `length` says."""
+        """Append values; None appends `length` times nan or 0."""
         dtype = self._array.dtype
         self._waiting.append(
             np.full(length, np.nan if dtype.kind == "f" else 0, dtype) if values is None else values
@@ -157,24 +159,23 @@ class _ZarrColumn:
             self.write(self._length - self._length % self._chunk)
 
     def write(self, number: int) -> None:
-        """Write so many of the values that wait."""
+        """Write a number of waiting values."""
         waiting = np.concatenate([np.empty(0, self._array.dtype), *self._waiting])
         self._array.append(waiting[:number])
         self._waiting = [waiting[number:].copy()]
         self._length = len(waiting) - number
 
     def finish(self) -> None:
-        """Write all that wait."""
+        """Write all waiting values."""
         self.write(self._length)
 
 
 def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write the columns that the first scan has, and `scan`, along "points", `stamp_ns`, `rate_hz`
-    and `complete` along "scans".
+    """Write the columns of the first scan along "points", and those of scans.
 
-    Arrays have their `units`; the group has `sensor`, `source`, `frame` (where x, y and z point)
-    and `calibration`. A column that a later scan lacks is nan there, or 0 where it holds whole
-    numbers.
+    Each point has `scan`; `stamp_ns`, `rate_hz` and `complete` are along "scans". Arrays have their
+    `units`; the group has `sensor`, `source`, `frame` (the directions of x, y and z) and
+    `calibration`. If a later scan lacks a column, its values are nan, or 0 for integers.
     """
     group = import_library("zarr", "zarr").open_group(str(path), mode="w")
     of_scans = {

@@ -1,11 +1,10 @@
-"""Robotics logs: each scan as ROS's messages, in an MCAP file, a ROS 1 bag or a ROS 2 bag.
+"""Write robotics logs: ROS messages in an MCAP file, ROS 1 bag or ROS 2 bag.
 
-On /points stands each scan as sensor_msgs/PointCloud2, and on /scan, where the sensor has one
-plane, as sensor_msgs/LaserScan (see `messages`), in the frame "laser". Both are in the log at the
-stamp of the scan, which is that of the cloud. What no message can say, the units of further
-columns, stands in the log's metadata; ROS 1 bags have none. Where they are asked for, /packets has
-what the sensor sent, so that the log can be read again as a source: each packet with the time of
-its arrival.
+/points has each scan as sensor_msgs/PointCloud2. For planar sensors, /scan has it as
+sensor_msgs/LaserScan (see `messages`). The frame is "laser", and the log time of both is the stamp
+of the scan. The units of additional columns, for which messages have no field, are in the metadata
+of the log; ROS 1 bags have none. On request, /packets has the raw packets with their arrival times,
+so that the log can be read again as a source.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from lidarspec.scans.scan import Scan
 from lidarspec.transports.bags import RAW
 from lidarspec.transports.protocol import Chunk, Format
 
-#: where messages are published, by their kind.
+#: message type -> topic.
 TOPICS = {CLOUD: "/points", SCAN: "/scan", RAW: "/packets"}
-#: bytes of a chunk of an MCAP file, which a reader holds at once: a scan or some.
+#: bytes of a chunk of an MCAP file, which a reader loads at once: about one scan.
 CHUNK = 1 << 20
 
 
@@ -35,11 +34,11 @@ class BagWriter:
     """The messages of one log.
 
     Args:
-        release: whose definitions they follow, as rosbags names them: "ROS1_NOETIC".
+        release: the release with the message definitions, as rosbags names it: "ROS1_NOETIC".
 
     Attributes:
         types: the definitions.
-        units: of the further columns, by name, as far as scans have come.
+        units: the units of additional columns so far, by name.
     """
 
     def __init__(self, release: str) -> None:
@@ -51,10 +50,10 @@ class BagWriter:
     def messages(
         self, scans: Iterable[Scan], packets: Iterable[Chunk], *, every_point: bool
     ) -> Iterator[Message]:
-        """The messages of each scan and packet, by their times as far as both are in order.
+        """Yield the messages of scans and packets, merged by time if both are in order.
 
         Raises:
-            UsageError: for a stamp that no message can hold.
+            UsageError: for a stamp that no message can contain.
         """
         return heapq.merge(
             self._of_scans(scans, every_point=every_point),
@@ -75,7 +74,10 @@ class BagWriter:
 def write_mcap(
     path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
 ) -> None:
-    """Write an MCAP file as ROS 2 records it, which Foxglove, `ros2 bag` and PlotJuggler read."""
+    """Write an MCAP file as ROS 2 records it.
+
+    Foxglove, `ros2 bag` and PlotJuggler read it.
+    """
     mcap = import_library("mcap.writer", "ros")
     held = BagWriter("ROS2_HUMBLE")
     channels = dict[str, int]()
@@ -116,11 +118,10 @@ def write_ros2(
 ) -> None:
     """Write a ROS 2 bag of metadata version 8, which releases from Foxy on read.
 
-    Args:
-        storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a database
-            file alone, as `ros2 bag` reads it, too.
+    Args: storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a single
+        database file, which `ros2 bag` reads too.
     """
-    import sqlite3  # which the whole module would otherwise wait for
+    import sqlite3  # only needed here
 
     rosbag2 = import_library("rosbags.rosbag2", "ros")
     with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as folder:
@@ -135,7 +136,7 @@ def write_ros2(
 
 
 def _record(log: Any, held: BagWriter, every: Iterable[Message]) -> None:
-    """Write messages by a writer of rosbags."""
+    """Write messages with a writer of rosbags."""
     connections = dict[str, Any]()
     with log:
         for kind, at, data in every:
@@ -146,7 +147,7 @@ def _record(log: Any, held: BagWriter, every: Iterable[Message]) -> None:
             log.set_custom_data(f"unit of {name}", unit)
 
 
-#: what messages have a place for.
+#: the features of these formats.
 _HOLDS = ("scans", "organized", "beams", "frame-id", "packets")
 MCAP = Format(".mcap", "an MCAP file with ROS 2 messages", write_mcap, _HOLDS)
 BAG = Format(".bag", "a ROS 1 bag", write_ros1, _HOLDS)

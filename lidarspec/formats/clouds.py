@@ -1,8 +1,8 @@
-"""Files of point clouds: PCD of the Point Cloud Library, PLY, and the .bin of KITTI.
+"""Write point clouds: PCD of the Point Cloud Library, PLY, and the .bin of KITTI.
 
-They have no place for more than one scan: the rows of several follow one another, with the number
-of the scan in a field of its own. `time` counts from the stamp of the scan; that of the first one,
-the sensor and the units stand in comments of the header.
+The formats have no scans: the rows of several scans follow one another, with the number of the scan
+as a field. `time` counts from the stamp of the scan. Comments of the header have the stamp of the
+first scan, the sensor and the units.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from lidarspec.libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: types that a format, or a common reader of it, does not know, and those that hold their numbers:
-#: whole ones of 64 bits up to 2**53.
+#: types that a format, or a common reader of it, does not support, and their replacements. Integers
+#: of 64 bits are exact up to 2**53.
 _PCD_TYPES = {"f2": "f4", "b1": "u1"}
 _PLY_TYPES = {
     **_PCD_TYPES,
@@ -31,18 +31,18 @@ _PLY_TYPES = {
     **dict.fromkeys(("u4", "i8", "u8"), "f8"),
 }
 _PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-#: how many bytes the sizes before compressed points can tell.
+#: maximum size in the header of compressed points.
 _MOST_COMPRESSED = (1 << 32) - 1
 
 
 def write_pcd(
     path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
 ) -> None:
-    """Write a binary PCD 0.7 file: x y z intensity ring time, as far as the sensor has them, and
-    its further columns in their types.
+    """Write a binary PCD 0.7 file.
 
-    WIDTH and HEIGHT are those of a single organised scan whose every point is written, missing ones
-    as nan, `organized` or not; else HEIGHT is 1.
+    It has the columns of x y z intensity ring time that the sensor has, and its additional columns
+    in their types. WIDTH and HEIGHT are those of a single organized scan if every point is written,
+    with missing points as nan; otherwise HEIGHT is 1.
     """
     write_rows(path, _pcd_rows(scans, every_point=every_point), _pcd_header)
 
@@ -50,10 +50,10 @@ def write_pcd(
 def write_lzf_pcd(
     path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
 ) -> None:
-    """Write the same as `write_pcd` as DATA binary_compressed: field by field, with LZF.
+    """Write the content of `write_pcd` as DATA binary_compressed, with LZF.
 
     Raises:
-        UsageError: where the points take 4 GiB or more, which the format cannot say.
+        UsageError: for 4 GiB of points or more, which the format does not support.
     """
     compress = import_library("lzf", "pcd").compress
     rows = _pcd_rows(scans, every_point=every_point)
@@ -68,7 +68,7 @@ def write_lzf_pcd(
             for name, field in fields.items():
                 field.add(
                     _compressed(block[name], compress)
-                )  # what is compressed piece by piece is one, one piece after another
+                )  # concatenated compressed blocks are a valid compressed field
         start = target.write(_pcd_header(rows, "binary_compressed")) + 8
         target.seek(start)
         for field in fields.values():
@@ -83,7 +83,7 @@ def _compressed(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
     data = values.tobytes()
     return np.frombuffer(
         compress(data, len(data) + len(data) // 16 + 64) if data else b"", np.uint8
-    )  # the most that noise grows to
+    )  # the maximum size of compressed noise
 
 
 def _refuse_size(size: int) -> None:
@@ -121,11 +121,11 @@ def _pcd_header(rows: PointRows, data: str = "binary") -> bytes:
 
 
 def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a binary little-endian PLY file: x y z intensity ring time, as far as the sensor has
-    them, and its further columns.
+    """Write a binary little-endian PLY file.
 
-    Properties are float, double, uchar or int, since Open3D skips the other types: int for `ring`,
-    double for longer whole numbers.
+    It has the columns of x y z intensity ring time that the sensor has, and its additional columns.
+    Properties are float, double, uchar or int, because Open3D skips other types: int for `ring`,
+    double for larger integers.
     """
     write_rows(
         path,
@@ -150,17 +150,16 @@ def _ply_header(rows: PointRows) -> bytes:
 
 
 def _packed(types: Mapping[str, Any], known: Mapping[str, str]) -> np.dtype[Any]:
-    """A row of columns without gaps, in types that a format knows."""
+    """Return the type of a row without gaps, in types that a format supports."""
     codes = {name: np.dtype(dtype).str[1:] for name, dtype in types.items()}
     return np.dtype([(name, "<" + known.get(code, code)) for name, code in codes.items()])
 
 
 def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write x y z intensity as float32, little endian, nothing else; 0 is the intensity of a sensor
-    that has none.
+    """Write x y z intensity as little-endian float32, without a header.
 
-    A file of KITTI is one scan: ``out/%06d.bin``. Intensities are the wire's numbers, not scaled to
-    1.
+    The intensity is 0 if the sensor has none. A file of KITTI is one scan: ``out/%06d.bin``.
+    Intensities are raw values, not scaled to 1.
     """
     row = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
     write_rows(path, PointRows(scans, lambda types: row, every_point=every_point), lambda rows: b"")

@@ -1,4 +1,4 @@
-"""ASTM E57, by libE57Format (pye57): a header and a section of points for each scan."""
+"""Write ASTM E57 with libE57Format (pye57): a header and points for each scan."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidarspec.libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: our columns, and the standard's names of them.
+#: column -> name in the standard.
 NAMES = {
     **{
         "x": "cartesianX",
@@ -32,19 +32,18 @@ NAMES = {
         "return_index": "returnIndex",
     },
 }
-#: fields whose smallest and largest number the header has, by the group that these stand in and
-#: what they are called there.
+#: fields with limits in the header: group -> name in the group -> field.
 LIMITS = {
     "cartesianBounds": {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ"},
     "intensityLimits": {"intensity": "intensity"},
     "indexBounds": {"row": "rowIndex", "column": "columnIndex", "return": "returnIndex"},
 }
-#: what the standard calls a point whose coordinates mean nothing.
+#: the standard's value for a point without valid coordinates.
 INVALID = 2
-#: prefix of the further columns, which are an extension, and what declares it.
+#: prefix and URL of the extension with the additional columns.
 PREFIX = "lidarspec"
 EXTENSION = "urn:lidarspec:columns"
-#: types that libE57Format does not take, and those that hold their numbers.
+#: types that libE57Format does not support, and their replacements.
 TAKEN_AS = {
     "f2": np.float32,
     "b1": np.uint8,
@@ -53,14 +52,14 @@ TAKEN_AS = {
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a scan with a header for each: places, intensity, time, ring as the row, column and
-    return, and the further columns.
+    """Write each scan with a header.
 
-    `timeStamp` counts from the scan's acquisitionStart, its stamp as GPS time with 18 leap seconds;
-    `returnCount` is the most of the scan. Further columns are an extension, lidarspec:NAME, which
-    readers pass over that do not know it; their units stand in the scan's description. With
-    `every_point`, a point without a return is at 0 with cartesianInvalidState 2. Headers are in
-    memory until the file is closed, as the library has it.
+    Points have coordinates, intensity, time, ring as row, column and return, and the additional
+    columns. `timeStamp` counts from the scan's acquisitionStart, which is its stamp as GPS time
+    with 18 leap seconds. `returnCount` is the maximum of the scan. Additional columns are an
+    extension, lidarspec:NAME, which other readers skip; their units are in the scan's description.
+    With `every_point`, a point without a return is at 0 with cartesianInvalidState 2. The library
+    keeps headers in memory until the file is closed.
     """
     pye57 = import_library("pye57", "e57")
     libe57 = import_library("pye57.libe57", "e57")
@@ -73,7 +72,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
                 own = columns_of(scan, (*NAMES, *scan.points.extra), every_point=every_point)
                 _add(libe57, file, _header(number, scan), _columns(own))
             file.close()
-        except libe57.E57Exception as error:  # of the system's errors alone, without its words
+        except libe57.E57Exception as error:  # it omits the text of system errors
             raise OSError(f"{str(error).splitlines()[0]}; is the disk full?") from None
 
 
@@ -97,11 +96,11 @@ def _add(
         writer.write(length)
         writer.close()
     finally:
-        del writer  # before the file is closed, which it writes to when it goes
+        del writer  # its destructor writes to the file, so it has to go before the file is closed
 
 
 def _columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The columns of points by the names of the standard, in types that libE57Format takes."""
+    """Return the columns by their standard names, in supported types."""
     invalid = ~own["valid"]
     columns = {NAMES.get(name, f"{PREFIX}:{name}"): column for name, column in own.items()}
     columns["cartesianInvalidState"] = invalid * np.uint8(INVALID)
@@ -120,7 +119,7 @@ def _columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _header(number: int, scan: Scan) -> dict[str, Any]:
-    """What is said of a scan."""
+    """Return the header of a scan."""
     units = ", ".join(f"{name} [{unit}]" for name, unit in scan.points.units.items() if unit)
     start = (scan.stamp_ns - GPS_EPOCH) * 1e-9
     return {
@@ -138,7 +137,7 @@ def _header(number: int, scan: Scan) -> dict[str, Any]:
 
 
 def _limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Between what numbers the valid points of a scan lie."""
+    """Return the minimum and maximum of the valid points, by group and name."""
     valid = columns["cartesianInvalidState"] == 0
     if not valid.any():
         return {}
@@ -155,7 +154,7 @@ def _limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def _node(libe57: Any, image: Any, value: Any) -> Any:
-    """A value of a header, mappings as structures."""
+    """Return a node for a value of a header; mappings become structures."""
     if not isinstance(value, Mapping):
         kinds = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
         return kinds[type(value)](image, value)
@@ -166,7 +165,7 @@ def _node(libe57: Any, image: Any, value: Any) -> Any:
 
 
 def _kind(libe57: Any, image: Any, column: NDArray[Any]) -> Any:
-    """What a column holds: whole numbers take as many bits as those that come need."""
+    """Return the node of a column; integers use only the bits that they need."""
     if column.dtype.kind != "f":
         low, high = (int(column.min()), int(column.max())) if len(column) else (0, 0)
         return libe57.IntegerNode(image, low, low, high)

@@ -1,9 +1,8 @@
-"""Logs for Foxglove: each scan as Foxglove's own messages in Protobuf, in an MCAP file, which say
-nothing of ROS.
+"""Write logs for Foxglove: scans as Foxglove Protobuf messages in an MCAP file.
 
-On /points stands each scan as foxglove.PointCloud, and on /scan, where the sensor has one plane, as
-foxglove.LaserScan; stamps, frame, layout of the points and the units in the metadata are those of
-the logs of ROS (see `bags`).
+/points has each scan as foxglove.PointCloud. For planar sensors, /scan has it as
+foxglove.LaserScan. Stamps, frame, layout of the points and the units in the metadata are those of
+ROS logs (see `bags`).
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from lidarspec.scans.planes import Planes
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: the numbers by which foxglove.PackedElementField names types.
+#: the numbers of types in foxglove.PackedElementField.
 FIELD_TYPES = {"u1": 1, "b1": 1, "i1": 2, "u2": 3, "i2": 4, "u4": 5, "i4": 6, "f4": 7, "f8": 8}
 
 

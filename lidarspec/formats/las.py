@@ -1,5 +1,6 @@
-"""LAS and its compressed form LAZ, by laspy: version 1.4, point format 6, with GPS time, in steps
-of 0.1 mm.
+"""Write LAS and its compressed form LAZ, with laspy.
+
+The files have version 1.4, point format 6 and GPS time, with coordinates in steps of 0.1 mm.
 """
 
 from __future__ import annotations
@@ -20,20 +21,17 @@ from lidarspec.libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: the columns that LAS has a place for, and those that are extra dimensions as the sensor's further
-#: ones are.
+#: columns with a standard field in LAS, and columns that become extra dimensions.
 PLACED = ("x", "y", "z", "intensity", "time", "return_index", "valid")
 EXTRA = ("ring", "column")
-#: types that extra dimensions do not have, and those that hold their numbers.
+#: types that extra dimensions do not support, and their replacements.
 WIDER = {"f2": np.dtype(np.float32), "b1": np.dtype(np.uint8)}
-#: metres a step, and metres from 0 up to which places count from there; farther away they count
-#: from whole metres nearby.
+#: size of a coordinate step in metres, and the distance in metres up to which the offset is 0.
 STEP = 1e-4
 NEAR = 1e5
-#: ns since 1970 at what adjusted standard GPS time counts from.
+#: ns since 1970 of the origin of adjusted standard GPS time.
 EPOCH = GPS_EPOCH + 10**18
-#: points put together at once; the farthest step, the largest intensity, the last number of a
-#: return, and the flag of what is withheld.
+#: points per write; the largest step, intensity and return number; and the withheld flag.
 ROWS = 1 << 17
 FARTHEST = (1 << 31) - 1
 BRIGHTEST = 0xFFFF
@@ -42,19 +40,19 @@ WITHHELD = 1 << 2
 
 
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compressed: bool) -> None:
-    """Write places, intensity, return and GPS time; ring, column, number of the scan and the
-    sensor's further columns as extra dimensions.
+    """Write coordinates, intensity, return and GPS time, and extra dimensions.
 
-    `intensity` is the sensor's number, rounded, 65535 at most. A stamp is taken as a time since
-    1970, and written as adjusted standard GPS time with 18 leap seconds, exact to 0.1 microseconds.
-    `number_of_returns` is the most that a point of the scan has. The unit of a further column is
-    its description; where its name means something else in LAS, "_" is added. With `every_point`, a
-    point without a return is withheld and stands at the file's offset, 0, as there is no nan. What
-    a later scan lacks is nan there, or 0. Range and angles are left out: they follow from the
-    places.
+    Ring, column, the number of the scan and the additional columns are extra dimensions.
+    `intensity` is the raw value, rounded, at most 65535. The stamp is taken as a time since 1970,
+    and written as adjusted standard GPS time with 18 leap seconds, exact to 0.1 microseconds.
+    `number_of_returns` is the maximum of the scan. The unit of an additional column is its
+    description; "_" is appended to a name that LAS already uses. With `every_point`, a point
+    without a return is withheld and at the file's offset, 0, because there is no nan. If a later
+    scan lacks a column, its values are nan, or 0. Range and angles are omitted: they follow from
+    the coordinates.
 
     Raises:
-        UsageError: where places are farther apart than numbers of 32 bits reach, 214 km.
+        UsageError: if coordinates are farther apart than 32-bit numbers reach, 214 km.
     """
     laspy = import_library("laspy", "las")
     with contextlib.ExitStack() as files:
@@ -75,7 +73,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
                 further = _describe(laspy, header, own, scan)
                 buffers = itertools.cycle(
                     np.zeros((2, ROWS), header.point_format.dtype())
-                )  # of which one is written, one is filled
+                )  # one is filled while the other is written
                 writer = files.enter_context(opened())
                 write = files.enter_context(behind(writer.write_points))
             own["returns"] = _returns(own)
@@ -91,8 +89,10 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
 def _describe(
     laspy: Any, header: Any, own: Mapping[str, NDArray[Any]], scan: Scan
 ) -> dict[str, str]:
-    """Say in a header what points have, by those of the first scan: the names of extra dimensions,
-    by column.
+    """Add extra dimensions and facts of the first scan to a header.
+
+    Returns:
+        column -> name of its extra dimension.
     """
     taken = {*header.point_format.dimension_names, *header.point_format.dtype().names}
     further = {name: f"{name}_" if name in taken else name for name in own if name not in PLACED}
@@ -106,7 +106,7 @@ def _describe(
     )
     header.scales = [STEP] * 3
     header.offsets = [_offset(own[axis]) for axis in "xyz"]
-    header.global_encoding.wkt = True  # as this point format has it
+    header.global_encoding.wkt = True  # required for this point format
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.generating_software = "lidarspec"
     header.system_identifier = scan.sensor.id[:32]
@@ -125,7 +125,10 @@ def _offset(places: NDArray[Any]) -> float:
 
 
 def _returns(own: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """The number of each return, from 1 on, and above it how many there are, (n,)."""
+    """Return the number of each return and the number of returns, (n,).
+
+    The number is in the low bits, from 1, and the number of returns above it.
+    """
     if "return_index" in own:
         numbers = np.minimum(own["return_index"], LAST - 1) + 1
     else:
@@ -160,11 +163,11 @@ def _fill(
 
 
 def _write_compressed(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write the same, compressed: a sixth to a half as large, in seven times the time."""
+    """Write a compressed file: 1/6 to 1/2 of the size, in seven times the time."""
     lazrs = import_library("lazrs", "las")
     try:
         _write(path, scans, every_point=every_point, is_compressed=True)
-    except lazrs.LazrsError as error:  # of the system's errors alone, without its words
+    except lazrs.LazrsError as error:  # it omits the text of system errors
         raise OSError(f"{error}; is the disk full?") from error
 
 

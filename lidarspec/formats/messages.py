@@ -1,9 +1,8 @@
-"""ROS's messages of scans, packets and IMU samples, as the bytes that stand in logs and go over
-topics.
+"""Serialize scans, packets and IMU samples as ROS messages, for logs and topics.
 
-A scan is a sensor_msgs/PointCloud2, and where the sensor has one plane a sensor_msgs/LaserScan on
-an even grid of angles. Points have PCL's layout: x y z intensity time as float32, ring as uint16,
-then the further columns; a column that the sensor lacks is no field.
+A scan is a sensor_msgs/PointCloud2, and for planar sensors a sensor_msgs/LaserScan on an even grid
+of angles. Points have PCL's layout: x y z intensity time as float32, ring as uint16, then the
+additional columns. A column that the sensor lacks is omitted.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from lidarspec.transports.bags import DATAGRAM, RAW, STAMP, STREAM
 from lidarspec.transports.protocol import Chunk
 
 CLOUD, SCAN, IMU = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "LaserScan", "Imu"))
-#: the numbers by which PointField names types; anything else is written as float64.
+#: the numbers of types in PointField; other types are written as float64.
 FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 _SECOND = 1_000_000_000
 
 
 class Message(NamedTuple):
-    """A message as it stands in a log: its type, its time in ns, its bytes."""
+    """A serialized message: its type, its time in ns, its bytes."""
 
     kind: str
     at: int
@@ -41,12 +40,12 @@ class Messages:
     """Makes messages.
 
     Args:
-        release: whose definitions they follow, as rosbags names them: "ROS1_NOETIC".
+        release: the release with the message definitions, as rosbags names it: "ROS1_NOETIC".
 
     Attributes:
         types: the definitions.
 
-    Methods raise a UsageError for a stamp that no message can hold.
+    Methods raise a UsageError for a stamp that no message can contain.
     """
 
     def __init__(self, release: str) -> None:
@@ -59,8 +58,10 @@ class Messages:
         self._counts = release.startswith("ROS1")
 
     def raw(self, packet: Chunk, *, datagram: bool = True) -> Message:
-        """A packet as it was received, which `transports.bags` reads again; not a `datagram`: of a
-        stream.
+        """Return a raw packet as a message, which `transports.bags` reads again.
+
+        Args:
+            datagram: whether it is a datagram, not a piece of a stream.
         """
         at = packet.at or 0
         size = len(packet.data)
@@ -74,13 +75,15 @@ class Messages:
         )
 
     def cloud(self, scan: Scan, at: int, *, every_point: bool, number: int = 0) -> Message:
-        """The points of a scan; organised ones have a row for each row of the sensor, several
-        returns side by side; of others, and valid ones, there is one.
+        """Return the points of a scan.
+
+        Organized points have the sensor's rows, with several returns side by side. Others, and
+        valid points alone, have one row.
 
         Args:
             at: its stamp, ns.
-            every_point: also those without a valid return.
-            number: of the scan, which messages of ROS 1 say.
+            every_point: also points without a valid return.
+            number: of the scan, for messages of ROS 1.
         """
         cloud = scan.points
         points = records(cloud, every_point=every_point)
@@ -89,7 +92,7 @@ class Messages:
         ]
         points = points.view(
             np.dtype((np.void, points.itemsize))
-        )  # copied whole: of records what is between the fields is left out
+        )  # copied as a whole, because a copy of records skips the padding between fields
         if every_point and cloud.shape and len(cloud):
             points = picture(points, cloud)
         height, width = np.atleast_2d(points).shape
@@ -109,7 +112,7 @@ class Messages:
         )
 
     def laserscan(self, scan: Scan, planar: LaserScan, at: int, *, number: int = 0) -> Message:
-        """A scan on a grid of angles; `at`, `number`: as of a cloud."""
+        """Return a planar scan on a grid of angles; arguments as for `cloud`."""
         names = self.types.types[SCAN].__dataclass_fields__
         values = {name: getattr(planar, name) for name in names if hasattr(planar, name)}
         if scan.points.intensity is None:
@@ -117,8 +120,10 @@ class Messages:
         return self._message(SCAN, at, **values, header=self._header(number, at, scan.frame_id))
 
     def imu(self, felt: ImuSamples, index: int, at: int, frame_id: str) -> Message:
-        """One sample of an IMU, by REP-145: a first covariance of -1 says that something is not
-        measured, 0 that its error is not known.
+        """Return one IMU sample, by REP-145.
+
+        The first covariance is -1 for a quantity that is not measured, and 0 for one with unknown
+        error.
         """
         vector = self.types.types["geometry_msgs/msg/Vector3"]
         values: dict[str, Any] = {}
@@ -157,8 +162,9 @@ def _covariance(*, known: bool) -> NDArray[np.float64]:
 
 
 def fields_of(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, str]]:
-    """Name, offset and type ("f4") of each field of the records of a cloud; a column that it lacks
-    is none.
+    """Return name, offset and type ("f4") of each field of a cloud's records.
+
+    Columns that the cloud lacks are omitted.
     """
     lacking = {
         name
@@ -173,10 +179,10 @@ def fields_of(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, s
 
 
 def records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
-    """The points that are written, in PCL's layout, all columns of types that messages have."""
+    """Return the points to write in PCL's layout, in types that messages support."""
     points = cloud.to_structured()
     if not every_point:
-        points = np.compress(cloud.valid, points)  # ten times as quick as an index
+        points = np.compress(cloud.valid, points)  # ten times as fast as an index
     kinds = {name: points.dtype[name] for name in points.dtype.names or ()}
     if all(kind.str[1:] in FIELD_TYPES for kind in kinds.values()):
         return points

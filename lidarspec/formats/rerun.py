@@ -1,9 +1,8 @@
-"""Recordings of Rerun, .rrd: scans as coloured points on the sensor's and on the host's time,
-figures beside them.
+"""Write Rerun recordings, .rrd: scans as coloured points, with statistics.
 
-A `RerunRecording` is also what `view --rerun` shows in Rerun's viewer. Everything of a sensor
-stands under its id, so that the recordings of several can be opened together: its points, where it
-is mounted, what is known of it, and under `statistics` how it is doing.
+They are on the timelines of the sensor and of the host. `view --rerun` uses the same `RerunRecording` for the
+Rerun viewer. All entities of a sensor are below its id, so that recordings of several sensors can
+be opened together: its points, its mount, facts about it, and `statistics`.
 """
 
 from __future__ import annotations
@@ -27,35 +26,36 @@ from lidarspec.points.look import STEPS, Look, look, steps
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: of a point on the screen, in its viewer's pixels; and metres of the axes of a sensor.
+#: radius of a point in pixels of the viewer; length of a sensor's axes in metres.
 RADIUS = 1.5
 AXES = 0.3
-#: points that are handed over together, which bounds what is held.
+#: points that are flushed together, which limits the memory.
 HELD = 1 << 13
-#: bytes that are taken out of a pipe at once.
+#: maximum bytes per read of a pipe.
 PIPED = 1 << 16
-#: the names of the timelines: by the sensor's clock, by arrival, by number.
+#: names of the timelines: sensor clock, arrival, number of the scan.
 SENSOR = "sensor_time"
 HOST = "host_time"
 NUMBER = "scan"
 
 
 class RerunRecording:
-    """One recording, a context manager; it goes to a file (`save`), or where its `stream` is told
-    to (`spawn`, `connect_grpc`).
+    """One recording, a context manager.
+
+    It is written to a file (`save`), or to the target of its `stream` (`spawn`, `connect_grpc`).
 
     Args:
-        ramp: what colours show, "range", "intensity" or a further column; their scale is that of
-            the first scan.
+        ramp: the column that colours show, "range", "intensity" or an additional one; the first
+            scan sets their scale.
 
     Raises:
-        UsageError: where Rerun's SDK is not installed.
+        UsageError: if the Rerun SDK is not installed.
     """
 
     def __init__(self, ramp: str = "range") -> None:
         self._rerun = import_library("rerun", "rerun")
         self.stream = self._rerun.RecordingStream("lidarspec", send_properties=False)
-        self.stream.set_log_time_enabled(False)  # when it was logged is not when it was measured
+        self.stream.set_log_time_enabled(False)  # it is not the time of measurement
         self.stream.set_log_tick_enabled(False)
         self._ramp = ramp
         self._colours = _Colours()
@@ -74,7 +74,7 @@ class RerunRecording:
         trace: TracebackType | None,
     ) -> None:
         try:
-            if not isinstance(error, OSError):  # one that was stopped is whole as well
+            if not isinstance(error, OSError):  # an interrupted recording is complete too
                 self.flush()
         finally:
             self.stream.disconnect()
@@ -84,10 +84,10 @@ class RerunRecording:
             raise self._copy.failure
 
     def save(self, path: str | Path) -> None:
-        """Write it to a file.
+        """Write the recording to a file.
 
         Raises:
-            OSError: where that cannot be written.
+            OSError: if it cannot be written.
         """
         if os.name != "posix":
             with _told():
@@ -99,10 +99,10 @@ class RerunRecording:
             self.stream.save(f"/dev/fd/{self._copy.end}")
 
     def scan(self, scan: Scan, *, every_point: bool = False) -> None:
-        """Log a scan, and before the first what is known of its sensor.
+        """Log a scan, and before the first one the facts about its sensor.
 
         Raises:
-            OSError: where it cannot be written.
+            OSError: if it cannot be written.
         """
         is_first = not self._home
         if is_first:
@@ -137,7 +137,7 @@ class RerunRecording:
         self.figures(
             {"points": len(scan), "valid": int(scan.points.valid.sum()), "speed_hz": scan.rate_hz}
         )
-        if is_first:  # it names what there has to be by then: a time that runs
+        if is_first:  # it refers to a timeline, which has to exist by then
             self.stream.send_blueprint(self._layout())
 
     def figures(self, figures: Mapping[str, float | None]) -> None:
@@ -152,10 +152,10 @@ class RerunRecording:
                 )
 
     def flush(self) -> None:
-        """Hand over what was logged.
+        """Flush the logged data.
 
         Raises:
-            OSError: where it cannot be written.
+            OSError: if it cannot be written.
         """
         self._waiting = 0
         with _told():
@@ -196,7 +196,10 @@ class RerunRecording:
             self.stream.set_time(HOST, timestamp=np.datetime64(scan.host_ns, "ns"))
 
     def _layout(self) -> Any:
-        """The points, and beside them figures and facts; the sensor's time runs."""
+        """Return the layout: points, with statistics and facts beside them.
+
+        The sensor's timeline is active.
+        """
         views = import_library("rerun.blueprint", "rerun")
         figures = [
             views.TimeSeriesView(
@@ -215,15 +218,16 @@ class RerunRecording:
 
 
 class _Copy(threading.Thread):
-    """Writes to a file what Rerun's SDK writes into a pipe: where a disk is full, the SDK may wait
-    for ever for its own file.
+    """Copies the output of the Rerun SDK from a pipe to a file.
+
+    If a disk is full, the SDK may wait forever for its own file.
 
     Attributes:
-        end: of the pipe, to write to.
-        failure: what the system said of the file; what comes then is read, and lost.
+        end: the end of the pipe to write to.
+        failure: the error of the file; data after it is read and discarded.
 
     Raises:
-        OSError: where the file cannot be written.
+        OSError: if the file cannot be written.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -241,13 +245,13 @@ class _Copy(threading.Thread):
                         self._file.write(data)
             except OSError as error:
                 self.failure = error
-            while pipe.read(PIPED):  # the SDK is not to wait for it
+            while pipe.read(PIPED):  # the SDK must not block
                 pass
 
 
 @contextlib.contextmanager
 def _told() -> Iterator[None]:
-    """What Rerun's SDK says of a file as an OSError."""
+    """Convert errors of the Rerun SDK to OSError."""
     try:
         yield
     except RuntimeError as error:
@@ -261,9 +265,9 @@ class _Colours:
         self._look: Look | None = None
 
     def __call__(self, cloud: PointCloud, ramp: str) -> NDArray[np.uint8]:
-        """(n, 3), red, green and blue."""
+        """Return the colours of points, (n, 3): red, green and blue."""
         shown = self._look or look(cloud, ramp=ramp)
-        if len(cloud):  # an empty one tells nothing of the scale
+        if len(cloud):  # an empty cloud has no scale
             self._look = shown
         colours = np.array(make_ramp("dark", STEPS), np.uint8)  # the viewer is dark
         return colours[steps(cloud, shown)]

@@ -1,5 +1,6 @@
-"""Points as rows of bytes, as PCD, PLY, KITTI's .bin and .npy hold them: scan by scan, behind a
-header that says how many they are.
+"""Convert points to rows of bytes, for PCD, PLY, KITTI's .bin and .npy.
+
+The rows of all scans follow one another, after a header with their number.
 """
 
 from __future__ import annotations
@@ -18,32 +19,30 @@ from lidarspec.points.table_types import STRUCTURED
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import handed_out
 
-#: columns that rows begin with; a sensor's further ones follow.
+#: the first columns of a row; additional columns follow.
 NAMES = STRUCTURED.names or ()
-#: figures that there is room for where a header says how many rows follow.
+#: digits reserved for the number of rows in a header.
 FIGURES = 20
-#: bytes written at once: what a processor's cache holds is copied three times as fast.
+#: bytes per write; pieces that fit into the processor's cache are copied three times as fast.
 PIECE = 1 << 20
 
 
 class PointRows:
-    """The points of scans as structured rows of one type, (n,) a scan.
+    """The points of scans as structured rows of one type, (n,) per scan.
 
     Args:
-        layout: makes the type of a row from those of the columns that the first scan has: x y z
-            intensity ring time, its further ones, and `scan`, the number of the scan, where there
-            are several. Columns of other names are left out; of a scan that has not all of them,
-            what is missing is 0.
-        every_point: also the points without a valid return.
-        is_picture: where every point of a single organised scan is written, put them row by row.
+        layout: returns the type of a row for the types of the columns of the first scan: x y z
+            intensity ring time, additional ones, and `scan`, the number of the scan, if there are
+            several. Other columns are left out. If a later scan lacks a column, its values are 0.
+        every_point: also points without a valid return.
+        is_picture: order the points row by row if every point of a single organized scan is
+            written.
 
     Attributes:
         dtype: of a row.
-        length: how many rows there were so far.
-        shape: (width, height) of such a picture, else None; several returns of a place stand side
-            by side.
-        facts: what a header may say of the sensor, the stamp of the first scan and the units, a
-            line each.
+        length: the number of rows so far.
+        shape: (width, height) of an organized scan, else None; several returns are side by side.
+        facts: lines for a header: the sensor, the stamp of the first scan, and the units.
     """
 
     def __init__(
@@ -82,12 +81,12 @@ class PointRows:
         return itertools.starmap(self.filled, self.parts())
 
     def parts(self) -> Iterator[tuple[Mapping[str, NDArray[Any]], PointCloud]]:
-        """The columns of each scan, and its points, of which `filled` makes rows."""
+        """Yield the columns and points of each scan, for `filled`."""
         for number, scan in enumerate(self._scans):
             yield self._columns(scan, number, self.dtype.names or ()), scan.points
 
     def filled(self, columns: Mapping[str, NDArray[Any]], points: PointCloud) -> NDArray[Any]:
-        """The rows of a scan, which are counted."""
+        """Return the rows of a scan, and count them."""
         rows = np.zeros(len(columns["x"]), self.dtype)
         for name, column in columns.items():
             rows[name] = column
@@ -108,8 +107,10 @@ class PointRows:
 
 
 def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]) -> None:
-    """Write rows behind a header, which is made again when they are counted: its length must not
-    depend on their number.
+    """Write rows after a header.
+
+    The header is written again at the end with the number of rows, so its length must not depend on
+    it.
     """
     with path.open("wb") as file:
         file.write(header(rows))
@@ -127,5 +128,5 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
 
 
 def room(*numbers: int) -> str:
-    """The spaces that make a header as long with these numbers as with any others."""
+    """Return spaces that make the length of a header independent of these numbers."""
     return " " * sum(FIGURES - len(str(number)) for number in numbers)

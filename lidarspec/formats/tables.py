@@ -1,8 +1,7 @@
-"""Tables for data tools, by pyarrow: Parquet for queries, Arrow and Feather to be mapped into
-memory; a row a point.
+"""Write tables with pyarrow, one row per point: Parquet, Arrow and Feather.
 
-Scans are gathered until there are `ROWS`, which are a row group or a record batch. Columns are
-handed over as they are, without a copy.
+Arrow and Feather files can be memory-mapped. Scans are joined to row groups or record batches of at
+least `ROWS` points. Columns are passed on without a copy.
 """
 
 from __future__ import annotations
@@ -22,23 +21,23 @@ from lidarspec.points.table_types import arrow_schema
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: points of a row group or record batch at least, those at the end excepted.
+#: minimum number of points of a row group or record batch, except the last one.
 ROWS = 1 << 17
-#: scans of so many points that are not worth joining.
+#: maximum number of scans of this size that are not joined.
 MANY = 8
 
 
 def _write(
     path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer: Callable[[Path, Any], Any]
 ) -> None:
-    """Write the columns that the first scan has, and for each point of which scan it is.
+    """Write the columns of the first scan, and the scan of each point.
 
-    `scan` is its number, `stamp` its stamp, to which `time` is added, as a timestamp in ns without
-    a zone, which pandas and DuckDB keep exactly; `complete` as in `Scan`. A column that a later
-    scan lacks is nan there, or null where it holds whole numbers; with `every_point` x, y and z of
-    a point without a return are nan. Each field has its unit in its metadata, and the schema's has
-    `sensor`, `source` (what is known of its format), `frame` (where x, y and z point), `units` as
-    JSON, and `calibration`: "nominal" or "own".
+    `scan` is its number; `stamp` its stamp as a timestamp in ns without a zone, which pandas and
+    DuckDB keep exactly (`time` counts from it); `complete` is as in `Scan`. If a later scan lacks a
+    column, its values are nan, or null for integers. With `every_point`, x, y and z of a point
+    without a return are nan. The metadata of a field has its unit. The metadata of the schema has
+    `sensor`, `source` (the facts about its format), `frame` (the directions of x, y and z), `units`
+    as JSON, and `calibration`: "nominal" or "own".
     """
     made = tables(scans, path, every_point=every_point)
     first = next(made)
@@ -48,11 +47,10 @@ def _write(
 
 
 def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool) -> Iterator[Any]:
-    """The points of scans as tables of `ROWS` rows and more, at least one.
+    """Yield the points of scans as tables of at least `ROWS` rows, and at least one.
 
     Args:
-        path: where they go; a column that a folder of it says already, such as scan=7, is left out,
-            as Hive has it.
+        path: of the file; a column that its folder names, such as scan=7, is left out, as in Hive.
     """
     arrow = import_library("pyarrow", "arrow")
     of_scans = _of_scans(path)
@@ -75,7 +73,7 @@ def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
 
 
 def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
-    """The rows of some batches; many small ones are joined."""
+    """Return the rows of some batches as a table; many small ones are joined."""
     table = arrow.Table.from_batches(batches, schema)
     if len(batches) > MANY:
         return table.combine_chunks()
@@ -83,24 +81,24 @@ def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
 
 
 def _of_scans(path: Path | None) -> list[Any]:
-    """The fields that say of each point which scan it is from, but for those that a folder says."""
+    """Return the fields about the scan of a point, except those that the folder names."""
     arrow = import_library("pyarrow", "arrow")
     folders = path.parent.parts if path else ()
-    said = {part.partition("=")[0] for part in folders if "=" in part}
+    named = {part.partition("=")[0] for part in folders if "=" in part}
     types = {"scan": arrow.int32(), "stamp": arrow.timestamp("ns"), "complete": arrow.bool_()}
     return [
-        arrow.field(name, kind, nullable=False) for name, kind in types.items() if name not in said
+        arrow.field(name, kind, nullable=False) for name, kind in types.items() if name not in named
     ]
 
 
 def _schema(arrow: Any, scan: Scan, cloud: PointCloud, of_scans: Sequence[Any]) -> Any:
-    """The fields of a scan."""
+    """Return the schema of the points of a scan."""
     known = arrow_schema(cloud.columns, units_of(cloud), scan.facts)
     return arrow.schema([*known, *of_scans], known.metadata)
 
 
 def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) -> Any:
-    """The points of a scan as a record batch."""
+    """Return the points of a scan as a record batch."""
     own: dict[str, Any] = {**cloud.columns}
     for name, value in (
         ("scan", np.int32(number)),
@@ -120,8 +118,10 @@ def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) 
 
 
 def _array(arrow: Any, values: Any, kind: Any) -> Any:
-    """Values as an array of Arrow. Of its type they are not converted: for that pyarrow loads
-    pandas, which takes a fifth of a second.
+    """Return values as an Arrow array.
+
+    Values of the right type are not converted, because pyarrow loads pandas for that, which takes
+    0.2 s.
     """
     if not isinstance(values, np.ndarray) or arrow.from_numpy_dtype(values.dtype) != kind:
         return arrow.array(values, kind)
@@ -133,8 +133,9 @@ def _array(arrow: Any, values: Any, kind: Any) -> Any:
 
 
 def _parquet(path: Path, schema: Any) -> Any:
-    """A writer of Parquet, not compressed, which takes longer than all else; numbers of few values
-    take few bits, as in a dictionary.
+    """Return a Parquet writer, without compression.
+
+    Compression would take longer than everything else. Columns with few values use a dictionary.
     """
     few = [field.name for field in schema if str(field.type) not in ("float", "double", "bool")]
     timed = [name for name in ("scan", "stamp") if name in schema.names]
@@ -145,7 +146,7 @@ def _parquet(path: Path, schema: Any) -> Any:
 
 
 def _batches(path: Path, schema: Any, compression: str | None) -> Any:
-    """A writer of Arrow's file format."""
+    """Return a writer of Arrow's file format."""
     ipc = import_library("pyarrow.ipc", "arrow")
     return ipc.new_file(str(path), schema, options=ipc.IpcWriteOptions(compression=compression))
 

@@ -1,9 +1,11 @@
-"""What formats have in common: the points of scans, columns that grow beside the file, and a file
-that appears when it is whole.
+"""Functions shared by file formats.
+
+They select the points of scans, spool columns beside the file, and replace a file when the new one
+is complete.
 
 A format is a function that writes scans to a path, one by one, so that memory stays small. Many
-begin with how much they hold, which is known at the end alone: they write it there and come back,
-or let their columns grow in files without a name.
+formats begin with their size, which is only known at the end: they go back and write it, or spool
+their columns in unnamed files.
 """
 
 from __future__ import annotations
@@ -27,26 +29,26 @@ from lidarspec.scans.scan import Scan
 from lidarspec.stores import take_away
 from lidarspec.unfinished import path_while_written, remove_abandoned
 
-# Files that a written folder holds, by its suffix: an existing folder with any other file is not
-# replaced.
+# Files of a folder format, by suffix: an existing folder with any other file is not replaced.
 FOLDER_FILES = {
     ".zarr": re.compile(r"(.+/)?(zarr\.json|\.z(group|attrs|array|metadata)|(c/)?\d+([./]\d+)*)"),
     ".rosbag2": re.compile(r"metadata\.yaml|[^/]+\.(mcap|db3(-wal|-shm)?)"),
 }
-#: ns since 1970 of the GPS epoch, 1980-01-06, for a clock that leaves out leap seconds, with those
-#: that there are since 2017.
+#: ns since 1970 of the GPS epoch, 1980-01-06, for a clock without leap seconds, minus the 18 leap
+#: seconds that apply since 2017.
 GPS_EPOCH = (315_964_800 - 18) * 10**9
 _Piece = TypeVar("_Piece")
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file or folder beside another one to write to, which takes its place when the block ends,
-    and is gone if that fails.
+    """Yield a path to write to; it replaces a file or folder when the block ends.
+
+    If the block fails, the new file is removed.
 
     Raises:
-        SourceError: where it cannot be written.
-        UsageError: if the path is a folder that holds files of other kinds.
+        SourceError: if it cannot be written.
+        UsageError: if the path is a folder with files of other kinds.
     """
     refuse_foreign_files(path)
     remove_abandoned(path)
@@ -86,10 +88,9 @@ def refuse_foreign_files(folder: Path) -> None:
 
 @contextlib.contextmanager
 def behind(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
-    """A function that hands what it is given over to another one, which writes it while the next
-    piece is made; at the end all is written.
+    """Yield a function that writes pieces in a thread, while the next piece is made.
 
-    What fails there is raised with the next piece, or at the end.
+    At the end everything is written. An error is raised with the next piece, or at the end.
     """
     with ThreadPoolExecutor(1) as thread:
         last: Future[object] = thread.submit(lambda: None)
@@ -104,7 +105,7 @@ def behind(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], Non
 
 
 def written(scan: Scan, *, every_point: bool) -> PointCloud:
-    """The points of a scan that are written: those with a valid return, or all."""
+    """Return the points of a scan to write: those with a valid return, or all."""
     which = kept(scan.points, every_point=every_point)
     if which is None:
         return scan.points
@@ -112,8 +113,9 @@ def written(scan: Scan, *, every_point: bool) -> PointCloud:
 
 
 def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
-    """The indices of the points that are written, which pick columns several times as fast as a
-    mask; None for all.
+    """Return the indices of the points to write, None for all.
+
+    Indexing columns by numbers is several times as fast as by a mask.
     """
     if every_point or cloud.valid.all():
         return None
@@ -121,8 +123,9 @@ def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
 
 
 def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[str, NDArray[Any]]:
-    """Those of some columns that a scan has, "valid" and its further ones too, of the points that
-    are written.
+    """Return the requested columns that a scan has, for the points to write.
+
+    "valid" and additional columns may be requested too.
     """
     cloud = scan.points
     named = tuple(name for name in names if name == "valid" or cloud.shows(name))
@@ -140,8 +143,9 @@ def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[s
 
 
 def picture(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
-    """Values of organised points, (n,), as (rows, columns), a row for each ring; several returns of
-    a place stand side by side.
+    """Return values of organized points, (n,), as (rows, columns).
+
+    There is a row for each ring; several returns are side by side.
     """
     columns, rows = cloud.shape or (len(cloud), 1)
     returns = len(cloud) // max(columns * rows, 1) or 1
@@ -155,9 +159,7 @@ def picture(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
 
 
 class Spool:
-    """The values of one column, as long as scans come, in a file without a name in the folder of
-    the target.
-    """
+    """The values of one column in an unnamed file in the folder of the target."""
 
     def __init__(self, folder: Path, dtype: DTypeLike) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed by `close`
@@ -170,10 +172,10 @@ class Spool:
         self.length += len(values)
 
     def copy_to(self, target: IO[bytes]) -> None:
-        """Put all of them into a file."""
+        """Copy all values to a file."""
         self._file.seek(0)
         shutil.copyfileobj(self._file, target)
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close and remove the file."""
         self._file.close()

@@ -1,18 +1,18 @@
-"""Scans drawn: in a terminal, as pictures in files, in notebooks and in Rerun's viewer.
+"""Draw scans: in a terminal, as pictures in files, in notebooks and in the Rerun viewer.
 
-In: a device, or points. Out: pictures. The page in a browser is drawn by the distribution
-`lidarspec-web`. Modules in reading order:
+Input: a device, or points. Output: pictures. The distribution `lidarspec-web` draws the page in a
+browser. Modules in reading order:
 
 * `window`: shows a sensor at work in the terminal: keys in, pictures and figures out.
 * `window_parts`: title, figures, colours and keys around the picture.
-* `feed`: the scans of a device, counted, and played if they are of a file.
+* `feed`: reads, counts and plays the scans of a device.
 * `meter`: speed, rates, losses and jitter of a sensor at work.
-* `polar`: points as seen from above and from the side.
-* `canvas`: pictures in character cells, and their inks.
-* `screen`: the terminal: cells that changed, single keys.
+* `polar`: points from above and from the side.
+* `canvas`: pictures in character cells, and their colours.
+* `screen`: the terminal: writes changed cells, reads single keys.
 * `svg`: one scan as a file.
 * `figures`: a scan, intensities, ranges and rates over time, for reports.
-* `rerun`: the scans in Rerun's viewer.
-* `notebook`: what notebooks show of scans, packets, explained frames and sensors.
-* `page_server`: which plugin serves the page of `view --web`, and how its server is called.
+* `rerun`: scans in the Rerun viewer.
+* `notebook`: scans, packets, explained frames and sensors in notebooks.
+* `page_server`: the interface of the server of `view --web`, a plugin.
 """

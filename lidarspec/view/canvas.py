@@ -1,8 +1,8 @@
-"""Pictures in character cells: two by four dots of braille in each, square where a cell is twice as
-high as wide.
+"""Pictures in character cells, with two by four braille dots per cell.
 
-Pictures hold the numbers of inks, so that two of them are compared cell by cell; only the terminal
-knows what it can show, and what each ink looks like with true colour, 256 colours, 16, or none.
+The dots are square if a cell is twice as high as wide. Pictures contain the numbers of inks, so
+that two of them can be compared cell by cell. The colour depth of the terminal decides how an ink
+is shown: true colour, 256 colours, 16, or none.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lidarspec.points.look import STEPS
 
 Depth = Literal["truecolor", "256", "standard", "none"]
 
-#: the scale in 16 colours, as SGR numbers: those of its hues that get lighter from one to the next.
+#: SGR numbers of the ramp in 16 colours, from dark to light.
 _STANDARD = (94, 36, 92, 93)
 PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
 ACROSS = 2
@@ -32,7 +32,7 @@ DOWN = 4
 BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.int64)
 BLANK = 0x2800
 _SPACE = ord(" ")
-#: what stands for a character where only ASCII can be shown; braille by the number of its dots.
+#: replacements in ASCII; a braille character is replaced by its number of dots.
 ASCII = {
     "▲": "^",
     "▶": ">",
@@ -52,8 +52,12 @@ _BY_DOTS = " ..::oo##"
 
 @dataclass(frozen=True)
 class Ink:
-    """A colour and weight; `rgb` None is the terminal's own colour, `standard` the SGR number of
-    the nearest of 16.
+    """A colour and weight.
+
+    Attributes:
+        rgb: None for the terminal's own colour.
+        standard: the SGR number of the nearest of 16 colours.
+        bold, faint: the weight.
     """
 
     rgb: Rgb | None = None
@@ -70,7 +74,7 @@ _FIXED = (
     Ink((96, 216, 110), 92, bold=True),
     Ink((255, 92, 87), 91, bold=True),
 )
-#: the first ink of the scale, for its lowest values.
+#: the first ink of the ramp, for its lowest values.
 FIRST_STEP = len(_FIXED)
 _SCALE = tuple(
     Ink(rgb, _STANDARD[step * len(_STANDARD) // STEPS])
@@ -83,7 +87,7 @@ INKS: tuple[Ink, ...] = (*_FIXED, *_SCALE)
 def sgr(ink: int, depth: Depth) -> str:
     """The escape sequence that selects an ink, from whatever was selected before.
 
-    Without colours the weights stay: what is faint is told from points by that alone.
+    Without colours the weights are kept: only they distinguish faint lines from points.
     """
     chosen = INKS[ink]
     parts = ["0"]
@@ -103,7 +107,7 @@ def sgr(ink: int, depth: Depth) -> str:
 
 
 def style(ink: int) -> str:
-    """An ink as a style of rich."""
+    """Return an ink as a style of rich."""
     chosen = INKS[ink]
     if chosen.rgb is None:
         colour = ""
@@ -126,7 +130,7 @@ class Cells:
 
     @classmethod
     def blank(cls, width: int, height: int) -> Cells:
-        """A picture of spaces."""
+        """Return a picture of spaces."""
         return cls(np.full((height, width), _SPACE, np.int32), np.zeros((height, width), np.int16))
 
     @property
@@ -135,7 +139,7 @@ class Cells:
         return self.codes.shape[1], self.codes.shape[0]
 
     def write(self, row: int, column: int, text: str, ink: int = PLAIN) -> None:
-        """Text from a cell on; what does not fit is cut off."""
+        """Write text from a cell on; it is cut off at the edge."""
         width, height = self.size
         if not 0 <= row < height or column >= width:
             return
@@ -146,7 +150,7 @@ class Cells:
         self.inks[row, column : column + len(text)] = ink
 
     def paste(self, row: int, column: int, other: Cells) -> None:
-        """Another picture with its upper left corner in a cell; what does not fit is cut off."""
+        """Copy a picture, with its upper left corner in a cell; it is cut off at the edge."""
         width = min(other.size[0], self.size[0] - column)
         height = min(other.size[1], self.size[1] - row)
         if width > 0 and height > 0:
@@ -154,11 +158,11 @@ class Cells:
             self.inks[row : row + height, column : column + width] = other.inks[:height, :width]
 
     def lines(self) -> list[str]:
-        """The characters alone, line by line."""
+        """Return the characters without colours, line by line."""
         return ["".join(map(chr, row)) for row in self.codes.tolist()]
 
     def text(self) -> Text:
-        """The picture for rich, in colours."""
+        """Return the picture as coloured text for rich."""
         found = Text(no_wrap=True)
         for number, (line, inks) in enumerate(zip(self.lines(), self.inks.tolist(), strict=True)):
             start = 0
@@ -171,7 +175,7 @@ class Cells:
         return found
 
     def ascii(self) -> Cells:
-        """The picture in ASCII alone, for terminals that show nothing else."""
+        """Return the picture in ASCII, for terminals without Unicode."""
         codes = self.codes.copy()
         for character in set(np.unique(codes).tolist()):
             if character > 0x7E:
@@ -189,7 +193,7 @@ class Canvas:
 
     Attributes:
         width, height: in cells.
-        ramp: what the colours of points show, "range" or what is weak or strong.
+        ramp: the column that colours show: "range", or one with weak and strong values.
         dots: (4 * height, 2 * width) bool, points.
         lines: the same for rings and axes, shown where a cell has no point.
         steps: (height, width) int16, the colour of a cell's points on the ramp; -1 without.
@@ -205,11 +209,12 @@ class Canvas:
         self.labels: dict[tuple[int, int], tuple[str, int]] = {}
 
     def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any]) -> None:
-        """Set dots of points at fractional dot coordinates; what is outside is left out.
+        """Set dots of points at fractional dot coordinates; dots outside are left out.
 
         Args:
-            shade: (n,) from 0 to 1, where on the ramp each is: of several in a cell the nearest, or
-                the strongest, gives the colour.
+            column, row: (n,) coordinates in dots.
+            shade: (n,) positions on the ramp, from 0 to 1. A cell takes the colour of its nearest
+                or strongest point.
         """
         across, down, inside = self._places(column, row)
         self.dots[down, across] = True
@@ -225,11 +230,13 @@ class Canvas:
     def label(
         self, row: int, column: int, text: str, ink: int = LABEL, *, over: bool = False
     ) -> bool:
-        """Write text from a cell on, unless it would leave the canvas or hide something; whether it
-        was written.
+        """Write text from a cell on, unless it would leave the canvas or hide something.
 
         Args:
-            over: it may hide points.
+            over: whether it may hide points.
+
+        Returns:
+            Whether it was written.
         """
         cells = [(row, column + index) for index in range(len(text))]
         if not (0 <= row < self.height and column >= 0 and column + len(text) <= self.width):
@@ -240,7 +247,7 @@ class Canvas:
         return True
 
     def cells(self) -> Cells:
-        """The picture."""
+        """Return the picture."""
         points = _braille(self.dots)
         lines = _braille(self.lines)
         codes = np.where(
@@ -262,6 +269,6 @@ class Canvas:
 
 
 def _braille(dots: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The braille bits of each cell, (height, width)."""
+    """Return the braille bits of each cell, (height, width)."""
     blocks = dots.reshape(dots.shape[0] // DOWN, DOWN, dots.shape[1] // ACROSS, ACROSS)
     return np.asarray(np.einsum("rdca,da->rc", blocks, BITS))

@@ -1,6 +1,6 @@
 """The scans of an open device, between two pictures or two lines of figures.
 
-`pump` reads what has come, counts it in a `Meter` and keeps the newest scan. A file can be played:
+`pump` reads arrived data, counts it in a `Meter` and keeps the newest scan. A file can be played:
 then each scan is shown as long after the one before as their times say, and little of the file is
 read ahead, so that figures and bytes belong to the scan that is shown.
 """
@@ -18,15 +18,15 @@ from lidarspec.scans.selection import Selection, Sieve, Slice
 from lidarspec.scans.stream import ScanStream
 from lidarspec.view.meter import Meter
 
-#: for which one look at a live source waits for data.
+#: seconds that one read of a live source waits for data.
 LOOK_S = 0.04
-#: from scan to scan of a file whose times do not say it.
+#: seconds between scans of a file without times.
 DEFAULT_STEP_S = 0.1
-#: a longer pause between two scans of a file is shortened to `DEFAULT_STEP_S`.
+#: the longest pause between two scans of a file in seconds; longer ones become `DEFAULT_STEP_S`.
 MAX_STEP_S = 2.0
-#: of a file that is played that are read at once.
+#: seconds of a played file that one read covers.
 READ_AHEAD_S = 0.1
-#: of such a file are read at first.
+#: bytes of the first read of a played file.
 MIN_PORTION_BYTES = 1 << 12
 
 
@@ -35,7 +35,7 @@ class Feed:
 
     Args:
         device: open; it is not closed.
-        played: whether scans of a file come at the times that they bear, or as fast as possible.
+        played: whether scans of a file are shown at their own times, or as fast as possible.
         speed: of a file that is played, as a multiple of its own.
         select: the scans to take; by default all.
         ahead: seconds of a file that is played that are read at once; None for as many as are
@@ -105,7 +105,7 @@ class Feed:
                 return
 
     def step(self) -> None:
-        """Show the next scan of a file that is played at once; nothing at its end.
+        """Show the next scan of a played file at once; do nothing at its end.
 
         Raises:
             LidarSpecError: if the source fails.

@@ -1,5 +1,6 @@
-"""Figures for reports, by matplotlib: a scan to scale, its intensities, ranges over time, and how a
-source did over time.
+"""Draw figures for reports with matplotlib.
+
+They show a scan to scale, its intensities, ranges over time, and rates of a source over time.
 """
 
 from __future__ import annotations
@@ -21,23 +22,23 @@ from lidarspec.scans.scan import Scan
 from lidarspec.view.feed import Feed
 from lidarspec.view.meter import totals
 
-#: what `save` writes, by suffix.
+#: supported suffixes of `save`.
 SUFFIXES = (".png", ".pdf", ".svg")
-#: inches: the width of a figure, the height of one panel, and of the view from the side at least
-#: and at most; dots an inch.
+#: in inches: the width of a figure, the height of a panel, and the limits of the side view; dots
+#: per inch.
 WIDTH = 7.0
 PANEL = 4.2
 LOWEST = 0.7
 HIGHEST = 3.0
 DPI = 160
-#: bins of a histogram, of ranges, and of time at most; seconds of the narrowest of these.
+#: maximum bins of a histogram, of ranges, and of time; the smallest bin of time in seconds.
 BINS = 128
 NEAR = 200
 MOMENTS = 400
 NARROWEST = 0.1
-#: the share of the ranges that the axis takes in.
+#: the percentile of the ranges that the axis shows.
 MOST = 99.8
-#: steps of the scale of colours.
+#: steps of the colour ramp.
 COLOURS = 256
 STYLE = {
     "font.size": 9,
@@ -49,14 +50,14 @@ STYLE = {
     "axes.axisbelow": True,
     "grid.color": "#dddddd",
     "grid.linewidth": 0.6,
-    "svg.hashsalt": "lidarspec",  # the same figure, the same bytes
+    "svg.hashsalt": "lidarspec",  # identical figures have identical bytes
 }
 
 _Drawing = TypeVar("_Drawing", bound=Callable[..., Any])
 
 
 def _with_style(draw: _Drawing) -> _Drawing:
-    """A function that draws, in the style of these figures."""
+    """Return a function that draws in the style of these figures."""
 
     @functools.wraps(draw)
     def drawn(*args: Any, **options: Any) -> Any:
@@ -79,8 +80,9 @@ def save(figure: Any, target: Any, suffix: str) -> None:
 
 @_with_style
 def of_scan(scan: Scan, look: Look, title: str) -> Any:
-    """A scan from above, forward up, and where it is not flat from its right side, all metres
-    alike.
+    """Draw a scan from above, forward up, to scale.
+
+    Unless it is flat, it is also drawn from its right side.
     """
     cloud = scan.points[scan.points.valid]
     column: Any
@@ -133,10 +135,10 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
 
 @_with_style
 def of_intensities(scans: Iterable[Scan], title: str) -> Any:
-    """How often each intensity comes.
+    """Draw the histogram of the intensities.
 
     Raises:
-        UsageError: where the sensor has none.
+        UsageError: if the sensor has none.
     """
     counted = Counter[float]()
     for scan in scans:
@@ -169,11 +171,12 @@ def of_intensities(scans: Iterable[Scan], title: str) -> Any:
 
 @_with_style
 def of_ranges(scans: Iterable[Scan], title: str) -> Any:
-    """How many returns there are at each range, over time, and the median; of many scans an even
-    choice is shown.
+    """Draw the number of returns by range over time, and the median.
+
+    If there are many scans, an even selection is shown.
 
     Args:
-        scans: one at least.
+        scans: at least one.
     """
     every = list[tuple[int, NDArray[np.float32], bool]]()
     step = 1
@@ -181,10 +184,10 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
     for number, scan in enumerate(scans, 1):
         if (number - 1) % step == 0:
             every.append((scan.stamp_ns, scan.points.range[scan.points.valid], scan.whole))
-        if len(every) == 2 * MOMENTS:  # what is held stays bounded, however long it lasts
+        if len(every) == 2 * MOMENTS:  # limits memory for any duration
             every = every[::2]
             step = 2 * step
-    every = [one for one in every if one[2]] or every  # pieces have fewer returns
+    every = [one for one in every if one[2]] or every  # incomplete scans have fewer returns
     if any(len(ranges) for _, ranges, _ in every):
         farthest = np.percentile(np.concatenate([ranges for _, ranges, _ in every]), MOST)
     else:
@@ -223,10 +226,10 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
 
 @_with_style
 def of_rates(rates: Rates, title: str) -> Any:
-    """Packets and scans a second, and the shares that are lost or wrong, over time.
+    """Draw packets and scans per second, and the lost and invalid shares, over time.
 
     Raises:
-        UsageError: where packets bear no times.
+        UsageError: if packets have no times.
     """
     seconds, (packets, lost, wrong) = rates.series()
     figure = _figure(f"{title}: {int(rates.totals[0].sum()):,} packets", 2 * PANEL * 0.8)
@@ -254,18 +257,19 @@ def of_rates(rates: Rates, title: str) -> Any:
 
 
 class Rates:
-    """Packets, and what is lost and wrong, in even steps of the time of their arrival, or else of
-    the sensor's clock.
+    """Counts of packets, losses and invalid frames in even steps of time.
+
+    The time is that of arrival, else that of the sensor's clock.
 
     Args:
-        feed: read to its end, or up to a time.
-        until: of `time.monotonic`.
+        feed: is read to its end, or until a time.
+        until: a time of `time.monotonic`.
 
     Attributes:
         width: of a step, seconds.
-        totals: (3, n): packets, lost ones, and frames that were wrong, in each step. What is lost
-            or wrong is known for each batch of packets, over which it is spread.
-        scans: seconds from the first packet and rate of each whole scan.
+        totals: (3, n): packets, lost packets and invalid frames in each step. Losses and invalid
+            frames are counted per batch of packets, and spread over it.
+        scans: seconds from the first packet, and rate, of each whole scan.
     """
 
     def __init__(self, feed: Feed, until: float) -> None:
@@ -286,11 +290,11 @@ class Rates:
             ]
 
     def _seconds(self, at: int) -> float:
-        """A time as seconds from the first packet."""
+        """Return a time as seconds from the first packet."""
         return (at - self._first) * 1e-9
 
     def _take(self) -> None:
-        """Count what the last look of the feed took in."""
+        """Count the last batch of the feed."""
         packets = self._feed.packets
         if packets is None or not len(packets):
             return
@@ -310,8 +314,9 @@ class Rates:
         self.totals = grown + np.outer((1, lost / len(packets), wrong / len(packets)), counted)
 
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The edges of the steps, (n + 1,) seconds, and the counts in them, (3, n); not the last
-        step, which is not full.
+        """Return the edges of the steps, (n + 1,) seconds, and their counts, (3, n).
+
+        The last step is left out, because it is incomplete.
         """
         if self._last < self.width:
             raise UsageError(
@@ -332,12 +337,12 @@ def colour_map() -> Any:
 
 
 def _legend(axes: Any) -> None:
-    """Above the axes, where no data are."""
+    """Draw the legend above the axes, outside of the data."""
     axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 0.99), borderpad=0.2)
 
 
 def _share(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Per cent."""
+    """Return percentages."""
     every = some + others
     return np.asarray(np.divide(100 * some, every, out=np.full(len(some), np.nan), where=every > 0))
 

@@ -1,6 +1,6 @@
-"""Figures of a sensor at work: speed, rates, losses and jitter.
+"""Measure a running sensor: speed, rates, losses and jitter.
 
-A `Meter` counts packets and scans as they come, both since its last reading and from the beginning.
+A `Meter` counts packets and scans, both since its last reading and from the beginning.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
 
-#: scans that means and medians are made of.
+#: number of scans for means and medians.
 KEPT_SCANS = 1 << 12
 Seconds = NDArray[np.float64]
 
@@ -170,7 +170,7 @@ class Tally:
 
 
 class Meter:
-    """Counts packets and scans as they come.
+    """Counts packets and scans.
 
     Args:
         counters: of the decoder now.

@@ -1,9 +1,9 @@
-"""What a notebook shows: a scan and a cloud as a picture, packets and an explained frame as tables,
-a sensor as its packet diagrams.
+"""HTML and SVG for notebooks.
 
-`lidarspec.display` calls what is named here after the kind of value. All are bounded in size,
-escaped, and readable on light and dark pages: pictures have their own ground, tables take the
-page's letters.
+Scans and clouds are pictures, packets and explained frames tables, sensors packet diagrams.
+`lidarspec.display` calls the functions here by the kind of value. Their output is limited in size,
+escaped, and readable on light and dark pages: pictures have their own background, tables use the
+text colour of the page.
 """
 
 from __future__ import annotations
@@ -28,36 +28,36 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.view.svg import svg
 
-#: pixels of a side of a picture, and the dots of each of its views at most.
+#: size of a picture in pixels, and the maximum number of dots of a view.
 SIDE = 520
 DOTS = 12_000
-#: rows of packets at the beginning and at the end, their fields at most, and rows of an
+#: rows of packets at the beginning and at the end, maximum number of fields, and of rows of an
 #: explanation.
 ENDS = 5
 FIELDS = 24
 ROWS = 200
-#: degrees of hue from one field to the next, and the most pixels that a table is high before it
-#: scrolls.
+#: degrees of hue between fields, and the height in pixels above which a table scrolls.
 HUE = 67
 TALL = 640
 _CELL = "text-align:{align};white-space:nowrap;padding:1px 8px;vertical-align:top"
 
 
 def scan(value: Scan) -> str:
-    """A scan from above, and from the side where it is not flat, as SVG."""
+    """Return a scan from above, and from the side unless it is flat, as SVG."""
     return _picture(value.points, f"{value.sensor.id}: {value}")
 
 
 def cloud(value: PointCloud) -> str | None:
-    """The same of a cloud; None of a single point."""
+    """Return a cloud as SVG, None for a single point."""
     if np.ndim(value.x):
         return _picture(value, str(value))
     return None
 
 
 def packets(value: Packets) -> str:
-    """The first and the last packets as an HTML table: offset, times, fields in their units; of
-    arrays number and span.
+    """Return the first and the last packets as an HTML table.
+
+    It has offset, times and fields in their units; for arrays, number and span.
     """
     fields = {path: info for path, info in value.table.schema.fields.items() if info.const is None}
     shown = dict(list(fields.items())[:FIELDS])
@@ -89,7 +89,10 @@ def packets(value: Packets) -> str:
 
 
 def explanation(value: Explanation) -> str:
-    """Every byte of a frame as an HTML table, a colour for each field; what is wrong is red."""
+    """Return every byte of a frame as an HTML table, with a colour for each field.
+
+    Invalid values are red.
+    """
     rows = []
     for number, row in enumerate(value.rows[:ROWS]):
         indent = "&nbsp;" * 2 * len(parents(row.path))
@@ -125,7 +128,7 @@ def explanation(value: Explanation) -> str:
 
 
 def sensor(value: Sensor) -> str:
-    """The packet diagrams of a sensor as HTML, those of data open and others folded."""
+    """Return the packet diagrams of a sensor as HTML; only those of data are open."""
     head = (
         f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b>"
         f" <code>{escape(value.id)}</code>, proven by {escape(value.status)}"
@@ -153,7 +156,7 @@ def _picture(points: PointCloud, title: str) -> str:
 
 
 def _ends(number: int) -> NDArray[np.intp]:
-    """The first and the last of so many."""
+    """Return the indices of the first and the last rows."""
     return np.array(
         [index for index in range(number) if index < ENDS or index >= number - ENDS], np.intp
     )
@@ -166,8 +169,9 @@ def _clock(packets: Packets) -> str:
 
 
 def _since(times: NDArray[np.int64]) -> list[str]:
-    """Times of the first and the last packets as seconds since the first, "-" where one is not
-    known.
+    """Return times of the first and the last packets, in seconds since the first.
+
+    An unknown time is "-".
     """
     return [
         f"{(at - int(times[0])) * 1e-9:.6f}" if at else "-"
@@ -176,7 +180,7 @@ def _since(times: NDArray[np.int64]) -> list[str]:
 
 
 def _values(column: NDArray[np.float64], info: FieldInfo) -> list[str]:
-    """A field of some packets, (n, ...), in words."""
+    """Return a field of some packets, (n, ...), as text."""
     if info.kind == "bytes":
         return [f"{row.size} bytes" for row in column]
     return [_number(float(row)) if not row.ndim else _span(row) for row in column]
@@ -198,7 +202,7 @@ def _number(value: float) -> str:
 def _table(
     caption: str, heads: Iterable[str], rows: Iterable[Sequence[str]], *, align: str = "left"
 ) -> str:
-    """A table; the cells are HTML, caption and heads are text."""
+    """Return an HTML table; cells are HTML, caption and heads are text."""
     cell = _CELL.format(align=align)
     head = "".join(f'<th style="{cell}">{escape(printable(name))}</th>' for name in heads)
     body = "\n".join(

@@ -1,7 +1,7 @@
-"""The page of `lidarspec view --web`: which plugin serves it, and how its server is called.
+"""The interface of the server of `lidarspec view --web`, which is a plugin.
 
-The page and its server are a distribution of their own, `lidarspec-web`, because they need a web
-framework that nothing else here needs.
+The page and its server are a distribution of their own, `lidarspec-web`, because only they need a
+web framework.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Clouds in character cells: from above with range rings, forward up and left left; 3D ones from
-the right side as well.
+"""Draw clouds in character cells, from above with range rings.
+
+Forward is up, and left is left. 3D clouds are also drawn from the right side.
 """
 
 from __future__ import annotations
@@ -13,19 +14,19 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.look import MOST, Look, ring_step, shade
 from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, Cells
 
-#: dots from one dot of a ring to the next.
+#: dots between two dots of a ring.
 RING_GAP = 4
-#: share of the height that the view from above gets where there are two.
+#: share of the height for the view from above if there are two views.
 ABOVE = 0.62
-#: by how much heights may be drawn larger than lengths, and the share of the side view that they
-#: then fill at most.
+#: possible exaggerations of heights, and the maximum share of the side view that they fill.
 HEIGHTS = (1, 2, 5, 10)
 FILLED = 0.9
 
 
 def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells:
-    """The cloud in `width` by `height` cells: from above, and below that from its right side unless
-    the look is flat.
+    """Return the cloud in `width` by `height` cells, from above.
+
+    Unless the look is flat, the view from its right side is below.
     """
     cloud = points[points.valid]
     if look.flat:
@@ -44,7 +45,7 @@ def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells
 
 
 def _scale(width: int, height: int, reach: float) -> float:
-    """Dots per metre, so that `reach` fits into half of the canvas both ways."""
+    """Return the dots per metre with which `reach` fits into half of the canvas."""
     return (min(width * ACROSS, height * DOWN) - 1) / 2 / reach
 
 
@@ -74,7 +75,7 @@ def _from_above(cloud: PointCloud, width: int, height: int, look: Look) -> Cells
 
 
 def _label_directions(canvas: Canvas, home: tuple[int, int]) -> None:
-    """The four directions as azimuths, at the edges."""
+    """Write the azimuths of the four directions at the edges."""
     row, column = home
     canvas.label(0, column, "0° forward") or canvas.label(0, column, "0°")
     canvas.label(row, 0, "90° ")
@@ -83,9 +84,7 @@ def _label_directions(canvas: Canvas, home: tuple[int, int]) -> None:
 
 
 def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: float) -> None:
-    """The range of a ring where it crosses an axis, on the first of its four crossings that is
-    free.
-    """
+    """Write the range of a ring at the first free one of its crossings with the axes."""
     text = f"{radius:g} m"
     across = round(radius * scale / ACROSS)
     down = round(radius * scale / DOWN)
@@ -102,8 +101,9 @@ def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: flo
 def _from_side(
     cloud: PointCloud, width: int, height: int, look: Look, scale: float
 ) -> tuple[Cells, int]:
-    """Forward to the right and up up, and by how much heights are drawn larger; the height is
-    centred on the points.
+    """Return the view from the right side, and the exaggeration of heights.
+
+    Forward is right. The heights are centred on the points.
     """
     canvas = Canvas(width, height, look.ramp)
     inside = np.abs(cloud.x - look.middle[0]) <= canvas.dots.shape[1] / 2 / scale
@@ -131,8 +131,9 @@ def _from_side(
 
 
 def _heights(z: NDArray[np.float32]) -> tuple[float, float]:
-    """The lowest and highest that the side view has to show: those of most points, and the sensor's
-    own.
+    """Return the lowest and highest height that the side view has to show.
+
+    That includes most of the points, and the sensor.
     """
     if not len(z):
         return 0.0, 0.0
@@ -141,5 +142,5 @@ def _heights(z: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _middle(canvas: Canvas) -> tuple[float, float]:
-    """The middle of a canvas in dots, across and down, on the middle of a cell."""
+    """Return the middle of a canvas in dots, across and down, in the middle of a cell."""
     return canvas.width // 2 * ACROSS + ACROSS / 2, canvas.height // 2 * DOWN + DOWN / 2

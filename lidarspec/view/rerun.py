@@ -1,4 +1,4 @@
-"""A sensor at work in Rerun's viewer, or in a recording of Rerun's while it comes."""
+"""Show live scans in the Rerun viewer, or write them to a Rerun recording."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from lidarspec.errors import UsageError, suggest, system_errors
 from lidarspec.formats.rerun import RerunRecording
 from lidarspec.view.feed import LOOK_S, Feed
 
-#: seconds between two readings of the figures, by the time of the scans.
+#: seconds between two readings of the statistics, by the time of the scans.
 FIGURES = 1.0
-#: which of them; what stands in a scan is logged with each.
+#: the statistics that are logged; those of a scan are logged with it.
 FIGURED = ("packet_rate_hz", "error_rate", "skipped_rate", "loss_rate", "jitter_s", "bytes_per_s")
-#: what the URL of a viewer begins with.
+#: beginnings of a viewer's URL.
 SCHEMES = ("rerun://", "rerun+http://", "rerun+https://")
 
 
 def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
-    """Log scans as they come, and figures, until the feed ends or a time of `time.monotonic` has
-    come.
+    """Log scans and statistics as they arrive, until the feed ends or a time.
 
     Args:
-        target: a file to write, the URL of a viewer that runs, or "" to open one here.
+        feed: of the open device.
+        target: a file to write, the URL of a running viewer, or "" to open one here.
+        ramp: the column that colours show.
+        until: a time of `time.monotonic`.
 
     Raises:
-        UsageError: where no viewer can be opened, or Rerun's SDK is not installed.
-        SourceError: where the file cannot be written.
+        UsageError: if no viewer can be opened, or the Rerun SDK is not installed.
+        SourceError: if the file cannot be written.
     """
     with system_errors(target or "Rerun's viewer"), RerunRecording(ramp) as log:
         _open(log, target)

@@ -1,9 +1,8 @@
-"""A terminal taken over for a while: the alternate screen, of which only the cells that changed are
-written, and single keys.
+"""Take over a terminal: the alternate screen, and single keys.
 
-rich would draw every cell of every picture anew, 50 times what changes; so pictures go out from
-here, and rich serves for what is printed once. Keys come without waiting for a line: termios on
-POSIX, msvcrt on Windows, behind one class.
+Only changed cells are written. rich would write every cell of every picture, about 50 times as
+many, so it is only used for output that is printed once. Keys are read without waiting for a line:
+with termios on POSIX, with msvcrt on Windows.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from rich.console import Console
 from lidarspec.transports.base import wait_readable
 from lidarspec.view.canvas import Cells, Depth, sgr
 
-#: what the cursor keys send on POSIX, after escape, and on Windows, after a byte of their own.
+#: codes of cursor keys: on POSIX after escape, on Windows after a prefix byte.
 _POSIX = {
     "[A": "up",
     "[B": "down",
@@ -37,26 +36,30 @@ _POSIX = {
 #: a cursor key, the sequence of another one, or a character.
 _KEY = re.compile(r"\x1b([\[O][A-D])|\x1b[\[O][^A-Za-z~]*.?|(.)", re.DOTALL)
 _WINDOWS = {"H": "up", "P": "down", "M": "right", "K": "left"}
-#: seconds between two looks at the keyboard on Windows, which has nothing to wait on.
+#: seconds between two checks of the keyboard on Windows, which has nothing to wait on.
 _LOOK = 0.02
-#: the alternate screen, no cursor, no wrapping at the edge; and all of it back.
+#: escape sequences: alternate screen, no cursor, no wrapping; and the reverse.
 ENTER = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J"
 LEAVE = "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
-#: the terminal holds a picture back until all of it is there, where it knows how to.
+#: terminals that support it show the picture only when it is complete.
 BEGIN = "\x1b[?2026h"
 END = "\x1b[?2026l"
-#: unchanged cells between two changed ones that are written along: moving the cursor costs as much.
+#: maximum number of unchanged cells that are rewritten between two changed ones: moving the cursor
+#: costs as much.
 BRIDGED = 4
 
 
 class Keys:
-    """A keyboard: a context manager that gives the terminal back as it was. This one has no keys,
-    but time passes.
+    """A keyboard, as a context manager that restores the terminal.
+
+    This base class has no keys, but waits like one.
     """
 
     def read(self, timeout: float) -> list[str]:
-        """The keys that came within some seconds: characters, "up" "down" "left" "right", "escape";
-        empty where none did.
+        """Return the keys pressed within some seconds.
+
+        Returns:
+            Characters, "up", "down", "left", "right" and "escape"; empty if there were none.
         """
         time.sleep(timeout)
         return []
@@ -70,11 +73,11 @@ class Keys:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Give the terminal back."""
+        """Restore the terminal."""
 
 
 def decode_keys(text: str) -> list[str]:
-    """The keys in what a POSIX terminal sent; sequences of other keys are left out."""
+    """Return the keys in the input from a POSIX terminal, without unknown sequences."""
     keys = _KEY.finditer(text)
     return [
         _POSIX[key[1]] if key[1] else "escape" if key[2] == "\x1b" else key[2]
@@ -90,20 +93,20 @@ if sys.platform == "win32":
         """The console's keyboard."""
 
         def read(self, timeout: float) -> list[str]:
-            """The keys that came within some seconds."""
+            """Return the keys pressed within some seconds."""
             end = time.monotonic() + timeout
             while not msvcrt.kbhit() and time.monotonic() < end:
                 time.sleep(_LOOK)
-            found = []
+            keys = []
             while msvcrt.kbhit():
                 key = msvcrt.getwch()
-                found.append(_WINDOWS.get(msvcrt.getwch(), "") if key in ("\x00", "\xe0") else key)
-            if "\x03" in found:
+                keys.append(_WINDOWS.get(msvcrt.getwch(), "") if key in ("\x00", "\xe0") else key)
+            if "\x03" in keys:
                 raise KeyboardInterrupt
-            return [key for key in found if key]
+            return [key for key in keys if key]
 
     def keyboard(*, taken: bool = False) -> Keys:
-        """The keyboard of the console; one without keys where there is none."""
+        """Return the keyboard of the console, or one without keys."""
         if sys.stdin.isatty() and not taken:
             return Keyboard()
         return Keys()
@@ -113,18 +116,18 @@ else:
     import tty
 
     class Keyboard(Keys):
-        """A terminal whose keys come one by one and unseen; Ctrl-C and Ctrl-Z stay signals."""
+        """A terminal that returns single keys unechoed; Ctrl-C and Ctrl-Z stay signals."""
 
         def __init__(self, descriptor: int) -> None:
             self._descriptor = descriptor
             self._before = termios.tcgetattr(descriptor)
 
         def read(self, timeout: float) -> list[str]:
-            """The keys that came within some seconds."""
+            """Return the keys pressed within some seconds."""
             if not wait_readable(self._descriptor, timeout):
                 return []
             data = os.read(self._descriptor, 1024)
-            if not data:  # the terminal went away
+            if not data:  # the terminal was closed
                 raise EOFError("the terminal was closed")
             return decode_keys(data.decode("utf-8", "replace"))
 
@@ -142,10 +145,10 @@ else:
                 termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
     def keyboard(*, taken: bool = False) -> Keys:
-        """The keyboard of the terminal; one without keys where there is none.
+        """Return the keyboard of the terminal, or one without keys.
 
         Args:
-            taken: standard input is the data: keys come from the terminal itself.
+            taken: whether standard input is the data: keys are then read from the terminal itself.
         """
         try:
             if sys.stdin.isatty() and not taken:
@@ -156,10 +159,10 @@ else:
 
 
 class Terminated(BaseException):
-    """A signal asks the process to end; what is open is closed on the way out.
+    """Raised when a signal ends the process, so that resources are closed.
 
     Attributes:
-        code: the exit code that shells expect, 128 and the signal's number.
+        code: the exit code that shells expect: 128 plus the signal's number.
     """
 
     def __init__(self, number: int) -> None:
@@ -168,7 +171,7 @@ class Terminated(BaseException):
 
 
 def depth(stream: TextIO) -> Depth:
-    """The colours that a terminal shows, by NO_COLOR, COLORTERM and TERM as rich reads them."""
+    """Return the colour depth of a terminal, by NO_COLOR, COLORTERM and TERM."""
     console = Console(file=stream)
     system = console.color_system
     if system is None or console.no_color:
@@ -181,7 +184,7 @@ def depth(stream: TextIO) -> Depth:
 
 
 def encodable(stream: TextIO) -> bool:
-    """Whether a stream takes braille characters."""
+    """Return whether a stream supports braille characters."""
     try:
         "⣿▲│".encode(stream.encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
@@ -190,9 +193,9 @@ def encodable(stream: TextIO) -> bool:
 
 
 class Screen:
-    """A terminal's screen, as a context manager that leaves it as it was, whatever ends it.
+    """A terminal's screen, as a context manager that always restores it.
 
-    Also when the process is asked to end (SIGTERM, SIGHUP), and while it is suspended (SIGTSTP).
+    This includes the end of the process by SIGTERM or SIGHUP, and its suspension by SIGTSTP.
     """
 
     def __init__(self, stream: TextIO, keys: Keys) -> None:
@@ -201,18 +204,18 @@ class Screen:
         self._depth = depth(stream)
         self._plain = not encodable(stream)
         self._shown: Cells | None = None
-        # how often the terminal was taken over: what was shown before is gone, also in the middle
-        # of `show`
+        # number of times the terminal was taken over: this discards the shown picture, also during
+        # `show`
         self._taken = 0
         self._handlers: dict[int, Any] = {}
 
     def size(self) -> tuple[int, int]:
-        """Columns and lines of the window as it is now."""
-        found = os.get_terminal_size(self._stream.fileno())
-        return max(found.columns, 1), max(found.lines, 1)
+        """Return the columns and lines of the window."""
+        window = os.get_terminal_size(self._stream.fileno())
+        return max(window.columns, 1), max(window.lines, 1)
 
     def show(self, cells: Cells) -> None:
-        """Put a picture on the screen."""
+        """Show a picture on the screen."""
         if self._plain:
             cells = cells.ascii()
         taken = self._taken
@@ -228,7 +231,7 @@ class Screen:
     def __enter__(self) -> Screen:
         self.keys.__enter__()
         if sys.platform == "win32":
-            os.system("")  # switches the console over to escape sequences
+            os.system("")  # enables escape sequences in the console
         self._write(ENTER)
         for name, function in (("SIGTERM", _end), ("SIGHUP", _end), ("SIGTSTP", self._suspend)):
             number = getattr(signal, name, None)
@@ -245,7 +248,7 @@ class Screen:
         try:
             self._write(LEAVE)
         except OSError:
-            pass  # the terminal is gone, and with it what was to be cleaned
+            pass  # the terminal is closed and needs no cleaning
         finally:
             self.keys.__exit__(kind, error, traceback)
             for number, handler in self._handlers.items():
@@ -257,13 +260,13 @@ class Screen:
             self._stream.write(text)
             self._stream.flush()
             return
-        # past the stream's own buffer, which a signal in the middle of a write must not enter again
+        # bypasses the stream's buffer, which a signal handler must not enter during a write
         data = text.encode(self._stream.encoding or "utf-8", "replace")
         while data:
             data = data[os.write(self._stream.fileno(), data) :]
 
     def _suspend(self, number: int, frame: FrameType | None) -> None:
-        """Give the terminal back, sleep until the shell wakes us, and take it again."""
+        """Restore the terminal, sleep until the process continues, and take it over again."""
         self._write(LEAVE)
         self.keys.__exit__(None, None, None)
         signal.signal(number, signal.SIG_DFL)
@@ -276,8 +279,11 @@ class Screen:
 
 
 def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
-    """What to write to a terminal that shows `before` for it to show `after`; None is an empty
-    screen.
+    """Return the text that changes a terminal from one picture to another.
+
+    Args:
+        before: the shown picture; None for an empty screen.
+        after: the new picture.
     """
     if before is not None:
         old = before
@@ -310,5 +316,5 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 def interactive() -> bool:
-    """Whether there is a screen to take over."""
+    """Return whether there is a screen to take over."""
     return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"

@@ -1,5 +1,6 @@
-"""A cloud as an SVG picture: the same views as in the terminal, for a page, light or dark as its
-reader wishes.
+"""Draw a cloud as SVG, with the same views as in the terminal.
+
+The picture follows the colour scheme of the reader: light or dark.
 """
 
 from __future__ import annotations
@@ -16,23 +17,23 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp, to_hex
 from lidarspec.points.look import STEPS, Look, bounds, ring_step, steps
 
-#: pixels: of each side of the view from above, of the margins, of the lines above it, of one above
-#: each view, and of a dot.
+#: in pixels: a side of the view from above, the margins, the header, a line above each view, and a
+#: dot.
 SIDE = 720
 MARGIN = 24
 HEAD = 58
 LINE = 18
 DOT = 1.6
-#: share of a side that heights take at most, and how near to dots and to the sensor the view from
-#: above ends, pixels.
+#: maximum share of a side for heights, and the margin in pixels between the content and the edge of
+#: the view from above.
 HIGHEST = 0.45
 NEAR = 24
-#: pixels above the base line of a text, and of a character of it.
+#: height of a text above its base line, and the width of a character, in pixels.
 FONT_HEIGHT = 11
 CHARACTER_WIDTH = 6.7
-#: pixels from dot to dot, where there would be too many of them the next.
+#: distances between dots in pixels; the first one with few enough dots is used.
 GRIDS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
-#: of ground, lines, text and headings, on white; and on a dark ground.
+#: colours of background, lines, text and headings: on light and on dark pages.
 _LIGHT, _DARK = ("#fff", "#ddd", "#555", "#222"), ("#14161b", "#34373f", "#9ea3ae", "#e4e6eb")
 _PARTS = ("ground", "line", "text", "head")
 
@@ -40,11 +41,13 @@ _PARTS = ("ground", "line", "text", "head")
 def svg(
     points: PointCloud, look: Look, title: str, *, side: int = SIDE, most: int | None = None
 ) -> str:
-    """The cloud from above and, unless the look is flat, from its right side, as an SVG document.
+    """Return a cloud as an SVG document, from above and from its right side.
+
+    A flat look has only the view from above.
 
     Args:
         side: pixels of a side of the view from above.
-        most: dots of a view at most: where there are more returns, one stands for its neighbours.
+        most: maximum number of dots of a view: one dot may stand for several returns.
     """
     cloud = points[points.valid]
     views = _Views(cloud, look, side, most, steps(cloud, look))
@@ -81,8 +84,13 @@ def svg(
 
 @dataclass(frozen=True)
 class _View:
-    """A view: what it is, what is drawn, where that begins and how high it is in pixels, how many
-    dots there are.
+    """A view.
+
+    Attributes:
+        told: its title.
+        parts: its SVG elements.
+        top, height: its vertical range in pixels.
+        dots: the number of dots.
     """
 
     told: str
@@ -94,8 +102,10 @@ class _View:
 
 @dataclass(frozen=True)
 class _Views:
-    """The views of a cloud of valid points, in pixels; `colours`: the step of the ramp of each,
-    (n,).
+    """The views of a cloud of valid points, in pixels.
+
+    Attributes:
+        colours: the step of the ramp of each point, (n,).
     """
 
     cloud: PointCloud
@@ -109,7 +119,7 @@ class _Views:
         return self.side / 2 / self.look.reach
 
     def above(self) -> _View:
-        """Rings with their ranges, axes, points, and the sensor; forward is up."""
+        """Return rings with their ranges, axes, points, and the sensor; forward is up."""
         scale, side, (forward, left) = self._scale, self.side, self.look.middle
         across = side / 2 + left * scale
         down = side / 2 + forward * scale
@@ -155,7 +165,7 @@ class _Views:
         return _View("from above, forward is up", parts, top, bottom - top, dots)
 
     def beside(self) -> _View:
-        """Heights with their labels, and points; forward is right."""
+        """Return heights with their labels, and points; forward is right."""
         scale = self._scale
         side = self.side
         lowest, highest = bounds(self.cloud)
@@ -192,8 +202,9 @@ class _Views:
     def _dots(
         self, across: NDArray[np.float32], down: NDArray[np.float32], height: float
     ) -> tuple[int, list[str]]:
-        """How many round dots points make, one path for each colour, on the finest grid that holds
-        no more than are wanted.
+        """Return the number of dots, and a path of dots for each colour.
+
+        The finest grid with few enough dots is used.
         """
         inside = np.flatnonzero(
             (across >= 0) & (across <= self.side) & (down >= 0) & (down <= height)
@@ -221,11 +232,12 @@ class _Views:
 
 
 class _Labels:
-    """Texts of a view that neither leave it nor touch each other; those for which there is no room
-    are left out.
+    """Texts of a view that neither leave it nor overlap.
+
+    Texts without room are left out.
 
     Attributes:
-        parts: the texts that were written, as SVG.
+        parts: the texts as SVG elements.
     """
 
     def __init__(self, side: float, top: float, bottom: float) -> None:
@@ -253,18 +265,18 @@ class _Labels:
 
 
 def _text_width(text: str) -> float:
-    """Return about how wide a text is, in pixels."""
+    """Return the approximate width of a text in pixels."""
     return CHARACTER_WIDTH * len(text)
 
 
 def _path(places: NDArray[np.int64]) -> str:
-    """Dots at (row, column), each said from the one before."""
+    """Return the path of dots at (row, column), as relative moves."""
     steps = np.diff(places, axis=0, prepend=0)
     return "".join(f"m{across} {down}h0" for down, across in steps.tolist())
 
 
 def _legend(look: Look, right: int) -> Iterator[str]:
-    """A bar of the ramp, with what it shows and the values at its ends, which ends at `right`."""
+    """Yield a bar of the ramp with its column and values, which ends at `right`."""
     low, high = (escape(text) for text in look.ends)
     left = right - 7 * len(high) - 12 - STEPS * 6
     yield (
@@ -280,14 +292,15 @@ def _legend(look: Look, right: int) -> Iterator[str]:
 
 
 def _as(part: str, attribute: str = "fill") -> str:
-    """The attributes of a part of the picture: its colour on white, and the class that has that on
-    a dark ground.
+    """Return the attributes of a part of the picture.
+
+    They are its colour on light pages, and the class for its colour on dark ones.
     """
     return f'class="{part}" {attribute}="{_LIGHT[_PARTS.index(part)]}"'
 
 
 def _style() -> str:
-    """What is different where a dark page is preferred."""
+    """Return the style for dark pages."""
     inks = [to_hex(rgb) for rgb in make_ramp("dark", STEPS)]
     dots = [
         f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(inks)

@@ -1,4 +1,4 @@
-"""The window that shows a sensor at work: keys in, pictures out, a dozen times a second at most.
+"""The terminal window of a running sensor, drawn at most twelve times a second.
 
 `Window.run` waits for keys and data in turn. `Choice` is the state that the keys change, and
 `Window.cells` draws the window anew from it, the newest scan and the figures; `Screen` writes the
@@ -29,26 +29,26 @@ from lidarspec.view.window_parts import (
     write_title,
 )
 
-#: from picture to picture, at least.
+#: minimum seconds between two pictures.
 FRAME_PERIOD_S = 0.08
-#: between two readings of the figures.
+#: seconds between two readings of the figures.
 FIGURES_PERIOD_S = 1.0
-#: of one key press.
+#: zoom factor of one key press, and its limits.
 ZOOM_FACTOR = 1.25
 MAX_ZOOM = 1e3
 MIN_ZOOM = 1e-2
-#: of the reach of the picture, for one key press.
+#: movement of one key press, as a share of the reach of the picture.
 MOVE_SHARE = 0.2
 #: axis and sign by key: forward is the first axis, left the second.
 MOVES = {"up": (1, 0), "down": (-1, 0), "left": (0, 1), "right": (0, -1)}
 #: a picture is drawn larger when its points need less than this share of its reach.
 MIN_USED_SHARE = 0.7
-#: columns of the figures beside the picture.
+#: width of the figures beside the picture, in columns.
 SIDE_COLUMNS = 25
 #: a window with less room for picture or lines has the figures in its last line.
 MIN_PICTURE_COLUMNS = 36
 MIN_SIDE_LINES = 14
-#: an error or loss rate from which on a figure is an alarm.
+#: error or loss rate above which a figure is an alarm.
 ALARM_RATE = 0.01
 DEFAULT_RAMPS = ("range", "intensity")
 

@@ -21,9 +21,9 @@ KEYS = (
 )
 HINTS = (("space pause", "c colour"), ("+ - zoom", "0 all"), ("? help", "q quit"))
 HINT_COLUMNS = 13
-#: of the margins, and of the longest key with its margin, on the page of keys.
+#: columns of the margins, and of the longest key with its margin, on the page of keys.
 KEY_COLUMNS = 14
-#: a title with less room for the name of the source has none.
+#: minimum room for the name of the source in the title.
 MIN_SOURCE_COLUMNS = 8
 
 
