@@ -218,9 +218,11 @@ class Registry:
     Two threads may load the same sensor at the same time: it is then added twice, with the same
     result.
 
-    Args: modules: entry points of modules with hooks; each is loaded at once. offered: entry points
-        of sensors, by id and alias; each is loaded on request. owners: returns the distributions
-        that the user names as owners, by id; called if several claim a name.
+    Args:
+        modules: entry points of modules with hooks; each is loaded at once.
+        offered: entry points of sensors, by id and alias; each is loaded on request.
+        owners: returns the distributions that the user names as owners, by id; called if several
+            claim a name.
     """
 
     def __init__(
@@ -279,8 +281,9 @@ class Registry:
     def add(self, plugin: Any, *, name: str) -> list[str]:
         """Register a plugin, a module or object with hooks, and return the ids it adds.
 
-        Raises: SpecError: for an unknown hook, a wrong signature, or an invalid sensor; nothing is
-            left registered.
+        Raises:
+            SpecError: for an unknown hook, a wrong signature, or an invalid sensor; nothing is left
+                registered.
         """
         _check_hooks(plugin, name)
         try:

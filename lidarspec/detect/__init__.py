@@ -1,6 +1,6 @@
 """Identify the sensor of a source, and diagnose a source without usable data.
 
-Input: a SOURCE, or bytes. Output: a verdict, and findings with the command that fixes them. Modules
+In: a SOURCE, or bytes. Out: a verdict, and findings with the command that fixes them. Modules
 in reading order:
 
 * `heard`: the bytes of one source.

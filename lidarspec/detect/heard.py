@@ -24,11 +24,16 @@ MIN_TEXT_BYTES = 16
 class Heard:
     """Bytes that one sender of a source sent.
 
-    Attributes: source: the SOURCE, to open it again. chunks: datagrams, or pieces of a stream.
-        datagrams: whether they are datagrams. baud: the baud rate at which a serial port was read;
-        None for other sources, and for a port without a baud rate. sender: address of the sender,
-        if there are several. failure: the reason why it could not be opened. warnings: warnings
-        about the source at its end. ports: the UDP ports that datagrams of a capture were sent to.
+    Attributes:
+        source: the SOURCE, to open it again.
+        chunks: datagrams, or pieces of a stream.
+        datagrams: whether they are datagrams.
+        baud: the baud rate at which a serial port was read; None for other sources, and for a port
+            without a baud rate.
+        sender: address of the sender, if there are several.
+        failure: the reason why it could not be opened.
+        warnings: warnings about the source at its end.
+        ports: the UDP ports that datagrams of a capture were sent to.
     """
 
     source: str

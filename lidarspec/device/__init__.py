@@ -1,6 +1,6 @@
 """Devices: a sensor on a source, as `open` returns it.
 
-Input: a SOURCE and a sensor. Output: packets and scans as they arrive, replies to commands,
+In: a SOURCE and a sensor. Out: packets and scans as they arrive, replies to commands,
 counters, warnings. Modules in reading order:
 
 * `device`: `Device`, the public class.

@@ -37,9 +37,11 @@ from lidarspec.transports.protocol import Chunk, Transport
 class Arrival:
     """Frames of a piece of input, in stream order.
 
-    Attributes: found: the frames of every incoming type. interrupted: whether input is missing
-        after them: no frame, packet or scan continues there. replaced: whether these frames come
-        from another sensor than the previous ones, which have to be discarded.
+    Attributes:
+        found: the frames of every incoming type.
+        interrupted: whether input is missing after them: no frame, packet or scan continues there.
+        replaced: whether these frames come from another sensor than the previous ones, which have
+            to be discarded.
     """
 
     found: list[Frames] = field(default_factory=list)

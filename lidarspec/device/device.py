@@ -181,8 +181,10 @@ class Device(Closing):
         A file is read once, by all iterators together. After `latest` they begin with the batch in
         which its scan was found.
 
-        Args: frame: the name of a frame type; by default the data frame. wait: yield an empty batch
-            if none arrives for this number of seconds, so that the caller can do something else.
+        Args:
+            frame: the name of a frame type; by default the data frame.
+            wait: yield an empty batch if none arrives for this number of seconds, so that the
+                caller can do something else.
 
         Raises:
             SourceError: if a file has been read to its end before.
@@ -220,9 +222,11 @@ class Device(Closing):
         A file is read once, by all iterators together. After `latest` they begin with the batch in
         which its scan was found.
 
-        Args: wait: yield None if no scan arrives for this number of seconds, so that the caller can
-            do something else. select: the scans and the parts of them to yield. Nothing is read
-            after the last one, and long stretches of a recording before the first one are skipped.
+        Args:
+            wait: yield None if no scan arrives for this number of seconds, so that the caller can
+                do something else.
+            select: the scans and the parts of them to yield. Nothing is read after the last one,
+                and long stretches of a recording before the first one are skipped.
 
         Raises:
             SourceError: if a file has been read to its end before.
@@ -239,8 +243,9 @@ class Device(Closing):
         They are in the axes of the carrier if the sensor has a mount. `Scan.imu` has the samples
         that belong to a scan. A file is read once, by all iterators together.
 
-        Args: wait: yield no samples if none arrive for this number of seconds, so that the caller
-            can do something else.
+        Args:
+            wait: yield no samples if none arrive for this number of seconds, so that the caller can
+                do something else.
 
         Raises:
             UsageError: if no frame of the sensor has IMU samples.

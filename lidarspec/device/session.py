@@ -53,11 +53,15 @@ class Outgoing:
 class Reply:
     """The answer to a command.
 
-    Attributes: command: the name of the command. frame: the type of the frame that answered; None
-        if no answer is documented. values: its fields, raw wire integers as `Sensor.parse` returns
-        them; ``reply["path"]`` is the physical value. confirmed: whether the device answered. at:
-        the arrival time by the session's clock; without a reply, the time when the command was
-        sent. data: the bytes of the frame.
+    Attributes:
+        command: the name of the command.
+        frame: the type of the frame that answered; None if no answer is documented.
+        values: its fields, raw wire integers as `Sensor.parse` returns them; ``reply["path"]`` is
+            the physical value.
+        confirmed: whether the device answered.
+        at: the arrival time by the session's clock; without a reply, the time when the command was
+            sent.
+        data: the bytes of the frame.
     """
 
     command: str

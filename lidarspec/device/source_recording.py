@@ -67,8 +67,10 @@ class TimedLog:
         recorder: writes the file; closed with this one.
         seconds: the limit; None for none.
 
-    Attributes: first, last: arrival times of the first and the last recorded chunk, ns; None before
-        the first. is_over: whether it ignores all further arrivals.
+    Attributes:
+        first, last: arrival times of the first and the last recorded chunk, ns; None before the
+            first.
+        is_over: whether it ignores all further arrivals.
     """
 
     def __init__(self, recorder: Appender, seconds: float | None) -> None:

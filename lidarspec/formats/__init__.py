@@ -1,15 +1,21 @@
 """File formats of scans, by the suffix of the file.
 
-Input: scans. Output: a file, which gets its name only when it is complete. `write` is the function
+In: scans. Out: a file, which gets its name only when it is complete. `write` is the function
 for callers. `formats` includes the formats of plugins. Modules in reading order:
 
-* `writing`: functions shared by the formats. * `text`: .csv, .csv.gz and .xyz, one row per point. *
-`arrays`: .npz, one array per column; .npy, a structured array; .zarr, a folder with one array per
-column. * `tables`: .parquet, .arrow and .feather, for data tools. * `rows`: points as rows of bytes
-after a header. * `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin. * `las`: .las and .laz, for
-surveying tools. * `e57`: .e57, with a header and points for each scan. * `messages`: ROS messages
-of scans, packets and IMU samples. * `bags`: .mcap, .bag, .rosbag2 and .db3, one message per scan. *
-`foxglove`: .foxglove.mcap, with Foxglove messages. * `rerun`: .rrd, for the Rerun viewer.
+* `writing`: functions shared by the formats.
+* `text`: .csv, .csv.gz and .xyz, one row per point.
+* `arrays`: .npz, one array per column; .npy, a structured array; .zarr, a folder with one array per
+  column.
+* `tables`: .parquet, .arrow and .feather, for data tools.
+* `rows`: points as rows of bytes after a header.
+* `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
+* `las`: .las and .laz, for surveying tools.
+* `e57`: .e57, with a header and points for each scan.
+* `messages`: ROS messages of scans, packets and IMU samples.
+* `bags`: .mcap, .bag, .rosbag2 and .db3, one message per scan.
+* `foxglove`: .foxglove.mcap, with Foxglove messages.
+* `rerun`: .rrd, for the Rerun viewer.
 """
 
 from __future__ import annotations

@@ -118,8 +118,9 @@ def write_ros2(
 ) -> None:
     """Write a ROS 2 bag of metadata version 8, which releases from Foxy on read.
 
-    Args: storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a single
-        database file, which `ros2 bag` reads too.
+    Args:
+        storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a single
+            database file, which `ros2 bag` reads too.
     """
     import sqlite3  # only needed here
 

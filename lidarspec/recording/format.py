@@ -2,12 +2,18 @@
 
 A recording is a sequence of records, each complete in itself. The first one describes it in JSON.
 
-    offset  size  of a record, little-endian 0       4     mark b"\xb5LS\x1e" 4       1     kind: 0
-    header, 1 received, 2 sent, 3 event 5       1     flags: 1 a datagram, 2 the line was
-    interrupted before it, 4 the line was silent before it 6       1     a, bytes of addresses 7 2
-    n, bytes of data 9       8     arrival time, ns since 1970, signed; the lowest number: unknown
-    17      a     sender, receiver: each a length byte, that many bytes of address, and, if there
-    are any, the port in 2 bytes 17+a    n     data 17+a+n  4     CRC-32 (zlib) of everything before
+    offset  size  of a record, little-endian
+    0       4     mark b"\xb5LS\x1e"
+    4       1     kind: 0 header, 1 received, 2 sent, 3 event
+    5       1     flags: 1 a datagram, 2 the line was interrupted before it,
+                  4 the line was silent before it
+    6       1     a, bytes of addresses
+    7       2     n, bytes of data
+    9       8     arrival time, ns since 1970, signed; the lowest number: unknown
+    17      a     sender, receiver: each a length byte, that many bytes of address,
+                  and, if there are any, the port in 2 bytes
+    17+a    n     data
+    17+a+n  4     CRC-32 (zlib) of everything before
 
 An event is a JSON object, with its name as "event": "disconnect", "reconnect", "dropped" ("records"
 has their number), or "clock": the wall clock was set, and is "ahead_ns" ahead of the arrival times,

@@ -74,13 +74,17 @@ class Recorder(Appender):
         datagrams: whether each chunk is a datagram; by default as the sensor's link declares.
         baud: of a serial port.
 
-    Attributes: header: the header of the recording. records, bytes: the number of records so far,
-        and of the data bytes in them. dropped: the number of records and events dropped while the
-        disk was too slow, or after it failed. error: the failure of the file; None if there was
-        none.
+    Attributes:
+        header: the header of the recording.
+        records, bytes: the number of records so far, and of the data bytes in them.
+        dropped: the number of records and events dropped while the disk was too slow, or after it
+            failed.
+        error: the failure of the file; None if there was none.
 
-    Raises: UsageError: if the file exists, or if the sensor is not installed and `datagrams` is not
-        given. SourceError: if it cannot be made.
+    Raises:
+        UsageError: if the file exists, or if the sensor is not installed and `datagrams` is not
+            given.
+        SourceError: if it cannot be made.
     """
 
     def __init__(

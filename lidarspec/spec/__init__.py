@@ -3,7 +3,7 @@
     from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, OnWrap, Polar, Scaled,
     Sensor, Serial, Simulation, hookimpl, spread
 
-A plugin imports from here and from `lidarspec` alone. Input: the facts of a manual. Output: a
+A plugin imports from here and from `lidarspec` alone. In: the facts of a manual. Out: a
 `Sensor`, which is checked when it is made. All other packages are functions of its description.
 Nothing in this package reads a stream. Modules in reading order:
 

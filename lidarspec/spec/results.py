@@ -103,17 +103,22 @@ def _name_extras(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
 class Polar:
     """Points given by range and direction.
 
-    Args: range: metres; 0 is no return, `inf` is kept, nan is invalid. azimuth: radians,
-        counter-clockwise seen from above; a nan makes the point invalid. elevation: radians above
-        the horizon. intensity: the number on the wire; None if the sensor has none. time: seconds
-        after the packet's clock. ring: number of the laser or channel; None if there is none.
+    Args:
+        range: metres; 0 is no return, `inf` is kept, nan is invalid.
+        azimuth: radians, counter-clockwise seen from above; a nan makes the point invalid.
+        elevation: radians above the horizon.
+        intensity: the number on the wire; None if the sensor has none.
+        time: seconds after the packet's clock.
+        ring: number of the laser or channel; None if there is none.
         return_index: 0 for the first or only return, 1 for the second ...; None if there is only
-        one. invalid: True if the sensor marks a point as invalid (becomes nan). origin: (x, y, z)
-        of the start of the beam, metres, in REP-103 axes; numbers or columns. nominal: True if a
-        default calibration replaces the sensor's own; `PointCloud.nominal` reports it. column:
-        number of the column in its revolution, from 0, if points form columns of rings; used by
-        `PointCloud.organised`. extra: additional columns by name: values, or an `Extra` with their
-        unit and type.
+            one.
+        invalid: True if the sensor marks a point as invalid (becomes nan).
+        origin: (x, y, z) of the start of the beam, metres, in REP-103 axes; numbers or columns.
+        nominal: True if a default calibration replaces the sensor's own; `PointCloud.nominal`
+            reports it.
+        column: number of the column in its revolution, from 0, if points form columns of rings;
+            used by `PointCloud.organised`.
+        extra: additional columns by name: values, or an `Extra` with their unit and type.
 
     Raises:
         SpecError: for a name in `extra` that already has a meaning.
@@ -140,15 +145,20 @@ class Polar:
 class Cartesian:
     """Points given by coordinates.
 
-    Args: x, y, z: metres, x forward, y left, z up; all three 0 is no return; a nan or infinite one
-        makes the point invalid. intensity: the number on the wire; None if the sensor has none.
-        time: seconds after the packet's clock. ring: number of the laser or channel; None if there
-        is none. return_index: 0 for the first or only return, 1 for the second ...; None if there
-        is only one. invalid: True if the sensor marks a point as invalid (becomes nan). nominal:
-        True if a default calibration replaces the sensor's own; `PointCloud.nominal` reports it.
+    Args:
+        x, y, z: metres, x forward, y left, z up; all three 0 is no return; a nan or infinite one
+            makes the point invalid.
+        intensity: the number on the wire; None if the sensor has none.
+        time: seconds after the packet's clock.
+        ring: number of the laser or channel; None if there is none.
+        return_index: 0 for the first or only return, 1 for the second ...; None if there is only
+            one.
+        invalid: True if the sensor marks a point as invalid (becomes nan).
+        nominal: True if a default calibration replaces the sensor's own; `PointCloud.nominal`
+            reports it.
         column: number of the column in its revolution, from 0, if points form columns of rings;
-        used by `PointCloud.organised`. extra: additional columns by name: values, or an `Extra`
-        with their unit and type.
+            used by `PointCloud.organised`.
+        extra: additional columns by name: values, or an `Extra` with their unit and type.
 
     Raises:
         SpecError: for a name in `extra` that already has a meaning.

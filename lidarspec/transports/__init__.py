@@ -1,6 +1,6 @@
 """Inputs and outputs: ports, sockets, files and simulated sensors.
 
-Input: a SOURCE as text. Output: an open `Transport`, which yields `Chunk`s and sends bytes.
+In: a SOURCE as text. Out: an open `Transport`, which yields `Chunk`s and sends bytes.
 Modules in reading order:
 
 * `protocol`: the base classes of transports; plugins derive from them.

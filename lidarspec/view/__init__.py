@@ -1,6 +1,6 @@
 """Draw scans: in a terminal, as pictures in files, in notebooks and in the Rerun viewer.
 
-Input: a device, or points. Output: pictures. The distribution `lidarspec-web` draws the page in a
+In: a device, or points. Out: pictures. The distribution `lidarspec-web` draws the page in a
 browser. Modules in reading order:
 
 * `window`: shows a sensor at work in the terminal: keys in, pictures and figures out.
