@@ -1,8 +1,8 @@
 """Write Rerun recordings, .rrd: scans as coloured points, with statistics.
 
-They are on the timelines of the sensor and of the host. `view --rerun` uses the same `RerunRecording` for the
-Rerun viewer. All entities of a sensor are below its id, so that recordings of several sensors can
-be opened together: its points, its mount, facts about it, and `statistics`.
+They are on the timelines of the sensor and of the host. `view --rerun` uses the same
+`RerunRecording` for the Rerun viewer. All entities of a sensor are below its id, so that recordings
+of several sensors can be opened together: its points, its mount, facts about it, and `statistics`.
 """
 
 from __future__ import annotations
