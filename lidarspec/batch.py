@@ -1,18 +1,16 @@
-"""Many files, and large ones in pieces, by several processes or machines: files of points, or a
-table of Dask.
+"""Convert many files, large ones in pieces, in several processes or on a cluster.
 
-In: captures by path, pattern or URL. Out: a file of points for each, several for one that is larger
-than a piece, and a manifest; or a Dask dataframe with a partition for each piece. Nothing here
-schedules: tasks go to `concurrent.futures`, or to the scheduler of a Dask cluster.
+In: captures by path, pattern or URL. Out: a file of points for each, or several for one that is
+larger than a piece, and a manifest; or a Dask dataframe with a partition for each piece. Tasks are
+scheduled by `concurrent.futures`, or by the scheduler of a Dask cluster.
 
-A large file is cut as `device.file_scans` does it. Its pieces are found one after another: the task
-that passes over one gives the bookmark with which the next one begins, so that points are made of a
-piece while those behind it are still looked for.
+`device.file_scans` cuts a large file. Its pieces are located one after another: the task that skips
+one gives the bookmark of the next, so that points of a piece are made while the following pieces
+are still being located.
 
-The manifest, `manifest.jsonl` in the folder of the results, has a line of JSON for each piece: what
-was read, with which sensor and versions, what was written, or the error. A file whose lines and
-results are all there is not read again. A line that is there is true: it is written when the result
-is.
+The manifest, `manifest.jsonl` in the folder of the results, has a line of JSON for each piece: the
+input, the sensor and versions, the output, or the error. A file is not read again if all its lines
+and results exist. A line is written only after its result.
 """
 
 from __future__ import annotations
@@ -70,12 +68,12 @@ from lidarspec.stores import (
     take_away,
 )
 
-#: bytes of a piece that is written to a file, and of one that is a partition in memory.
+#: Bytes of a piece that is written to a file, and of a piece that is a partition in memory.
 PIECE = 256_000_000
 PARTITION = 32_000_000
 MANIFEST = "manifest.jsonl"
-#: tasks handed to an executor at a time, and seconds between two writings of a manifest that cannot
-#: be appended to.
+#: Number of tasks handed to an executor at a time, and seconds between two writes of a manifest
+#: that cannot be appended to.
 AHEAD = 1000
 PERIOD = 2.0
 VERSIONS = {"lidarspec": __version__, "numpy": np.__version__, "python": platform.python_version()}
@@ -85,21 +83,19 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class FilePiece:
-    """Some scans of a file, and where they go.
+    """Some scans of a file, and their output.
 
     Attributes:
         source: path or URL of the file.
-        sensor, options: whose, by name, with what it is configured with; "" where it is to be found
-            out.
-        target: the file that all scans would go to; a piece has its number in the name. "" for
-            none.
-        every_point: whether points without a valid return count.
+        sensor, options: id and options of the sensor; "" if it is to be detected.
+        target: the output file for all scans; a piece has its number in the name. "" for none.
+        every_point: whether to include points without a valid return.
         size: bytes of a piece.
-        select: what is wanted of its scans; by their times and numbers, of a file in one piece.
-        number, first: which piece it is, and the number of its first scan.
-        count: how many scans it has; None for all that follow.
-        bookmark: where it begins, None for the beginning of the file.
-        is_last: whether none follows.
+        select: the selected scans; a file selected by times or numbers is not cut.
+        number, first: number of the piece, and of its first scan.
+        count: number of its scans; None for all that follow.
+        bookmark: start of the piece, None for the start of the file.
+        is_last: whether it is the last piece.
     """
 
     source: str
@@ -117,7 +113,7 @@ class FilePiece:
 
     @property
     def output(self) -> str:
-        """The file that it goes to."""
+        """The file that the piece is written to."""
         if not self.number and self.is_last:
             return self.target
         suffix = format_of(self.target).suffix
@@ -125,7 +121,7 @@ class FilePiece:
 
     @property
     def asked(self) -> Record:
-        """What its result depends on, besides the file and which piece of it this is."""
+        """The settings that its result depends on, besides the file and the piece number."""
         options = {name: str(value) for name, value in self.options.items()}
         select = {
             name: str(value)
@@ -141,7 +137,7 @@ class FilePiece:
         return {"asked": self.sensor, **how, "target": self.target}
 
     def open_scans(self) -> FileScans:
-        """The file, from where the piece begins."""
+        """Open the file at the start of the piece."""
         if self.sensor:
             named = _configure_sensor(self.sensor, tuple(self.options.items()))
         else:
@@ -149,7 +145,7 @@ class FilePiece:
         return FileScans(self.source, named, self.bookmark)
 
     def record(self, **more: Any) -> Record:
-        """What the manifest says of it."""
+        """Return the record of the piece for the manifest."""
         return {
             "source": self.source,
             "piece": self.number,
@@ -160,7 +156,7 @@ class FilePiece:
         }
 
     def describe_failure(self, error: Exception) -> Record:
-        """What the manifest says where it was not to be made."""
+        """Return the record of the piece after an error."""
         return self.record(
             error=(
                 str(error)
@@ -170,7 +166,7 @@ class FilePiece:
         )
 
     def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
-        """What is wanted of its scans, with their numbers in the file."""
+        """Yield the selected scans of the piece, with their numbers in the file."""
         sieve = Sieve(self.select, self.source)
         for number, scan in enumerate(itertools.islice(scans, self.count), self.first):
             if (wanted := sieve.take(scan)) is not None:
@@ -183,14 +179,14 @@ class FilePiece:
 
 @functools.lru_cache(maxsize=64)
 def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
-    """One for all files, since what is compiled for it is kept with it."""
+    """Return one sensor for all files, because its compiled code is cached with it."""
     known = named_sensor(name)
     configured: Sensor = known.configure(**dict(options)) if options else known
     return configured
 
 
 def survey(piece: FilePiece) -> list[FilePiece]:
-    """The piece, with the number of its scans, and what follows it, if anything does."""
+    """Return the piece with the number of its scans, and the piece after it, if any."""
     with piece.open_scans() as scans:
         count, bookmark = scans.survey(piece.size)
     if bookmark is None:
@@ -202,7 +198,7 @@ def survey(piece: FilePiece) -> list[FilePiece]:
 
 
 def convert_piece(piece: FilePiece) -> Record:
-    """What the manifest says of a piece, once its points are written, or it has failed."""
+    """Write the points of a piece, and return its record for the manifest."""
     counts: Record = {"first_scan": piece.first, "scans": 0, "points": 0}
     try:
         about = {**stamp(piece.source), "digest": digest(piece.source)}
@@ -219,7 +215,7 @@ def convert_piece(piece: FilePiece) -> Record:
                 output=piece.output if first is not None else None,
                 warnings=scans.warnings,
             )
-    except Exception as error:  # of whatever kind: the others go on
+    except Exception as error:  # any error: the other pieces continue
         return piece.describe_failure(error)
 
 
@@ -231,7 +227,7 @@ def _count_scans(piece: FilePiece, scans: Iterator[Scan], counts: Record) -> Ite
 
 
 def _write(piece: FilePiece, scans: Iterable[Scan]) -> None:
-    """Write scans to where the piece goes, which appears whole."""
+    """Write scans to the output of the piece, which appears only when complete."""
     if not is_stored(piece.output):
         with system_errors(piece.output):
             Path(piece.output).parent.mkdir(parents=True, exist_ok=True)
@@ -253,11 +249,11 @@ def pieces(
     size: int,
     select: Selection,
 ) -> list[FilePiece]:
-    """The files of some paths, patterns and URLs, each as one piece.
+    """Return the files of some paths, patterns and URLs, each as one piece.
 
     Raises:
-        SourceError: where there is none.
-        UsageError: where two results would have one name.
+        SourceError: if there is none.
+        UsageError: if two results would have the same name.
     """
     if isinstance(sensor, Sensor):
         name = sensor.id
@@ -282,9 +278,9 @@ def pieces(
     return list(made.values())
 
 
-#: keys that each record of a manifest has, with their types.
+#: Keys of each record of a manifest, with their types.
 _RECORD_KEYS: Mapping[str, Any] = {"source": str, "target": str, "piece": int}
-#: further keys of the record of a piece that was written.
+#: Further keys of the record of a written piece.
 _WRITTEN_KEYS: Mapping[str, Any] = {
     "last": bool,
     "size": int,
@@ -295,9 +291,7 @@ _WRITTEN_KEYS: Mapping[str, Any] = {
 
 
 def _is_record(value: Any) -> bool:
-    """Return whether a value from a line of a manifest has the keys of a record, with values of the
-    right types.
-    """
+    """Return whether a value from a manifest has the keys and types of a record."""
     if not isinstance(value, dict):
         return False
     keys = dict(_RECORD_KEYS)
@@ -307,16 +301,16 @@ def _is_record(value: Any) -> bool:
 
 
 class Manifest:
-    """What is known of the pieces that were written into a folder, by this run and those before.
+    """The records of the pieces in a folder, of this run and earlier ones.
 
     Args:
         folder: path or URL.
 
     Raises:
-        SourceError: where the folder cannot be written to.
+        SourceError: if the folder cannot be written to.
 
     Attributes:
-        is_new: whether nothing was written into the folder before.
+        is_new: whether the folder had no manifest before.
     """
 
     def __init__(self, folder: str) -> None:
@@ -333,7 +327,7 @@ class Manifest:
             with system_errors(self.path):
                 Path(folder).mkdir(parents=True, exist_ok=True)
                 self._file = open(self.path, "a", encoding="utf-8")  # noqa: SIM115  closed by `close`
-                if self._file.tell():  # lest a line that was cut off take the next one with it
+                if self._file.tell():  # keep a truncated line separate from the next one
                     self._file.write("\n")
 
     def _read_lines(self) -> list[str]:
@@ -345,12 +339,10 @@ class Manifest:
             return []
 
     def _known(self, line: str, number: int) -> bool:
-        """Remember the record of a line; return False for one that a killed run left incomplete, or
-        that is damaged.
+        """Store the record of a line; return False if the line is incomplete or damaged.
 
         Raises:
-            SourceError: if the line nests more deeply than any record does: no run of ours wrote
-                it.
+            SourceError: if the line is nested more deeply than any record.
         """
         try:
             record = json.loads(line)
@@ -366,11 +358,11 @@ class Manifest:
         return True
 
     def has(self, path: str) -> bool:
-        """Whether a file was in the folder at the beginning."""
+        """Return whether a file was in the folder at the beginning."""
         return plain(path) in self._outputs
 
     def done(self, piece: FilePiece) -> Record | None:
-        """What was said of a piece that need not be made again."""
+        """Return the record of a piece that need not be made again, else None."""
         record = self._records.get((piece.source, piece.target), {}).get(piece.number)
         if (
             record is None
@@ -384,7 +376,7 @@ class Manifest:
         return None
 
     def _is_same(self, source: str, record: Record) -> bool:
-        """Whether a file is the one that a record is of."""
+        """Return whether a file is the one of a record."""
         now = stamp(source)
         return bool(
             now["size"] == record["size"]
@@ -392,7 +384,7 @@ class Manifest:
         )
 
     def find_records(self, piece: FilePiece) -> list[Record]:
-        """What was said of all pieces of a file, none where one is missing."""
+        """Return the records of all pieces of a file; empty if one is missing."""
         records = list[Record]()
         for number in itertools.count():
             if (record := self.done(replace(piece, number=number))) is None:
@@ -403,14 +395,14 @@ class Manifest:
         return []
 
     def clear(self, piece: FilePiece) -> None:
-        """Remove the outputs of a file that has changed or is converted differently now."""
+        """Remove the outputs of a file that has changed or is now converted differently."""
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
             if output and self.has(output) and self.done(replace(piece, number=number)) is None:
                 take_away(output)
 
     def add(self, record: Record) -> None:
-        """Write down what became of a piece."""
+        """Write the record of a piece."""
         line = json.dumps(record)
         if self._is_stored:
             self._lines.append(line)
@@ -422,7 +414,7 @@ class Manifest:
         self._file.flush()
 
     def close(self) -> None:
-        """Write what has not been written."""
+        """Write pending records, and close the file."""
         if self._is_stored:
             self._put()
         else:
@@ -436,10 +428,10 @@ class Manifest:
 
 
 class _Here(Executor):
-    """Runs each task in this process when it is handed over."""
+    """Runs each task in this process when it is submitted."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """What the task gives, which is there already."""
+        """Run the task, and return its finished future."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -449,9 +441,7 @@ class _Here(Executor):
 
 
 def _begin() -> None:
-    """A worker ends with the process that it works for, however that ends, and without a word where
-    the user ends both.
-    """
+    """Make a worker process end together with its parent, without a traceback."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -465,11 +455,11 @@ def _begin() -> None:
 
 @contextlib.contextmanager
 def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
-    """What runs tasks: this process, others of this computer, or the workers of a Dask cluster.
+    """Yield an executor: this process, other processes, or a Dask cluster.
 
     Raises:
-        UsageError: where Dask is not installed.
-        SourceError: where the scheduler cannot be reached.
+        UsageError: if Dask is not installed.
+        SourceError: if the scheduler cannot be reached.
     """
     if scheduler:
         distributed = import_library("distributed", "dask")
@@ -509,29 +499,29 @@ def convert(
     size: int = PIECE,
     force: bool = False,
 ) -> Iterator[tuple[Record, bool]]:
-    """Write the points of many files into a folder: what the manifest says of each piece, as it is
-    done, and whether it was done before.
+    """Write the points of many files into a folder.
 
-    What fails is said in the "error" of its record, and stops nothing else.
+    Yields the record of each piece when it is finished, and whether it was finished before. A piece
+    that fails has an "error" in its record; the others continue.
 
     Args:
         sources: paths, patterns such as "drives/**/*.pcap", and URLs of fsspec.
-        folder: path or URL; the files in it are named as those that they are of, below the fixed
-            part of the pattern.
+        folder: path or URL; its files are named after their sources, below the fixed part of the
+            pattern.
         to: the suffix of a format, "parquet".
-        sensor: as in `lidarspec.open`; found out for each file where left out.
-        jobs: how many processes of this computer work.
-        scheduler: the address of a Dask scheduler, whose workers do it instead; sources and folder
-            have to be theirs too.
-        every_point: also the points without a valid return.
-        select: what is wanted of the scans of each file; by times and numbers, the file is not cut.
+        sensor: as in `lidarspec.open`; by default detected for each file.
+        jobs: number of processes on this computer.
+        scheduler: the address of a Dask scheduler, to use its workers; they must be able to access
+            sources and folder.
+        every_point: include points without a valid return.
+        select: the selected scans of each file; a file selected by times or numbers is not cut.
         size: bytes of a piece; a larger file gives several files of points.
-        force: what was done before is done again.
+        force: repeat finished pieces.
 
     Raises:
-        SourceError: where there is no such source, the folder cannot be written to, the scheduler
-            not be reached, or a worker was killed.
-        UsageError: for a format that is none, and where a library is missing.
+        SourceError: if a source does not exist, the folder cannot be written to, the scheduler
+            cannot be reached, or a worker was killed.
+        UsageError: for an unknown format, or if a library is missing.
     """
     format_of(f"x.{to}")
     todo = pieces(
@@ -567,8 +557,9 @@ def convert(
 def _run(
     executor: Executor, todo: Iterable[FilePiece], done: Callable[[FilePiece], Record | None]
 ) -> Iterator[tuple[Record, bool]]:
-    """What became of each piece, as it is done; those of which something is known already are not
-    made again.
+    """Yield the record of each finished piece, and whether it is an old one.
+
+    Pieces for which `done` returns a record are not made again.
     """
     ended = queue.SimpleQueue[tuple[FilePiece, Future[Any]]]()
     tasks = deque((survey if _is_large(piece) else convert_piece, piece) for piece in todo)
@@ -594,7 +585,7 @@ def _run(
                 " written"
             )
             raise suggest(error, "the same again, which goes on where this ended") from None
-        except Exception as failure:  # of a survey, or a worker of Dask that died again and again
+        except Exception as failure:  # an error of a survey, or a Dask worker that died repeatedly
             result = piece.describe_failure(failure)
         if isinstance(result, dict):
             yield result, False
@@ -607,7 +598,7 @@ def _run(
 
 
 def _is_large(piece: FilePiece) -> bool:
-    """Whether a file is larger than a piece, and is cut; what cannot be looked at is not."""
+    """Return whether a file is larger than a piece; False if its size is unknown."""
     if piece.select.is_counted:
         return False
     with contextlib.suppress(LidarSpecError):
@@ -626,9 +617,7 @@ def _try(to: str) -> None:
 
 @contextlib.contextmanager
 def _swept(folder: str, to: str) -> Iterator[None]:
-    """A folder in which, before and after, nothing is left that a process was writing when it was
-    killed.
-    """
+    """Remove partial files of killed processes from a folder, before and after."""
 
     def sweep() -> None:
         for path in () if is_stored(folder) else Path(folder).rglob(f".*.{to}"):
@@ -650,22 +639,21 @@ def read(
     select: Selection = EVERYTHING,
     size: int = PARTITION,
 ) -> Any:
-    """The points of many files as a Dask dataframe, a partition for each piece, whose columns are
-    those of a Parquet file.
+    """Return the points of many files as a Dask dataframe, one partition per piece.
 
-    A file that is larger than a piece is passed over once at this call, without making its points;
-    the rest waits until it is asked for.
+    The columns are those of a Parquet file. A file that is larger than a piece is read through once
+    by this call, without making its points; everything else is deferred.
 
     Args:
         urls: paths, patterns such as "s3://bucket/drives/**/*.pcap", and URLs of fsspec.
-        sensor: as in `lidarspec.open`; found out for each file where left out.
-        every_point: also the points without a valid return.
+        sensor: as in `lidarspec.open`; by default detected for each file.
+        every_point: include points without a valid return.
         select: as in `convert`.
-        size: bytes of a piece; its points take ten times as many, about.
+        size: bytes of a piece; its points take about ten times as many.
 
     Raises:
-        SourceError: where there is no such file.
-        UsageError: where a library is missing.
+        SourceError: if a file does not exist.
+        UsageError: if a library is missing.
     """
     dask = import_library("dask", "dask")
     frames = import_library("dask.dataframe", "dask")
@@ -683,7 +671,7 @@ def read(
 
 
 def _cut(piece: FilePiece) -> list[FilePiece]:
-    """All pieces of a file."""
+    """Return all pieces of a file."""
     if not _is_large(piece):
         return [piece]
     found = list[FilePiece]()
@@ -695,7 +683,7 @@ def _cut(piece: FilePiece) -> list[FilePiece]:
 
 
 def _partition(piece: FilePiece) -> Any:
-    """The points of a piece as a pandas dataframe."""
+    """Return the points of a piece as a pandas dataframe."""
     with piece.open_scans() as scans:
         made = tables(piece.iter_numbered(scans), every_point=piece.every_point)
         table = import_library("pyarrow", "arrow").concat_tables(made)

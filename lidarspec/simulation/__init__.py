@@ -1,11 +1,11 @@
-"""A sensor that is not there, made from its spec.
+"""Simulated sensors, made from their specs.
 
-In: a sensor, a scene, commands. Out: the bytes that it would send, and when. No port, clock or
-thread in here. Modules in reading order:
+In: a sensor, a scene, commands. Out: the bytes that the sensor would send, and their times. This
+package uses no port, clock or thread. Modules in reading order:
 
-* `scenes`: what a beam meets, and how far away.
-* `frame_maker`: frames out of physical values.
-* `simulator`: `simulate`: ranges measured in a scene, packets out of them, and when each is sent.
-* `device`: all of that as something to talk to, which answers commands.
-* `faults`: what goes wrong on the way to the reader.
+* `scenes`: the range of a beam in a scene.
+* `frame_maker`: frames from physical values.
+* `simulator`: `simulate`: ranges measured in a scene, packets with them, and their times.
+* `device`: a simulated device, which also replies to commands.
+* `faults`: faults on the links.
 """

@@ -1,10 +1,9 @@
-"""A simulated sensor as a device, sans-IO: bytes in, bytes out, in real time or any other.
+"""A simulated sensor as a device, sans-IO: bytes in, bytes out.
 
-It behaves as its spec says and knows no sensor: data frames come at the pace of the sensor's clock,
-commands are answered with the documented replies (`Answering`), start and stop are honoured, other
-frames come at their own rate. A sensor that no command of `on_open` starts sends from power-on.
-
-All times are the caller's, in ns of one monotonic clock.
+It follows the spec and knows no sensor. Time runs as in reality or faster: data frames are sent at
+the pace of the sensor's clock, commands get the documented replies (`Answering`), start and stop
+are obeyed, other frames are sent at their own rate. A sensor that no command of `on_open` starts
+sends from power-on. All times are the caller's, in ns of one monotonic clock.
 """
 
 from __future__ import annotations
@@ -34,25 +33,26 @@ from lidarspec.spec.sensor import with_frames
 from lidarspec.spec.tree import FieldInfo
 
 SECOND = 1_000_000_000
-#: ns of the device's time for which data is made in one go, and the most packets.
+#: Nanoseconds of the device's time for which data is made at once, and the maximum number of
+#: packets.
 AHEAD = SECOND // 4
 MOST = 128
-#: frames of one type that the sensor sends by itself, such as those of an IMU, that are made
-#: together.
+#: Number of frames that are made together, of a type that the sensor sends unasked, such as IMU
+#: data.
 UNASKED_BATCH = 50
-#: fillers that are sent in a pause.
+#: Number of fillers that are sent in a pause.
 FILLERS = 14
-#: ns that a device may be behind; where nobody asked it for longer, its time stood still.
+#: Maximum delay of a device in ns; if it is polled less often, its time stands still.
 BEHIND = SECOND
 
 Packet = tuple[str, bytes]
-#: ns of silence after which half a request is forgotten.
+#: Nanoseconds of silence after which half a request is discarded.
 PATIENCE = 50_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """A command that arrived: its name, and the raw values of the fields of its frame, by path."""
+    """A received command with the raw values of the fields of its frame, by path."""
 
     name: str
     command: Command
@@ -60,8 +60,9 @@ class Request:
 
 
 class Answered(NamedTuple):
-    """A piece of an answer: the name of a frame and its bytes; no name for bytes that are no frame.
-    Or seconds of a pause.
+    """A part of a reply: the name of a frame and its bytes, or a pause in seconds.
+
+    The name is empty for bytes that are no frame.
     """
 
     frame: str = ""
@@ -70,8 +71,10 @@ class Answered(NamedTuple):
 
 
 class Answering:
-    """One sensor's side of the conversation; `shake`: the noise on what an IMU feels, m/s2 and
-    rad/s.
+    """The replies of one sensor.
+
+    Args:
+        shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
     """
 
     def __init__(self, sensor: Sensor, shake: float = 0.0) -> None:
@@ -84,10 +87,10 @@ class Answering:
         self._makers: dict[str, FrameMaker] = {}
         self._unasked: dict[
             str, tuple[int, list[bytes]]
-        ] = {}  # by type: the number of the first frame of a batch, and the batch
+        ] = {}  # frame type: number of the first frame of a batch, and the batch
 
     def requests(self, data: bytes, now: int, link: str) -> list[Request]:
-        """The commands that these bytes complete; what is none is ignored."""
+        """Return the commands that these bytes complete; other bytes are ignored."""
         decoder = self._decoders.get(link)
         if decoder is None:
             return []
@@ -98,7 +101,7 @@ class Answering:
         return [request for request in requests if request is not None]
 
     def answers(self, request: Request) -> list[Answered]:
-        """All that is sent for a command before any data."""
+        """Return everything that is sent for a command before any data."""
         declared = self._sensor.simulation.answers.get(request.name)
         chosen: Iterable[Answer] = request.command.replies[:1]
         if declared is not None:
@@ -109,15 +112,16 @@ class Answering:
         return [self._answer(answer, request) for answer in chosen]
 
     def frame(self, name: str, values: Mapping[str, Any]) -> bytes:
-        """Return a frame of a type other than data: the defaults of the spec, its `sweep`, and
-        these physical values.
+        """Return a frame of a type other than data.
+
+        It has the defaults of the spec, the values of its `sweep`, and these physical values.
         """
         return self._make(name, range(1), values)[0]
 
     def unasked_frame(self, name: str, number: int) -> bytes:
-        """Return the frame of this number of a type that the sensor sends by itself.
+        """Return the frame of this number of a type that the sensor sends unasked.
 
-        A batch takes hardly longer than one frame, so they are made in batches.
+        Frames are made in batches, since a batch takes hardly longer than one frame.
         """
         start = number - number % UNASKED_BATCH
         if self._unasked.get(name, (-1, []))[0] != start:
@@ -147,7 +151,7 @@ class Answering:
         return Answered(name, self.frame(name, {**self._matching_values(name, request), **values}))
 
     def _matching_values(self, name: str, request: Request) -> dict[str, Any]:
-        """The physical values that tie a reply to its request."""
+        """Return the physical values that match a reply to its request."""
         fields = codec(self._sensor.frames[name]).schema.fields
         raw = {
             path: request.values[path] for path in request.command.echoes if path in request.values
@@ -157,7 +161,7 @@ class Answering:
         }
 
     def _request(self, frame: str, data: bytes, link: str) -> Request | None:
-        """The command that a frame is: of several that fit, the one that says most about it."""
+        """Return the command of a frame, the most specific of several that match."""
         values = dict(_flat(parse(self._sensor, data, frame=frame)))
         sent = [
             one
@@ -175,7 +179,7 @@ class Answering:
 
 
 def _listening(sensor: Sensor, link: str) -> Decoder:
-    """A decoder of what is sent to the sensor: the outgoing frames, seen from its side."""
+    """Return a decoder for the frames that are sent to the sensor."""
     frames = {
         name: _as_incoming(frame)
         for name, frame in sensor.frames.items()
@@ -188,14 +192,15 @@ def _listening(sensor: Sensor, link: str) -> Decoder:
 def _as_incoming(frame: Frame) -> Frame:
     """Return an outgoing frame type as the sensor receives it.
 
-    It is kept, because its layout is kept with it.
+    The result is cached, because its layout is cached with it.
     """
     return replace(frame, direction="in")
 
 
 def _physical(info: FieldInfo, value: Any) -> Any:
-    """A parsed value in the unit of its field; bytes as they are, the number of a name, the numbers
-    of an array.
+    """Return a parsed value in the unit of its field.
+
+    Bytes are unchanged, labels become numbers, and arrays are converted element by element.
     """
     if isinstance(value, bytes) or (isinstance(value, list) and info.kind == "bytes"):
         return value
@@ -213,9 +218,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, An
 
 
 class _Due(NamedTuple):
-    """Something to be sent at a time, ns since the device was switched on; what was planned first
-    goes first.
-    """
+    """Data to be sent at a time, in ns since power-on; first planned, first sent."""
 
     at: float
     number: int
@@ -225,10 +228,10 @@ class _Due(NamedTuple):
 
 
 class _Stream:
-    """The data frames of one type, from a time on, ns since the device was switched on.
+    """The data frames of one type from a time on, in ns since power-on.
 
     Attributes:
-        due: when the next one is sent.
+        due: the time of the next frame.
     """
 
     def __init__(
@@ -246,7 +249,7 @@ class _Stream:
         self.due = began
 
     def take(self, upto: float) -> list[tuple[float, bytes]]:
-        """The frames that are due by then, with the times at which they are."""
+        """Return the frames that are due by a time, with their times."""
         taken: list[tuple[float, bytes]] = []
         while self.due <= upto:
             if self._spot == len(self._frames):
@@ -263,7 +266,7 @@ class _Stream:
         return taken
 
     def _more(self) -> None:
-        """The next batch."""
+        """Make the next batch."""
         count = max(min(int(AHEAD / max(self._made.interval, 1)), MOST), 1)
         block = self._made.block(self._next, count, self._scene, self._end / SECOND, self._shake)
         times = (self._end + block.times).tolist()
@@ -275,23 +278,23 @@ class _Stream:
 
 
 class SimulatedDevice:
-    """A sensor that stands in a scene and can be talked to.
+    """A simulated sensor in a scene, which replies to commands.
 
     Args:
-        scene: what it sees; by default a room of the seed's, in which somebody walks.
-        seed: of the scene, the faults and the fillers.
-        rate: how many times faster than in reality; inf: as fast as it is asked.
-        faults: what goes wrong on its links.
+        scene: the surroundings of the sensor; by default a random room with a walking person.
+        seed: seed of the scene, the faults and the fillers.
+        rate: speed relative to real time; inf: as fast as it is read.
+        faults: the faults on its links.
 
     Attributes:
         present: whether it is plugged in.
-        heard: the names of the commands that it was sent.
-        sent: number of frames sent by type, before anything went wrong.
-        lines: by link, what went wrong.
+        heard: the names of the commands that it received.
+        sent: number of sent frames by type, before any faults.
+        lines: link -> its faults.
 
     Raises:
-        UsageError: where the sensor declares no `sweep`.
-        SpecError: where nothing says how fast it sends.
+        UsageError: if the sensor declares no `sweep`.
+        SpecError: if its packet rate is unknown.
     """
 
     def __init__(
@@ -322,8 +325,9 @@ class SimulatedDevice:
         self._simulation(sensor.data_frame)
 
     def _line(self, name: str, seed: int) -> FaultyLink:
-        """The way of a link; one beside the data over which bytes come in order is TCP or HTTP,
-        which bring them all.
+        """Return the faulty line of a link.
+
+        A byte stream other than the data link is TCP or HTTP, which lose nothing.
         """
         stream = not is_datagram(self.sensor.links[name])
         return FaultyLink(
@@ -331,7 +335,7 @@ class SimulatedDevice:
         )
 
     def start(self, now: int) -> None:
-        """Switch it on, or off and on again."""
+        """Switch the device on, or off and on again."""
         self._plan = []
         self._stream = None
         self._powered = now
@@ -348,36 +352,37 @@ class SimulatedDevice:
             self._begin(0.0, self.sensor.data_frame)
 
     def _waits_for_a_command(self) -> bool:
-        """Return whether it sends no data until a command starts it: one that every program sends
-        when it opens the sensor.
+        """Return whether it sends no data until a command of `on_open` starts it.
 
-        A sensor with a start command that `on_open` leaves out sends from power-on: nothing else
-        would start it for a program.
+        A sensor with a start command that `on_open` leaves out sends from power-on: no program
+        would start it otherwise.
         """
         opening = [self.sensor.commands[name] for name in self.sensor.on_open]
         return any(command.starts and command.frame for command in opening)
 
     def unplug(self) -> None:
-        """Pull the plug; `start` puts it in again."""
+        """Pull the plug; `start` plugs it in again."""
         self.present = False
         self._plug = None
 
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
-        """Bytes, or a datagram, that arrive at the device."""
+        """Receive bytes or a datagram."""
         self._switch_plug(now)
         if self.present:
             for request in self._answering.requests(data, now, link):
                 self._obey(request, self._clock(now))
 
     def outgoing(self, now: int) -> list[tuple[str, bytes]]:
-        """What leaves the device by now: for each link its bytes, or its datagrams one by one, in
-        order.
+        """Return the data sent until now, in order, as (link, bytes).
+
+        A byte stream gives one entry for each link, other links one for each datagram.
         """
         return [(link, data) for link, _, data in self.sendings(now)]
 
     def sendings(self, now: int) -> list[tuple[str, str, bytes]]:
-        """What leaves the device by now, with its type: (link, type, bytes) a datagram; of a byte
-        stream all in one, without a type.
+        """Return the data sent until now with its type, as (link, type, bytes).
+
+        A byte stream gives one entry for each link, without a type.
         """
         self._switch_plug(now)
         if not self.present:
@@ -398,9 +403,7 @@ class SimulatedDevice:
 
     @property
     def deadline(self) -> int | None:
-        """When `outgoing` next has something to give, or the plug is pulled or put in; None if
-        nothing will happen by itself.
-        """
+        """The time of the next output or change of the plug, None if there is none."""
         times = [self._plug] if self._plug is not None else []
         if self.present:
             due = [self._plan[0].at] if self._plan else []
@@ -409,8 +412,9 @@ class SimulatedDevice:
         return min(times, default=None)
 
     def _clock(self, now: int) -> float:
-        """The device's own time, ns since it was switched on; one that has no pace goes on whenever
-        it is asked for data.
+        """Return the device's time in ns since power-on.
+
+        With an infinite rate it advances whenever data is requested.
         """
         if math.isinf(self.rate):
             return self._time
@@ -419,7 +423,7 @@ class SimulatedDevice:
         return (now - self._powered) * self.rate
 
     def _due(self, upto: float) -> list[tuple[str, str, bytes]]:
-        """What is due by then, in the order of its times."""
+        """Return the data that is due by a time, in order, as (link, type, bytes)."""
         found: list[tuple[float, str, str, bytes]] = []
         while self._plan and self._plan[0].at <= upto:
             due = heapq.heappop(self._plan)
@@ -435,7 +439,7 @@ class SimulatedDevice:
         return [item[1:] for item in found]
 
     def _again(self, due: _Due) -> None:
-        """Plan the next one of a frame that is sent by itself."""
+        """Plan the next frame of a type that is sent unasked."""
         if due.frame:
             rate = self.sensor.frames[due.frame].simulation.rate
         else:
@@ -450,8 +454,9 @@ class SimulatedDevice:
             )
 
     def _obey(self, request: Request, now: float) -> None:
-        """Answer a command, unless it has to wait until the data stop; where it starts the sensor,
-        data follows the answer.
+        """Reply to a command, unless it has to wait until the data stops.
+
+        If the command starts the sensor, data follows the reply.
         """
         self.heard.append(request.name)
         command = request.command
@@ -489,7 +494,7 @@ class SimulatedDevice:
                 self._begin(at, chosen)
 
     def _settle(self, at: float, seconds: float, link: str) -> float:
-        """The end of a pause, in which fillers are sent."""
+        """Send fillers during a pause, and return the time of its end."""
         for step in range(FILLERS if self.sensor.fillers else 0):
             data = bytes([self._source.choice(self.sensor.fillers)])
             self._put(at + seconds * SECOND * (step + 1) / (FILLERS + 1), link, "", data)
@@ -513,7 +518,7 @@ class SimulatedDevice:
         heapq.heappush(self._plan, _Due(at, self._planned, link, frame, data))
 
     def _switch_plug(self, now: int) -> None:
-        """Pull the plug, or put it in, where it is time."""
+        """Pull the plug or plug it in, if it is time."""
         if self._plug is None or now < self._plug:
             return
         if self.present:

@@ -17,15 +17,15 @@ from typing import Any
 from lidarspec.errors import OutOfRange, UsageError
 from lidarspec.spec.fields import duration, share
 
-#: fraction of datagrams that are delayed if `reorder` is set.
+#: Fraction of datagrams that are delayed if `reorder` is set.
 LATE = 0.1
-#: the value of `rotor` for a rotor that does not turn.
+#: The value of `rotor` for a rotor that does not turn.
 BLOCKED = "blocked"
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong.
+    """The faults of a simulated sensor.
 
     Args:
         errors: fraction of corrupt bytes, 0 to 1. A bit of the byte is flipped; in a byte stream
@@ -90,7 +90,7 @@ def faults_of(options: Mapping[str, str]) -> Faults:
     return Faults(**values)
 
 
-#: the names of what can go wrong.
+#: The names of the faults.
 FAULTS = tuple(field.name for field in fields(Faults))
 
 

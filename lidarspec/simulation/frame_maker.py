@@ -1,9 +1,8 @@
-"""Frames made of physical values by path: everything else is 0, constants and checksums are in
-place.
+"""Make frames from physical values by path; other fields are 0.
 
-This is `build` for many frames at once, and without asking for every field: what a sensor sends is
-declared by the values that matter (a `sweep`, an answer to a command), and counts and options in
-the header decide the layout as they do for a decoder.
+Constants and checksums are filled in. This is `build` for many frames at once that does not require
+every field: the values of a `sweep` or a reply are enough, and counts and options in the header
+decide the layout as in a decoder.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ Values = Mapping[str, Any]
 
 
 class FrameMaker:
-    """Makes frames of one type of a sensor; layouts are kept from one call to the next.
+    """Makes frames of one type of a sensor, and caches their layouts.
 
     Raises:
-        SpecError: where the frame type is not compiled.
+        SpecError: if the frame type is not compiled.
     """
 
     def __init__(self, sensor: Sensor, frame: str) -> None:
@@ -56,9 +55,13 @@ class FrameMaker:
 
     @classmethod
     def _of_parts(cls, sensor: str, root: Node, limit: int, given: Mapping[str, int]) -> FrameMaker:
-        """Makes parts of one kind, in frames whose fields have the values that they ask for."""
+        """Return a maker for parts of one kind.
+
+        Args:
+            given: raw values of the fields of the frame that the parts depend on.
+        """
         maker = cls.__new__(cls)
-        maker._coder = None  # parts have none of their own
+        maker._coder = None  # parts have no wire form of their own
         maker._makes(sensor, root, limit, given, set())
         return maker
 
@@ -86,11 +89,12 @@ class FrameMaker:
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
 
     def table(self, frames: Sequence[Values]) -> Rows:
-        """One frame for each mapping of field paths to physical values; arrays may be given as
-        bytes, too, and parts as such mappings.
+        """Return one frame for each mapping of field paths to physical values.
+
+        Arrays may also be given as bytes, and parts as such mappings.
 
         Raises:
-            SpecError: where a value is given to a field that the frame does not have.
+            SpecError: if a value is given for a field that the frame does not have.
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
         given = [self._with_counts(values) for values in frames] if self._counts else frames
@@ -108,14 +112,14 @@ class FrameMaker:
         return Rows(self.schema, groups)
 
     def frame(self, values: Values) -> bytes:
-        """One frame, sealed."""
+        """Return one frame with its checksum."""
         return self.seal(self.table([values]))[0]
 
     def seal(self, table: Rows) -> list[bytes]:
-        """The frames of a table as they are sent.
+        """Return the frames of a table as they are sent.
 
         Raises:
-            SpecError: where its wire form cannot write a value.
+            SpecError: if the wire form cannot write a value.
         """
         structs = seal_frames(table)
         if self._coder is None:
@@ -133,9 +137,7 @@ class FrameMaker:
         return frames
 
     def _with_counts(self, values: Values) -> Values:
-        """The values of a frame with the counts that follow from arrays and bytes, where these are
-        left out.
-        """
+        """Return the values of a frame with the missing counts of its arrays and bytes."""
         missing = [
             axis for axis, asked in self._counts.items() if axis in values and asked not in values
         ]
@@ -145,8 +147,9 @@ class FrameMaker:
         return given
 
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
-        """The values of a frame with what follows from its parts, and the bytes of these, by their
-        axis.
+        """Return the values of a frame with its parts replaced by their sizes and counts.
+
+        The second result has the bytes of the parts, by axis.
         """
         given = dict(values)
         made = dict[str, bytes]()
@@ -184,9 +187,7 @@ class FrameMaker:
     def _fill_in(
         self, formula: Formula | None, values: dict[str, Any], number: int, axis: str
     ) -> None:
-        """Set the field that a formula depends on, where it is not given, so that the formula gives
-        a number.
-        """
+        """Set the first field of a formula, if it is not given, so that it gives `number`."""
         if formula is None:
             asked = []
         else:
@@ -199,7 +200,7 @@ class FrameMaker:
             values[asked[0]] = self.schema.fields[asked[0]].physical(member(raw, asked[0]))
 
     def _layout(self, values: Values) -> Layout:
-        """The layout that these values of header fields ask for."""
+        """Return the layout for these values of header fields."""
         while True:
             header = {path: self._raw(values, path) for path in self._asked}
             key = tuple(header.values())
@@ -256,7 +257,7 @@ class FrameMaker:
     def _raw(self, values: Values, path: str) -> int:
         info = self.schema.fields.get(path)
         if info is None:
-            return int(values[path])  # the bytes of parts
+            return int(values[path])  # the total size of parts
         base, indices = without_indices(path)
         if base in values:
             return int(info.raw(float(np.asarray(values[base])[tuple(indices.values())])))
@@ -266,7 +267,7 @@ class FrameMaker:
 
 
 def set_nested(values: dict[str, Any], path: str, value: Any) -> None:
-    """Put a value into nested mappings."""
+    """Set a value in nested mappings."""
     *parents, name = path.split(".")
     for parent in parents:
         values = values.setdefault(parent, {})
@@ -274,7 +275,7 @@ def set_nested(values: dict[str, Any], path: str, value: Any) -> None:
 
 
 def seal_frames(table: Rows) -> list[bytes]:
-    """The frames of a table in order, with constants and checksums in place."""
+    """Return the frames of a table in order, with constants and checksums."""
     frames = [b""] * len(table)
     for group in table.groups:
         group.layout.seal(group.rows)

@@ -1,11 +1,10 @@
-"""Scenes for simulated sensors: what a beam in a direction meets, and how far away.
+"""Scenes for simulated sensors: the range of a beam in a direction.
 
-Everything is upright boxes in the sensor's axes: x forward, y left, z up, metres, the sensor at the
-origin. Beams may begin beside
-the origin, and what moves stands elsewhere at another time, so both can be given for each beam. A
-scene is read from a small TOML file:
+A scene consists of upright boxes in the sensor's axes: x forward, y left, z up, in metres, with the
+sensor at the origin. Beams may begin next to the origin, and movers change their position with
+time, so both can be given for each beam. A scene can be read from a TOML file:
 
-    [room]                                  # walls, floor and ceiling; left out: in the open
+    [room]                                  # walls, floor and ceiling; optional
     low = [-3.0, -2.2, -1.2]                # metres, in the sensor's axes: x forward, y left, z up
     high = [4.6, 3.1, 1.6]
 
@@ -16,7 +15,7 @@ scene is read from a small TOML file:
     [[mover]]                               # goes along its path and back again
     size = [0.4, 0.5, 1.7]
     path = [[1.4, -1.5], [0.8, 1.9]]
-    speed = 0.8                             # metres a second
+    speed = 0.8                             # metres per second
     floor = -1.2
 """
 
@@ -36,52 +35,52 @@ from lidarspec.errors import UsageError, did_you_mean
 from lidarspec.trust import document
 
 Floats = NDArray[np.float64]
-#: what broadcasts against the beams: an array, or one number for all.
+#: A value that broadcasts against the beams: an array, or one number for all.
 Value = Any
 Vector = tuple[Value, Value, Value]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 class Scene(Protocol):
-    """Something that can be measured."""
+    """A scene with measurable ranges."""
 
     def measure(
         self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0
     ) -> Floats:
-        """Metres along each beam to what it meets, inf where it meets nothing.
+        """Return the range of each beam in metres, inf if it hits nothing.
 
         Args:
             azimuth, elevation: radians, of shapes that broadcast.
-            origin: where the beams begin, metres; each of the three broadcasts against the beams.
+            origin: start of the beams, metres; each of the three broadcasts against the beams.
             time: seconds since the scene began; broadcasts against the beams.
         """
 
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box by its corners, metres, in the sensor's axes."""
+    """An upright box by its corners, in metres, in the sensor's axes."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
     def at(self, time: Value) -> tuple[Vector, Vector]:
-        """The corners of the box at a time, metres: always the same ones."""
+        """Return the corners of the box in metres, the same at any time."""
         return self.low, self.high
 
     @property
     def radius(self) -> float:
-        """From its middle to a corner."""
+        """The distance from the centre to a corner, in metres."""
         return float(np.linalg.norm(np.subtract(self.high, self.low))) / 2
 
 
 @dataclass(frozen=True)
 class Mover:
-    """A box whose middle goes along a path and back again, for ever.
+    """A box that moves along a path and back again, for ever.
 
     Args:
-        size: of the box, metres.
-        path: (x, y) of the places that it passes in straight lines; at least two.
-        speed: metres a second.
+        size: size of the box, metres.
+        path: (x, y) of the points that its centre passes in straight lines; at least two.
+        speed: metres per second.
         floor: height of its underside.
     """
 
@@ -91,7 +90,10 @@ class Mover:
     floor: float = -1.2
 
     def at(self, time: Value) -> tuple[Vector, Vector]:
-        """The lowest and highest corner at a time, metres; x and y of the shape of `time`."""
+        """Return the lowest and highest corner at a time, in metres.
+
+        x and y have the shape of `time`.
+        """
         places = np.array(self.path, np.float64)
         along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
         whole = along[-1]
@@ -107,18 +109,19 @@ class Mover:
 
     @property
     def radius(self) -> float:
-        """From its middle to a corner."""
+        """The distance from the centre to a corner, in metres."""
         return float(np.linalg.norm(self.size)) / 2
 
 
 @dataclass(frozen=True)
 class Room:
-    """Walls, floor and ceiling around the sensor, and boxes in it; no symmetry, so that a mirrored
-    picture shows.
+    """Walls, floor and ceiling around the sensor, with boxes in it.
+
+    The default room has no symmetry, so that a mirrored point cloud can be recognised.
 
     Args:
-        walls: None in the open, where only the boxes are met.
-        boxes, movers: what stands, and what moves.
+        walls: the walls; None outdoors, with nothing but the boxes.
+        boxes, movers: fixed and moving boxes.
     """
 
     walls: Box | None = Box((-3.0, -2.2, -1.2), (4.6, 3.1, 1.6))
@@ -131,11 +134,11 @@ class Room:
     def measure(
         self, azimuth: Floats, elevation: Floats, origin: Vector = ORIGIN, time: Value = 0.0
     ) -> Floats:
-        """Metres along each beam to what it meets, inf where it meets nothing.
+        """Return the range of each beam in metres, inf if it hits nothing.
 
         Args:
             azimuth, elevation: radians, of shapes that broadcast.
-            origin: where the beams begin, metres; each of the three broadcasts against the beams.
+            origin: start of the beams, metres; each of the three broadcasts against the beams.
             time: seconds since the scene began; broadcasts against the beams.
         """
         level = np.cos(elevation)
@@ -159,7 +162,7 @@ class Room:
 
 
 def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value) -> None:
-    """Shorten the beams, in place, that meet a body from outside."""
+    """Shorten, in place, the beams that hit a body from outside."""
     low, high = body.at(time)
     near = _near(body, low, high, beams, origin)
     where = np.flatnonzero(np.broadcast_to(near, found.shape))
@@ -184,7 +187,7 @@ def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time:
 
 
 def _near(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: Vector) -> Any:
-    """Which beams pass within the sphere around a body: the others need no closer look."""
+    """Return which beams pass the sphere around a body; others cannot hit it."""
     middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
     aside = np.sqrt(sum(np.max(np.square(part)) for part in origin))
     squared = sum(np.square(part) for part in middle) - (body.radius + aside) ** 2
@@ -195,7 +198,7 @@ def _near(body: Box | Mover, low: Vector, high: Vector, beams: Vector, origin: V
 def make_room(seed: int = 0) -> Room:
     """Return a room with boxes and a walking person.
 
-    Each seed gives another room, the same one every time.
+    Each seed gives a different room, the same one every time.
     """
     walker = Mover((0.4, 0.5, 1.7), ((1.4, -1.5), (0.8, 1.9), (-1.8, 1.2)))
     if seed == 0:
@@ -216,23 +219,23 @@ def make_room(seed: int = 0) -> Room:
 
 
 def read_scene(path: str | Path) -> Room:
-    """The scene of a TOML file.
+    """Return the scene of a TOML file.
 
     Raises:
-        SourceError: where it cannot be read.
-        UsageError: where it is no TOML, or says something that is no scene: the key is named.
+        SourceError: if it cannot be read.
+        UsageError: if it is invalid; the message names the key.
     """
     return scene_of(document(Path(path)), str(path))
 
 
 def scene_of(table: Mapping[str, Any], place: str = "scene") -> Room:
-    """The scene that a table describes; see the module's text.
+    """Return the scene that a table describes; see the module's text.
 
     Args:
-        place: what errors begin with.
+        place: the beginning of error messages.
 
     Raises:
-        UsageError: for what is no scene.
+        UsageError: for an invalid scene.
     """
     _known(table, ("room", "box", "mover"), place)
     walls = None

@@ -1,21 +1,20 @@
-"""Frames that a sensor would send from a scene, made from its own spec, and when it would send
-them.
+"""Make the frames that a sensor would send from a scene, and their times.
 
-The sensor's `sweep` says what is not measured (angles, counters, time). The packets are filled with
-that, `points` says where the beams go, the scene says how far, and the ranges go back through the
-scale of the fields that they come from (`Measurement`): no inverse of `points` is written anywhere,
-but by giving each field in metres a probing value it is found out which points answer to it. Where
-direction depends on range the measurement is repeated; a beam that finds no fixed point is a
-no-return. A frame type with an `encode` of its own is given the measured points and returns the
-values of its fields.
+The sensor's `sweep` gives the values that are not measured (angles, counters, time). The packets
+are filled with them, `points` gives the directions of the beams, the scene their ranges, and the
+ranges are written through the scale of the fields that they come from (`Measurement`). This needs
+no inverse of `points`: each field in metres is set to a probe value to find the points that depend
+on it. If directions depend on ranges, the measurement is repeated; a beam without a fixed point has
+no return. A frame type with an `encode` of its own gets the measured points and returns the values
+of its fields.
 
-When each packet is sent follows from what the spec says of time, in this order: the rate that is
-declared; the sensor's clock, which its `sweep` sets; the times of the points, which say how long
-one takes; the speed of its serial line, which no sensor outruns.
+The time of each packet comes from the spec, in this order: the declared rate; the sensor's clock,
+which its `sweep` sets; the times of the points, which give the time per point; the speed of the
+serial line, which limits every sensor.
 
-Where points are given by coordinates, nothing says where a beam would go: the spec declares the
-directions, and the raw values that the coordinates are linear in are solved for the place that is
-met (`Placement`).
+Cartesian points do not give the directions of beams: the spec declares them, and the equations of
+the coordinates, which are linear in the raw values, are solved for the point that a beam hits
+(`Placement`).
 """
 
 from __future__ import annotations
@@ -46,28 +45,27 @@ from lidarspec.spec.timing import Every
 from lidarspec.spec.tree import FieldInfo, exact
 
 Times = NDArray[np.int64]
-#: bits on a serial line for each byte: start, eight, stop.
+#: Bits on a serial line for each byte: start, eight, stop.
 BITS = 10
-#: ns; a clock that strays less from even steps is taken for a coarse one, and the steps for even.
+#: Nanoseconds; a clock that deviates less from even steps counts as coarse, and the steps as even.
 COARSE = 1_000_000
-#: packets simulated beyond those asked for, since directions may depend on the next packet.
+#: Number of extra packets to simulate, since directions may depend on the next packet.
 AHEAD = 1
-#: packets on which it is found out how a sensor carries its ranges, and how fast it is.
+#: Number of packets that show which fields hold the ranges, and the packet rate.
 PROBED = 256
-#: The same in bytes: of long frames fewer are probed, at least so many.
+#: Maximum bytes of these packets, and their minimum number.
 PROBED_BYTES = 1 << 21
 LEAST_PROBED = 4
 Floats = NDArray[np.float64]
-#: how often ranges are measured again while directions still move.
+#: Maximum number of measurements while directions still change.
 ROUNDS = 8
-#: the parts of points that beams are made of.
+#: The attributes of points that define beams.
 _MEASURED = ("range", "azimuth", "elevation", "ox", "oy", "oz", "x", "y", "z", "time")
-#: raw value that a range field is given to see which points answer to it.
+#: The raw value that is set to find the points that depend on a field.
 PROBE = 100
-#: by how much of itself a range may be off the field that it is read from, for the arithmetic
-#: alone.
+#: Relative tolerance between a range and its field, for rounding errors.
 EXACT = 1e-9
-#: m/s2, standard gravity.
+#: Standard gravity, m/s2.
 GRAVITY = 9.80665
 
 
@@ -76,10 +74,10 @@ class Target:
     """A field that ranges come from.
 
     Attributes:
-        path: of the field.
+        path: path of the field.
         inner: index of the innermost axes of the points that belongs to it.
-        step, zero: metres of one raw step and of raw 0; no step where packets have their own, such
-            as the header's or a calibration's.
+        step, zero: metres per raw step, and of raw 0; `step` is None if packets have their own,
+            such as the header's or a calibration's.
     """
 
     path: str
@@ -90,13 +88,13 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """Where the beams of a table go: arrays that broadcast, the first axis for the packets.
+    """The beams of a table: arrays that broadcast, with the packets on the first axis.
 
     Attributes:
-        range, azimuth, elevation, time, origin: as in `Polar`, directions that nobody knows nan.
-        counts: (n,) points of each packet.
-        intensity: path of the field that it comes from, "" where it is none.
-        places: x, y and z of points that are given by coordinates, (3, n, ...).
+        range, azimuth, elevation, time, origin: as in `Polar`; unknown directions are nan.
+        counts: (n,) number of points of each packet.
+        intensity: path of the field that it comes from, "" if there is none.
+        places: x, y and z of Cartesian points, (3, n, ...).
     """
 
     range: Floats
@@ -109,21 +107,21 @@ class Beams:
     places: Floats | None = None
 
     def unit(self) -> Floats:
-        """x, y and z of where the beams go, one metre on: (3, n, ...)."""
+        """Return x, y and z of the unit vectors of the beams, (3, n, ...)."""
         return np.stack(
             np.broadcast_arrays(*coordinates(np.ones(()), self.azimuth, self.elevation, (0, 0, 0)))
         )
 
 
 class Measurement:
-    """How one frame type of a sensor carries its ranges; found out once, on a table of its frames.
+    """Writes ranges into one frame type of a sensor; analysed once, on a table.
 
     Raises:
-        SpecError: where ranges cannot be traced back to fields and there is no `encode`.
+        SpecError: if ranges cannot be traced back to fields and there is no `encode`.
 
     Args:
-        given: paths of the fields that the sensor's `sweep` gives, which are left as they are where
-            they are not ranges.
+        given: paths of the fields that the sensor's `sweep` gives; they are not changed unless they
+            are ranges.
     """
 
     def __init__(self, sensor: Sensor, frame: str, table: Rows, given: Container[str] = ()) -> None:
@@ -143,7 +141,7 @@ class Measurement:
     def of(cls, sensor: Sensor, frame: str, table: Rows, given: Container[str]) -> Measurement:
         """Return the measurement of a frame's points.
 
-        It is a `Placement` if the points are given by coordinates, else by direction.
+        It is a `Placement` for Cartesian points, else a `Measurement`.
         """
         return (
             Placement if _result(sensor, frame, table)[0].__class__ is Cartesian else Measurement
@@ -153,7 +151,7 @@ class Measurement:
         """Measure a table's ranges in the scene, and write them.
 
         Args:
-            numbers: of the packets; of parts, those of the packets that they are in.
+            numbers: numbers of the packets; for parts, of the packets that contain them.
             times: (n,) seconds since the scene began, of each packet.
         """
         steps = [self._step(table, target) for target in self._targets]
@@ -179,11 +177,11 @@ class Measurement:
             self._shine(table, known[self._targets[0].path])
 
     def _shine(self, table: Rows, ranges: NDArray[Any]) -> None:
-        """Write intensities, some number for each range."""
+        """Write an intensity for each range."""
         store(table, self._intensity, np.where(ranges > 0, 40 + np.rint(ranges) % 160, 0))
 
     def beams(self, table: Rows) -> Beams:
-        """Where the beams of a table go as it stands."""
+        """Return the beams of a table."""
         result, batch = _result(self._sensor, self._frame, table)
         with (
             np.errstate(all="ignore"),
@@ -217,8 +215,9 @@ class Measurement:
         )
 
     def _measure(self, beams: Beams, scene: Scene, times: Floats) -> Floats:
-        """Metres along each beam; 0 where the sensor does not reach, or nobody knows where the beam
-        goes.
+        """Return the range of each beam in metres.
+
+        It is 0 outside the sensor's range limits, and for unknown directions.
         """
         known = np.isfinite(beams.azimuth) & np.isfinite(beams.elevation)
         at = times.reshape(-1, *(1,) * (beams.range.ndim - 1)) + beams.time
@@ -234,7 +233,7 @@ class Measurement:
     def _values(
         self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]
     ) -> dict[str, NDArray[Any]]:
-        """The raw values of the fields that carry these ranges."""
+        """Return the raw values of the fields for these ranges."""
         if self._encode is not None:
             polar = Polar(
                 ranges,
@@ -255,7 +254,7 @@ class Measurement:
         return found
 
     def _most(self, table: Rows, path: str) -> float:
-        """The largest raw value that a field holds, and that the frame's wire form can write."""
+        """Return the largest raw value that a field and the wire form can hold."""
         most = table.schema.fields[path].limits[1]
         form = self._sensor.frames[self._frame].wire
         leaves = [
@@ -266,7 +265,7 @@ class Measurement:
         return min(most, *(form.largest(leaf.size) for leaf in leaves))
 
     def _trace_targets(self, table: Rows) -> tuple[Target, ...]:
-        """The fields in metres that the ranges of the points answer to."""
+        """Return the fields in metres that the ranges of the points depend on."""
         found: list[Target] = []
         for path, info in table.schema.fields.items():
             if factor(info.unit, "m") is None or not any(
@@ -294,9 +293,11 @@ class Measurement:
         return tuple(found)
 
     def _linear(self, table: Rows) -> list[Target]:
-        """The fields that ranges are linear in, not by their own scale: those in metres, shifted or
-        stretched by a correction; and the elements of arrays without a unit to which ranges are in
-        proportion, since the header has the unit."""
+        """Return the fields that ranges are linear in with another scale than their own.
+
+        These are fields in metres that a correction shifts or stretches, and elements of arrays
+        without a unit that are proportional to ranges, since the header has the unit.
+        """
         found = []
         for path, info in table.schema.fields.items():
             metres = factor(info.unit, "m") is not None
@@ -313,7 +314,7 @@ class Measurement:
         return found
 
     def _probe(self, table: Rows, paths: Iterable[str], *probes: int) -> list[Beams]:
-        """The beams while some fields have one value and another; the table is left as it was."""
+        """Return the beams for each of some values of fields, then restore the table."""
         before = {path: table.raw(path) for path in paths}
         beams = []
         for probe in probes:
@@ -325,7 +326,7 @@ class Measurement:
         return beams
 
     def _step(self, table: Rows, target: Target) -> tuple[Any, Any]:
-        """Metres of one raw step and of raw 0, numbers or for each point."""
+        """Return metres per raw step, and of raw 0: numbers, or arrays over points."""
         if target.step is not None:
             return target.step, target.zero
         once, twice = (
@@ -335,14 +336,14 @@ class Measurement:
         return (twice - once) / PROBE, 2 * once - twice
 
     def _inner(self, table: Rows, answer: Floats) -> list[tuple[int, ...]]:
-        """The indices of the axes of the points that are further in than those of the fields."""
+        """Return the indices of the axes that points have in addition to the fields."""
         extra = answer.ndim - 1 - table.schema.depth()
         if extra > 0:
             return list(np.ndindex(*answer.shape[answer.ndim - extra :]))
         return [()]
 
     def _turning(self, table: Rows) -> bool:
-        """Whether directions depend on ranges."""
+        """Return whether directions depend on ranges."""
         first, second = self._probe(
             table, [target.path for target in self._targets], PROBE, 2 * PROBE
         )
@@ -354,11 +355,10 @@ class Measurement:
 
 
 class Placement(Measurement):
-    """How one frame type of a sensor carries coordinates: its fields are solved for the place that
-    a beam in a declared direction meets.
+    """Writes Cartesian points: solves for raw values of the point that a beam hits.
 
     Raises:
-        SpecError: where no directions are declared, or no field makes a coordinate of a point.
+        SpecError: if no directions are declared, or no field gives a coordinate of a point.
     """
 
     def fill(self, table: Rows, numbers: Sequence[int], scene: Scene, times: Floats) -> None:
@@ -372,8 +372,9 @@ class Placement(Measurement):
             self._shine(table, _part(ranges, self._targets[0].inner) * 1000)
 
     def _directions(self, numbers: Sequence[int], shape: tuple[int, ...]) -> tuple[Floats, Floats]:
-        """The declared azimuths and elevations of packets, (n, *shape) each; nan beyond those of a
-        packet that has fewer points.
+        """Return the declared azimuths and elevations of packets, (n, *shape) each.
+
+        They are nan for missing points of shorter packets.
         """
         declared = self._sensor.simulation_of(self._frame).directions
         if declared is None:
@@ -433,8 +434,9 @@ class Placement(Measurement):
         return found
 
     def _move(self, table: Rows, paths: Sequence[str]) -> list[Floats]:
-        """The coordinates while all of these fields are 0, and with each of them at its probing
-        value; (3, n, ...) each.
+        """Return coordinates with all fields at 0, then with each at its probe value.
+
+        Each array has the shape (3, n, ...).
         """
         before = {path: table.raw(path) for path in paths}
         for path in paths:
@@ -445,7 +447,7 @@ class Placement(Measurement):
         return [each.places for each in beams if each.places is not None]
 
     def _trace_targets(self, table: Rows) -> tuple[Target, ...]:
-        """The fields of points, in metres or without a unit, that coordinates are linear in."""
+        """Return the fields, in metres or without a unit, that coordinates are linear in."""
         found = []
         for path, info in table.schema.fields.items():
             metres = not info.unit or factor(info.unit, "m") is not None
@@ -475,8 +477,11 @@ class Placement(Measurement):
 
 
 def _solve(slopes: Floats, aims: Floats) -> Floats:
-    """What fields have to be, (k, n, ...), that move values by `slopes`, (k, m, n, ...), for these
-    to be at `aims`, (m, n, ...).
+    """Solve linear equations for raw values, (k, n, ...).
+
+    Args:
+        slopes: changes of the values per raw step, (k, m, n, ...).
+        aims: the values to reach, (m, n, ...).
     """
     matrices = np.moveaxis(slopes, (0, 1), (-1, -2))
     wanted = np.moveaxis(aims, 0, -1)
@@ -486,14 +491,14 @@ def _solve(slopes: Floats, aims: Floats) -> Floats:
 
 
 def _name(frame: str, table: Rows) -> str:
-    """What a table is of: a frame type, or parts of it."""
+    """Return the name of a table's frame type or parts."""
     if isinstance(table, PartRows):
         return ".".join(filter(None, (frame, *table.place)))
     return frame
 
 
 def _result(sensor: Sensor, frame: str, table: Rows) -> tuple[Points, Batch]:
-    """What the sensor's `points` says of a table of its frames, which nothing goes before."""
+    """Return the result of `points` for a table of frames without predecessors."""
     batch = _batch(sensor, table)
     points = sensor.points_of(_name(frame, table))
     with np.errstate(all="ignore"), plugin_errors(f"points of {frame}", sensor.id, points):
@@ -509,7 +514,7 @@ def _result(sensor: Sensor, frame: str, table: Rows) -> tuple[Points, Batch]:
 
 
 def _batch(sensor: Sensor, table: Rows) -> Batch:
-    """A table of frames, or of parts of them, which nothing goes before."""
+    """Return a batch of frames, or of parts of them, without predecessors."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
     if isinstance(table, PartRows):
@@ -518,18 +523,18 @@ def _batch(sensor: Sensor, table: Rows) -> Batch:
 
 
 def whole(info: FieldInfo, raw: Floats) -> Floats:
-    """Raw values as a field can hold them."""
+    """Return raw values as a field can hold them."""
     if info.kind == "int":
         return np.rint(raw)
     return raw
 
 
 class PartRows(Rows):
-    """The parts that have the points of frames, with these frames, and the one that each is in.
+    """The parts of frames that have the points, with their frames.
 
     Args:
-        frames: which are written to by `put_back`.
-        path: of the parts.
+        frames: the frames; `put_back` writes to them.
+        path: path of the parts.
     """
 
     def __init__(self, frames: Rows, path: str) -> None:
@@ -545,7 +550,7 @@ class PartRows(Rows):
         )
 
     def put_back(self) -> None:
-        """Write the parts into their frames, sealed."""
+        """Write the parts, with their checksums, into their frames."""
         left = iter(seal_frames(self))
         axis, kind = self.place
         spots = list[tuple[int, int, NDArray[np.uint8]]]()
@@ -564,7 +569,7 @@ class PartRows(Rows):
 
 
 def store(table: Rows, path: str, values: NDArray[Any]) -> None:
-    """Write raw values, (n, ...) or one for all, into every frame that has the field."""
+    """Write raw values, (n, ...) or a single one, into every frame that has the field."""
     for group in table.groups:
         leaf = group.layout.leaves.get(path)
         if leaf is None:
@@ -587,7 +592,7 @@ def _as_deep(array: Floats, depth: int) -> Floats:
 
 
 def _counts(shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch) -> NDArray[np.intp]:
-    """How many points each packet has."""
+    """Return the number of points of each packet, (n,)."""
     counts = np.ones(len(batch), np.intp)
     for length, name in zip(shape[1:], axes, strict=True):
         counts = counts * (
@@ -597,14 +602,13 @@ def _counts(shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch) 
 
 
 class Rest:
-    """What an IMU feels in a sensor that stands level and still, written into the fields that the
-    `imu` of a frame type answers to.
+    """Writes the readings of an IMU at rest into the fields that `imu` depends on.
 
     Args:
         given: paths of the fields that the frame's `sweep` gives.
 
     Raises:
-        SpecError: where no field makes what the IMU feels.
+        SpecError: if no field holds a reading.
     """
 
     def __init__(self, sensor: Sensor, frame: str, given: Container[str]) -> None:
@@ -615,11 +619,11 @@ class Rest:
         self._targets: list[str] | None = None
 
     def fill(self, frames: Rows, shake: float, seed: Sequence[int]) -> None:
-        """Write it into frames.
+        """Write the readings into frames.
 
         Args:
-            shake: standard deviation of the noise on it, m/s2 and rad/s; 0 for none.
-            seed: of the noise.
+            shake: standard deviation of their noise, m/s2 and rad/s; 0 for none.
+            seed: seed of the noise.
         """
         table = PartRows(frames, self._path) if self._path else frames
         if not len(table):
@@ -651,7 +655,7 @@ class Rest:
             table.put_back()
 
     def _answering(self, table: Rows) -> list[str]:
-        """The fields that what is felt is linear in."""
+        """Return the fields that the readings are linear in."""
         zero = self._read_motion(table)
         found = list[str]()
         for path, info in table.schema.fields.items():
@@ -675,14 +679,14 @@ class Rest:
         return found
 
     def _probe(self, table: Rows, path: str) -> Floats:
-        """What is felt while one of the fields has its probing value, and the others are 0."""
+        """Return the readings with one field at its probe value, and the others at 0."""
         store(table, path, np.array(PROBE))
         felt = self._read_motion(table)
         store(table, path, np.array(0))
         return felt
 
     def _read_motion(self, table: Rows) -> Floats:
-        """Angular velocities, then accelerations: (6, n, ...)."""
+        """Return angular velocities, then accelerations, (6, n, ...)."""
         batch = _batch(self._sensor, table)
         function = self._sensor.imu_of(_name(self._frame, table))
         with (
@@ -706,10 +710,10 @@ class Pace:
     """The times of a sensor's packets, batch by batch.
 
     Args:
-        beams: those of the first packets, `table`.
+        beams: the beams of `table`, the first packets.
 
     Attributes:
-        interval: ns from one packet to the next, on average; 0 where the spec says nothing of time.
+        interval: mean ns from one packet to the next; 0 if the spec has no times.
     """
 
     def __init__(self, sensor: Sensor, frame: str, table: Rows, beams: Beams) -> None:
@@ -723,8 +727,10 @@ class Pace:
         self.interval = float(times[-1]) / (len(times) - 1)
 
     def times(self, table: Rows, beams: Callable[[], Beams]) -> Times:
-        """(n,) ns of each packet of a batch after its first; `beams` gives those of the batch where
-        they are needed.
+        """Return the times of the packets of a batch after its first, (n,) ns.
+
+        Args:
+            beams: returns the beams of the batch, if they are needed.
         """
         if self._rate:
             return np.asarray(np.rint(np.arange(len(table)) * 1e9 / self._rate), np.int64)
@@ -753,7 +759,7 @@ class Pace:
 
 
 def _seconds_per_point(beams: Beams) -> float:
-    """From one point of a packet to the next, 0 where the points bear one time."""
+    """Return the median time between points of a packet; 0 if all have the same time."""
     times = np.broadcast_to(beams.time, beams.range.shape).reshape(len(beams.range), -1)
     steps: NDArray[Any] = np.diff(times, axis=1)
     if (steps > 0).any():
@@ -770,8 +776,9 @@ def _sizes(table: Rows) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class PacketBlock:
-    """Packets in a row: their bytes, and (n + 1,) int64 ns from the first one to each, and to the
-    one after them.
+    """Consecutive packets: their bytes and times.
+
+    The times are (n + 1,) int64 ns since the first packet, of each and of the one after them.
     """
 
     frames: list[bytes]
@@ -782,15 +789,15 @@ class FrameSimulation:
     """A data frame type of a sensor, ready to be simulated.
 
     Args:
-        blocked: whether the rotor stands still: angles, and what else a scan is cut by, stay as in
-            the second frame.
+        blocked: whether the rotor stands still: angles and the field that separates scans stay as
+            in the second frame.
 
     Attributes:
-        interval: ns from one packet to the next, on average; 0 where the spec says nothing of time.
+        interval: mean ns from one packet to the next; 0 if the spec has no times.
 
     Raises:
-        UsageError: where the sensor declares no `sweep`.
-        SpecError: where its ranges cannot be traced back to fields.
+        UsageError: if the sensor declares no `sweep`.
+        SpecError: if its ranges cannot be traced back to fields.
     """
 
     def __init__(self, sensor: Sensor, frame: str, *, blocked: bool = False) -> None:
@@ -826,11 +833,11 @@ class FrameSimulation:
     def block(
         self, start: int, count: int, scene: Scene, since: float = 0.0, shake: float = 0.0
     ) -> PacketBlock:
-        """The packets from number `start` on.
+        """Return the packets from number `start` on.
 
         Args:
             since: seconds since the scene began at the first of them.
-            shake: standard deviation of the noise on what an IMU feels, m/s2 and rad/s.
+            shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
         """
         numbers = range(start, start + count + AHEAD)
         table = self._maker.table(self._swept(numbers))
@@ -852,13 +859,13 @@ class FrameSimulation:
         return PacketBlock(self._maker.seal(table)[:count], times[: count + 1])
 
     def _with_points(self, table: Rows) -> Rows:
-        """What points are made of: frames, or the parts in them."""
+        """Return the rows that have points: frames, or the parts in them."""
         if self._parts:
             return PartRows(table, self._parts)
         return table
 
     def _beams(self, table: Rows) -> Beams:
-        """The beams of frames, those of their parts together."""
+        """Return the beams of frames, with those of their parts joined."""
         measured = self._with_points(table)
         beams = self._measurement.beams(measured)
         if not isinstance(measured, PartRows):
@@ -867,12 +874,12 @@ class FrameSimulation:
         return replace(beams, counts=counts.astype(np.intp))
 
     def _swept(self, numbers: range) -> list[Mapping[str, Any]]:
-        """The values of the packets of these numbers, before anything is measured."""
+        """Return the values of packets before anything is measured."""
         with plugin_errors(f"sweep of {self._frame}", self._sensor.id, self._sweep):
             return [{**self._sweep(number), **self._stuck} for number in numbers]
 
     def _turning(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Those of a frame's values that change because the rotor turns."""
+        """Return the values of a frame that change because the rotor turns."""
         fields = codec(self._sensor.frames[self._frame]).schema.fields
         rule = self._sensor.scan
         cut_by = "" if isinstance(rule, Every) else rule.name
@@ -885,34 +892,30 @@ class FrameSimulation:
 
 @functools.lru_cache(maxsize=64)
 def simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> FrameSimulation:
-    """The simulation of a data frame type; kept, since it takes a while to find out how a sensor
-    carries its ranges.
-    """
+    """Return the simulation of a data frame type; cached, as its analysis is slow."""
     return FrameSimulation(sensor, frame, blocked=blocked)
 
 
 def simulate(
     sensor: Sensor, packets: int = 100, *, start: int = 0, scene: Scene | None = None
 ) -> list[bytes]:
-    """The data frames that a sensor standing in a scene sends, one after another.
+    """Return the data frames that a sensor in a scene sends, in order.
 
     Args:
-        packets: how many.
+        packets: number of frames.
         start: the number of the first one since the sensor was switched on.
-        scene: what it sees, such as `read_scene` reads from a file; a room where left out.
+        scene: the surroundings, such as `read_scene` reads from a file; by default a room.
 
     Raises:
-        UsageError: where the sensor declares no `sweep`.
-        SpecError: where its ranges cannot be traced back to fields.
+        UsageError: if the sensor declares no `sweep`.
+        SpecError: if its ranges cannot be traced back to fields.
     """
     made = simulation(sensor, sensor.data_frame)
     return made.block(start, packets, scene or Room(), start * made.interval / 1e9).frames
 
 
 def opening(sensor: Sensor) -> bytes:
-    """What the sensor sends before its data frames: the frame that they come after; empty where
-    they need none.
-    """
+    """Return the frame that has to precede the data frames, empty if there is none."""
     after = sensor.frames[sensor.data_frame].after
     if after is None:
         return b""
