@@ -1,15 +1,14 @@
-"""Frames for people: what every byte says, what is wrong with it, what differs from another frame.
+"""Explain frames: the meaning of every byte, faults, and differences.
 
-In: the bytes of a frame, whole or damaged, or of a stream, and a sensor. Out: an `Explanation` of
-each frame, and its lines; of a file what is in it.
-Modules in reading order:
+In: a sensor, and the bytes of a frame, valid or damaged, or of a stream. Out: an `Explanation` of
+each frame, and its lines; or the contents of a file. Modules in reading order:
 
 * `explanation`: `explain`: from bytes to rows, verdict and points.
 * `frame_rows`: one frame as rows of values.
-* `damage`: the flipped bit, the lost or inserted byte that explains a damage.
-* `pieces`: a stream in pieces: frames, and what was one before it was damaged.
-* `wording`: the words for values, bits, rows, points and differences.
-* `contents`: what is in a file.
-* `assignments`: the other way round, from what people write to values.
+* `damage`: the flipped bit, or the lost or inserted byte, that explains damage.
+* `pieces`: a stream in pieces: valid frames, damaged frames, and other bytes.
+* `wording`: the texts for values, bits, rows, points and differences.
+* `contents`: the contents of a file.
+* `assignments`: text from users as raw values.
 * `listing`: rows and differences as lines, with roles for colours.
 """

@@ -1,8 +1,7 @@
-"""What people write, as the values of the wire: field=value of a frame, and the arguments of a
-command.
+"""Parse field=value of a frame, and the arguments of a command, as raw values.
 
-A bare number is the wire's integer of a field, and in the unit of its field as an argument; a
-number with a unit is turned into that one.
+A bare number is the raw integer of a field, but an argument in the unit of its field; a number with
+a unit is converted.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ _PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")
 
 
 def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, Any]:
-    """Raw values, nested as in the struct.
+    """Return the raw values, nested as in the struct.
 
     Raises:
-        UsageError: for an assignment that is none, an unknown field, or a value that its field
-            cannot take.
+        UsageError: for an invalid assignment, an unknown field, or a value that its field cannot
+            hold.
     """
     parsed = [_assignment(table, text, place) for text in assignments]
     found: dict[str, Any] = {}
@@ -62,8 +61,9 @@ def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
 
 
 def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
-    """The raw value that a text stands for: hexadecimal for bytes, a label, a number, or a number
-    with a unit.
+    """Return the raw value of a text.
+
+    It is hexadecimal for bytes, a label, a number, or a number with a unit.
     """
     if info.kind == "bytes":
         return _octets(text, f"{place}: {path}")
@@ -91,7 +91,7 @@ def _octets(text: str, place: str) -> bytes:
 
 
 def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, str]:
-    """A number, turned into a unit where it has one of its own, and this one."""
+    """Return a number, converted to `unit` if it has a unit, and its own unit."""
     digits, given = split_unit(text)
     if given:
         per_unit = factor(given, unit)
@@ -112,7 +112,7 @@ def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, st
 
 
 def _nearest(info: FieldInfo, number: Fraction, path: str, place: str) -> int | float:
-    """The raw value nearest to a physical one."""
+    """Return the raw value nearest to a physical one."""
     raw: int | float = info.raw(number)
     if info.kind != "int":
         return float(raw)
@@ -124,8 +124,9 @@ def _nearest(info: FieldInfo, number: Fraction, path: str, place: str) -> int | 
 
 
 def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
-    """The length of an array: declared, or from the count fields given; 0 where it follows from
-    single elements given.
+    """Return the length of an array: declared, or from the given count fields.
+
+    Returns 0 if it follows from single elements that are given.
     """
     declared = table.arrays.get(path)
     if isinstance(declared, int):
@@ -148,11 +149,13 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
 
 
 def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, Any]:
-    """The arguments of a command: numbers in the units of their fields, texts and addresses as they
-    are, bytes from hexadecimal digits.
+    """Return the arguments of a command.
+
+    Numbers are in the units of their fields, texts and addresses are unchanged, bytes come from
+    hexadecimal digits.
 
     Raises:
-        UsageError: for an unknown command or argument, or a text that stands for no value of it.
+        UsageError: for an unknown command or argument, or an invalid value.
     """
     if name not in sensor.commands:
         hint = "" if sensor.commands else "; it takes no commands"

@@ -1,8 +1,7 @@
-"""What is in a file: its kind, who sent what to where, whose frames these are, from when to when,
-and how much of them is lost.
+"""Describe the contents of a file: kind, senders, sensors, times, and losses.
 
-A long file is looked at from its beginning for as long as anybody waits; what is counted then is of
-that part, and says so. Where times can be found in it without reading it, the last one is.
+Only the beginning of a long file is read; then all counts refer to that part. The last time is
+determined if that is possible without reading the whole file.
 """
 
 from __future__ import annotations
@@ -39,14 +38,14 @@ from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
 from lidarspec.view.feed import Feed
 from lidarspec.view.meter import MeterReading
 
-#: bytes, and packets, that are looked at from the beginning of a file, and bytes of a sensor that
-#: are decoded.
+#: Maximum number of bytes and of packets to read from the beginning of a file, and of bytes of a
+#: sensor to decode.
 LOOKED_AT = 1 << 26
 PACKETS = 1 << 18
 DECODED = 1 << 24
-#: senders that are listed.
+#: Maximum number of senders to list.
 FLOWS = 6
-#: later than any arrival, ns since 1970.
+#: Later than any arrival, ns since 1970.
 _END = (1 << 63) - 1
 KINDS: Mapping[type[Transport], str] = {
     RecordingTransport: "a recording",
@@ -59,10 +58,10 @@ KINDS: Mapping[type[Transport], str] = {
 
 @dataclass
 class Flow:
-    """What one sender sent to one place; None where nobody knows the address.
+    """The packets from one sender to one receiver; an unknown address is None.
 
     Attributes:
-        packets, bytes: how much of it was seen.
+        packets, bytes: number of them in the part that was read.
     """
 
     sender: Sender | None
@@ -73,15 +72,15 @@ class Flow:
 
 @dataclass(frozen=True)
 class Content:
-    """What one sensor sent.
+    """The data of one sensor in a file.
 
     Attributes:
-        source: how it is read.
-        sensors: those that it may be, by id; where it is one alone, that one.
-        share: of the bytes that are in its frames, from 0 to 1; None where the file itself names
-            the sensor.
-        options: what to type for it, "" where the file says it.
-        reading: how it was doing in the part that was decoded.
+        source: the source that opens it.
+        sensors: ids of the matching sensors.
+        share: share of the bytes that are in its frames, from 0 to 1; None if the file names the
+            sensor.
+        options: command-line options to read it, "" if the file names the sensor.
+        reading: statistics of the part that was decoded.
     """
 
     source: str
@@ -92,24 +91,23 @@ class Content:
 
     @property
     def command(self) -> str:
-        """What to type to read it."""
+        """The command that shows it."""
         return f"lidarspec view {quote(self.source)} {self.options}".rstrip()
 
 
 @dataclass
 class Contents:
-    """What is in a file.
+    """The contents of a file.
 
     Attributes:
-        path, kind, size: of the file: its name, what it is in words, its bytes.
-        header: of a recording.
-        flows: who sent to where, most first; of a byte stream one.
-        first_ns, last_ns: when the first and the last packet arrived, ns since 1970; None where
-            nobody knows it.
-        seen_ns: when the last packet that was looked at arrived.
-        whole: whether all of the file was looked at; else what is counted is of its beginning.
-        contents: what was sent, of each sensor.
-        warnings: what is to be said of the file.
+        path, kind, size: of the file: name, kind in words, size in bytes.
+        header: the header of a recording.
+        flows: senders and receivers, most bytes first; one for a byte stream.
+        first_ns, last_ns: arrival of the first and the last packet, ns since 1970; None if unknown.
+        seen_ns: arrival of the last packet that was read.
+        whole: whether all of the file was read; otherwise counts are of its beginning.
+        contents: the data of each sensor.
+        warnings: warnings about the file.
     """
 
     path: str
@@ -126,30 +124,30 @@ class Contents:
 
     @property
     def packets(self) -> int:
-        """How many packets, or pieces of a stream, were seen."""
+        """Number of packets, or chunks of a stream, in the part that was read."""
         return sum(flow.packets for flow in self.flows)
 
     @property
     def bytes(self) -> int:
-        """How many bytes of them."""
+        """Number of their bytes."""
         return sum(flow.bytes for flow in self.flows)
 
     @property
     def seconds(self) -> float | None:
-        """From the first packet to the last; None where times are not known."""
+        """Seconds from the first packet to the last; None if times are unknown."""
         if self.first_ns is None or self.last_ns is None:
             return None
         return (self.last_ns - self.first_ns) * 1e-9
 
     @property
     def seen_seconds(self) -> float | None:
-        """How long what was looked at took."""
+        """Duration in seconds of the part that was read; None if times are unknown."""
         if self.first_ns is None or self.seen_ns is None:
             return None
         return (self.seen_ns - self.first_ns) * 1e-9
 
     def to_dict(self) -> dict[str, Any]:
-        """The same for JSON."""
+        """Return the contents as a dict for JSON."""
         return {
             **{
                 name: getattr(self, name)
@@ -194,11 +192,11 @@ class Contents:
 
 
 def contents(path: str | Path) -> Contents:
-    """What is in a file.
+    """Return the contents of a file.
 
     Raises:
-        UsageError: for a live source, and standard input, which can be read only once.
-        SourceError: where the file cannot be opened.
+        UsageError: for a live source, and for standard input, which can be read only once.
+        SourceError: if the file cannot be opened.
     """
     if str(path) == "-" or is_live(path):
         raise suggest(
@@ -223,11 +221,12 @@ def contents(path: str | Path) -> Contents:
 
 
 def duration(path: str | Path) -> float | None:
-    """Seconds from the first packet of a file to the last, where that is found without reading all
-    of a long one; None where not.
+    """Return the seconds from the first packet of a file to the last.
+
+    Returns None if that would require reading all of a long file.
 
     Raises:
-        SourceError: where the file cannot be opened.
+        SourceError: if the file cannot be opened.
     """
     with contextlib.closing(transport(path)) as opened:
         found = Contents(str(path), "", 0)
@@ -242,7 +241,7 @@ def _size(path: Path) -> int:
 
 
 def _count(found: Contents, opened: Transport) -> None:
-    """Count what is at the beginning, and find the last time."""
+    """Count the beginning of the file, and find the last time."""
     flows = dict[tuple[Sender | None, Sender | None], Flow]()
     left = LOOKED_AT
     chunks = opened.chunks()
@@ -266,7 +265,7 @@ def _count(found: Contents, opened: Transport) -> None:
 
 
 def _last(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
-    """The time of the last packet, where it can be found without reading all before it."""
+    """Return the time of the last packet, None if that requires reading everything."""
     last = None
     for chunk in chunks if opened.skip(_END) else ():
         last = chunk.at or last
@@ -274,7 +273,7 @@ def _last(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
 
 
 def _sent(found: Contents) -> list[Content]:
-    """What was sent, of each sensor."""
+    """Return the data of each sensor."""
     try:
         if (known := find_declared_sensor(found.path)) is not None:
             return [Content(found.path, (known.id,), None, "", _reading(found.path, known))]
@@ -304,7 +303,10 @@ def _content(path: str, one: Verdict) -> Content:
 
 
 def _reading(source: str, sensor: Sensor) -> MeterReading | None:
-    """How a sensor was doing at the beginning of a file; None where its frames cannot be read."""
+    """Return the statistics of a sensor at the beginning of a file.
+
+    Returns None if its frames cannot be read.
+    """
     try:
         with Device(source, sensor) as device:
             feed = Feed(device)
@@ -316,7 +318,7 @@ def _reading(source: str, sensor: Sensor) -> MeterReading | None:
 
 
 def shown(found: Contents) -> Sequence[tuple[str, str]]:
-    """What there is to be said of a file, in lines: a word, and what it is."""
+    """Return the description of a file as lines of (word, text)."""
     lines = list[tuple[str, str]]()
     if (header := found.header) is not None:
         lines.append(("recorded", f"{header.created} from {header.source or 'an unknown source'}"))

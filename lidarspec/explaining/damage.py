@@ -1,9 +1,9 @@
-"""What became of the bytes of a frame on their way: the one change that explains the damage.
+"""Find the single change of a damaged frame that explains the damage.
 
-Each single bit is turned back, each single byte taken out, and every byte put in at every place,
-and the engine itself says which of these make one valid frame of the type. So nothing is known here
-of checksums and lengths. With a short checksum several changes may do by chance: where they are
-many, what happened is told, and not where.
+Each bit is flipped back, each byte removed, and every byte value inserted at every offset, and the
+engine decides which of these give one valid frame of the type. So this module needs no knowledge of
+checksums and lengths. With a short checksum several changes may match by chance: if there are
+many, only their kind is reported.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import formulas, nodes, refs
 
-#: bytes of candidates that are tried in one go, the longest frame that construct alone has to read
-#: so often, and the longest in which lost bytes are looked for, of which there are 256 for each
-#: place; and on how many fields its layout may depend for that, since where they are many nearly
+#: Bytes of candidates that are tried at once; the longest frame, read by plain construct, that is
+#: tried; the longest frame in which lost bytes are searched, with 256 candidates for each offset;
+#: and the maximum number of fields that its layout may depend on for that, since otherwise nearly
 #: each candidate has a layout of its own.
 BLOCK = 1 << 20
 INTERPRETED = 128
 SEARCHED = 512
 HEADED = 4
-#: most changes that are told one by one.
+#: Maximum number of changes to report one by one.
 TOLD = 3
-#: what may have happened, the likeliest first: by how many bytes it made the frame longer, and how
-#: many candidates there are for a place.
+#: Kinds of damage, the likeliest first -> number of bytes that it adds to the frame, and number of
+#: candidates for each offset.
 KINDS = {"flipped bit": (0, 8), "inserted byte": (1, 1), "lost byte": (-1, 256)}
 
 
 class Change(NamedTuple):
-    """One thing that may have happened to a frame.
+    """A possible change of a frame.
 
     Attributes:
         kind: "flipped bit", "inserted byte" or "lost byte".
         offset: the byte of the damaged frame that was changed or inserted, or before which one was
             lost.
-        value: which bit, 0 the lowest; or the byte.
+        value: number of the bit, 0 the lowest; or the byte.
     """
 
     kind: str
@@ -53,7 +53,7 @@ class Change(NamedTuple):
     value: int
 
     def repair(self, data: bytes) -> bytes:
-        """The bytes as they were sent."""
+        """Return the bytes before the change."""
         before = data[: self.offset]
         after = data[self.offset :]
         if self.kind == "inserted byte":
@@ -66,8 +66,9 @@ class Change(NamedTuple):
 def changes(
     frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets: Sequence[int] | None = None
 ) -> list[Change]:
-    """Return every single change of the likeliest kind that makes these bytes of one valid and
-    plausible frame of this type.
+    """Return every single change that would explain the damage, of the likeliest kind.
+
+    Undoing such a change gives one valid and plausible frame of this type.
 
     Args:
         offsets: the bytes at which changes are tried; by default all.
@@ -87,7 +88,7 @@ def changes(
 
 
 def _most(engine: Codec, values: int) -> int:
-    """The longest frame of which every candidate is tried, so many for a place."""
+    """Return the maximum length of a frame for which every candidate is tried."""
     is_compiled = isinstance(engine, CompiledCodec)
     if values > 8:
         if is_compiled and _deciding(engine.frame) <= HEADED:
@@ -100,7 +101,7 @@ def _most(engine: Codec, values: int) -> int:
 
 @functools.cache
 def _deciding(frame: Frame) -> int:
-    """How many fields decide on the layout of a frame."""
+    """Return the number of fields that decide the layout of a frame."""
     asked = (formula for node in nodes(frame.tree) for formula in formulas(node))
     return len({ref.path for formula in asked for ref in refs(formula)})
 
@@ -113,7 +114,7 @@ def _found(
     if kind == "inserted byte":
         places = places[
             np.diff(old, prepend=~old[:1]) != 0
-        ]  # of a run of equal bytes the first stands for all
+        ]  # the first of a run of equal bytes represents them all
     if chosen is not None:
         places = places[np.isin(places, chosen)]
     offsets = np.repeat(places, values)
@@ -122,7 +123,7 @@ def _found(
     else:
         numbers = np.tile(np.arange(values, dtype=np.uint8), len(places))
     if kind == "lost byte":
-        is_new = numbers != old[offsets - 1]  # the same byte once more before an equal one
+        is_new = numbers != old[offsets - 1]  # not the same byte again before an equal one
         is_new[offsets == 0] = True
         offsets = offsets[is_new]
         numbers = numbers[is_new]
@@ -155,7 +156,7 @@ def _rows(
     numbers: NDArray[np.uint8],
     size: int,
 ) -> NDArray[np.uint8]:
-    """The bytes with each change undone, one a row."""
+    """Return the bytes with each change undone, one per row."""
     columns = counted(size)
     places = offsets[:, None]
     if kind == "inserted byte":

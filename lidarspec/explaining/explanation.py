@@ -30,7 +30,7 @@ from lidarspec.points.plain import evaluate_plainly
 from lidarspec.scans.ends import first_points
 from lidarspec.spec import Sensor
 
-#: points to list in the notes of a frame without arrays.
+#: Maximum number of points in the notes of a frame without arrays.
 MAX_LISTED_POINTS = 4
 
 

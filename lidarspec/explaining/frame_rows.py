@@ -20,7 +20,7 @@ from lidarspec.frames.wire_table import bit_text, format_hex
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import UNNAMED, FieldInfo, exact, format_values
 
-#: most decimals that steps are told apart by, and those that may be added to show one in full.
+#: Maximum number of decimals to distinguish steps, and of decimals to add to show a step in full.
 MAX_DIGITS = 12
 MAX_SPARE_DIGITS = 2
 
@@ -29,7 +29,7 @@ class FrameRows:
     """The rows of one frame, as far as its bytes go.
 
     Args:
-        fault: what is wrong with the frame, which is said at its row.
+        fault: the fault of the frame, which is reported at its row.
 
     Attributes:
         after: the byte after the frame.
@@ -42,7 +42,7 @@ class FrameRows:
         self._has_form = frame.wire is not None
         self._axes = self._array_axes()
         decoded = frame_coder(frame).decode(data)
-        #: offset in the frame of each byte of its struct.
+        #: Offset in the frame of each byte of its struct.
         self._offsets = decoded.offsets
         self._verdicts: dict[str, tuple[str, bool]] = {}
         fields = self._read_fields(frame, decoded.struct)
@@ -67,7 +67,7 @@ class FrameRows:
         if isinstance(frame_layouts(frame), NotCompilable):
             return plain_fields(frame, struct)
         examined = examine(frame.tree, struct, frame.room)
-        with contextlib.suppress(Exception):  # a plugin's checksum; `fault` says what it raised
+        with contextlib.suppress(Exception):  # a plugin's checksum; `fault` has the exception
             self._verdicts = {seal.path: _verdict(seal) for seal in examined.seals()}
         fields = list(examined.fields())
         if examined.layout is None and all(each.raw is not None for each in fields):
@@ -110,7 +110,7 @@ class FrameRows:
             yield Row(self.after, left, "", (), ("after the frame's end",), right=False)
 
     def _row_path(self, path: str) -> str:
-        """Return the innermost array element that a field stands in, or the field itself."""
+        """Return the innermost array element that contains a field, or the field itself."""
         head, bracket, _ = path.rpartition("]")
         array = without_indices(head + bracket)[0]
         in_blocks = tuple(f"{block}." for block in self._blocks)
@@ -147,7 +147,7 @@ class FrameRows:
         return found
 
     def _remark(self, each: WireField, info: FieldInfo) -> str:
-        """Return what is wrong with a value; "" if nothing is."""
+        """Return the fault of a value; "" if there is none."""
         if info.const is not None and each.raw != info.const:
             shown = format_hex(each.raw, info.bits)
             return f"wrong: {shown}, expected {format_hex(info.const, info.bits)}"
@@ -177,8 +177,9 @@ def _value(each: WireField, info: FieldInfo) -> FieldValue:
 
 @functools.lru_cache
 def _digits(scale: float, offset: float) -> int:
-    """Decimals that tell every step of a field from the next; a few more where these show it in
-    full.
+    """Return the decimals that distinguish all values of a field.
+
+    A few more are added if they show each step in full.
     """
     steps = (exact(scale), exact(offset))
     apart = next(
@@ -195,7 +196,7 @@ def _digits(scale: float, offset: float) -> int:
 
 
 def _verdict(seal: PlacedSeal) -> tuple[str, bool]:
-    """Return what a checksum says, and whether it is right."""
+    """Return the text of a checksum, and whether it is right."""
     algorithm = seal.seal.algorithm
     count = sum(end - start for start, end in seal.seal.spans)
     plural = "s" if count != 1 else ""

@@ -1,8 +1,8 @@
-"""How an explained frame is listed: a line for each part, indented as the struct is nested, bit
-fields drawn below.
+"""List an explained frame, and differences between frames, as lines.
 
-Lines are pieces with roles, so that who has a terminal can colour them; their texts alone say the
-same. What differs between two frames is listed in the same way, field by field and down to the bit.
+There is a line for each part, indented as the struct is nested, with bit fields drawn below. Lines
+consist of spans with roles, which a terminal can colour; their texts alone are complete.
+Differences are listed field by field and down to the bit.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from itertools import groupby
 from lidarspec.explaining.wording import Difference, FieldValue, Row, TextSpan, bit_picture, number
 from lidarspec.frames.wire_table import format_hex
 
-#: bytes in a line, spaces of a level of nesting, and the widest columns of bits and of names.
+#: Bytes in a line, spaces of a level of nesting, and the maximum widths of the columns of bits and
+#: of names.
 LINED = 8
 LEVEL = 2
 PICTURES = 35
 NAMES = 36
 
-#: bytes of a field in a line of its differences.
+#: Bytes of a field in a line of its differences.
 COMPARED = 4
-#: pieces of a line that are columns, and how much room there has to be beside them for folding.
+#: Number of spans of a line that are columns, and the minimum width beside them for folding.
 FIXED = 3
 FOLDED = 24
 
@@ -30,13 +31,14 @@ Line = tuple[TextSpan, ...]
 
 
 def text(line: Line) -> str:
-    """A line without its roles."""
+    """Return a line without its roles."""
     return "".join(span.text for span in line).rstrip()
 
 
 def fold(line: Line, width: int) -> Line:
-    """A line with line breaks where it is wider than `width`; what goes on stands below the first
-    piece of its text.
+    """Return a line with line breaks if it is wider than `width`.
+
+    Continuation lines start below the text.
     """
     indent = sum(len(span.text) for span in line[:FIXED])
     if len(text(line)) <= width or indent + FOLDED > width:
@@ -56,16 +58,19 @@ def fold(line: Line, width: int) -> Line:
 
 
 def parents(path: str) -> list[str]:
-    """The structs and elements that a path goes through, outermost first: "a[0].b.c" is in "a[0]"
-    and "a[0].b".
+    """Return the structs and elements in a path, outermost first.
+
+    "a[0].b.c" is in "a[0]" and "a[0].b".
     """
     parts = path.split(".")
     return [".".join(parts[:depth]) for depth in range(1, len(parts))]
 
 
 class Listing:
-    """The lines of the rows of a frame, in columns; `every` draws the bits of all elements of an
-    array, and not of the first alone.
+    """The lines of the rows of a frame, in columns.
+
+    Args:
+        every: draw the bits of all elements of an array, not only of the first.
     """
 
     def __init__(self, rows: Sequence[Row], *, every: bool) -> None:
@@ -94,7 +99,7 @@ class Listing:
         )
 
     def lines(self) -> Iterator[Line]:
-        """The lines, those of structs and elements before what is in them."""
+        """Yield the lines; structs and elements come before their contents."""
         above: list[str] = []
         for index, row in enumerate(self._rows):
             around = parents(row.path)
@@ -158,7 +163,7 @@ class Listing:
 
 
 def _bits(row: Row) -> list[tuple[bytes, bytes]]:
-    """The bytes and the bits in them of each value."""
+    """Return the bytes and the bit masks of each value."""
     return [
         (row.data[value.start - row.offset :][: len(value.masks)], value.masks)
         for value in row.values
@@ -170,8 +175,10 @@ def _indent_path(path: str, depth: int) -> str:
 
 
 def list_differences(differences: list[Difference], sizes: tuple[int, int]) -> Iterator[Line]:
-    """The differences of two frames of so many bytes: each field with both values, and the bits
-    that differ below it.
+    """Yield the differences of two frames: each field with both values and its bits.
+
+    Args:
+        sizes: the sizes of the frames in bytes.
     """
     for missing, group in groupby(differences, lambda difference: difference.missing):
         if missing:

@@ -25,11 +25,11 @@ from lidarspec.spec import Sensor
 from lidarspec.spec.sensor import with_frames
 from lidarspec.transports.protocol import Chunk
 
-#: constant bytes that a frame type must begin with to be searched for between other bytes.
+#: Minimum number of constant bytes at the start of a frame type that is searched for.
 MIN_SYNC_BYTES = 2
-#: bytes without a frame that are collected before they are yielded as a piece.
+#: Number of bytes without a frame that are collected before they are yielded as a piece.
 MAX_HELD_BYTES = 1 << 16
-#: placeholder for the frame type of a whole input that may be one damaged frame.
+#: Placeholder for the frame type of a whole input that may be one damaged frame.
 NEAREST = "?"
 
 
@@ -38,7 +38,7 @@ class InputPiece:
     """A frame of the input, or bytes that are in no frame.
 
     Attributes:
-        offset: of the first byte in the input.
+        offset: offset of the first byte in the input.
         data: the bytes.
         frame: the frame type, "" for bytes in no frame, or `NEAREST`.
         datagram: True for bytes of a datagram that are in no frame.

@@ -14,9 +14,9 @@ from lidarspec.spec.arguments import Range, Taken
 if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
 
-#: bytes in a line of a hexdump.
+#: Bytes in a line of a hexdump.
 HEXDUMP_LINE_BYTES = 16
-#: lines of a hexdump before the marked line.
+#: Lines of a hexdump before the marked line.
 HEXDUMP_LINES_BEFORE = 2
 DEGREES_PER_TURN = 360
 

@@ -1,14 +1,13 @@
-"""What a spec says, in the languages of other tools: kinds of exports by name.
+"""Exports of a spec to the formats of other tools, by name.
 
-In: a sensor. Out: a text, by `export`. An export walks the frame trees (`lidarspec.spec.tree`) that
-`messages` hands out, and is refused,
-with the reason, where they hold Python code or its target cannot say what the spec says. Modules in
-reading order:
+In: a sensor. Out: a text, by `export`. An export walks the frame trees (`lidarspec.spec.tree`) of
+`messages`. It raises `Refused`, with the reason, if they contain Python code or the target cannot
+express the spec. Modules in reading order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
 * `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
 * `ksy`, `wireshark`: a Kaitai Struct format, and a dissector in Lua.
-* `c`, `c_fields`: a header in C: the whole of it, and what reads the fields.
+* `c`, `c_fields`: a header in C, and its functions that read fields.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from lidarspec.spec.sensor import with_frames
 if TYPE_CHECKING:
     from lidarspec.sensor_operations import Sensor
 
-#: kind -> "module:function"; each takes a Sensor and returns the text of the export.
+#: Kind -> "module:function"; the function takes a Sensor and returns the text of the export.
 EXPORTS: dict[str, str] = {
     "wireshark": "lidarspec.exports.wireshark:dissector",
     "c": "lidarspec.exports.c:header",
@@ -38,18 +37,19 @@ EXPORTS: dict[str, str] = {
 
 
 class ExportError(UsageError):
-    """An export that cannot say what the spec says, with the reason."""
+    """The target of an export cannot express the spec; the message has the reason."""
 
 
 class UnknownExport(UnknownName):
-    """There is no export of this kind."""
+    """The kind of export does not exist."""
 
     what = "export"
 
 
 def select_frame(sensor: Sensor, frame: str) -> Sensor:
-    """The sensor with one frame type alone, and no commands: what exports of a single message are
-    made from.
+    """Return the sensor with only one frame type, and no commands.
+
+    Exports of a single message are made from it.
 
     Raises:
         UnknownFrame: if it has no frame type of this name.
@@ -60,21 +60,21 @@ def select_frame(sensor: Sensor, frame: str) -> Sensor:
 
 
 def beginning(sensor: Sensor) -> str:
-    """What names begin with where they have to begin with a letter."""
+    """Return the id for use in names that must begin with a letter."""
     if sensor.id[0].isalpha():
         return sensor.id
     return f"lidar-{sensor.id}"
 
 
 def export(sensor: Sensor, kind: str) -> str:
-    """The text of an export of a sensor.
+    """Return the text of an export of a sensor.
 
     Args:
         kind: one of `EXPORTS`.
 
     Raises:
-        Refused: where the target cannot say what the spec says.
-        UnknownExport: for a kind that is none of them.
+        Refused: if the target cannot express the spec.
+        UnknownExport: for an unknown kind.
     """
     if kind not in EXPORTS:
         raise UnknownExport(kind, EXPORTS)
@@ -87,15 +87,16 @@ def export(sensor: Sensor, kind: str) -> str:
 
 
 def _line(text: str) -> str:
-    """What stands in a heading, a comment or a string of any language as one line; its own marks
-    each export escapes itself.
+    """Return a text as one printable line, for a heading, comment or string.
+
+    Each export escapes its own special characters.
     """
     return printable(" ".join(text.split()))
 
 
 @dataclass(frozen=True, eq=False)
 class ExportedFrame:
-    """One frame type: its name, what the sensor says of it, and its tree."""
+    """One frame type: its name, declaration and tree."""
 
     name: str
     frame: Frame
@@ -113,14 +114,14 @@ class ExportedFrame:
 
 
 def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ...]:
-    """All frame types of a sensor, in their order.
+    """Return all frame types of a sensor, in their order.
 
     Args:
-        on_wire: their bytes as they are sent are asked for, and not the fields alone.
+        on_wire: whether the export describes the bytes as they are sent, not only the fields.
 
     Raises:
-        Refused: if it has none yet, or one holds a part that only Python code can decide, or stands
-            on the wire in a form of its own.
+        Refused: if there are no frames yet, or one contains Python code, or has a wire form of its
+            own.
     """
     if not sensor.frames:
         raise ExportError(f"{sensor.id}: has no frames yet: configure it first")
@@ -137,8 +138,10 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
 
 
 def find_references(node: tree.Node) -> list[tree.Ref]:
-    """The fields that the formulas of a node and of what is in it ask for, and those that lengths
-    and conditions are held to.
+    """Return the fields that a node depends on.
+
+    These are the fields in formulas of the node and its descendants, and those that lengths and
+    conditions are compared with.
     """
     found = [
         value
@@ -150,7 +153,7 @@ def find_references(node: tree.Node) -> list[tree.Ref]:
 
 
 def find_held_formulas(node: tree.Node) -> dict[str, tree.Formula]:
-    """What the fields that a node is have to say of other parts, by their paths."""
+    """Return the formulas that the fields of a node must equal, by their paths."""
     return {
         info.path: info.rebuilt
         for info in tree.infos(node)
@@ -171,7 +174,7 @@ def _message(sensor: Sensor, name: str, frame: Frame) -> ExportedFrame:
 
 
 def _check(node: tree.Node) -> None:
-    """Refuse what no other language can say."""
+    """Raise `Refused` if other languages cannot express a node."""
     for formula in (
         *tree.formulas(node),
         *([node.condition] if isinstance(node, tree.Check) else []),

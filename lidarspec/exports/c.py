@@ -453,7 +453,7 @@ _TAIL = """\
 #endif
 #endif
 """
-#: endings of the names of whole-frame functions, which are reserved.
+#: Endings of the names of whole-frame functions, which are reserved.
 _RESERVED_ENDINGS = (
     "frame_length",
     "is_frame",

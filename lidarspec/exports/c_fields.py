@@ -1,11 +1,11 @@
-"""Where everything in a frame type stands, as C expressions, and the C functions that read it.
+"""The offsets of fields as C expressions, and C functions that read the fields.
 
-`CLayout` walks a frame tree once and notes an `Entry` for each node: its first byte as a C
+`CLayout` walks a frame tree once and makes an `Entry` for each node: its first byte as a C
 expression of the frame's bytes and of array indices, its size, the conditions under which it is
-there and the counts of the arrays around it. A length or count that a header decides is a call of
-the function that reads it, so that no expression grows with the header. From the entries come an
-accessor for each field, which tries what alternatives have of it one after another, the counts of
-arrays, whether an optional field is there, and the scaling to its unit and to the SI unit.
+present and the counts of the arrays around it. A length or count from a header is a call of the
+function that reads it, so that expressions stay short. The entries give an accessor for each field,
+which tries its alternatives one after another, the counts of arrays, the presence of optional
+fields, and the scaling to the field's unit and to the SI unit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidarspec.exports import ExportedFrame, ExportError, find_references
 from lidarspec.frames.wire_table import Extent, meaning, unit_text
 from lidarspec.spec import tree
 
-#: comparisons go through a function: compilers warn of what a narrow number can never be.
+#: Comparisons are function calls, because compilers warn if a narrow type cannot have a value.
 _OPERATIONS = {
     **{
         "//": "lidarspec_floor_div({}, {})",
@@ -33,27 +33,27 @@ _INDICES = "ijklmnoq"
 
 
 def index(depth: int) -> str:
-    """The name of an array index by its depth."""
+    """Return the name of an array index by its depth."""
     return _INDICES[depth]
 
 
 def parameters(depth: int) -> str:
-    """The parameters of a function for what is in so many arrays."""
+    """Return the parameters of a function for an entry inside `depth` arrays."""
     return ", ".join(["const uint8_t *p", *(f"size_t {index(level)}" for level in range(depth))])
 
 
 def arguments(depth: int) -> str:
-    """The arguments of a call of such a function."""
+    """Return the arguments of a call of such a function."""
     return ", ".join(["p", *map(index, range(depth))])
 
 
 def identifier(text: str) -> str:
-    """A text as a part of a C name."""
+    """Return a text as a part of a C name."""
     return re.sub(r"\W", "_", text.replace("[]", "_inner"), flags=re.ASCII)
 
 
 def number_type(fields: Sequence[tree.FieldInfo]) -> str:
-    """The C type that holds what any of these fields holds."""
+    """Return the C type that can hold the values of all these fields."""
     if any(info.kind == "float" for info in fields):
         if max(info.bits for info in fields) > 32 or any(info.kind != "float" for info in fields):
             return "double"
@@ -69,7 +69,7 @@ def number_type(fields: Sequence[tree.FieldInfo]) -> str:
 
 
 def comment(*texts: str) -> str:
-    """A comment of one line, whatever the texts hold; "" where they hold nothing."""
+    """Return a comment of one line; "" if the texts are empty."""
     text = (
         "; ".join(" ".join(part.split()) for part in texts if part)
         .replace("*/", "* /")
@@ -81,12 +81,12 @@ def comment(*texts: str) -> str:
 
 
 def quote_bytes(data: bytes) -> str:
-    """Bytes as a C string, each as a literal of its own, so that no escape runs into the next."""
+    """Return bytes as a C string of octal escapes."""
     return '"' + "".join(f"\\{byte:03o}" for byte in data) + '"'
 
 
 class CCondition(NamedTuple):
-    """A C expression, and whether it depends on nothing in arrays."""
+    """A C expression, and whether it is independent of array elements."""
 
     text: str
     is_fixed: bool
@@ -94,16 +94,16 @@ class CCondition(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A node at one of the places where it stands.
+    """A node at one of its positions in the frame.
 
     Attributes:
-        path: of the node, without indices; of an array that of its axis.
-        node: what stands there.
+        path: path of the node, without indices; for an array that of its axis.
+        node: the node.
         start, size: in bytes.
-        depth: number of arrays that it is in.
-        conditions: what has to hold for it to be there.
+        depth: number of arrays around it.
+        conditions: conditions under which it is present.
         loops: for each of those arrays the C expression of its count.
-        part: of a bit block, what is read of it.
+        part: the part of a bit block that is read.
     """
 
     path: str
@@ -122,7 +122,7 @@ class Entry:
 
     @property
     def fields(self) -> list[Entry]:
-        """What can be read there: an entry for each part of a bit block, else itself."""
+        """An entry for each part of a bit block, else the entry itself."""
         if isinstance(self.node, tree.Block):
             return [replace(self, part=part) for part in self.node.parts]
         return [self]
@@ -136,14 +136,14 @@ class Entry:
 
     @property
     def indices(self) -> tuple[int, ...]:
-        """Where it stands in the arrays inside its bit block."""
+        """The indices of a part in the arrays inside its bit block."""
         if self.part is not None:
             return self.part.indices
         return ()
 
     @property
     def expression(self) -> str:
-        """What is read there, as C."""
+        """The C expression of its raw value."""
         node = self.node
         if self.part is not None:
             return _bits(self.part, self.start)
@@ -168,7 +168,7 @@ class Entry:
 
     @property
     def condition(self) -> str:
-        """When it is there, of a part in its bit block too; "" for always."""
+        """The condition under which it is present, with its indices; "" for always."""
         inside = [
             f"{index(self.depth + level)} == {number}" for level, number in enumerate(self.indices)
         ]
@@ -176,8 +176,9 @@ class Entry:
 
 
 def format_size_arguments(node: tree.Node, depth: int) -> str:
-    """The arguments by which a size is asked for in so many arrays; where it is the same for all
-    elements, it is that of the first.
+    """Return the arguments of a call of a size function inside `depth` arrays.
+
+    If the size is the same for all elements, it is that of the first.
     """
     is_own = any(ref.info.axes for ref in find_references(node))
     if is_own:
@@ -186,15 +187,15 @@ def format_size_arguments(node: tree.Node, depth: int) -> str:
 
 
 class CLayout:
-    """The entries of a frame type, in the order of the wire.
+    """The entries of a frame type, in wire order.
 
     Attributes:
         message: the frame type.
-        name: the C name of what stands at a path, given as its path and an ending.
-        size: of a frame, in bytes.
+        name: returns the C name for a path and an ending.
+        size: size of a frame, in bytes.
 
     Raises:
-        Refused: where an entry cannot be found without reading all elements before it.
+        Refused: if the offset of an entry depends on all elements before it.
     """
 
     def __init__(self, message: ExportedFrame, name: Callable[[str, str], str]) -> None:
@@ -206,8 +207,9 @@ class CLayout:
         self._visit(top)
 
     def find_entries(self, path: str) -> list[Entry]:
-        """Every entry of the numbers, bytes or bits at a path: one, unless alternatives have it
-        each.
+        """Return the entries of the numbers, bytes or bits at a path.
+
+        There are several if alternatives contain the field.
         """
         return [
             entry
@@ -216,14 +218,14 @@ class CLayout:
         ]
 
     def whole(self, path: str) -> Entry:
-        """The entry of the part at a path, of whatever kind: all of an array, all alternatives."""
+        """Return the entry of the whole part at a path: an array, or all alternatives."""
         return next(entry for entry in self.entries if entry.path == path)
 
     def formula(self, value: tree.Formula) -> str:
-        """A formula as a C expression of type int64_t.
+        """Return a formula as a C expression of type int64_t.
 
         Raises:
-            Refused: where 64-bit integers cannot hold what it may come to.
+            Refused: if its value may exceed 64-bit integers.
         """
         if tree.width(value) > tree.MOST_BITS:
             raise ExportError("a formula that may pass what a 64-bit integer holds")
@@ -234,19 +236,19 @@ class CLayout:
         )
 
     def length(self, value: tree.Formula) -> str:
-        """A number of elements or bytes as C."""
+        """Return a number of elements or bytes as C."""
         if isinstance(value, int):
             return str(value)
         return f"(size_t)({self.formula(value)})"
 
     def count(self, node: tree.Repeat, depth: int) -> int | str:
-        """The number of elements of an array in so many others: a number, or C."""
+        """Return the number of elements of an array inside `depth` others: a number, or C."""
         if isinstance(node.count, int):
             return node.count
         return f"(int64_t){self.name(node.axis, 'count')}({format_size_arguments(node, depth)})"
 
     def extent(self, entry: Entry) -> Extent:
-        """The size of what stands somewhere."""
+        """Return the size of an entry."""
         match entry.node:
             case tree.Number() | tree.Block():
                 return Extent(entry.node.size)
@@ -280,8 +282,9 @@ class CLayout:
         return sum((self.extent(below) for below in self._below(entry)), Extent())
 
     def extent_name(self, entry: Entry) -> str:
-        """The function that gives the size of a part with alternatives; one of these may be the
-        alternative of another.
+        """Return the name of the size function of a part with alternatives.
+
+        Alternatives may contain each other, so that several such parts can have the same path.
         """
         choices = [
             node
@@ -292,11 +295,11 @@ class CLayout:
         return self.name(entry.path, f"extent{alike.index(id(entry.node)) or ''}")
 
     def sizes(self, entry: Entry) -> list[tuple[str, Extent]]:
-        """The sizes of the alternatives of a part, each with its condition."""
+        """Return the sizes of the alternatives of a part, each with its condition."""
         return [(condition.text, self.extent(below)) for condition, below in self._cases(entry)]
 
     def _visit(self, entry: Entry) -> None:
-        """Note an entry and all in it."""
+        """Store an entry and all entries in it."""
         node = entry.node
         if not isinstance(node, tree.Empty):
             if isinstance(node, tree.Repeat):
@@ -326,7 +329,7 @@ class CLayout:
                 start = start + self.extent(below)
 
     def _below(self, entry: Entry) -> Iterator[Entry]:
-        """The members of a struct, all at its own start."""
+        """Yield the members of a struct, all with its own start."""
         node = entry.node
         if isinstance(node, tree.Sealed):
             yield replace(entry, node=node.body)
@@ -346,7 +349,7 @@ class CLayout:
         return size
 
     def _cases(self, entry: Entry) -> list[tuple[CCondition, Entry]]:
-        """The alternatives of a part, each with its condition."""
+        """Return the alternatives of a part, each with its condition."""
         node = entry.node
         is_fixed = not any(
             ref.info.axes for value in tree.formulas(node) for ref in tree.refs(value)
@@ -369,7 +372,7 @@ class CLayout:
         return [(CCondition(text, is_fixed), replace(entry, node=case)) for text, case in cases]
 
 
-#: unit -> the SI unit that it is a multiple of, as part of a C name; factor and offset.
+#: Unit -> its SI unit as part of a C name, factor and offset.
 SI: dict[str, tuple[str, float, float]] = {
     "cm": ("m", 0.01, 0),
     "mm": ("m", 0.001, 0),
@@ -384,12 +387,12 @@ SI: dict[str, tuple[str, float, float]] = {
     "mA": ("A", 1e-3, 0),
     "kHz": ("Hz", 1e3, 0),
 }
-#: bytes of a float -> the function that makes it of its bits.
+#: Bytes of a float -> the C function that converts its bits.
 FLOATS = {2: "lidarspec_half", 4: "lidarspec_float", 8: "lidarspec_double"}
 
 
 def word(start: Extent, size: int, order: str) -> str:
-    """An unsigned integer of several bytes."""
+    """Return the C expression of an unsigned integer of several bytes."""
     return f"lidarspec_{'le' if order == 'little' else 'be'}(p + {start}, {size})"
 
 
@@ -411,7 +414,7 @@ def _bits(part: tree.Part, start: Extent) -> str:
 
 
 def accesses(layout: CLayout, path: str) -> list[Entry]:
-    """All ways to read a field: an entry for each."""
+    """Return an entry for each way to read a field."""
     return [
         access
         for entry in layout.find_entries(path)
@@ -421,8 +424,9 @@ def accesses(layout: CLayout, path: str) -> list[Entry]:
 
 
 def fields(layout: CLayout) -> Iterator[str]:
-    """The functions of all fields in the order of the wire; one that stands in several alternatives
-    comes with the last.
+    """Yield the functions of all fields in wire order.
+
+    A field in several alternatives comes with the last.
     """
     functions = [
         function for entry in layout.entries for function in dict.fromkeys(_functions(entry))
@@ -434,12 +438,12 @@ def fields(layout: CLayout) -> Iterator[str]:
     yield from extents
 
 
-#: what writes a function, or several, of the field or the array at a path.
+#: Yields one or more functions for the field or array at a path.
 Writer = Callable[[CLayout, str], Iterator[str]]
 
 
 def _functions(entry: Entry) -> Iterator[tuple[Writer, str]]:
-    """What is written for an entry, and the path of what it is about."""
+    """Yield the writers of the functions for an entry, with their paths."""
     if isinstance(entry.node, tree.Block):
         for part in entry.node.parts:
             yield from ((_inner_count, axis) for axis in _inner(part))
@@ -453,7 +457,7 @@ def _functions(entry: Entry) -> Iterator[tuple[Writer, str]]:
 
 
 def _extents(layout: CLayout) -> Iterator[str]:
-    """The sizes of parts that have alternatives of several sizes."""
+    """Yield the size functions of parts with alternatives of several sizes."""
     for entry in layout.entries:
         if isinstance(entry.node, tree.When | tree.Select):
             sizes = layout.sizes(entry)
@@ -466,12 +470,12 @@ def _extents(layout: CLayout) -> Iterator[str]:
 
 
 def _inner(part: tree.Part) -> tuple[str, ...]:
-    """The arrays inside a bit block that a part of it is in."""
+    """Return the arrays inside a bit block that contain a part."""
     return part.info.axes[len(part.info.axes) - len(part.indices) :]
 
 
 def _inner_count(layout: CLayout, axis: str) -> Iterator[str]:
-    """The number of elements of an array inside a bit block."""
+    """Yield the count function of an array inside a bit block."""
     inside = [
         (access, access.part)
         for entry in layout.entries
@@ -495,9 +499,7 @@ def _count(layout: CLayout, axis: str) -> Iterator[str]:
 
 
 def _field(layout: CLayout, path: str) -> Iterator[str]:
-    """The functions of a field: what it holds, whether it is there, its scaling; and the names of
-    its values.
-    """
+    """Yield the functions of a field: value, presence and scaling, with its labels."""
     ways = accesses(layout, path)
     name = layout.name(path, "")
     first = ways[0]
@@ -542,7 +544,7 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
 
 
 def _function(kind: str, name: str, depth: int, ways: list[tuple[str, str]]) -> str:
-    """A function that gives the first value whose condition holds, else 0."""
+    """Return a C function that returns the first value with a true condition, else 0."""
     used = " ".join(condition + " " + value for condition, value in ways)
     lines = [
         f"    (void){argument};"
@@ -567,7 +569,7 @@ def _group(expression: str) -> str:
 
 
 def _scaling(info: tree.FieldInfo, name: str, kind: str) -> Iterator[str]:
-    """From the raw number to the field's unit, and to the SI unit where that is another one."""
+    """Yield the conversions of a raw number to the field's unit and to the SI unit."""
     yield _conversion(f"{name}_to_{_unit_name(info.unit)}", kind, info.scale, info.offset)
     if info.unit in SI:
         unit, factor, offset = SI[info.unit]

@@ -30,7 +30,7 @@ from lidarspec.frames.wire_table import (
 )
 from lidarspec.spec import Sensor, tree
 
-#: prefixes of the names of fields without a meaning, as manuals call them.
+#: Prefixes of the names of fields without a meaning, as in manuals.
 SPARE_PREFIXES = ("reserved", "unused", "spare", "zeros", "padding")
 
 
@@ -44,7 +44,7 @@ class Cell:
         detail: the text below the title.
         tooltip: the full description.
         role: "const", "sum", "spare" or ""; it decides the colour.
-        offset: of its first byte.
+        offset: offset of its first byte.
     """
 
     name: str
@@ -249,37 +249,37 @@ class _ItemBuilder:
         )
 
 
-#: bits in a row.
+#: Bits in a row.
 ROW_BITS = 32
-#: width of a bit, in pixels.
+#: Width of a bit, in pixels.
 BIT_WIDTH = 22
-#: height of a row, in pixels.
+#: Height of a row, in pixels.
 ROW_HEIGHT = 46
-#: width of the column of offsets at the left, in pixels.
+#: Width of the column of offsets at the left, in pixels.
 LEFT_MARGIN = 104
-#: width of a level of brackets at the right, in pixels.
+#: Width of a level of brackets at the right, in pixels.
 BRACKET_WIDTH = 136
-#: margin around the drawing, in pixels.
+#: Margin around the drawing, in pixels.
 MARGIN = 16
-#: bits of the longest field that is drawn in full; a longer one is drawn as a cut row.
+#: Bits of the longest field that is drawn in full; a longer one is drawn as a cut row.
 MAX_DRAWN_BITS = 128
-#: letters of the longest offset that is written in one line.
+#: Letters of the longest offset that is written in one line.
 MAX_OFFSET_LETTERS = 13
-#: fill colour by role.
+#: Fill colour by role.
 FILLS = {"": "#ffffff", "const": "#e4e8ee", "sum": "#fde7b8", "spare": "#f4f4f2"}
-#: colour of names.
+#: Colour of names.
 INK = "#1c2430"
-#: colour of details and offsets.
+#: Colour of details and offsets.
 FAINT = "#64707f"
-#: colour of lines.
+#: Colour of lines.
 LINE = "#4a5565"
-#: width of a letter as a share of the font size.
+#: Width of a letter as a share of the font size.
 LETTER_ASPECT = 0.61
-#: font size of names, in pixels.
+#: Font size of names, in pixels.
 NAME_SIZE = 13
-#: font size of details, in pixels.
+#: Font size of details, in pixels.
 DETAIL_SIZE = 10.5
-#: smallest font size of names, in pixels.
+#: Smallest font size of names, in pixels.
 MIN_NAME_SIZE = 8
 
 
@@ -304,7 +304,7 @@ def svg(sensor: Sensor) -> str:
     return sheet.document(f"{sensor.id}: packet diagrams")
 
 
-#: the piece of a box in one row: left edge, upper edge, bits.
+#: The piece of a box in one row: left edge, upper edge, bits.
 Piece = tuple[float, float, int]
 
 
@@ -476,7 +476,7 @@ def _depth(group: BoxGroup) -> int:
 
 
 def _draw_outline(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
-    """Yield the filled pieces of a box, and the outline around them without the lines between."""
+    """Yield the filled pieces of a box, and their common outline."""
     rects = "".join(
         f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT_WIDTH}" height="{ROW_HEIGHT}"/>'
         for x, y, bits in pieces

@@ -1,9 +1,8 @@
-"""A whole spec as data, for programs in any language: JSON whose every key stands in
-docs/reference/spec-json.md.
+"""A whole spec as JSON, for programs in any language.
 
-Wire types, places of bits, formulas and checksums are said in full, so that a decoder can be
-written from it. What is Python code (`points`, `plausible`, `sweep`) is not in it; that a frame has
-such a function is.
+docs/reference/spec-json.md describes every key. Wire types, bit positions, formulas and checksums
+are complete, so that a decoder can be written from them. Python code (`points`, `plausible`,
+`sweep`) is not included; only the presence of `plausible` is.
 """
 
 from __future__ import annotations
@@ -19,24 +18,24 @@ from lidarspec.spec import Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Address, Count
 from lidarspec.spec.links import Link, Udp
 
-#: raised whenever a key changes its meaning or goes.
+#: Increased whenever the meaning of a key changes or a key is removed.
 VERSION = 1
 
 
 def text(sensor: Sensor) -> str:
-    """The spec as JSON.
+    """Return the spec as JSON.
 
     Raises:
-        Refused: where a frame holds Python code that no data can stand for.
+        Refused: if a frame contains Python code that data cannot represent.
     """
     return json.dumps(spec(sensor), indent=2, ensure_ascii=False) + "\n"
 
 
 def spec(sensor: Sensor) -> dict[str, Any]:
-    """The spec as plain data: dicts, lists, numbers, texts.
+    """Return the spec as plain data: dicts, lists, numbers, texts.
 
     Raises:
-        Refused: where a frame holds Python code that no data can stand for.
+        Refused: if a frame contains Python code that data cannot represent.
     """
     sequence = sensor.sequence
     return {
@@ -68,13 +67,13 @@ def spec(sensor: Sensor) -> dict[str, Any]:
 
 
 def facts(value: object, *names: str) -> dict[str, Any]:
-    """Some attributes of a value as data, by their names."""
+    """Return some attributes of an object as JSON data, by name."""
     own = ((name, getattr(value, name)) for name in names)
     return {name: _plain(fact) for name, fact in own}
 
 
 def _plain(fact: Any) -> Any:
-    """A fact as data: tuples as lists, mappings as objects, bytes as hex."""
+    """Return a value as JSON data: tuples as lists, mappings as objects, bytes as hex."""
     if isinstance(fact, Mapping):
         return {name: _plain(value) for name, value in fact.items()}
     if isinstance(fact, list | tuple):
@@ -87,7 +86,7 @@ def _plain(fact: Any) -> Any:
 
 
 def link_data(link: Link) -> dict[str, Any]:
-    """A link as data: its kind, then what its class declares."""
+    """Return a link as JSON data: its kind, then the attributes of its class."""
     said = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
     if isinstance(link, Udp) and (rule := link.assembled) is not None:
         fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
@@ -147,7 +146,7 @@ def _command(command: Command) -> dict[str, Any]:
 
 
 def node_data(node: tree.Node) -> dict[str, Any]:
-    """A part of a frame as data: "kind" says which keys follow."""
+    """Return a node of a frame as JSON data; "kind" decides the other keys."""
     match node:
         case tree.Struct():
             return {
@@ -210,8 +209,9 @@ def node_data(node: tree.Node) -> dict[str, Any]:
 
 
 def _parts(node: tree.PartSequence) -> dict[str, Any]:
-    """Parts: what says where the last one is, and what each kind is; `following` is the bytes of
-    the next part.
+    """Return a node of parts: the rules for their end, and each kind.
+
+    `following` is the size in bytes of the next part.
     """
     rules = {"count": node.count, "size": node.size, "within": node.within}
     data = {name: formula_data(rule) for name, rule in rules.items()}

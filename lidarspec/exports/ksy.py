@@ -1,12 +1,12 @@
-"""A spec as a Kaitai Struct format, for Kaitai's compiler, its web IDE and its visualizer.
+"""A spec as a Kaitai Struct format, for Kaitai's compiler, web IDE and visualizer.
 
-A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in the
-order of the wire (`seq`), calculated `instances` and inner `types`, and is plain data until `yaml`
-writes the document. Formulas name a field by its way from the type that asks
-(`format_reference`), since Kaitai knows no paths from the top. Bit blocks become bit-sized
-integers if one of Kaitai's two bit orders yields their parts in a row, else bytes and calculated
-instances. A field with a scale gets an instance with the physical value. Kaitai cannot express
-checksums, plausibility tests and points: checksums are named in the documentation of their fields.
+A frame type becomes a Kaitai type, and so does each struct in it: a type has attributes in wire
+order (`seq`), calculated `instances` and inner `types`, and is plain data until `yaml` writes the
+document. Formulas refer to a field by its path from the current type (`format_reference`), since
+Kaitai has no absolute paths. Bit blocks become bit-sized integers if one of Kaitai's two bit orders
+yields their parts in a row, else bytes and calculated instances. A field with a scale gets an
+instance with the physical value. Kaitai cannot express checksums, plausibility tests and points:
+checksums are named in the documentation of their fields.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.fields import slug
 
-#: a string that means the same without quotes.
+#: A string that needs no quotes in YAML.
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./()<>=+*-]*( [A-Za-z0-9_./()<>=+*;,-]+)*")
-#: values of a field that are listed.
+#: Maximum number of allowed values to list.
 LISTED = 16
 _WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
 
@@ -39,7 +39,7 @@ class Byte(int):
 
 
 def yaml(value: Mapping[str, Any]) -> str:
-    """The text of a document."""
+    """Return the text of a document."""
     return "\n".join(_lines(value, "")) + "\n"
 
 
@@ -80,20 +80,20 @@ def _scalar(value: Any) -> str:
 
 
 def identifier(name: str) -> str:
-    """A name as Kaitai takes it."""
+    """Return a name in Kaitai's spelling."""
     return re.sub(r"[^a-z0-9_]", "_", name.lower())
 
 
-#: the types that an expression stands in, outermost first, by the path of their struct; None for
-#: one that holds a single part.
+#: The types around an expression, outermost first, by the path of their struct; None for a type
+#: that holds a single part.
 Scope = tuple[str | None, ...]
 
 
 def format_reference(scope: Scope, ref: tree.Ref) -> str:
-    """A field as an integer, by its way from a type.
+    """Return a field as an integer, by its path from a type.
 
     Raises:
-        Refused: where no type around this place holds it.
+        Refused: if no type around the expression contains it.
     """
     for up, path in enumerate(reversed(scope)):
         if path is not None and (path == "" or ref.path.startswith(f"{path}.")):
@@ -112,12 +112,12 @@ _OPERATIONS = {
 
 
 def number(formula: tree.Formula, scope: Scope) -> str:
-    """A formula as an integer."""
+    """Return a formula as an integer expression."""
     return tree.write(formula, functools.partial(format_reference, scope), _OPERATIONS)
 
 
 def truth(formula: tree.Formula, scope: Scope) -> str:
-    """A formula as a condition: not 0."""
+    """Return a formula as a condition, true if it is not 0."""
     match formula:
         case tree.Op("not", (operand,)):
             return f"not ({truth(operand, scope)})"
@@ -132,7 +132,8 @@ def truth(formula: tree.Formula, scope: Scope) -> str:
 
 Attribute = dict[str, Any]
 
-#: bits that Kaitai reads in one go, and bytes of its other integers and of its floats.
+#: Maximum bits that Kaitai reads at once, and sizes in bytes of its other integers and of its
+#: floats.
 WIDEST = 64
 INTEGERS = (1, 2, 4, 8)
 FLOATS = (4, 8)
@@ -141,7 +142,7 @@ FLOATS = (4, 8)
 def block_type(
     block: tree.Block, doc: Callable[[tree.FieldInfo], Attribute]
 ) -> tuple[list[Attribute], dict[str, Attribute]]:
-    """The attributes and the instances of the type of a block, with what is said of each part.
+    """Return the attributes and instances of a block's type, with their documentation.
 
     Raises:
         Refused: for an integer that is too wide for Kaitai.
@@ -174,8 +175,9 @@ def block_type(
 def inline(
     block: tree.Block, more: Mapping[str, Any]
 ) -> tuple[Attribute, dict[str, Attribute]] | None:
-    """The attribute and the instances of a block that is one plain integer; None for any other
-    block.
+    """Return the attribute and instances of a block that is one plain integer.
+
+    Returns None for any other block.
     """
     if len(block.parts) != 1 or block.parts[0].names or block.parts[0].indices or not block.name:
         return None
@@ -192,8 +194,9 @@ def inline(
 
 
 def odd(node: tree.Node) -> tree.Node:
-    """A node, or where it is an integer of a size that Kaitai has no type for, the block of one
-    part that says the same.
+    """Return the node, or an equivalent block for an integer of an unusual size.
+
+    Kaitai has no type for such integers.
     """
     if not isinstance(node, tree.Number) or node.kind == "float" or node.size in INTEGERS:
         return node
@@ -206,12 +209,12 @@ def odd(node: tree.Node) -> tree.Node:
 
 
 def _name(part: tree.Part) -> str:
-    """What a part is called in the type of its block."""
+    """Return the name of a part in the type of its block."""
     return identifier("_".join([*(part.names or ("value",)), *map(str, part.indices)]))
 
 
 def _any_of(info: tree.FieldInfo) -> Attribute:
-    """The values that a field may have, unless they are too many to be listed."""
+    """Return the allowed values of a field, unless there are too many to list."""
     if info.allowed and len(info.allowed) <= LISTED:
         return {"valid": {"any-of": list(info.allowed)}}
     return {}
@@ -226,18 +229,17 @@ def _valid(part: tree.Part) -> Attribute:
 
 
 def _condition(more: Mapping[str, Any]) -> Attribute:
-    """The condition under which an attribute is there, for the instances that are made from it."""
+    """Return the condition of an attribute, for the instances that depend on it."""
     if "if" in more:
         return {"if": more["if"]}
     return {}
 
 
 def _in_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
-    """The parts as one of Kaitai's bit orders meets them, and its suffix; None where they do not
-    fill the block in either.
+    """Return the parts in the order of one of Kaitai's bit orders, and its suffix.
 
-    "be" reads each byte from its highest bit on and fills integers from the top, "le" does both
-    from the lowest bit on.
+    Returns None if they do not fill the block in either. "be" reads each byte from its highest bit
+    on and fills integers from the top, "le" does both from the lowest bit on.
     """
     if sum(part.bits.width for part in block.parts) != 8 * block.size:
         return None
@@ -249,8 +251,9 @@ def _in_order(block: tree.Block) -> tuple[list[tree.Part], str] | None:
 
 
 def _starts(bits: BitField, suffix: str) -> set[int]:
-    """Where reading would have begun for each bit to stand where it does; one number if the bits
-    follow each other.
+    """Return the possible bit positions at which reading begins.
+
+    It is one number if the bits are consecutive.
     """
     ahead = ((segment, segment.low - segment.target) for segment in bits.segments)
     return {
@@ -260,7 +263,7 @@ def _starts(bits: BitField, suffix: str) -> set[int]:
 
 
 def _assemble_part(part: tree.Part, raw: str) -> str:
-    """A part as an expression of the block's bytes."""
+    """Return a part as an expression of the block's bytes."""
     terms = []
     for segment in part.bits.segments:
         if segment.mask == 0xFF:
@@ -278,12 +281,13 @@ def _assemble_part(part: tree.Part, raw: str) -> str:
 
 
 def ksy(sensor: Sensor) -> str:
-    """The sensor's frame types as a .ksy document; parsed with it is a row of data frames, or of
-    the only frame type.
+    """Return the sensor's frame types as a .ksy document.
+
+    It parses a sequence of data frames, or of the only frame type.
 
     Raises:
-        Refused: for what Kaitai cannot say: half-precision floats, Python code, names that are one
-            name there.
+        Refused: if Kaitai cannot express the spec: half-precision floats, Python code, or names
+            that differ only in case.
     """
     frames = messages(sensor)
     main = next((message for message in frames if message.frame.data), frames[0])
@@ -313,17 +317,17 @@ def _frame(sensor: Sensor, message: ExportedFrame) -> Attribute:
 
 @dataclass
 class _Type:
-    """A Kaitai type while it is written."""
+    """A Kaitai type under construction."""
 
     seq: list[Attribute] = field(default_factory=list)
     instances: dict[str, Attribute] = field(default_factory=dict)
     types: dict[str, Attribute] = field(default_factory=dict)
 
     def done(self, path: str) -> Attribute:
-        """The type as Kaitai has it.
+        """Return the finished type.
 
         Raises:
-            Refused: where two members have one name.
+            Refused: if two members have the same name.
         """
         ids = [part["id"] for part in self.seq if "id" in part] + list(self.instances)
         twice = next((name for name in ids if ids.count(name) > 1), None)
@@ -336,19 +340,23 @@ class _Type:
 
 @dataclass
 class _Types:
-    """Writes the types of one frame; `seals`: path of a field that holds a checksum -> its seal."""
+    """Writes the types of one frame.
+
+    Attributes:
+        seals: path of a field that holds a checksum -> its seal.
+    """
 
     seals: Mapping[str, tree.Sealed]
 
     def struct(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
-        """The type of a struct; `scope` says which types it stands in."""
+        """Return the type of a struct inside the types of `scope`."""
         kaitai = _Type()
         for member in node.struct.members:
             self._member(kaitai, member, (*scope, node.struct.path))
         return kaitai.done(node.struct.path)
 
     def _member(self, kaitai: _Type, node: tree.Node, scope: Scope, **more: Any) -> None:
-        """Add a part to a type, with what else is said of its attribute."""
+        """Add a part to a type, with further keys of its attribute."""
         node = odd(node)
         match node:
             case tree.Empty():
@@ -398,7 +406,7 @@ class _Types:
                 self._add_typed(kaitai, node.name, node, scope, **more)
 
     def _parts(self, kaitai: _Type, node: tree.PartSequence, scope: Scope, **more: Any) -> None:
-        """Add parts; those of one kind, since Kaitai chooses a type before it reads it."""
+        """Add parts of one kind; Kaitai has to know a type before it reads it."""
         if len(node.kinds) > 1:
             raise ExportError(
                 f"{node.axis}: parts that are told apart by their constants, which Kaitai cannot do"
@@ -426,13 +434,13 @@ class _Types:
     def _add_typed(
         self, kaitai: _Type, name: str, node: tree.Node, scope: Scope, **more: Any
     ) -> None:
-        """Add an attribute whose type is one of its own."""
+        """Add an attribute with a type of its own."""
         name = identifier(name)
         kaitai.types[name] = self._type(node, scope)
         kaitai.seq.append({"id": name, "type": name, **more})
 
     def _type(self, node: tree.Node, scope: Scope) -> Attribute:
-        """A type for any part: its own, or one that holds it as `value`."""
+        """Return a type for any part: its own, or one that holds it as `value`."""
         if isinstance(node, tree.Struct | tree.Sealed):
             return self.struct(node, scope)
         kaitai = _Type()
@@ -480,7 +488,7 @@ class _Types:
         )
 
     def _plain(self, node: tree.Number | tree.Blob, scope: Scope) -> Attribute:
-        """The attribute of a number or of bytes."""
+        """Return the attribute of a number or of bytes."""
         head = {"id": identifier(node.name)} if node.name else {}
         if isinstance(node, tree.Blob):
             size = _size(node.size, scope)
@@ -523,7 +531,7 @@ class _Types:
     def _physical(
         self, kaitai: _Type, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = ""
     ) -> None:
-        """An instance with the physical value of a field that has a scale."""
+        """Add an instance with the physical value of a field that has a scale."""
         own = identifier(name or info.name)
         if info.scaled and own:
             value = f"{own} * {info.scale!r}" + (f" + {info.offset!r}" if info.offset else "")
@@ -540,7 +548,7 @@ def _size(formula: tree.Formula, scope: Scope) -> int | str:
 
 
 def _value(node: tree.Node) -> tree.Node:
-    """The part of an array or a choice as the one member of a type of its own."""
+    """Return the part of an array or a choice as the only member of a type."""
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))

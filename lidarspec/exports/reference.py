@@ -1,9 +1,8 @@
-"""A sensor's reference page in Markdown: links, commands, the wire table of every frame, checksums,
-clock and geometry.
+"""A sensor's reference page in Markdown.
 
-Each section is a table or a few sentences made from the spec alone. Only geometry looks at bytes:
-the points of an example frame say which columns there are, and in which directions the channels
-look.
+It has links, commands, the wire table of every frame, checksums, clock and geometry. Each section
+is a table or a few sentences from the spec alone. Only geometry uses bytes: the points of an
+example frame give the columns and the directions of the channels.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ STATUSES = {
     "capture": "agrees with captures of the device",
     "hardware": "tried on the device",
 }
-#: what a scan ends at, by the name of its rule.
+#: Rule of a scan -> a description of its end.
 RULES = {
     "OnWrap": "where `{name}` passes {at:g}",
     "OnFlag": "before every packet in which `{name}` is set",
@@ -38,15 +37,15 @@ RULES = {
     "OnJump": "before every packet in which `{name}` jumps by more than {by:g}",
     "OnRewind": "before every packet in which `{name}` falls back",
 }
-#: most channels that are listed.
+#: Maximum number of channels to list.
 RINGS = 128
 
 
 def page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
-    """The page as Markdown.
+    """Return the page as Markdown.
 
     Args:
-        pictures: where the packet diagram of a frame type is, for those that have one.
+        pictures: frame type -> address of its packet diagram.
     """
     parts = [f"# {escape(f'{sensor.vendor} {sensor.model}')}", "\n".join(_facts(sensor))]
     if sensor.commands:
@@ -93,7 +92,7 @@ def _link(link: Link) -> str:
 
 
 def _levels(lines: Mapping[str, bool | None]) -> list[str]:
-    """Control lines with the level that they are set to."""
+    """Return the control lines with their levels."""
     return [
         f"{name.upper()} {'high' if level else 'low'}"
         for name, level in lines.items()
@@ -151,7 +150,7 @@ def _answer(command: Command) -> str:
 
 
 def effect(sensor: Sensor, name: str) -> str:
-    """What a command does, and when it is sent, in words."""
+    """Return the effect of a command and when it is sent, in words."""
     command = sensor.commands[name]
     said = {
         "starts the data": command.starts,
@@ -190,7 +189,7 @@ def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
     ]
     told = [
         [cell if "`" in cell else cell.replace("[", r"\[") for cell in row] for row in rows
-    ]  # an index is no link
+    ]  # an index is not a link
     yield "\n".join(_table(["offset", "size", "type", "field", "unit", "meaning"], told))
 
 
@@ -240,7 +239,7 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
 
 
 def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
-    """The points of an example frame; None where it has none of its own."""
+    """Return the points of an example frame, None if it has none."""
     try:
         frames = packed([Found(name, 0, sensor.example(name))])
         packets = PacketStream(sensor, name, Counters()).add([frames]).with_points
@@ -250,7 +249,7 @@ def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
 
 
 def _rings(cloud: PointCloud) -> Sequence[tuple[str, str]]:
-    """The elevation of each channel, where it is one and the same in all points."""
+    """Return the elevation of each channel, if it is constant in all points."""
     if cloud.ring is None:
         return []
     rows = []

@@ -1,7 +1,7 @@
-"""A spec as a type stub for editors and type checkers: a class for each struct of each frame, and
-the sensor's own methods.
+"""A spec as a type stub for editors and type checkers.
 
-What `parse` returns has the fields as attributes, so a frame can be typed by the class of its type:
+It has a class for each struct of each frame, and the sensor's own methods. The result of `parse`
+has the fields as attributes, so a frame can be typed by the class of its type:
 
     if TYPE_CHECKING:
         from acme_x1 import Data, AcmeX1
@@ -40,17 +40,17 @@ from lidarspec.spec.tree import (
     children,
 )
 
-#: the types of arguments of commands.
+#: The types of arguments of commands.
 TYPES = {Range: "float", Text: "str", Address: "str", Octets: "bytes"}
-#: what `parse` takes besides the bytes and the frame.
+#: The further parameters of `parse`.
 PARSING = "verify: bool = True, units: bool = False"
 
 
 def pyi(sensor: Sensor) -> str:
-    """The stub of a sensor.
+    """Return the stub of a sensor.
 
     Raises:
-        Refused: where a frame holds Python code, or two frame types have one class name.
+        Refused: if a frame contains Python code, or two frame types have the same class name.
     """
     frames = messages(sensor, on_wire=False)
     names = {message.name: camel(message.name) for message in frames}
@@ -70,7 +70,7 @@ def pyi(sensor: Sensor) -> str:
 
 
 def camel(name: str) -> str:
-    """A name as a class has it."""
+    """Return a name in the spelling of a class."""
     words = "".join(part[:1].upper() + part[1:] for part in re.split(r"\W+|_+", name) if part)
     if words[:1].isalpha():
         return words
@@ -86,15 +86,13 @@ from lidarspec import Sensor'''
 
 @dataclass
 class _Classes:
-    """The classes written so far, the inner ones before those that hold them, and the names that
-    are taken.
-    """
+    """The classes written so far, inner ones first, and the names in use."""
 
     taken: set[str]
     done: list[str] = field(default_factory=list)
 
     def add(self, node: Struct | Sealed | Block, name: str, says: str) -> str:
-        """Write the class of a struct or block; its name."""
+        """Write the class of a struct or block, and return its name."""
         while name in self.taken:
             name += "_"
         self.taken.add(name)
@@ -114,8 +112,10 @@ class _Classes:
                 yield name, [part.info for part in node.parts if part.names[0] == name]
 
     def _attribute(self, owner: str, name: str, node: Node | list[FieldInfo]) -> list[str]:
-        """The lines of a member: a node, or the infos of the parts of a bit block that begin with
-        its name.
+        """Return the lines of a member.
+
+        Args:
+            node: a node, or the parts of a bit block that begin with this name.
         """
         if isinstance(node, list):
             kind = "int" if len(node) == 1 else "Any"
@@ -167,7 +167,7 @@ class _Classes:
 
 
 def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, str]) -> str:
-    """The class of the sensor: what `parse`, `build`, `example` and `command` take and give."""
+    """Return the class of the sensor with `parse`, `build`, `example` and `command`."""
     parses = "\n".join(
         f'    @overload\n    def parse(self, data: bytes, frame: Literal["{frame}"], *, {PARSING})'
         f" -> {name}: ..."
@@ -199,8 +199,9 @@ class {camel(sensor.id)}(Sensor):
 
 
 def _build(message: ExportedFrame) -> str:
-    """The signature that builds a frame: its fields by name, numbers raw or with `units` physical;
-    constants and sums are filled in.
+    """Return the signature that builds a frame, with its fields by name.
+
+    Numbers are raw, or with `units` physical; constants and checksums are filled in.
     """
     fields = "".join(
         f", {member.name}: {'float' if isinstance(member, Number) else 'Any'} = ..."

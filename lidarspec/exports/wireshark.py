@@ -46,7 +46,7 @@ WIDTH = 140
 
 
 class Code(str):
-    """Lua as it stands, not to be quoted."""
+    """Lua code, which is not quoted."""
 
 
 _OPERATIONS = {
@@ -68,7 +68,7 @@ _OPERATIONS = {
 
 
 def formula(value: tree.Formula) -> Code:
-    """A formula as a number, or as a function of the values of fields."""
+    """Return a formula as a number, or as a Lua function of the values of fields."""
     if isinstance(value, int):
         return Code(str(value))
     return _function(value)
@@ -87,7 +87,7 @@ def _function(value: tree.Formula, missing: str = "") -> Code:
 
 
 def lua(value: Any, indent: str = "") -> str:
-    """Plain data as a Lua expression, on one line where it fits."""
+    """Return plain data as a Lua expression, on one line if it fits."""
     if isinstance(value, Code):
         return str(value)
     if isinstance(value, str):
@@ -114,7 +114,7 @@ def _key(key: object) -> str:
 
 
 def quote_lua(text: str | bytes) -> str:
-    """A Lua string; what is not printable ASCII as decimal escapes."""
+    """Return a Lua string, with decimal escapes for all but printable ASCII."""
     data = text.encode() if isinstance(text, str) else text
     return (
         '"'
@@ -126,7 +126,7 @@ def quote_lua(text: str | bytes) -> str:
     )
 
 
-#: an array element with at most this many fields shows their values in its own line.
+#: An array element with at most this many fields shows their values in its own line.
 SUMMED = 4
 Table = dict[str, Any]
 
@@ -489,7 +489,7 @@ def _leaves(node: tree.Node) -> list[tree.Node | tree.Part]:
 
 
 def _around(*paths: str) -> str:
-    """The path of the innermost struct that has all of these fields."""
+    """Return the path of the innermost struct that contains all of these fields."""
     parents = [path.split(".")[:-1] for path in paths]
     depth = next(
         (
@@ -535,8 +535,8 @@ def _run(bits: BitField, size: int, order: str) -> int | None:
     return None
 
 
-#: the link types that captures keep for private use, USER0 to USER15, by the numbers that
-#: Wireshark's wtap gives them.
+#: The link types USER0 to USER15, which captures reserve for private use, by their numbers in
+#: Wireshark's wtap.
 USER_LINKS = tuple(range(45, 61))
 
 _HEAD = """\
@@ -575,11 +575,12 @@ local marks = {{
 
 
 def dissector(sensor: Sensor) -> str:
-    """A Lua dissector for Wireshark: of the sensor's UDP and TCP ports, and of captures of a serial
-    line.
+    """Return a Lua dissector for Wireshark.
+
+    It is used for the sensor's UDP and TCP ports, and for captures of a serial line.
 
     Raises:
-        Refused: where only Python code can decide what a frame is made of.
+        Refused: if Python code decides the contents of a frame.
     """
     name = sensor.id.replace("-", "_")
     title = f"{sensor.vendor} {sensor.model}"
@@ -629,7 +630,7 @@ def _frame(message: ExportedFrame, name: str) -> dict[str, Any]:
 
 
 def _patterns(sensor: Sensor) -> dict[str, list[int]]:
-    """Where frames are found: Wireshark's table -> its patterns."""
+    """Return the patterns by which frames are found, by Wireshark's table."""
     links = sensor.links.values()
     patterns = {
         "udp.port": [port for link in links if isinstance(link, Udp) for port in link.ports],

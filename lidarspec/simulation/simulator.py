@@ -278,7 +278,7 @@ class Measurement:
                 part = _part(answer, spot)
                 near = part[
                     np.isclose(part, expected)
-                ]  # a direction whose length is 1 but for its own steps is part of the range
+                ]  # a direction with a length of nearly 1 is part of the range
                 if np.allclose(near, expected, EXACT, 0):
                     step = info.scale
                 else:
