@@ -1,9 +1,8 @@
-"""Which checksum is this: what a set of sample frames is sealed with, where it stands and what it
-covers.
+"""Find the checksum of sample frames: algorithm, place and covered bytes.
 
 The plain checksums are tried one by one, the usual ones first: XOR, sums of bytes and words, their
-complements, words in groups, folded sums, split nibbles. CRCs are found without trying
-(`crc_search`), and looked for only where no plain one is beyond doubt.
+complements, words in groups, folded sums, split nibbles. CRCs are found without trial
+(`crc_search`), and only if no plain checksum is certain.
 """
 
 from __future__ import annotations
@@ -29,17 +28,17 @@ from lidarspec.drafting.samples import (
 from lidarspec.frames.row_checksums import batch
 from lidarspec.spec.checksums import ByteOrder, Bytes, Checksum, Fold15, Sum, Values, WordXor, Xor
 
-#: matches that are told.
+#: Maximum number of matches to return.
 TOLD = 8
-#: frames that a guess is tried on before it is held against all.
+#: Number of frames on which a guess is tried before all frames are used.
 SCREENED = 16
-#: share of the frames that a checksum with a constant of its own has to be right for.
+#: Minimum share of frames with a valid checksum, if it has a constant of its own.
 CERTAIN = 0.95
 ANYWHERE = (
     "an XOR of a whole frame fits at other places of it as well:"
     " of those that do, this is where bytes vary most"
 )
-#: heads and groups of words that are tried.
+#: Heads and groups of words that are tried.
 HEADS = (0, 2, 4, 6, 8, 10, 12)
 GROUPS = ((2,), (1, 2), (2, 1), (1, 1, 2))
 _PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
@@ -47,8 +46,11 @@ _PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
 
 @dataclass(frozen=True)
 class WordSum(Checksum):
-    """The sum of two-byte words modulo 2**16, an odd last byte extended by zeros; with `carry`,
-    carries are added back.
+    """The sum of two-byte words modulo 2**16; an odd last byte is extended by zeros.
+
+    Attributes:
+        words: byte order of the words.
+        carry: whether carries are added back.
     """
 
     words: ByteOrder = "little"
@@ -80,8 +82,10 @@ class WordSum(Checksum):
 
 @dataclass(frozen=True)
 class Changed(Checksum):
-    """Another checksum with a constant on it: ``constant - it`` with `negative`, else ``constant +
-    it``; for XORs ``constant ^ it``.
+    """Another checksum with a constant.
+
+    It is ``constant - value`` with `negative`, else ``constant + value``; for XORs
+    ``constant ^ value``.
     """
 
     of: Checksum
@@ -123,14 +127,16 @@ class Changed(Checksum):
 def search(
     frames: Iterable[bytes], *, quick: bool = False, stands: Callable[[Place], bool] = anywhere
 ) -> list[Match]:
-    """The checksums that fit the frames, the plainest and best proven first; empty where none does.
+    """Return the checksums that match the frames, the simplest and surest first.
+
+    Returns an empty list if there is none.
 
     Args:
-        frames: whole frames, the more of them and the more different the better; some may be
+        frames: whole frames; more and more different frames give a surer result; some may be
             damaged, and lengths may differ.
-        quick: end after about a second: look for CRCs at the usual places only, and for those of
+        quick: end after about a second: search for CRCs at the usual places only, and for CRCs of
             long frames in the catalogue only.
-        stands: whether a checksum may stand at a place.
+        stands: returns whether a checksum may be at a place.
     """
     samples = Samples(frames)
     if samples.shortest < 3 or not any(map(any, samples.frames)):
@@ -144,7 +150,7 @@ def search(
 
 
 def format_algorithm(algorithm: Checksum) -> str:
-    """The algorithm as a plugin writes it; a class where the package has none."""
+    """Return the algorithm as Python source; a class if the package has none."""
     if isinstance(algorithm, Changed | WordSum):
         return _class(algorithm)
     if isinstance(algorithm, Sum):
@@ -155,7 +161,7 @@ def format_algorithm(algorithm: Checksum) -> str:
 
 
 def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) -> Iterator[Match]:
-    """Every plain checksum that fits, in no special order."""
+    """Yield every plain checksum that matches, in no special order."""
     few = samples.few(SCREENED)
     tried = 0
     sure = False
@@ -186,8 +192,9 @@ def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) 
 def _fitting(
     samples: Samples, few: Samples, algorithm: Checksum, place: Place, span: Span, tried: int
 ) -> Iterator[Match]:
-    """An algorithm and its complements where they fit; a constant is fitted where there are frames
-    to prove it.
+    """Yield an algorithm and its complements if they match.
+
+    A constant is fitted only if there are several frames to prove it.
     """
     computed = few.compute_checksums(algorithm, place, span)
     mask = np.uint64((1 << 8 * place.size) - 1)
@@ -256,7 +263,7 @@ def _change(algorithm: Checksum, constant: int) -> Checksum:
 
 
 def _constant(values: NDArray[np.uint64]) -> list[int]:
-    """The value that nearly all of them have, if there is one."""
+    """Return the value that nearly all elements have, if there is one."""
     distinct, counts = np.unique(values, return_counts=True)
     most = int(counts.argmax())
     if enough(int(counts[most]), len(values)):
@@ -265,7 +272,7 @@ def _constant(values: NDArray[np.uint64]) -> list[int]:
 
 
 def _nibbles(samples: Samples) -> Iterator[Match]:
-    """An XOR whose halves stand in the low nibbles of two bytes next to each other."""
+    """Yield an XOR that is stored in the low nibbles of two adjacent bytes."""
     for front in range(min(3, samples.shortest - 4)):
         place = Place(front, 2)
         there = samples.fields(place, "little")
@@ -299,7 +306,7 @@ _WIDE: tuple[Checksum, ...] = (
 
 
 def _class(algorithm: Checksum) -> str:
-    """The source of a class for a checksum that the package has no name for."""
+    """Return the source of a class for a checksum that the package does not have."""
     if isinstance(algorithm, Changed):
         changed = algorithm
     else:

@@ -154,7 +154,7 @@ class _Reading:
     """A conversion of frames to polynomials.
 
     Attributes:
-        width: of the CRC, in bits.
+        width: width of the CRC, in bits.
         order: byte order of the stored CRC.
         refin, refout: whether bytes and register begin with the lowest bit.
     """
@@ -196,7 +196,7 @@ def crc_matches(
     quick: bool = False,
     stands: Callable[[Place], bool] = anywhere,
 ) -> Iterator[Match]:
-    """Yield the CRCs that fit, up to the first place with a sure match.
+    """Yield the CRCs that match, up to the first place with a sure match.
 
     Args:
         mixed: search only for CRCs with different `refin` and `refout`; by default, only for CRCs
@@ -287,7 +287,7 @@ def _fitting(
     *,
     by_catalogue: bool,
 ) -> Iterator[Match]:
-    """Yield the CRCs that fit for one place, span and reading.
+    """Yield the CRCs that match for one place, span and reading.
 
     Args:
         few: the samples that are used to find candidates; all samples are used to test these.

@@ -330,7 +330,7 @@ def _find_front(known: Draft, parts: Sequence[bytes]) -> Draft:
 
 
 def _seals(known: Draft) -> list[Match]:
-    """Return the checksums that fit, except at rising fields and at nearly constant bytes."""
+    """Return the matching checksums, except at rising or nearly constant bytes."""
     frames = [frame for _, frame in known.frames]
     step = max(1, len(frames) // MAX_CHECKSUM_FRAMES)
     shortest = min(map(len, frames), default=0)
@@ -344,7 +344,7 @@ def _seals(known: Draft) -> list[Match]:
 
 
 def _changes(match: Match, frames: Sequence[bytes]) -> bool:
-    """Return whether most bits of a checksum change; True if there are too few frames."""
+    """Return whether most bits of a checksum change; True if there are few frames."""
     starts = [match.place.start(len(frame)) for frame in frames]
     stored = [
         int.from_bytes(frame[start : start + match.place.size])
@@ -408,7 +408,7 @@ def _add_details(known: Draft) -> Draft:
 
 
 def _find_flagged_blocks(rows: NDArray[np.uint8]) -> Blocks | None:
-    """Return blocks that begin with the same two constant bytes and fill much of the frame."""
+    """Return blocks that begin with the same two bytes and fill much of the frame."""
     first, steady = rows[0], (rows == rows[0]).mean(axis=0) >= STEADY
     pairs: dict[tuple[int, int], list[int]] = {}
     for spot in np.flatnonzero(steady[:-1] & steady[1:]).tolist():
@@ -431,7 +431,7 @@ def _find_flagged_blocks(rows: NDArray[np.uint8]) -> Blocks | None:
 
 
 def _find_blocks_of_fields(found: Sequence[Candidate], length: int) -> Blocks | None:
-    """Return the largest blocks that each begin with a rising field of the same kind."""
+    """Return the largest blocks that each begin with a rising field of one kind."""
     rows = []
     for one in found:
         like = [(one.size, one.order, one.kind, one.circle)]

@@ -158,7 +158,7 @@ def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:
 
 
 def follows(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
-    """Return the share of frames in which `last` is between this `first` and the next `first`."""
+    """Return the share of frames with `last` between this `first` and the next."""
     modulus = circle or 1 << 40
     return float((((last - first)[:-1] % modulus) <= (np.diff(first) % modulus)).mean())
 
@@ -258,7 +258,7 @@ def _rising(
 
 
 def _low_byte_counts(there: NDArray[np.int64]) -> bool:
-    """Return whether the lowest byte belongs to the field: without it, steps are less even."""
+    """Return whether the lowest byte belongs to the field: it makes steps more even."""
     steps = np.diff(there)
     coarse = 256 * np.diff(there >> 8)
     fine, rough = (np.abs(np.diff(each[steps != 0])) for each in (steps, coarse))
@@ -385,7 +385,7 @@ def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
 
 
 def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
-    """Return the structure that explains more bytes, and prefer one length for all frames."""
+    """Return the structure that explains more bytes; prefer one length."""
     periodic = _periodic(data)
     varying = _by_length(data)
     if periodic is None or varying is None:
@@ -423,7 +423,7 @@ def _periodic(data: NDArray[np.uint8]) -> Structure | None:
 
 
 def _split_groups(data: NDArray[np.uint8], whole: Structure) -> Structure:
-    """Split frames that are groups of shorter frames; return other frames unchanged.
+    """Split frames that are groups of shorter frames; return others unchanged.
 
     A group repeats if, for example, an index runs from 0 to 5, or the data is simulated. A part
     counts as a frame if its sync bytes have different values, or if it has a counter.
@@ -473,11 +473,10 @@ def _iter_frames_of_length(
 
 
 def _is_chance(data: NDArray[np.uint8], steady: int, count: int, period: int) -> bool:
-    """Return whether random bytes with the same shares of values would show such a structure as
-    well.
+    """Return whether random bytes are likely to show such a structure.
 
-    Chernoff's bound gives the probability of so many steady bytes at one period; all periods that
-    are tried count.
+    The random bytes have the same shares of values. Chernoff's bound gives the probability of as
+    many steady bytes at one period; all periods that are tried count.
 
     Args:
         steady: bytes of a period that are the same in each repetition, and not 0.
@@ -495,7 +494,7 @@ def _is_chance(data: NDArray[np.uint8], steady: int, count: int, period: int) ->
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
-    """Return start and length of the longest run of constant bytes, counted by nonzero bytes.
+    """Return start and length of the run with the most nonzero constant bytes.
 
     A run may continue from the end of the period to its start. Zeros at the start of a run are left
     out, since they are frequent in any data.
@@ -541,7 +540,9 @@ def _by_length(data: NDArray[np.uint8]) -> Structure | None:
 def _find_length_field(
     data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes
 ) -> Structure | None:
-    """Return the frames between sync bytes if a byte or word after these gives most lengths.
+    """Return the frames between sync bytes that a length field explains.
+
+    The length field is the byte or word after the sync bytes that gives most lengths.
 
     Args:
         starts: offsets of the sync bytes.

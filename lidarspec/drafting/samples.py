@@ -1,6 +1,4 @@
-"""Sample frames of an unknown format, where a checksum could stand in them, and which bytes it
-could cover.
-"""
+"""Sample frames of an unknown format, with possible places of a checksum."""
 
 from __future__ import annotations
 
@@ -17,34 +15,34 @@ from lidarspec.spec.checksums import ByteOrder, Checksum
 
 Part = Literal["all", "before", "behind"]
 
-#: frames up to this length are searched at every place, longer ones so near to their ends only.
+#: Maximum length of frames that are searched at every offset, and the distance from both ends at
+#: which longer ones are searched.
 SHORT = 64
 NEAR = 12
-#: bytes in front that a checksum at the end may leave out, and how far from the end that is.
+#: Maximum number of first bytes that a checksum at the end may omit, and its distance from the end.
 HEAD = 6
 TAIL = 4
-#: how far apart the values of each byte of a checksum lie, and how much more likely the usual place
-#: is.
+#: Minimum range of the values of each byte of a checksum, and the weight of the usual place.
 APART = 96
 USUAL = 1.1
-#: share of the frames that a checksum has to be right for: some may be damaged.
+#: Minimum share of frames with a valid checksum: some may be damaged.
 ENOUGH = 0.6
-#: doubt at which a match is sure enough for the search to end: one wrong guess in a million looks
-#: like that.
+#: Bits of evidence at which a match ends the search: one in a million wrong guesses reaches it.
 SURE = 20
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a checksum stands: `size` bytes from `offset` on, which counts from the end where it is
-    negative.
+    """The place of a checksum: `size` bytes from `offset` on.
+
+    A negative offset counts from the end of the frame.
     """
 
     offset: int
     size: int
 
     def start(self, length: int) -> int:
-        """The first byte in a frame of this length."""
+        """Return the offset in a frame of this length."""
         if self.offset < 0:
             return self.offset + length
         return self.offset
@@ -63,8 +61,9 @@ class Place:
 
 @dataclass(frozen=True)
 class Span:
-    """Which bytes a checksum covers: those before its place, behind it, or both, without the first
-    `head` and the last `tail`.
+    """The bytes that a checksum covers: before its place, behind it, or both.
+
+    The first `head` and the last `tail` bytes are omitted.
     """
 
     part: Part = "all"
@@ -72,7 +71,7 @@ class Span:
     tail: int = 0
 
     def ranges(self, place: Place, length: int) -> list[tuple[int, int]]:
-        """The byte ranges in a frame of this length."""
+        """Return the byte ranges in a frame of this length."""
         start = place.start(length)
         end = start + place.size
         before = (self.head, start)
@@ -81,7 +80,7 @@ class Span:
         return [(first, last) for first, last in chosen if last > first]
 
     def describe(self, place: Place, length: int) -> str:
-        """The bytes in words."""
+        """Describe the bytes in words."""
         if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(
             b - a for a, b in self.ranges(place, length)
         ) == length - place.size:
@@ -99,18 +98,17 @@ class Span:
 
 @dataclass(frozen=True)
 class Match:
-    """A checksum that fits.
+    """A checksum that matches.
 
     Attributes:
-        algorithm: what computes it.
-        place, span, order: where it stands, what it covers, and its byte order.
-        right, total: frames that it is right for, and all.
-        doubt: 2**doubt is the number of wrong checksums of which one would fit as well by chance;
-            low is weak.
-        paste: the algorithm as a plugin writes it.
-        remarks: what else is to be said.
-        name: what a catalogue calls it.
-        open: whether other parameters fit these frames as well.
+        algorithm: the algorithm.
+        place, span, order: its place, covered bytes, and byte order.
+        right, total: number of frames with a valid checksum, and of all.
+        doubt: bits of evidence: one of 2**doubt wrong checksums would match as well by chance.
+        paste: the Python source of the algorithm.
+        remarks: further remarks.
+        name: its name in the catalogue.
+        open: whether other parameters match these frames as well.
         varied: the variation of its place, as from `Samples.measure_variation`.
     """
 
@@ -129,15 +127,15 @@ class Match:
 
     @property
     def odds(self) -> str:
-        """The number of wrong checksums of which one would fit as well by chance, as a power of
-        ten.
-        """
+        """The number of wrong checksums of which one would match, as a power of ten."""
         return f"1e+{int(self.doubt * np.log10(2)):02}"
 
     @property
     def sure(self) -> bool:
-        """Whether nothing else has to be looked for: it stands at an end, and covers all or all but
-        a header.
+        """Whether the search can end.
+
+        The match is certain, and the checksum is at an end or covers all other bytes, or all but a
+        header.
         """
         at_end = self.place.offset < 0 and self.place.offset + self.place.size == 0
         return (
@@ -148,7 +146,7 @@ class Match:
 
 
 def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> NDArray[np.int64]:
-    """What stands at a place in each row, (n,); at most 7 bytes."""
+    """Return the values at a place in each row, (n,); at most 7 bytes."""
     columns = rows[:, offset : offset + size].astype(np.int64)
     shifts = 8 * np.arange(size, dtype=np.int64)
     total: NDArray[np.int64] = (columns << (shifts if order == "little" else shifts[::-1])).sum(
@@ -158,7 +156,7 @@ def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) ->
 
 
 class Samples:
-    """Distinct frames, those of one length together."""
+    """Distinct frames, grouped by length."""
 
     def __init__(self, frames: Iterable[bytes], *, most: int = 256) -> None:
         distinct = list(dict.fromkeys(frame for frame in frames if frame))[:most]
@@ -167,7 +165,7 @@ class Samples:
         self.groups: list[NDArray[np.uint8]] = [
             np.frombuffer(b"".join(group), np.uint8).reshape(len(group), -1) for group in groups
         ]
-        # The same fields are asked for with each algorithm that is tried.
+        # The same fields are read for each algorithm that is tried.
         self._fields: dict[tuple[Place, ByteOrder], NDArray[np.uint64]] = {}
 
     def __len__(self) -> int:
@@ -181,13 +179,16 @@ class Samples:
         return 0
 
     def few(self, number: int) -> Samples:
-        """So many frames, spread over all of them."""
+        """Return `number` frames, spread over all of them."""
         step = max(1, len(self.frames) // number)
         return Samples(self.frames[::step][:number])
 
     def alike(self, number: int, pick: int) -> Samples:
-        """So many frames of the commonest length, by `pick` other ones, and two of as many other
-        lengths.
+        """Return `number` frames of the most frequent length, and two of other lengths.
+
+        Args:
+            number: also the maximum number of other lengths.
+            pick: selects different frames.
         """
         largest = max(self.groups, key=len)
         step = max(1, len(largest) // number)
@@ -201,7 +202,7 @@ class Samples:
         )
 
     def fields(self, place: Place, order: ByteOrder) -> NDArray[np.uint64]:
-        """What stands at a place in each frame, shape (n,)."""
+        """Return the values at a place in each frame, (n,)."""
         if (place, order) not in self._fields:
             columns = [
                 values(group, place.start(group.shape[1]), place.size, order)
@@ -211,7 +212,7 @@ class Samples:
         return self._fields[place, order]
 
     def cut_span(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
-        """The bytes that a span covers, group by group: (frames, bytes) each."""
+        """Return the bytes that a span covers, group by group: (frames, bytes) each."""
         return [
             np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1)
             for group in self.groups
@@ -220,20 +221,21 @@ class Samples:
     def compute_checksums(
         self, algorithm: Checksum, place: Place, span: Span
     ) -> NDArray[np.uint64]:
-        """The checksum of each frame, shape (n,)."""
+        """Return the checksum of each frame, (n,)."""
         return np.concatenate(
             [batch(algorithm, np.ascontiguousarray(rows)) for rows in self.cut_span(place, span)]
         )
 
     def right(self, algorithm: Checksum, place: Place, span: Span, order: ByteOrder) -> int:
-        """How many frames a checksum is right for."""
+        """Return the number of frames with a valid checksum."""
         return int(
             (self.compute_checksums(algorithm, place, span) == self.fields(place, order)).sum()
         )
 
     def places(self, size: int) -> Iterator[Place]:
-        """Where a checksum of so many bytes can stand: at the end, in front, and elsewhere; only
-        where what stands there varies.
+        """Yield the possible places of a checksum: at the end, in front, elsewhere.
+
+        Places with constant values are omitted.
         """
         last = self.shortest - size
         first = last if self.alone else 0
@@ -262,14 +264,14 @@ class Samples:
 
     @property
     def alone(self) -> bool:
-        """Whether there is one frame: too little to look anywhere but at the usual places."""
+        """Whether there is only one frame, for which only the usual places are searched."""
         return len(self) == 1
 
     def measure_variation(self, place: Place) -> float:
-        """How much that byte of a place varies that varies least: whether its values lie far apart,
-        and how many are distinct.
+        """Return the variation of the byte of a place that varies least.
 
-        The usual place, at the end, needs a little less.
+        It depends on the range and on the number of distinct values. The usual place, at the end,
+        has a larger weight.
         """
         columns = [
             self.fields(Place(place.offset + spot, 1), "little") for spot in range(place.size)
@@ -285,8 +287,9 @@ def anywhere(_: Place) -> bool:
 
 
 def spans(place: Place, samples: Samples) -> Iterator[Span]:
-    """What a checksum at a place can cover, the usual first; what says the same of these frames in
-    other words is left out.
+    """Yield the spans of a checksum at a place, the usual first.
+
+    Spans that cover the same bytes of these frames are omitted.
     """
     start = place.start(samples.shortest)
     before = start
@@ -313,25 +316,26 @@ def spans(place: Place, samples: Samples) -> Iterator[Span]:
 
 
 def doubt(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
-    """How many bits of doubt a match leaves: of 2**doubt wrong checksums one would fit as well by
-    chance.
+    """Return the bits of evidence of a match.
+
+    One of 2**bits wrong checksums would match as well by chance.
 
     Args:
-        width: of the checksum, bits.
-        values: what the frames hold in its place, (n,).
-        fitted: how many distinct values were used up to find the parameters.
-        tried: checksums that were looked at.
+        width: width of the checksum, in bits.
+        values: the values of the frames in its place, (n,).
+        fitted: number of distinct values that determined the parameters.
+        tried: number of checksums that were tried.
     """
     return width * (len(np.unique(values)) - fitted) - float(np.log2(max(tried, 1)))
 
 
 def enough(right: int, total: int) -> bool:
-    """Whether a checksum is right often enough for the rest to be damaged frames."""
+    """Return whether enough frames are valid for the others to be damaged ones."""
     return right >= max(1, ENOUGH * total)
 
 
 def best_first(matches: Sequence[Match]) -> list[Match]:
-    """The plainest and best proven first."""
+    """Return the matches, the simplest and surest first."""
 
     def key(match: Match) -> tuple[object, ...]:
         span = match.span
