@@ -1,10 +1,10 @@
-"""Who may reach the page: the token of its link, and the Host and Origin of each request.
+"""Access to the page: the token of its link, and the Host and Origin headers.
 
 Each server makes a token, and each request needs it in its query: pages, scripts, downloads,
 socket. Other users of this computer can connect to the server, but do not know the token. It is not
 kept in a cookie: browsers send the cookies of one port to all ports of this computer, so a server
 of another user would receive it. Host and Origin stop other pages in the same browser, also those
-whose name was made to point to this computer.
+with a name that was made to point to this computer.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-#: random bytes of a token.
+#: Random bytes of a token.
 TOKEN_BYTES = 24
-#: names of this computer in its own browser.
+#: Names of this computer in its own browser.
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-#: addresses that stand for all interfaces.
+#: Addresses that stand for all interfaces.
 ANY_ADDRESS = ("0.0.0.0", "::")
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -61,14 +61,14 @@ def make_token() -> str:
 
 
 class Guard:
-    """Passes on the requests that the page itself makes, and adds headers that bind the browser.
+    """Passes on the requests of the page itself, and adds security headers.
 
     Args:
-        app: serves them.
-        host: where the server listens.
+        app: the application that serves them.
+        host: address on which the server listens.
         name: the host in the printed link.
-        port: where the server listens.
-        token: of the printed link.
+        port: port on which the server listens.
+        token: token of the printed link.
         admit: called with the client of each request that has the token.
     """
 
@@ -107,11 +107,11 @@ class Guard:
             await refusal(scope, receive, send_with_headers)
             return
         self._admit(scope["client"])
-        # Nothing behind this point sees the token, so that it is in no log and no message.
+        # The application does not see the token, so that it is in no log and no message.
         await self._app({**scope, "query_string": b""}, receive, send_with_headers)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """Return the answer to a request that is not served."""
+        """Return the response to a request that is refused, else None."""
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         origin = headers.get("origin")
@@ -162,7 +162,7 @@ def add_token(page: str, token: str) -> str:
 
 
 def write_opening_page(folder: Path, link: str) -> Path:
-    """Write a page that leads to the link, which the user alone can read, and return its path.
+    """Write a page that leads to the link, readable only by the user; return its path.
 
     A browser is started with this file: other users see the command lines of all programs, and
     would find the token of the link there.

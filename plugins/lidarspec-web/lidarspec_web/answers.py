@@ -21,9 +21,9 @@ from lidarspec_web.backlog import MAX_DAMAGED, Backlog, Damaged, Taken
 from lidarspec_web.broadcast import Broadcast, Shown
 from lidarspec_web.command_forms import find_restart, make_form
 
-#: explanations of frames that are kept.
+#: Number of cached explanations of frames.
 KEPT_EXPLANATIONS = 16
-#: damaged pieces in one message.
+#: Maximum number of damaged pieces in one message.
 MAX_DAMAGED_LISTED = 20
 
 
@@ -31,11 +31,11 @@ class Answers:
     """Makes the messages to the pages of a broadcast.
 
     Args:
-        broadcast: shown by the pages.
+        broadcast: the broadcast that the pages show.
         control: whether commands may be sent to a real sensor.
 
     Attributes:
-        duration: of a file, in seconds; None if it is not known.
+        duration: duration of a file, in seconds; None if it is unknown.
         why_no_control: the reason why no commands are sent; "" if they are.
     """
 
@@ -48,7 +48,7 @@ class Answers:
         self._verdict = functools.lru_cache(maxsize=MAX_DAMAGED)(self._make_verdict)
 
     def hello(self) -> dict[str, Any]:
-        """Return the first message to a page: the source, its sensor, and what can be done."""
+        """Return the first message to a page: source, sensor, and available actions."""
         broadcast = self.broadcast
         sensor = broadcast.device.sensor
         return {
@@ -108,7 +108,7 @@ class Answers:
         Args:
             taken: the frame.
             why: the reason why it is shown: "last", "number" or "point".
-            place: of the point in the frame that the page asked for.
+            place: origin of the point that the page asked for.
         """
         explanation = self._explain(taken.frame, taken.data)
         value = None
@@ -144,7 +144,7 @@ class Answers:
         return self.frame(taken, "point", place)
 
     def find_damaged(self, number: int, backlog: Backlog) -> dict[str, Any]:
-        """Return a damaged piece with what would explain the damage."""
+        """Return a damaged piece with the changes that would explain the damage."""
         piece = backlog.find_damaged(number)
         if piece is None:
             return _gone(f"damaged piece {number}")
@@ -162,8 +162,8 @@ class Answers:
         """Return the bytes of a command, explained.
 
         Args:
-            name: of the command.
-            texts: its arguments as they were typed, by name.
+            name: name of the command.
+            texts: its arguments as typed, by name.
 
         Raises:
             UsageError: if an argument is missing or invalid.
@@ -201,7 +201,7 @@ class Answers:
         return piece.verdict(self.broadcast.device.sensor)
 
     def _position(self, at: int) -> float | None:
-        """Return the position of an arrival, ns since 1970, in seconds from the first scan."""
+        """Return the seconds from the first scan to an arrival (ns since 1970)."""
         began_ns = self.broadcast.began_ns
         if at <= 0 or not began_ns:
             return None
@@ -232,7 +232,7 @@ def saves() -> list[str]:
 
 
 def _gone(what: str) -> dict[str, Any]:
-    """Return the answer to a question about data that are not kept any more."""
+    """Return the reply for data that is no longer kept."""
     return {"is": "gone", "what": what}
 
 

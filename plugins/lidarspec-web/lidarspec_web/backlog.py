@@ -1,9 +1,9 @@
-"""The newest bytes of a source: its frames by number and offset, and its damaged bytes.
+"""The newest bytes of a source: frames by number and offset, and damaged bytes.
 
-A decoder shows the backlog its input and the frames that it found (`Witness`). Both are kept as
-they are, up to a limit, so that reading is not slowed down; a frame is cut out when it is asked
-for. Bytes that the decoder skipped are cut out at once, because their input is dropped soon: they
-are explained when a page asks for them.
+A decoder passes the backlog its input and the frames that it found (`Witness`). Both are stored
+unchanged, up to a limit, so that reading is not slowed down; a frame is cut out on request. Bytes
+that the decoder skipped are cut out at once, because their input is dropped soon: they are
+explained when a page asks for them.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from lidarspec.explaining.pieces import InputPiece, explain_piece
 from lidarspec.framing.results import Frames, Numbers, array_of
 from lidarspec.scans.provenance import PointOrigin
 
-#: of input that are kept.
+#: Maximum bytes of stored input.
 MAX_INPUT_BYTES = 1 << 23
-#: results of the decoder that are kept.
+#: Maximum number of stored results of the decoder.
 MAX_RESULTS = 1024
-#: damaged pieces that are kept.
+#: Maximum number of stored damaged pieces.
 MAX_DAMAGED = 500
-#: of one damaged piece that are kept.
+#: Maximum number of stored bytes of one damaged piece.
 MAX_DAMAGED_BYTES = 1 << 13
 
 
 @dataclass(frozen=True)
 class Damaged:
-    """Bytes in no frame: a damaged frame, or bytes of another kind.
+    """Bytes in no frame: a damaged frame, or other bytes.
 
     Attributes:
-        number: counts the damaged pieces, from 0 on.
-        offset: in the input.
+        number: number of the damaged piece, from 0.
+        offset: offset in the input.
         size: in bytes.
-        at: when the frame behind them arrived, ns since 1970; -1 if that is not known.
+        at: arrival of the frame after them, ns since 1970; -1 if it is unknown.
         data: the bytes, or the first of them.
         datagram: whether they are one whole datagram.
     """
@@ -55,7 +55,7 @@ class Damaged:
     datagram: bool
 
     def verdict(self, sensor: Sensor) -> str:
-        """Return what is wrong with the bytes, in one sentence."""
+        """Return the fault of the bytes in one sentence."""
         if not self.data:
             return "a message of which datagrams are missing"
         try:
@@ -70,9 +70,9 @@ class Taken:
     """One frame of the backlog.
 
     Attributes:
-        number: counts the frames, from 0 on; None if the frame is kept by its scan only.
+        number: number of the frame, from 0; None if only its scan holds the frame.
         frame: its type.
-        at: when it arrived, ns since 1970; -1 if that is not known.
+        at: arrival, ns since 1970; -1 if it is unknown.
         data: its bytes.
     """
 
@@ -84,13 +84,13 @@ class Taken:
 
 @dataclass(frozen=True)
 class _DecoderInput:
-    """What the decoder was given at once.
+    """One input of the decoder.
 
     Attributes:
-        offset: of its first byte in the whole input.
-        buffer: has its bytes, and maybe others.
+        offset: offset of its first byte in the whole input.
+        buffer: contains its bytes, and maybe others.
         starts: offset of each part in the buffer: one for a stream, one for each datagram.
-        sizes: of the parts, in bytes.
+        sizes: sizes of the parts, in bytes.
     """
 
     offset: int
@@ -105,7 +105,7 @@ class _DecoderInput:
 
 @dataclass(frozen=True)
 class _Result:
-    """Frames that the decoder found at once, and the number of the first."""
+    """Frames from one input of the decoder, and the number of the first."""
 
     first_number: int
     frames: Frames
@@ -130,13 +130,13 @@ class _Result:
 
 
 class Backlog:
-    """Keeps the newest input of a decoder and the frames in it: a `Witness`.
+    """Stores the newest input of a decoder and the frames in it: a `Witness`.
 
     One thread adds to it; any thread may read it.
 
     Attributes:
-        sensor: sends the bytes.
-        damaged: how many damaged pieces there were.
+        sensor: the sensor that sends the bytes.
+        damaged: number of damaged pieces so far.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -149,13 +149,13 @@ class Backlog:
         self._input_size = 0
         self._results = deque[_Result]()
         self._frame_count = 0
-        self._end = 0  # of the last frame, an offset in the input
+        self._end = 0  # end of the last frame, an offset in the input
         self._damaged = deque[Damaged](maxlen=MAX_DAMAGED)
 
     def fed(
         self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
     ) -> None:
-        """Keep what the decoder is given."""
+        """Store the input of the decoder."""
         with self._lock:
             self._is_stream = decoder.stream
             self._joins_datagrams = decoder.joins
@@ -165,7 +165,7 @@ class Backlog:
             self._drop_old()
 
     def found(self, frames: Frames) -> None:
-        """Keep frames of the input, in its order."""
+        """Store frames of the input, in its order."""
         if not len(frames):
             return
         with self._lock:
@@ -176,7 +176,7 @@ class Backlog:
             self._end = int(frames.places[-1]) + int(frames.sizes[-1])
 
     def forget(self) -> None:
-        """Forget the bytes, because the input begins anew; frames are still counted on."""
+        """Discard the bytes, because the input begins anew; frame numbers continue."""
         with self._lock:
             self._inputs.clear()
             self._results.clear()
@@ -184,7 +184,7 @@ class Backlog:
             self._end = 0
 
     def freeze(self) -> Backlog:
-        """Return a backlog of the frames and damaged pieces of now, to which nothing is added."""
+        """Return a copy of the current frames and damaged pieces, which does not change."""
         copy = Backlog(self.sensor)
         with self._lock:
             copy._results = deque(self._results)
@@ -199,7 +199,7 @@ class Backlog:
         return self._frame_count - 1
 
     def frame(self, number: int) -> Taken | None:
-        """Return a frame by its number, None if it is not kept."""
+        """Return a frame by its number, None if it is no longer stored."""
         with self._lock:
             following = bisect_right(self._results, number, key=lambda one: one.first_number)
             result = self._results[following - 1] if following else None
@@ -210,7 +210,7 @@ class Backlog:
     def at(self, place: PointOrigin) -> Taken | None:
         """Return the frame that a point came from.
 
-        None if it is not kept, and the scan does not have its bytes as they were sent.
+        Returns None if it is no longer stored and the scan does not have its original bytes.
         """
         with self._lock:
             following = bisect_right(self._results, place.offset, key=lambda one: one.offset)
@@ -225,11 +225,11 @@ class Backlog:
         return Taken(None, place.frame, place.host_ns or -1, place.data)
 
     def find_damaged(self, number: int) -> Damaged | None:
-        """Return a damaged piece by its number, None if it is not kept."""
+        """Return a damaged piece by its number, None if it is no longer stored."""
         return next((piece for piece in self.since(number) if piece.number == number), None)
 
     def since(self, number: int) -> list[Damaged]:
-        """Return the damaged pieces that are kept, from a number on."""
+        """Return the stored damaged pieces from a number on."""
         with self._lock:
             return [piece for piece in self._damaged if piece.number >= number]
 
@@ -268,7 +268,7 @@ class Backlog:
             self._input_size -= inputs.popleft().size
 
     def _keep_skipped(self, frames: Frames) -> None:
-        """Keep the bytes that were skipped before some of these frames."""
+        """Store the bytes that were skipped before some of these frames."""
         ends = frames.offsets + frames.sizes
         previous_ends = np.concatenate([[self._end], ends[:-1]])
         for index in np.flatnonzero(frames.gaps).tolist()[-MAX_DAMAGED:]:
@@ -293,7 +293,7 @@ class Backlog:
         self.damaged += 1
 
     def _stream_bytes(self, begin: int, end: int) -> bytes:
-        """Return the bytes of a stream from one offset to another, as far as they are kept."""
+        """Return the stored bytes of a stream from one offset to another."""
         parts = [
             bytes(one.buffer[max(begin - one.offset, 0) : end - one.offset])
             for one in self._inputs

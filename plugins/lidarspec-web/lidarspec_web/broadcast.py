@@ -1,11 +1,11 @@
 """A source that is read once and shown to any number of viewers.
 
-One thread reads (`run`); other threads see the newest scan, the figures, and the newest bytes.
+One thread reads (`run`); other threads use the newest scan, the figures, and the newest bytes.
 A file is played: it can be paused, moved through, and played at another speed, for all viewers
-together. A live source goes on whatever its viewers do.
+together. A live source does not depend on its viewers.
 
-Requests of other threads (`seek`, `step`, `play`) only leave a note, which the reading thread
-carries out at its next turn.
+Requests of other threads (`seek`, `step`, `play`) are only stored; the reading thread carries them
+out at its next turn.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from lidarspec.view.feed import DEFAULT_STEP_S, LOOK_S, Feed
 from lidarspec_web.backlog import Backlog
 from lidarspec_web.scan_message import message
 
-#: of figures that are kept.
+#: Duration of the stored figures.
 HISTORY_S = 60.0
-#: between two readings of the figures.
+#: Period between two readings of the figures.
 FIGURES_PERIOD_S = 1.0
-#: how many times as fast as it was recorded a file is played.
+#: Limits of the speed of a file, relative to real time.
 MIN_SPEED = 0.01
 MAX_SPEED = 100.0
-#: until a file that is paused is looked at again.
+#: Period between checks of a paused file.
 PAUSED_CHECK_S = 0.25
 
 
 class Shown:
-    """A scan that viewers are shown.
+    """A scan that viewers show.
 
     Attributes:
         scan: its points.
-        number: counts the scans that are shown, from 0 on.
+        number: number of the shown scan, from 0.
         position: seconds from the first scan of the source.
-        sent: when its last packet arrived; of a file, when it was shown; seconds since 1970.
+        sent: arrival of its last packet, for a file the time when it was shown; seconds since 1970.
     """
 
     def __init__(self, scan: Scan, number: int, position: float, sent: float) -> None:
@@ -71,9 +71,9 @@ class Broadcast:
     """Reads a device for viewers. A context manager that closes the device.
 
     Args:
-        source: as the user typed it.
-        device: open.
-        reopen: opens the source once more; called for a file that is moved through.
+        source: the source as typed by the user.
+        device: an open device.
+        reopen: opens the source again; called to move through a file.
         select: the scans to show; by default all.
         switch: records the source, if it is live.
 
@@ -81,12 +81,12 @@ class Broadcast:
         shown: the newest scan; None before the first.
         backlog: the newest bytes.
         paused: whether a file is paused.
-        speed: of a file, as a multiple of its own.
-        warnings: of the device.
-        info: of the device, such as its serial number, by name.
+        speed: speed of a file, relative to real time.
+        warnings: warnings of the device.
+        info: facts about the device, such as its serial number, by name.
         history: the figures of the last minute, one dict for each second.
-        failure: the error that ended the reading, None while it goes on.
-        news: called in the reading thread if there is something new.
+        failure: the error that ended the reading, None while it continues.
+        news: called in the reading thread if there is anything new.
     """
 
     def __init__(
@@ -117,14 +117,14 @@ class Broadcast:
         self._scan_count = 0
         self._by_number = weakref.WeakValueDictionary[int, Shown]()
         self._seek_target: float | None = None
-        self._steps = 0  # asked for, and not done yet
+        self._steps = 0  # requested, but not done yet
         self._has_moved = False
         self._has_ended = False
         self._is_stopped = False
         self._has_request = threading.Event()
         self._measured_at = time.monotonic()
         self._feed = self._make_feed(self._select)
-        self._seen_count = 0  # scans of the feed that were taken over
+        self._seen_count = 0  # number of scans of the feed that were taken over
 
     def __enter__(self) -> Broadcast:
         return self
@@ -134,20 +134,20 @@ class Broadcast:
 
     @property
     def is_live(self) -> bool:
-        """Whether data arrive at the pace of a sensor, and not from a file."""
+        """Whether data arrives from a sensor in real time, and not from a file."""
         return self.device.is_live
 
     @property
     def can_seek(self) -> bool:
-        """Whether it is a file that can be moved through.
+        """Whether the source is a file that can be moved through.
 
-        A file is not, if its scans were selected by number.
+        This is False if its scans were selected by number.
         """
         return not self.is_live and not self._select.is_counted and self.source != "-"
 
     @property
     def state(self) -> str:
-        """The `Device.state` of a live source; of a file "playing", "paused" or "ended"."""
+        """`Device.state` of a live source; "playing", "paused" or "ended" for a file."""
         if self.is_live:
             return self.device.state
         if self._feed.ended:
@@ -163,7 +163,7 @@ class Broadcast:
 
     @property
     def ending(self) -> str:
-        """The reason why no more scans come."""
+        """The reason why there are no more scans."""
         if self.failure is not None:
             return str(self.failure)
         return "; ".join([f"{self.source} has ended", *self.warnings])
@@ -172,7 +172,7 @@ class Broadcast:
     def began_ns(self) -> int:
         """The arrival time of the first packet of the first scan, ns since 1970.
 
-        It is 0 if the time is not known.
+        It is 0 if the time is unknown.
         """
         if self._first_scan is None:
             return 0
@@ -183,7 +183,7 @@ class Broadcast:
         return self._clock.now() * 1e-9
 
     def find_scan(self, number: int) -> Shown | None:
-        """Return a scan by its number, None if no page holds it any more."""
+        """Return a scan by its number, None if no page holds it."""
         return self._by_number.get(number)
 
     def pause(self) -> None:
@@ -259,7 +259,7 @@ class Broadcast:
             raise
 
     def stop(self) -> None:
-        """Let `run` return."""
+        """Make `run` return."""
         self._is_stopped = True
         self._has_request.set()
 
@@ -268,7 +268,7 @@ class Broadcast:
         self.device.close()
 
     def _read_or_wait(self) -> None:
-        """Carry out one request, read for a moment, or wait for a moment."""
+        """Carry out one request, read briefly, or wait briefly."""
         feed = self._feed
         target = self._seek_target
         if target is not None:
@@ -301,7 +301,7 @@ class Broadcast:
                 raise
 
     def _move(self, target: float) -> None:
-        """Open a file once more, and show its first scan from a time on."""
+        """Open a file again, and show its first scan from a time on."""
         device = self._reopen()
         self.device.close()
         self.device = device
@@ -343,7 +343,7 @@ class Broadcast:
         return True
 
     def _update_figures(self) -> bool:
-        """Read the figures once a second, and return whether that was done."""
+        """Read the figures once a second, and return whether they were read."""
         now = time.monotonic()
         duration_s = now - self._measured_at
         if duration_s < FIGURES_PERIOD_S:
@@ -381,7 +381,7 @@ class Broadcast:
         }
 
     def _arrival(self, scan: Scan) -> float:
-        """Return when the last packet of a scan arrived, in seconds since 1970; of a file: now."""
+        """Return the arrival of a scan's last packet, seconds since 1970; for a file: now."""
         if self.is_live and len(scan):
             host_ns = scan.provenance(len(scan) - 1).host_ns
             if host_ns:
@@ -391,8 +391,8 @@ class Broadcast:
     def _position(self, scan: Scan) -> float:
         """Return the seconds from the first scan.
 
-        By arrival if the source is live, else by the times that select its scans, or by their
-        number if they have no times.
+        They come from the arrival for a live source, else from the times that select scans, or from
+        the number of the scan if there are no times.
         """
         first = self._first_scan
         assert first is not None

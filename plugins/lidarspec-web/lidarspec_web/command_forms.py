@@ -12,7 +12,7 @@ from lidarspec.spec.arguments import Range
 
 
 def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
-    """Return the form of a command: its text, and its arguments with their ranges and units."""
+    """Return the form of a command: its text, and its arguments with ranges and units."""
     command = sensor.commands[name]
     return {
         "name": name,
@@ -26,7 +26,7 @@ def make_form(sensor: Sensor, name: str) -> dict[str, Any]:
 def find_restart(sensor: Sensor) -> dict[str, str] | None:
     """Return the commands that stop the data and start it again, as on opening.
 
-    None if the sensor has none without arguments.
+    Returns None if the sensor has none without arguments.
     """
     names = [*sensor.on_open, *sensor.commands]
     plain = [name for name in names if not sensor.commands[name].args]
@@ -40,7 +40,7 @@ def find_restart(sensor: Sensor) -> dict[str, str] | None:
 def _group(sensor: Sensor, name: str) -> str:
     """Return the group of a command.
 
-    "switch" if it starts or stops the data, "ask" if it changes nothing, else "set".
+    It is "switch" if the command starts or stops the data, "ask" if it changes nothing, else "set".
     """
     command = sensor.commands[name]
     if command.starts or command.stops:

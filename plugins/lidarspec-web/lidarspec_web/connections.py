@@ -1,9 +1,9 @@
-"""Limits on the connections to the server, so that whoever can connect cannot make it unreachable.
+"""Limits on connections to the server, so that it stays reachable.
 
-A connection waits until one of its requests has brought the token. It is closed if that takes too
-long, or if it is the oldest that waits and there are too many connections. So idle connections of
-others always make way for a browser, which sends its request at once. Connections that have brought
-the token are closed by their pages, or by the timeouts of the server.
+A connection waits until one of its requests has the token. It is closed if that takes too long, or
+if there are too many connections and it is the oldest that waits. So idle connections of others
+always make room for a browser, which sends its request at once. Connections with the token are
+closed by their pages, or by the timeouts of the server.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-#: with and without the token.
+#: Maximum number of connections, with and without the token.
 MAX_CONNECTIONS = 128
-#: accepted by the system before the server has taken them; each needs a descriptor, too.
+#: Number of connections that the system accepts before the server does; each needs a descriptor,
+#: too.
 BACKLOG = 64
-#: until a connection has to bring the token.
+#: Timeout for the token of a connection.
 TOKEN_TIMEOUT_S = 10.0
 CHECK_PERIOD_S = 1.0
 
@@ -29,7 +30,7 @@ Client = tuple[str, int]
 
 @dataclass
 class PendingConnection:
-    """A connection that has not brought the token yet."""
+    """A connection without the token so far."""
 
     transport: asyncio.Transport
     since: float = field(default_factory=time.monotonic)
@@ -65,12 +66,12 @@ class Connections:
         return LimitedProtocol
 
     def admit(self, client: Client | None) -> None:
-        """Take note that a connection has brought the token; None is one that is closed again."""
+        """Mark a connection as having the token; None is one that is closed again."""
         if client in self._waiting:
             self._admitted[client] = self._waiting.pop(client).transport
 
     def drop(self, client: Client | None) -> None:
-        """Close the connection of a client that does not read what it asked for."""
+        """Close the connection of a client that does not read its response."""
         if client in self._admitted:
             self._admitted.pop(client).abort()
 
@@ -82,7 +83,7 @@ class Connections:
         await asyncio.sleep(0)  # the loop closes their sockets
 
     async def watch(self) -> None:
-        """Close connections that do not bring the token in time, until this is cancelled."""
+        """Close connections without the token after the timeout, until this is cancelled."""
         while True:
             await asyncio.sleep(CHECK_PERIOD_S)
             self._close_late()
@@ -96,7 +97,7 @@ class Connections:
             self._close_waiting(client)
 
     def _add(self, client: Client | None, transport: asyncio.Transport) -> None:
-        if client is None:  # it is closed already
+        if client is None:  # closed already
             transport.abort()
             return
         if len(self._waiting) + len(self._admitted) >= MAX_CONNECTIONS:
@@ -107,7 +108,7 @@ class Connections:
         self._waiting[client] = PendingConnection(transport)
 
     def _make_room(self) -> None:
-        # Connections that became sockets do not say when they are lost.
+        # Connections that became sockets do not report their end.
         for client, transport in list(self._admitted.items()):
             if transport.is_closing():
                 del self._admitted[client]

@@ -1,12 +1,11 @@
-"""One page that is open: its requests, and the messages that it is sent.
+"""One open page: its requests, and the messages to it.
 
-A page asks for each scan after it has drawn the one before, and gets the newest. So a slow or
-hidden page costs nothing, and no page is ever behind. Requests are JSON objects whose `do` names
-the handler; requests that take a while are done in threads (`page_requests`). Between scans the
-page is sent replies, the state of the source twice a second and, while its bytes are shown, the
-newest frame.
+A page asks for each scan after it has drawn the previous one, and gets the newest. So a slow or
+hidden page costs nothing, and no page falls behind. Requests are JSON objects with the name of the
+handler in `do`; slow requests run in threads (`page_requests`). Between scans the page is sent
+replies, the state of the source twice a second and, while its bytes are shown, the newest frame.
 
-A live source goes on while a page is paused: the page keeps the bytes as they were (`_frozen`).
+A live source continues while a page is paused: the page keeps the bytes of that time (`_frozen`).
 """
 
 from __future__ import annotations
@@ -36,24 +35,24 @@ from lidarspec_web.page_requests import (
     Workers,
 )
 
-#: replies that wait to be sent before no further request is read.
+#: Number of unsent replies above which no further request is read.
 MAX_REPLIES = 16
-#: until a page with too many requests is looked at again.
+#: Period between checks of a page with too many requests.
 BUSY_CHECK_S = 0.05
 STATE_PERIOD_S = 0.5
 FRAME_PERIOD_S = 0.5
-#: after which a page that takes no message is dropped.
+#: Timeout after which a page that does not read is disconnected.
 SEND_TIMEOUT_S = 20.0
-#: a page waits so long for a first scan before it is told about the source.
+#: Maximum wait for a first scan before the page gets its first message.
 GREETING_TIMEOUT_S = 3.0
 GREETING_CHECK_S = 0.05
-#: codes with which browsers close a socket.
+#: Codes with which browsers close a socket.
 CLOSE_CODES = (1000, 1001, 1012)
-#: the most points that a page may ask for.
+#: Maximum number of points that a page may request.
 MAX_POINTS = 1 << 24
-#: scans that a page may ask about: the one that is drawn, and the one that is on its way.
+#: Number of scans that a page may ask about: the drawn one, and the one that is being sent.
 HELD_SCANS = 2
-#: the largest number in a request.
+#: The largest number in a request.
 MAX_NUMBER = 1e12
 
 
@@ -62,8 +61,8 @@ class OpenPage:
 
     Args:
         answers: makes the messages.
-        socket: to the page.
-        workers: the threads for requests that take a while.
+        socket: the socket of the page.
+        workers: the threads for slow requests.
     """
 
     def __init__(self, answers: Answers, socket: WebSocket, workers: Workers) -> None:
@@ -76,7 +75,7 @@ class OpenPage:
         self._rate_limit = RateLimit(MESSAGES_AT_ONCE, MESSAGES_PER_S)
         self._questions = Lane(workers.answers, self._finish)
         self._commands = Lane(workers.commands, self._finish)
-        self._wanted_points: int | None = None  # of the scan that was asked for
+        self._wanted_points: int | None = None  # of the requested scan
         self._held = deque[Shown](maxlen=HELD_SCANS)
         self._frozen: Backlog | None = None
         self._shows_frames = False
@@ -88,7 +87,7 @@ class OpenPage:
         self._frame_due = math.inf
 
     async def serve(self) -> str:
-        """Serve the page until it goes away, and return what became of it."""
+        """Serve the page until it is closed, and return the reason of its end."""
         await self._socket.accept()
         works = (
             self._receive_requests(),
@@ -106,7 +105,7 @@ class OpenPage:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def notify(self) -> None:
-        """Look whether there is a message for the page."""
+        """Check for messages to the page."""
         self._has_news.set()
 
     # Messages to the page.
@@ -125,7 +124,7 @@ class OpenPage:
             return "closed"
 
     async def _is_taken(self, message: bytes | dict[str, Any]) -> bool:
-        """Send a message, and return whether the page takes it in time."""
+        """Send a message, and return whether the page reads it in time."""
         try:
             await asyncio.wait_for(self._send(message), SEND_TIMEOUT_S)
         except TimeoutError:
@@ -133,7 +132,7 @@ class OpenPage:
         return True
 
     async def _greet(self) -> None:
-        """Tell the page about the source after its first scan, or if that takes too long."""
+        """Send the first message after the first scan, or after a timeout."""
         end = time.monotonic() + GREETING_TIMEOUT_S
         while self._broadcast.shown is None and time.monotonic() < end:
             await asyncio.sleep(GREETING_CHECK_S)
@@ -218,7 +217,7 @@ class OpenPage:
         return state
 
     def _recording(self) -> tuple[str, str]:
-        """Return the name of the file that is being written, and why the last one failed."""
+        """Return the name of the file being written, and the error of the last one."""
         switch = self._broadcast.switch
         if switch is None:
             return "", ""
@@ -255,7 +254,7 @@ class OpenPage:
 
     @property
     def _is_busy(self) -> bool:
-        """Whether the page asks faster than it is answered, or does not read the answers."""
+        """Whether the page sends requests too fast, or does not read the replies."""
         return len(self._replies) > MAX_REPLIES or self._questions.is_full or self._commands.is_full
 
     def _handle(self, text: str) -> None:
@@ -288,11 +287,11 @@ class OpenPage:
     def _reply_later(
         self, word: str, work: Callable[[], dict[str, Any] | None], command: str = ""
     ) -> None:
-        """Answer a question that takes a while, after those before it."""
+        """Add a slow request to the queue."""
         self._questions.add(PageRequest(word, command, work))
 
     def _finish(self, request: PageRequest, result: dict[str, Any] | Exception | None) -> None:
-        """Answer a request that was done in a thread."""
+        """Send the reply of a request that ran in a thread."""
         if isinstance(result, LidarSpecError):
             self._refuse(request.word, result, request.command)
         elif isinstance(result, Exception):
@@ -399,7 +398,7 @@ class OpenPage:
 
 
 def describe_bug(error: Exception) -> str:
-    """Return the line for an exception that is no error of the user's."""
+    """Return the message for an exception that is a bug."""
     return f"a bug in lidarspec: {type(error).__name__}: {error}"
 
 

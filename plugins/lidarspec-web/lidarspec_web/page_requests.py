@@ -1,8 +1,8 @@
-"""The requests of one page: how many are taken a second, and those that take a while.
+"""The requests of one page: their rate limit, and the threads for slow ones.
 
-A page that asks without end waits for itself: the server reads its next message later. Requests
-that take a while are done in threads, for each page one after another, so that no page has more
-than its share of the threads.
+A page that sends requests without end delays itself: the server reads its next message later.
+The slow requests of a page run in threads one after another, so that no page has more than its
+share of the threads.
 """
 
 from __future__ import annotations
@@ -14,37 +14,37 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-#: messages of a page that are taken at once, and in each second.
+#: Number of messages of a page that are read at once, and in each second.
 MESSAGES_AT_ONCE = 100
 MESSAGES_PER_S = 100.0
-#: requests of a lane that wait before no message of the page is read any more.
+#: Number of waiting requests above which no message of the page is read.
 MAX_WAITING = 16
-#: at most, between two requests of a lane.
+#: Maximum pause between two requests of a lane.
 MAX_REST_S = 0.1
 ANSWER_THREADS = 4
 
 
 class Workers:
-    """The threads of a server, by what they do. Threads are started when they are needed."""
+    """The threads of a server, by purpose. Threads are started when they are needed."""
 
     def __init__(self) -> None:
         self.answers = ThreadPoolExecutor(ANSWER_THREADS, "page-answers")
-        # The sensor answers one command after another, which may take seconds.
+        # The sensor replies to one command after another, which may take seconds.
         self.commands = ThreadPoolExecutor(1, "page-commands")
         self.saves = ThreadPoolExecutor(1, "page-saves")
 
     def close(self) -> None:
-        """Forget the work that waits, and wait for the work that has begun."""
+        """Cancel the waiting work, and wait for the work that has begun."""
         for executor in (self.answers, self.commands, self.saves):
             executor.shutdown(cancel_futures=True)
 
 
 class RateLimit:
-    """The delay of messages that come faster than is allowed.
+    """The delay of messages that arrive faster than allowed.
 
     Args:
-        at_once: messages that need not wait after a pause.
-        per_second: messages.
+        at_once: number of messages without a delay after a pause.
+        per_second: number of messages per second.
     """
 
     def __init__(self, at_once: int, per_second: float) -> None:
@@ -53,18 +53,18 @@ class RateLimit:
         self._due = 0.0
 
     def delay_s(self, now: float) -> float:
-        """Take a message at a time of `time.monotonic`, and return how long it has to wait."""
+        """Count a message at a time of `time.monotonic`, and return its delay in seconds."""
         self._due = max(self._due, now - self._burst_s) + self._period_s
         return max(self._due - now, 0.0)
 
 
 @dataclass(frozen=True)
 class PageRequest:
-    """A request that takes a while.
+    """A slow request.
 
     Attributes:
-        word: of the message.
-        command: of the sensor that it is about, "" for none.
+        word: the name of the request.
+        command: the command of the sensor that it concerns, "" for none.
         work: returns the reply, None for none.
     """
 
@@ -74,11 +74,11 @@ class PageRequest:
 
 
 class Lane:
-    """Requests of one page that are done one after another, in a thread.
+    """Requests of one page that run one after another, in a thread.
 
     Args:
-        executor: has the thread.
-        finish: called with each request and its reply, or the exception that it ended with.
+        executor: provides the thread.
+        finish: called with each request and its reply, or its exception.
     """
 
     def __init__(
@@ -92,15 +92,15 @@ class Lane:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further request is to be added for now."""
+        """Whether no further request should be added for now."""
         return self._requests.qsize() >= MAX_WAITING
 
     def add(self, request: PageRequest) -> None:
-        """Add a request behind those that wait."""
+        """Add a request after the waiting ones."""
         self._requests.put_nowait(request)
 
     async def run(self) -> NoReturn:
-        """Do the requests until this is cancelled."""
+        """Run the requests until this is cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             request = await self._requests.get()

@@ -1,7 +1,7 @@
-"""Scans that are saved: written to temporary files by a thread of its own, and sent.
+"""Save scans: a thread writes them to temporary files, which are then sent.
 
-Only a few scans are saved at a time, so that saving takes little time from pages that look, and
-little room on the disk. A file is removed when it was sent, or when its client does not read it.
+Only a few scans are saved at a time, so that saving takes little time from open pages, and little
+space on the disk. A file is removed after it was sent, or if its client does not read it.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from lidarspec_web.broadcast import Shown
 from lidarspec_web.connections import Client
 from lidarspec_web.temporary import TemporaryFolder
 
-#: scans that wait, are written or are sent; further requests are refused.
+#: Maximum number of scans that wait, are written or are sent; further requests are refused.
 MAX_SAVES = 8
 CHUNK_BYTES = 1 << 16
-#: at most, from one scan that is written to the next.
+#: Maximum pause between two written scans.
 MAX_REST_S = 2.0
-#: until a client has to take a chunk.
+#: Timeout for a client to read a chunk.
 SEND_TIMEOUT_S = 20.0
 
 
@@ -37,8 +37,8 @@ class Saves:
     """Saves scans on request.
 
     Args:
-        folder: for the temporary files.
-        worker: writes them.
+        folder: folder of the temporary files.
+        worker: runs the writing.
         drop: closes the connection of a client that does not read its file.
     """
 
@@ -60,7 +60,7 @@ class Saves:
     async def serve(
         self, shown: Shown, suffix: str, scope: Scope, receive: Receive, send: Send
     ) -> None:
-        """Write a scan and send it, or say why that is not possible."""
+        """Write a scan and send it, or send the reason why that is not possible."""
         if self._count >= MAX_SAVES:
             text = f"{MAX_SAVES} scans are being saved already: try again in a moment"
             await PlainTextResponse(text, 503)(scope, receive, send)
@@ -88,7 +88,7 @@ class Saves:
             path.unlink()
 
     async def _write(self, path: Path, shown: Shown) -> None:
-        """Write a scan when the one before is written and pages had as much time as that took."""
+        """Write a scan after the previous one and a pause of the same duration for pages."""
         loop = asyncio.get_running_loop()
         async with self._writing:
             await asyncio.sleep(self._rests_until - time.monotonic())
@@ -128,7 +128,7 @@ async def _send_file(path: Path, name: str, send: Send) -> None:
     """Send a file as a download.
 
     Raises:
-        TimeoutError: if the client does not take it.
+        TimeoutError: if the client does not read it.
     """
     headers = {
         "content-type": "application/octet-stream",

@@ -22,25 +22,26 @@ from numpy.typing import NDArray
 from lidarspec import PointCloud, Scan
 from lidarspec.points.conventions import UNITS
 
-#: header and columns begin at a multiple of this in the message.
+#: Header and columns begin at a multiple of this in the message.
 ALIGNMENT_BYTES = 8
-#: the columns in a message; intensity and ring only if the sensor has them.
+#: The columns in a message; intensity and ring only if the sensor has them.
 COLUMNS = ("x", "y", "z", "range", "intensity", "ring")
 _HEADER_LENGTH = struct.Struct("<I")
-#: the golden section: the fractional parts of its multiples are evenly distributed over every
+#: The golden section: the fractional parts of its multiples are evenly distributed over every
 #: interval, and have no common period with the pattern of a sensor.
 _GOLDEN_SECTION = (math.sqrt(5) - 1) / 2
 
 
 def message(scan: Scan, number: int, *, position: float, sent: float, most: int) -> bytes:
-    """Return a scan as a message, without the points that have no return.
+    """Return a scan as a message, without points that have no return.
 
     Args:
-        scan: its points.
-        number: of the scan, by which the page asks for the frame of a point.
-        position: of its first point, seconds since the first packet of the source.
-        sent: when its last packet arrived, seconds since 1970 by this computer's clock.
-        most: the most points; of more points an even selection is sent, always the same one.
+        scan: the scan.
+        number: number of the scan, by which the page asks for the frame of a point.
+        position: position of its first point, seconds since the first packet of the source.
+        sent: arrival of its last packet, seconds since 1970 by this computer's clock.
+        most: maximum number of points; if there are more, an even selection is sent, always the
+            same.
     """
     points = scan.points
     points.load(*COLUMNS, "valid")
@@ -83,7 +84,7 @@ def _padding(size: int) -> int:
 
 
 def _take_columns(points: PointCloud, indices: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-    """Return the columns of some points by name, little-endian, and their indices as `index`."""
+    """Return the columns of some points, little-endian, and their indices as `index`."""
     columns: dict[str, NDArray[Any]] = {}
     for name in COLUMNS:
         column = getattr(points, name)

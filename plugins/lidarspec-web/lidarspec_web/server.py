@@ -33,15 +33,15 @@ from lidarspec_web.page_requests import Workers
 from lidarspec_web.saving import Saves
 from lidarspec_web.temporary import TemporaryFolder, remove_stale_folders
 
-#: the built page.
+#: The built page.
 PAGE = Path(__file__).parent / "page"
 MAX_PAGES = 64
-#: the longest request of a page.
+#: The longest request of a page.
 MAX_REQUEST_BYTES = 1 << 16
 PING_PERIOD_S = 10.0
-#: for open pages, when the server ends.
+#: Shutdown timeout for open pages.
 SHUTDOWN_TIMEOUT_S = 1
-#: more digits than the number of any scan has.
+#: Maximum number of digits of a scan's number.
 MAX_NUMBER_DIGITS = 12
 
 
@@ -49,9 +49,9 @@ class Site:
     """Serves the page of a broadcast while its context lasts.
 
     Args:
-        broadcast: shown by the page.
-        host: to listen at.
-        port: to listen at; 0 for any free port.
+        broadcast: the broadcast that the page shows.
+        host: address to listen on.
+        port: port to listen on; 0 for any free port.
         control: whether pages may send commands to a real sensor.
         page: the folder with the files of the page; by default the built one.
         report: called with a line for each page that is opened or closed.
@@ -115,7 +115,7 @@ class Site:
             http=self._connections.protocol_class(),
             backlog=BACKLOG,
             log_config=None,
-            log_level="critical",  # its remarks on requests are not for a terminal
+            log_level="critical",  # its messages about requests are not for a terminal
             access_log=False,
             lifespan="off",
             server_header=False,
@@ -196,7 +196,7 @@ class Site:
             self._report(f"page {number} {ending}; {len(self._open_pages)} open")
 
     async def _save_scan(self, request: Request) -> Response:
-        """Send a scan as a file, by the number that a page knows it by."""
+        """Send a scan as a file, by its number."""
         number, _, suffix = request.path_params["name"].partition(".")
         if suffix not in saves():
             return PlainTextResponse(f"a scan is saved as {', '.join(saves())}", 404)
@@ -209,7 +209,7 @@ class Site:
 
 
 def _link_host(host: str) -> str:
-    """Return the host in the link to a server that listens at an address."""
+    """Return the host in the link to a server that listens on an address."""
     if host in ANY_ADDRESS:
         return socket.gethostname()
     if ":" in host:
@@ -230,7 +230,7 @@ def _listen(host: str, port: int) -> socket.socket:
         reason = os.strerror(error.errno) if error.errno else error
         raise SourceError(f"no page can be served at {host}:{port}: {reason}") from error
     if hasattr(socket, "TCP_USER_TIMEOUT"):
-        # The system then drops data that a page never takes. Connections inherit the option.
+        # The system then drops data that a page never reads. Connections inherit the option.
         listener.setsockopt(
             socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(SEND_TIMEOUT_S * 1000)
         )

@@ -1,4 +1,4 @@
-"""A source that is read and whose page is served: what `lidarspec view --web` runs."""
+"""Read a source and serve its page: the server of `lidarspec view --web`."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class SourceServer:
 
     Args:
         source: port, socket, file or ``sim:`` URL.
-        sensor: None to identify it.
+        sensor: the sensor; None to identify it.
         selection: the scans to show.
-        host: to listen at.
-        port: to listen at; 0 for any free port.
+        host: address to listen on.
+        port: port to listen on; 0 for any free port.
         control: whether pages may send commands to a real sensor.
         report: called with a line for each page that is opened or closed.
         page: the folder with the files of the page; by default the built one.
-        folder: of the recordings that pages make; by default the working directory.
+        folder: the folder for recordings of pages; by default the working directory.
 
     Raises:
         LidarSpecError: if the source cannot be opened, or the server cannot listen.
@@ -83,14 +83,14 @@ class SourceServer:
 
     @property
     def recordings(self) -> Sequence[tuple[str, int]]:
-        """Path of each recording that pages have made, and the bytes of the wire in it."""
+        """Path of each recording of the pages, and the number of received bytes in it."""
         if self.switch is None:
             return ()
         return self.switch.written
 
     @property
     def trouble(self) -> str:
-        """The reason why the last recording could not be started or written, "" if it could."""
+        """The error of the last recording, "" if there was none."""
         if self.switch is None:
             return ""
         return self.switch.trouble

@@ -1,8 +1,8 @@
-"""The temporary folder of a server, which the next server removes if this one is killed.
+"""The temporary folder of a server; if it is killed, the next one removes it.
 
-Each server locks its folder. The system releases the lock when the process ends, however it ends,
-so a folder that can be locked belongs to no server any more. On systems without such locks
-(Windows) a folder is removed by its own server only.
+Each server locks its folder. The system releases the lock when the process ends for any reason, so
+a folder that can be locked no longer belongs to a server. On systems without such locks (Windows) a
+folder is removed by its own server only.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PREFIX = "lidarspec-view-"
 
 
 class TemporaryFolder:
-    """A folder that the user alone can read, made when it is first needed."""
+    """A folder that only the user can read, made when it is first needed."""
 
     def __init__(self) -> None:
         self._making = threading.Lock()
@@ -60,7 +60,7 @@ def remove_stale_folders() -> None:
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         except OSError:
-            continue  # a link, a file, of another user, or gone
+            continue  # a link, a file, another user's folder, or removed
         try:
             if os.fstat(descriptor).st_uid == os.getuid():
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -80,7 +80,7 @@ def _make_folder() -> tuple[Path, int | None]:
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         except FileNotFoundError:
-            continue  # another server, which starts, took it for a stale one
+            continue  # another server, just starting, removed it as a stale one
         with contextlib.suppress(OSError):  # a file system without locks
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         if path.is_dir():

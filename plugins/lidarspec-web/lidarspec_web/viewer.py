@@ -1,7 +1,7 @@
 """A source in a cell of a notebook, drawn by the code of the page.
 
-A thread reads the source. The cell asks for each scan after it has drawn the one before (`next`),
-as a page does, and says hello when it is shown. The messages are those of the page (`answers`).
+A thread reads the source. The cell asks for each scan after it has drawn the previous one (`next`),
+as a page does, and sends `hello` when it is shown. The messages are those of the page (`answers`).
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from lidarspec.view.feed import LOOK_S
 from lidarspec_web.answers import Answers
 from lidarspec_web.broadcast import Broadcast
 
-#: the built widget.
+#: The built widget.
 SCRIPT = Path(__file__).parent / "page" / "widget.js"
 HEIGHT_PIXELS = 420
 STATE_PERIOD_S = 0.5
 
 
 class Viewer:
-    """Shows a source in the cell whose value it is: ``Viewer("/dev/ttyUSB0", "vendor-model")``.
+    """Shows a source in a notebook cell: ``Viewer("/dev/ttyUSB0", "vendor-model")``.
 
     Files are played. The source is read until `close` is called or the cell is removed. If it
-    cannot be read, the cell says why.
+    cannot be read, the cell shows the reason.
 
     Args:
         source: port, socket, file or ``sim:`` URL.
-        sensor: by default the one that sends.
+        sensor: by default the detected one.
         select: the scans to show; by default all.
-        height: of the picture, in pixels.
+        height: height of the picture, in pixels.
 
     Raises:
         UsageError: if anywidget is not installed.
@@ -54,16 +54,16 @@ class Viewer:
         self._source = str(source)
         self._sensor = sensor
         self._select = select
-        self._lock = threading.RLock()  # the reading thread and that of the notebook send
+        self._lock = threading.RLock()  # the reading thread and the notebook's thread send
         self._broadcast: Broadcast | None = None
         self._answers: Answers | None = None
         self._is_closed = False
         self._failure = ""
         self._ending = ""
         self._wants_hello = False
-        self._wanted_points = 0  # of the scan that was asked for; 0 if none was
+        self._wanted_points = 0  # of the requested scan; 0 for none
         self._sent_scan = -1
-        self._state_due = math.inf  # no state before the hello
+        self._state_due = math.inf  # no state before the first message
         self._widget = _make_widget(height)
         self._widget.on_msg(lambda widget, message, buffers: self._handle(message))
         self._thread = threading.Thread(target=self._read, name=f"viewer of {source}", daemon=True)
@@ -82,7 +82,7 @@ class Viewer:
 
     @property
     def failure(self) -> str:
-        """The reason why the source cannot be read, and what to do; "" if it can."""
+        """The reason why the source cannot be read, and the next step; "" if it can."""
         return self._failure
 
     def close(self) -> None:
@@ -97,7 +97,7 @@ class Viewer:
         return self._widget._repr_mimebundle_()
 
     def _read(self) -> None:
-        """Read the source until it ends, and tell the cell why."""
+        """Read the source until it ends, and send the reason to the cell."""
         try:
             self._show_source()
         except LidarSpecError as error:
@@ -134,7 +134,7 @@ class Viewer:
         self._send_news()
 
     def _send_news(self) -> None:
-        """Send what the cell has asked for, as far as it is there."""
+        """Send the data that the cell has requested, if available."""
         with self._lock:
             if self._broadcast is not None and self._answers is not None:
                 self._send_scan(self._broadcast, self._answers)
@@ -172,7 +172,7 @@ def _make_widget(height: int) -> Any:
     """
     try:
         import anywidget
-        import traitlets  # anywidget requires it
+        import traitlets  # a requirement of anywidget
     except ImportError as error:
         text = f"the viewer in notebooks needs anywidget, which cannot be imported: {error}"
         raise suggest(UsageError(text), "pip install 'anywidget>=0.9.13'") from error
