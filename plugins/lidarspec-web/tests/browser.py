@@ -1,6 +1,4 @@
-"""The Chromium of the system, for tests of what a browser shows; a test that asks for it is skipped
-where there is none.
-"""
+"""The Chromium of the system, for tests in a browser; without it they are skipped."""
 
 from __future__ import annotations
 
@@ -8,8 +6,8 @@ import shutil
 
 import pytest
 
-#: Without the sandbox that root lacks. WebGL is drawn in software, and the page around it without
-#: WebGL, which costs less.
+#: Root cannot use the sandbox. WebGL is rendered in software, and the page around it without WebGL,
+#: which is faster.
 FLAGS = (
     "--no-sandbox",
     "--use-angle=swiftshader",
@@ -19,7 +17,7 @@ FLAGS = (
 
 
 def installed() -> str:
-    """Where it is."""
+    """Return its path."""
     path = (
         shutil.which("chromium")
         or shutil.which("chromium-browser")

@@ -1,4 +1,4 @@
-"""A browser for the tests of what is shown in one."""
+"""A browser for the tests of the page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .browser import FLAGS, installed
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser of playwright's, closed at the end."""
+    """Yield a browser of playwright, closed at the end."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     with (
         api.sync_playwright() as running,

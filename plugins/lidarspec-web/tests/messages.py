@@ -10,7 +10,7 @@ import numpy as np
 
 
 def parsed(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header of a message, and its columns."""
+    """Return the header of a message, and its columns."""
     (length,) = struct.unpack_from("<I", message)
     header, place = json.loads(message[4 : 4 + length]), 4 + length
     columns = {}

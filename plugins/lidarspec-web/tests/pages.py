@@ -1,6 +1,4 @@
-"""A broadcast that is served, and pages that are open on it: real sockets, and what a page says and
-hears.
-"""
+"""A served broadcast and its open pages, over real sockets."""
 
 from __future__ import annotations
 
@@ -26,10 +24,10 @@ from .messages import parsed
 
 client = Library("websockets.sync.client")
 
-#: seconds that anything may take; many times what it does.
+#: Timeout of every step in seconds, far above its usual duration.
 DEADLINE = 30.0
 FLAT, SOLID = "ldrobot-stl27l", "robosense-m1"
-#: a page that stands for the built one.
+#: A page that replaces the built one.
 PAGE_TEXT = (
     '<!doctype html><title>page</title><link rel="icon" href="data:,"><script'
     ' src="page.js"></script>'
@@ -37,12 +35,13 @@ PAGE_TEXT = (
 
 
 class Station:
-    """A source that is read in a thread and served, as `lidarspec view --web` does; a context
-    manager.
+    """A source that is read in a thread and served, as by `lidarspec view --web`.
+
+    A context manager.
 
     Attributes:
-        said: what was told of pages.
-        failure: what reading it ended with.
+        said: reports about pages.
+        failure: the error that ended the reading.
     """
 
     def __init__(
@@ -87,11 +86,11 @@ class Station:
         return self.link.partition("?token=")[2]
 
     def answered(self, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-        """What comes back on a raw request with the token."""
+        """Return the response to a raw request with the token."""
         return answered(self.port, f"{path}?token={self.token}", **headers)
 
     def handshake(self) -> bytes:
-        """What opens a WebSocket by hand."""
+        """Return the request that opens a WebSocket by hand."""
         host = f"127.0.0.1:{self.port}"
         given = {"Host": host, "Origin": f"http://{host}", "Connection": "Upgrade", **UPGRADE}
         lines = [
@@ -115,7 +114,7 @@ class Station:
 
 
 class Page:
-    """What a page says, and hears; a context manager."""
+    """An open page: the messages that it sends and receives; a context manager."""
 
     def __init__(self, link: str, **options: Any) -> None:
         address, _, query = link.partition("?")
@@ -135,7 +134,7 @@ class Page:
         self.socket.send(json.dumps({"do": word, **facts}))
 
     def heard(self, is_it: Callable[[Any], bool], *, within: float = DEADLINE) -> Any:
-        """The first message that is it, of those that were not asked for yet; the others wait."""
+        """Return the first unread message that matches; the others stay unread."""
         for message in self._kept:
             if is_it(message):
                 self._kept.remove(message)
@@ -154,13 +153,13 @@ class Page:
         raise TimeoutError([message["is"] for message in self._kept if isinstance(message, dict)])
 
     def until(self, word: str, holds: Callable[[Any], bool] = lambda message: True) -> Any:
-        """The next message of a word of which something holds."""
+        """Return the next message of a kind that matches."""
         return self.heard(
             lambda message: isinstance(message, dict) and message["is"] == word and holds(message)
         )
 
     def state(self, holds: Callable[[Any], bool] = lambda state: True) -> Any:
-        """The next state from now on of which something holds."""
+        """Return the next state from now on that matches."""
         self._kept = deque(
             message
             for message in self._kept
@@ -169,13 +168,14 @@ class Page:
         return self.until("state", holds)
 
     def scan(self, most: int = 1 << 20) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """The newest scan that the page has not had."""
+        """Return the newest scan that the page has not received."""
         self.say("next", most=most)
         return self.heard(lambda message: isinstance(message, tuple))  # type: ignore[no-any-return]
 
     def scan_at(self, position: float) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """The first scan from now on that is near a place; one that was on its way may come before
-        it.
+        """Return the first scan from now on that is near a position.
+
+        A scan that is already being sent may come before it.
         """
         while True:
             header, columns = self.scan()
@@ -183,7 +183,7 @@ class Page:
                 return header, columns
 
     def asked(self, word: str, **facts: Any) -> Any:
-        """What comes back on a question: whatever is neither a scan nor a state."""
+        """Return the reply to a request, neither a scan nor a state."""
         self.say(word, **facts)
         return self.heard(
             lambda message: (
@@ -206,18 +206,17 @@ def _no_constant(name: str) -> None:
 def recorded(
     folder: Path, sensor: str = FLAT, seconds: float = 5.0, suffix: str = ".lsr", **faults: Any
 ) -> Path:
-    """A file of what a simulated sensor sends."""
+    """Return a file of data from a simulated sensor."""
     path = folder / f"sent{suffix}"
     write_file(SimulatedDevice(ls.sensor(sensor), **faults), path, seconds)
     return path
 
 
 def answered(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Status, headers and body of what comes back on a raw request.
+    """Return status, headers and body of the response to a raw request.
 
     Args:
-        headers: in the place of the usual ones and beside them, with "_" for "-"; a WebSocket is
-            asked for where one of them is `upgrade`.
+        headers: replace or extend the usual ones, with "_" for "-"; `upgrade` requests a WebSocket.
     """
     given = {
         "Host": f"127.0.0.1:{port}",
@@ -247,7 +246,7 @@ def answered(port: int, path: str, **headers: str) -> tuple[int, dict[str, str],
     return int(lines[0].split()[1]), told, body
 
 
-#: the headers that ask for a WebSocket, with which a browser says whose page asks.
+#: The headers with which a browser requests a WebSocket, with the origin of the page.
 UPGRADE = {
     "upgrade": "websocket",
     "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
@@ -256,6 +255,6 @@ UPGRADE = {
 
 
 def masked(message: dict[str, Any]) -> bytes:
-    """A short message as a frame of a WebSocket, masked with zeros."""
+    """Return a short message as a WebSocket frame, masked with zeros."""
     text = json.dumps(message).encode()
     return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text

@@ -17,7 +17,7 @@ from lidarspec.simulation.faults import Faults
 
 from .pages import FLAT, SOLID, Page, Station, recorded
 
-#: a byte stream, datagrams, points that wait for the next packet, parts of a frame, text on the
+#: A byte stream, datagrams, points that wait for the next packet, parts of a frame, text on the
 #: wire, messages of several datagrams.
 SENSORS = (
     FLAT,
@@ -27,21 +27,21 @@ SENSORS = (
     "hokuyo-ust10lx",
     "robosense-airy",
 )
-#: Others of these kinds.
+#: Further sensors of these kinds.
 MORE_SENSORS = ("livox-mid360", "velodyne-vlp16")
-#: How fast sensors of many points are simulated: simulating some of them at full speed takes a
-#: whole processor.
+#: Rate of the simulation of sensors with many points: some of them need a whole processor at full
+#: speed.
 SLOWLY = "rate=0.3"
-#: points of a scan that are asked for.
+#: Number of points of a scan that are tested.
 ASKED = 8
-#: The same of sensors whose frames take long to explain.
+#: The same for sensors with frames that take long to explain.
 ASKED_OF_LONG_FRAMES = 3
 
 
 def agree(
     page: Page, header: dict[str, Any], columns: dict[str, np.ndarray], spot: int, scan: ls.Scan
 ) -> None:
-    """The frame of a point is explained as `explain` does it, and one of its points is this one."""
+    """Check that a point's frame is explained as by `explain`, with this point."""
     index = int(columns["index"][spot])
     frame = page.asked("frame", point={"scan": header["scan"], "index": index})
     assert (frame["is"], frame["why"]) == ("frame", "point"), frame
@@ -50,7 +50,7 @@ def agree(
     assert explanation.verdict == "valid"
     assert frame["explanation"]["rows"] == explanation.to_dict()["rows"]
     rows = [row for row in frame["explanation"]["rows"] if row["path"] == frame["value"]]
-    if frame["value"] is None:  # a frame of one point has it for itself
+    if frame["value"] is None:  # a frame with one point has it for itself
         assert len(explanation.fields) < 10
         return
     ranges, azimuths, elevations = scan.points.range, scan.points.azimuth, scan.points.elevation
@@ -72,7 +72,7 @@ def agree(
     ],
 )
 def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -> None:
-    """While newer scans arrive."""
+    """Newer scans arrive meanwhile."""
     source = f"sim:{sensor}" if sensor == FLAT else f"sim:{sensor}?{SLOWLY}"
     with Station(source, tmp_path) as station, station.page() as page:
         page.scan()
@@ -92,9 +92,7 @@ def test_a_point_leads_to_its_frame_and_its_field(tmp_path: Path, sensor: str) -
 def test_a_point_of_a_file_leads_to_its_frame(
     tmp_path: Path, sensor: str, suffix: str, to: int
 ) -> None:
-    """Also where what lies before it was passed over without being read, so that the same bytes
-    stand elsewhere in the input.
-    """
+    """Also after a seek, when the same bytes have other offsets in the input."""
     path = recorded(tmp_path, sensor, to + 2, suffix)
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         page.scan()
@@ -102,7 +100,7 @@ def test_a_point_of_a_file_leads_to_its_frame(
         page.state(lambda state: state["paused"])
         page.say("seek", to=to)
         header, columns = page.scan_at(to)
-        assert page.asked("frame", number=0)["is"] == "gone"  # of what was read before
+        assert page.asked("frame", number=0)["is"] == "gone"  # a frame from before the move
         shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         for spot in range(0, header["points"], header["points"] // ASKED_OF_LONG_FRAMES):
@@ -146,7 +144,7 @@ def test_points_that_are_not_shown_are_gone(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_frames_follow_one_another_by_number(tmp_path: Path) -> None:
-    """Each is what stands behind the one before it in the file."""
+    """Each is the frame after the previous one in the file."""
     path = recorded(tmp_path, suffix=".bin")
     data = path.read_bytes()
     with Station(path, tmp_path, FLAT) as station, station.page() as page:

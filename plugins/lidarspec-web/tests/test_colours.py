@@ -1,4 +1,4 @@
-"""The page has the colour scale of all other pictures."""
+"""The page uses the colour scale of all other pictures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from lidarspec.points.colours import SCALES, Theme, make_ramp, to_hex
 
-#: what the tests of the TypeScript sources compare the scale of the page with.
+#: The tests of the TypeScript sources compare the page's scale with this file.
 PAGE_RAMPS = Path(__file__).parents[1] / "page" / "tests" / "ramp.json"
 
 

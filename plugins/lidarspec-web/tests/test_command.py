@@ -1,4 +1,4 @@
-"""`view --web` in a process of its own: its link, its end, and a clear line where it cannot be."""
+"""`view --web` in a separate process: its link, its end, and its error messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.cli.running import process, ran
 
 from .pages import DEADLINE, FLAT, Page, recorded
 
-#: the command line with a page that stands for the built one.
+#: The command line with a page that replaces the built one.
 MAIN = """import pathlib, sys
 from lidarspec.cli import main
 from lidarspec_web import server
@@ -32,7 +32,7 @@ sys.exit(main())"""
 def served(
     folder: Path, *words: object, **variables: str
 ) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The verb at work, with environment variables, and its link."""
+    """Run the verb with environment variables, and yield the process and the link."""
     (folder / "page").mkdir(exist_ok=True)
     (folder / "page" / "index.html").write_text("<!doctype html><title>page</title>")
     command = [sys.executable, "-c", MAIN, str(folder / "page"), "view", *map(str, words), "--web"]
@@ -51,7 +51,7 @@ def served(
 def ended(
     running: subprocess.Popen[str], by: signal.Signals | None = None
 ) -> tuple[int, str, list[str]]:
-    """The exit code, what else went to standard output, and the lines on standard error."""
+    """Return the exit code, further standard output, and the lines on standard error."""
     if by is not None:
         running.send_signal(by)
     out, err = running.communicate(timeout=DEADLINE)
@@ -124,7 +124,7 @@ def test_another_address_is_reached_from_here(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="the browser is a script of a shell")
 def test_the_browser_is_led_to_the_link(tmp_path: Path) -> None:
-    """The command that starts it has no token, and the file that it opens has."""
+    """The command that starts it has no token; the file that it opens has."""
     browser = tmp_path / "browser"
     browser.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\n')
     browser.chmod(0o700)
@@ -143,8 +143,9 @@ def test_the_browser_is_led_to_the_link(tmp_path: Path) -> None:
     sys.platform != "linux", reason="the limit of another process is set on Linux alone"
 )
 def test_more_idle_connections_than_files_can_be_open(tmp_path: Path) -> None:
-    """1,100 of another user, without the token: the page stays reachable, and no traceback is
-    printed.
+    """1,100 connections of another user, without the token, do not block the page.
+
+    No traceback is printed.
     """
     resource = pytest.importorskip("resource")
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -175,7 +176,7 @@ def test_a_source_that_fails_ends_it_with_its_code(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_port_that_vanishes_and_comes_back_goes_on(tmp_path: Path) -> None:
-    """The simulator on a pty is ended and begun anew, behind the same link."""
+    """The simulator on a pty is stopped and started again, behind the same link."""
     port = tmp_path / "port"
     command = [sys.executable, "-m", "lidarspec", "sim", FLAT, "--to", "pty", "--link", str(port)]
 

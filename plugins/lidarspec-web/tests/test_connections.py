@@ -1,4 +1,4 @@
-"""Connections that bring no token: idle ones, slow ones, and too many of them."""
+"""Connections without the token: idle ones, slow ones, and too many of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MANY = 5 * FEW
 
 @pytest.fixture
 def station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Station]:
-    """A server of which a few connections are too many."""
+    """Yield a server with a low limit of connections."""
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", FEW)
     with Station(f"sim:{FLAT}", tmp_path) as station:
         yield station
@@ -33,7 +33,7 @@ def connect(station: Station) -> socket.socket:
 
 
 def is_closed(connection: socket.socket) -> bool:
-    """Return whether the server has closed a connection that nothing was sent to."""
+    """Return whether the server has closed a connection without a request."""
     connection.setblocking(False)
     try:
         return connection.recv(1) == b""
@@ -64,7 +64,7 @@ def test_idle_connections_make_way_for_a_page(station: Station) -> None:
 
 
 def test_pages_do_not_make_way(station: Station) -> None:
-    """With nothing but pages open, a further connection is closed at once."""
+    """If all connections are pages, a further one is closed at once."""
     with contextlib.ExitStack() as stack:
         pages = [stack.enter_context(station.page()) for _ in range(FEW)]
         for page in pages:
@@ -80,7 +80,7 @@ def test_pages_do_not_make_way(station: Station) -> None:
 def test_a_connection_without_the_token_ends(
     station: Station, monkeypatch: pytest.MonkeyPatch, sent: bytes
 ) -> None:
-    """Whether it sends nothing, or a header without an end, byte by byte."""
+    """Both if it sends nothing, and if it sends a header without an end, byte by byte."""
     with station.page() as page, connect(station) as slow:
         page.scan()
         monkeypatch.setattr(connections, "TOKEN_TIMEOUT_S", 0.0)

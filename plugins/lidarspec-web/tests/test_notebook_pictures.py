@@ -38,7 +38,7 @@ def test_pictures_and_tables_are_readable_on_light_and_dark_pages(browser: Any) 
 
 
 def luminance(colour: str) -> float:
-    """The relative luminance of "rgb(r, g, b)", as WCAG has it."""
+    """Return the relative luminance of "rgb(r, g, b)" as defined by WCAG."""
     channels = np.array([int(number) for number in re.findall(r"\d+", colour)[:3]]) / 255
     linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
     return float(linear @ [0.2126, 0.7152, 0.0722])

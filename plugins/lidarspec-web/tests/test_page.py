@@ -1,6 +1,4 @@
-"""The page in a real browser: what is drawn is the room, bytes and fields mark each other, and what
-one clicks happens.
-"""
+"""The page in a real browser: its picture, marked bytes and fields, and clicks."""
 
 from __future__ import annotations
 
@@ -31,14 +29,15 @@ from .visits import PATIENCE, Visit, served, streaming
 
 pytestmark = pytest.mark.slow
 
-#: packets a second of the planar sensor.
+#: Packets per second of the planar sensor.
 RATE = 1800
 
 
 @pytest.fixture(scope="module")
 def m1_page(browser: Any) -> Iterator[Visit]:
-    """A sensor of many points, slowed down to one scan a second, because drawing them in software
-    is dear.
+    """Yield a page of a sensor with many points.
+
+    It is slowed down to one scan a second, because drawing them in software is slow.
     """
     with served("sim:robosense-m1?rate=0.1") as link:
         visit = Visit(browser, link)
@@ -54,15 +53,16 @@ def m1(m1_page: Visit) -> Iterator[Visit]:
 
 
 def near(mask: np.ndarray, reach: int) -> np.ndarray:
-    """The pixels that are at most so far from one of these, along each axis."""
+    """Return the pixels within a distance of these, along each axis."""
     for axis in (0, 1):
         mask = np.any([np.roll(mask, step, axis) for step in range(-reach, reach + 1)], axis=0)
     return mask
 
 
 def check_drawing(visit: Visit) -> None:
-    """Hold the pixels of the picture against the scan that the server saves: points are where it
-    has some, and nowhere else.
+    """Compare the pixels of the picture with the scan that the server saves.
+
+    Points are drawn where the scan has some, and nowhere else.
     """
     scan, (coloured, looked) = visit.scan, visit.coloured
     own = np.array([[float(row[axis]) for axis in "xyz"] for row in visit.saved()])
@@ -157,7 +157,7 @@ def test_a_click_on_a_point_opens_its_frame_and_pointing_at_a_byte_names_its_fie
 
 
 def check_bytes(visit: Visit, explained: Any) -> None:
-    """Point at some bytes of the dump that are seen, and at a field."""
+    """Point at some visible bytes of the dump, and at a field."""
     offsets = [
         int(cell.get_attribute("data-offset")) for cell in visit.page.locator(".hex i").all()[::40]
     ]
@@ -184,7 +184,7 @@ def check_bytes(visit: Visit, explained: Any) -> None:
 
 @pytest.fixture(scope="module")
 def stl27l_page(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Visit]:
-    """A file of a planar sensor, with damage in it."""
+    """Yield a page of a file of a planar sensor, with damage in it."""
     sensor, path, began = (
         ls.sensor("ldrobot-stl27l"),
         tmp_path_factory.mktemp("page") / "stl27l.lsr",
@@ -328,7 +328,7 @@ def test_text_of_the_sensor_is_never_part_of_the_page(browser: Any, tmp_path: Pa
 
 
 def test_a_page_whose_server_is_started_again_says_so(browser: Any) -> None:
-    """The new server has a new token: the link that it prints shows it."""
+    """The new server has a new token: its printed link shows the page."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     source = "sim:ldrobot-stl27l?rate=0.5"
@@ -352,7 +352,7 @@ def test_a_page_whose_server_is_started_again_says_so(browser: Any) -> None:
 def test_a_page_whose_connection_is_lost_connects_again(
     browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A network that fails for a moment: the same server is there again, with the same token."""
+    """The network fails briefly: the same server is there again, with the same token."""
     monkeypatch.setattr("lidarspec_web.server.make_token", lambda: "token" * 6)
     source = "sim:ldrobot-stl27l?rate=0.5"
     with Station(source, tmp_path, page=PAGE) as station:
@@ -379,7 +379,9 @@ def test_the_file_that_a_browser_is_started_with_leads_to_the_page(
 
 
 def test_a_hidden_page_asks_for_nothing(tmp_path: Path) -> None:
-    """Without playwright, which keeps every page visible: tabs of one window, by the browser's own
+    """Without playwright, which keeps every page visible.
+
+    Tabs of one window are controlled by the browser's own
     protocol.
     """
     with served("sim:ldrobot-stl27l?rate=0.5") as link, tabs(link, tmp_path) as (evaluated, turned):
@@ -407,8 +409,10 @@ def until(holds: Callable[[], Any], otherwise: str) -> None:
 
 @contextlib.contextmanager
 def tabs(link: str, folder: Path) -> Iterator[tuple[Callable[[str], Any], Callable[[bool], None]]]:
-    """A page in a tab: what evaluates an expression in it, and what puts it in front of another tab
-    or behind it.
+    """Yield two functions for a page in a tab.
+
+    The first evaluates an expression in it, the second moves it in front of another tab or behind
+    it.
     """
     from websockets.sync.client import connect
 
@@ -450,7 +454,7 @@ def tabs(link: str, folder: Path) -> Iterator[tuple[Callable[[str], Any], Callab
                 socket.send(json.dumps(asked))
                 return (
                     json.loads(socket.recv()).get("result", {}).get("result", {}).get("value")
-                )  # none while a page is loaded
+                )  # none while a page is loading
 
             def turned(front: bool) -> None:
                 ask(f"activate/{(tab if front else other)['id']}")

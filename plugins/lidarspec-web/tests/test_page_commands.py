@@ -1,4 +1,4 @@
-"""Commands from the page: forms, their bytes before they are sent, replies, and who may send."""
+"""Commands from the page: forms, their bytes, replies, and permissions."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_a_reply_is_told_in_words_while_the_picture_goes_on(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_a_command_without_an_answer_is_sent(tmp_path: Path) -> None:
-    """The rotor stops, and with it the data."""
+    """The rotor stops, and the data with it."""
     with Station(f"sim:{STREAM}", tmp_path) as station, station.page() as page:
         page.scan()
         assert "not known" in page.asked("send", command="stop", arguments={})["text"]

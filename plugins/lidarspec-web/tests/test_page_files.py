@@ -1,6 +1,4 @@
-"""What the page does with what it shows: it is recorded and saved by a click, and a sensor that is
-unplugged and comes back is said.
-"""
+"""Recording, saving and reconnection on the page."""
 
 from __future__ import annotations
 
@@ -20,12 +18,12 @@ from .visits import Visit, served
 
 pytestmark = pytest.mark.slow
 
-#: what a PNG begins with.
+#: The first bytes of a PNG.
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def saved(visit: Visit, kind: str) -> tuple[str, bytes]:
-    """The name and the content of what the browser stores when the scan is saved."""
+    """Return the name and the content of the file that the browser stores for a scan."""
     visit.page.click("#save summary")
     with visit.page.expect_download() as download:
         visit.page.click(f"#saves [data-value={kind}]")
@@ -68,7 +66,7 @@ def test_a_double_click_starts_one_recording_that_all_pages_show(
         assert (
             visit.text("#recording").partition(" ")[0] == other.text("#recording").partition(" ")[0]
         )
-        visit.page.wait_for_timeout(600)  # from then on it is another press
+        visit.page.wait_for_timeout(600)  # afterwards it counts as another press
         other.page.click("#record")
         for page in (visit, other):
             page.until(
@@ -105,9 +103,7 @@ def test_the_scan_that_is_shown_is_saved(browser: Any) -> None:
 
 
 def check_picture(visit: Visit, data: bytes) -> None:
-    """Hold a saved picture against the one on the screen: as large, and with the walls of the room
-    in colour.
-    """
+    """Compare a saved picture with the one on the screen: size and coloured walls."""
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     assert data.startswith(SIGNATURE)
     pixels = np.asarray(image.open(io.BytesIO(data)).convert("RGB"), int)

@@ -1,6 +1,4 @@
-"""Pages that ask without end, and scans that are saved but not read: other pages are served as
-before.
-"""
+"""Floods of requests, and saved scans that are not read: other pages are served."""
 
 from __future__ import annotations
 
@@ -25,13 +23,13 @@ from .pages import DEADLINE, FLAT, Station
 
 FLOOD = 5000
 SAVES = 2
-#: more than the buffers of a connection take.
+#: Larger than the buffers of a connection.
 LARGE = 1 << 23
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder for temporary files."""
+    """Return the folder for temporary files."""
     folder = tmp_path / "temporary"
     folder.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(folder))
@@ -40,7 +38,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def station(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Station]:
-    """A server that saves few scans at a time."""
+    """Yield a server with a low limit of saved scans."""
     monkeypatch.setattr(saving, "MAX_SAVES", SAVES)
     monkeypatch.setattr(saving, "MAX_REST_S", 0.0)
     with Station(f"sim:{FLAT}", tmp_path) as station:
@@ -48,7 +46,7 @@ def station(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 
 def kept_scan(page: Any) -> int:
-    """Return the number of a scan that the page keeps."""
+    """Return the number of a scan that the page holds."""
     number = page.scan()[0]["scan"]
     page.say("pause")
     page.state(lambda state: state["paused"])
@@ -56,7 +54,7 @@ def kept_scan(page: Any) -> int:
 
 
 def start_save(station: Station, number: int) -> socket.socket:
-    """Ask for a scan without reading it."""
+    """Request a scan without reading it."""
     raw = socket.socket()
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     raw.settimeout(DEADLINE)
@@ -87,9 +85,7 @@ def test_messages_above_the_rate_wait() -> None:
 def test_a_page_that_asks_without_end_waits_for_itself(
     station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its messages are not all done before another page has its scans, and pausing again does
-    nothing.
-    """
+    """Another page gets its scans meanwhile, and pausing again does nothing."""
     counts = Counter[str]()
     delay_s, frozen = RateLimit.delay_s, Backlog.freeze
 
@@ -128,7 +124,7 @@ def test_questions_of_a_page_are_answered_in_their_order(station: Station) -> No
 def test_scans_that_are_written_keep_nothing_from_pages(
     station: Station, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A disk that stands still, and more requests than are saved at a time."""
+    """The disk hangs, and there are more requests than the limit of saved scans."""
     may_write = threading.Event()
     write = saving.write_file
 
@@ -195,7 +191,7 @@ def test_a_scan_that_is_not_read_is_given_up(
 def test_saved_scans_leave_nothing_behind(
     tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither if the server ends while they are sent, nor that of a server that was killed."""
+    """Also if the server ends while they are sent, or was killed."""
     stale = folder / f"{PREFIX}stale"
     stale.mkdir()
     monkeypatch.setattr(saving, "write_file", lambda path, shown: path.write_bytes(bytes(LARGE)))

@@ -1,5 +1,6 @@
-"""Who may reach the page: raw requests with hosts and origins of others, without the token, and
-what devices say of themselves.
+"""Access to the page: requests with foreign hosts or origins, or without token.
+
+Also hostile texts of devices.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ FOREIGN_HOSTS = (
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
-    """A page that is served, for requests that change nothing."""
+    """Yield a served page for requests that change nothing."""
     folder = tmp_path_factory.mktemp("page")
     (folder / "server.py").write_text("secret")
     with Station(f"sim:{FLAT}", folder) as station:
@@ -56,7 +57,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
 @pytest.mark.parametrize("path", ["/", "/index.html", "/save/0.pcd", "/socket"])
 @pytest.mark.parametrize("host", FOREIGN_HOSTS)
 def test_a_foreign_host_is_refused(shared: Station, path: str, host: str) -> None:
-    """A name of others that was made to point here (DNS rebinding) brings its own host along."""
+    """A foreign name that points here (DNS rebinding) has its own Host header."""
     named = host.format(port=shared.port)
     more: dict[str, Any] = {**UPGRADE, "Origin": f"http://{named}"} if path == "/socket" else {}
     status, _, body = shared.answered(path, Host=named, **more)
@@ -128,7 +129,7 @@ def test_only_the_files_of_the_page_are_served(shared: Station, path: str) -> No
     "path", ["/", "/index.html", "/page.js", "/nothing.js", "/save/0.csv", "/socket", "/?"]
 )
 def test_nothing_is_served_without_the_token(shared: Station, path: str) -> None:
-    """Other users of this computer can connect, and know no token."""
+    """Other users of this computer can connect, but do not know the token."""
     token = shared.token
     assert len(token) >= 32
     more = {**UPGRADE, "Origin": f"http://127.0.0.1:{shared.port}"} if path == "/socket" else {}
@@ -224,7 +225,7 @@ def test_a_port_that_is_taken_is_told_of(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_markup_that_a_device_sends_stays_text(tmp_path: Path) -> None:
-    """The model in an answer of a hostile device, and the name of a file."""
+    """The model in a reply of a hostile device, and the name of a file."""
     markup, sensor = "<script>alert(1)<!--", ls.sensor("hokuyo-ust10lx")
     told = sensor.parse(sensor.example("parameters"), "parameters")
     told["model"]["text"] = markup.encode()

@@ -21,25 +21,25 @@ pytestmark = pytest.mark.slow
 PHONE = (390, 844)
 MIN_TARGET_PX = 44
 AXE = Path(__file__).parents[1] / "page" / "node_modules" / "axe-core" / "axe.min.js"
-#: elements that reach beyond the window and cannot be scrolled into it: the strip of figures
+#: Elements that reach beyond the window and cannot be scrolled into it: the strip of figures
 #: scrolls by itself.
 TOO_WIDE = """[...document.querySelectorAll("body *")].filter((element) => {
   const { left, right, width } = element.getBoundingClientRect();
   return width > 1 && (left < -1 || right > innerWidth + 1) && !element.closest("#side, .scroll");
 }).map((element) => element.id || element.className || element.tagName)"""
-#: buttons and the like that are seen and smaller than a finger needs.
+#: Visible buttons and similar elements that are too small for a finger.
 TOO_SMALL = """(least) => [...document.querySelectorAll("button, select, input, summary, [role=treeitem]")].filter((element) => {
   const { width, height } = element.getBoundingClientRect();
   return element.checkVisibility() && (width < least || height < least);
 }).map((element) => element.id || element.textContent)"""
 
-#: saves the scan that is shown as a table, and says its number and its time in the file.
+#: Saves the shown scan as a table, and returns its number and its time in the file.
 SAVE_SHOWN = """(() => {
   const { scan, position } = lidarspec.picture.scan;
   document.querySelector("#saves [data-value=csv]").click();
   return [scan, position];
 })()"""
-#: what axe-core finds: the rule, an element that breaks it, and how to mend that.
+#: The findings of axe-core: the rule, an element that breaks it, and the remedy.
 VIOLATIONS = """axe.run().then(({ violations }) =>
   violations.map(({ id, nodes }) => `${id}: ${nodes[0].html}: ${nodes[0].failureSummary}`))"""
 
@@ -85,7 +85,7 @@ def check_fits(visit: Visit) -> None:
 
 
 def move_fingers(visit: Visit, *steps: list[tuple[float, float]]) -> None:
-    """Put fingers on the screen, move them from places to places, and lift them."""
+    """Put fingers on the screen, move them along positions, and lift them."""
     session = visit.context.new_cdp_session(visit.page)
     for kind, places in (
         ("touchStart", steps[0]),
@@ -98,12 +98,12 @@ def move_fingers(visit: Visit, *steps: list[tuple[float, float]]) -> None:
 
 
 def home(visit: Visit) -> list[float]:
-    """Return where the sensor is in the picture, in pixels."""
+    """Return the position of the sensor in the picture, in pixels."""
     return list(visit.value("lidarspec.picture.place(0, 0, 0)"))
 
 
 def metre(visit: Visit) -> float:
-    """Return the pixels of a metre."""
+    """Return the number of pixels per metre."""
     return float(
         visit.value("lidarspec.picture.place(0, 0, 0)[1] - lidarspec.picture.place(1, 0, 0)[1]")
     )
@@ -243,7 +243,7 @@ def test_axe_finds_no_violation(request: pytest.FixtureRequest, where: str, them
 
 
 def test_a_damaged_packet_is_counted_once(browser: Any, tmp_path: Path) -> None:
-    """Its checksum is wrong, and the sensor's clock misses it as well."""
+    """Its checksum is wrong, and the sensor's clock shows its loss as well."""
     sensor = ls.sensor("ldrobot-stl27l")
     frames = list(ls.simulate(sensor, packets=6000))
     damaged = [
@@ -355,7 +355,7 @@ def test_a_saved_scan_is_named_after_its_time_in_the_file_at_each_replay(
 ) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     path = tmp_path / "short.bin"
-    path.write_bytes(b"".join(ls.simulate(sensor, packets=1800)))  # a second
+    path.write_bytes(b"".join(ls.simulate(sensor, packets=1800)))  # one second
     with served(str(path), "-s", sensor.id) as link:
         visit = Visit(browser, link)
         newest = -1

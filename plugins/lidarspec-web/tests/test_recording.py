@@ -1,4 +1,4 @@
-"""Recordings that pages switch on and off: one at a time, however many press at once."""
+"""Recordings that pages switch on and off: only one at a time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .pages import FLAT, Station
 
 
 def test_pages_that_press_at_once_agree(tmp_path: Path) -> None:
-    """Each asks for the state that its button offers, and all see the same file."""
+    """Each requests the state that its button offers, and all see the same file."""
     station = Station(f"sim:{FLAT}", tmp_path)
     with station, station.page() as one, station.page() as other:
         for page in (one, other, one, other):
@@ -41,7 +41,7 @@ def recorders(folder: Path) -> list[threading.Thread]:
 
 @pytest.mark.slow
 def test_every_second_press_ends_the_recording(tmp_path: Path) -> None:
-    """The message without `on` changes the state, whatever that is."""
+    """The message without `on` toggles the state."""
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
         for _ in range(4):
             page.say("record")

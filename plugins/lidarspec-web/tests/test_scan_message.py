@@ -1,4 +1,4 @@
-"""Scans as messages: read back, they are the scan."""
+"""Scans as messages: they are equal when read back."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_points_are_thinned_to_what_is_asked(most: int) -> None:
 
 @pytest.mark.parametrize("period", [2, 5, 16, 128])
 def test_thinning_is_even_over_stretches_and_over_rings(period: int) -> None:
-    """One of two points, of a sensor whose rings come in turn: each ring keeps its half."""
+    """One of two points, of a sensor with alternating rings: each ring keeps its half."""
     kept = thin_out(np.arange(100_000), 50_000)
     assert len(np.unique(kept)) == len(kept)
     assert abs(np.diff(np.searchsorted(kept, np.arange(0, 100_001, 100))) - 50).max() <= 3

@@ -1,4 +1,4 @@
-"""The server of the page: what it says of scans, figures and bytes, to one page and to ten."""
+"""The server of the page: its messages to one page and to ten."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_scans_are_those_of_the_sensor_and_always_the_newest(tmp_path: Path) -> 
         while station.broadcast.shown.number < first["scan"] + 4:  # type: ignore[union-attr]
             time.sleep(0.01)
         header, columns = page.scan()
-        assert header["scan"] >= first["scan"] + 4  # those between were not waited for
+        assert header["scan"] >= first["scan"] + 4  # the scans between them were skipped
         shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         assert np.array_equal(columns["x"], shown.scan.points.x[columns["index"]])
@@ -184,7 +184,7 @@ def test_a_file_is_paused_stepped_and_moved_through(tmp_path: Path, suffix: str)
 
 @pytest.mark.slow
 def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
-    """Two stretches, compared with each other and with the clock."""
+    """Two parts, compared with each other and with the clock."""
     with Station(recorded(tmp_path, seconds=20), tmp_path) as station, station.page() as page:
         page.say("pause")
 
@@ -206,9 +206,7 @@ def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "suffix"), [(FLAT, ".bin"), (FLAT, ".lsr"), (SOLID, ".pcap")])
 def test_a_file_is_read_as_it_is_played(tmp_path: Path, sensor: str, suffix: str) -> None:
-    """Figures, bytes and damaged frames are those of the scans that are shown, and not of the rest
-    of the file.
-    """
+    """Figures, bytes and damaged frames are those of the shown scans alone."""
     path = recorded(tmp_path, sensor, 8, suffix)
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         header, _ = page.scan()
@@ -353,7 +351,7 @@ def test_a_file_is_not_recorded(tmp_path: Path) -> None:
 def test_a_page_that_takes_nothing_is_dropped_and_a_recording_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It asks for scan after scan and reads none of them, until its window is full."""
+    """It requests scan after scan and reads none of them, until its window is full."""
     monkeypatch.setattr("lidarspec_web.open_page.SEND_TIMEOUT_S", 2.0)
     with (
         Station(f"sim:{SOLID}", tmp_path) as station,

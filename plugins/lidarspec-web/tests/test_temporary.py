@@ -1,4 +1,4 @@
-"""The temporary folder of a server: removed at its end, and by the next server if it was killed."""
+"""The temporary folder of a server: removed at its end, or by the next server."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lidarspec_web.temporary import PREFIX, TemporaryFolder, remove_stale_folder
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="folders are locked on POSIX only")
 
-#: makes a folder, and is killed.
+#: Makes a folder, and is killed.
 KILLED = """import os, signal
 from lidarspec_web.temporary import TemporaryFolder
 (TemporaryFolder().path / "scan.csv").write_text("x")
@@ -49,7 +49,7 @@ def test_the_folder_of_a_killed_server_is_removed_and_that_of_another_stays(tmp_
 
 
 def test_links_and_files_with_such_a_name_stay(tmp_path: Path) -> None:
-    """Another user may have put them there, so that something else is removed."""
+    """Another user may have created them, so that something else would be removed."""
     target = tmp_path / "target"
     target.mkdir()
     (target / "kept").write_text("x")

@@ -1,6 +1,4 @@
-"""The widget in a cell: real messages of ipywidgets, the bundle in a real browser, one scan under
-way, closed with its cell.
-"""
+"""The widget in a cell, with messages of ipywidgets and a real browser."""
 
 from __future__ import annotations
 
@@ -20,7 +18,7 @@ from tests.cli.running import ran
 from tests.libraries import needs
 
 pytestmark = [pytest.mark.slow, needs("anywidget")]
-#: what a notebook's front end is to a widget of anywidget's: a model that sends and hears, and an
+#: The front end of a notebook for a widget of anywidget: a model that sends and receives, and an
 #: element to render into.
 CELL = """async (esm) => {
     const heard = new Set();
@@ -36,9 +34,7 @@ CELL = """async (esm) => {
 
 
 class Comm:
-    """The connection of a widget to its cell: what is sent there waits in a queue, in whichever
-    thread it was sent.
-    """
+    """The connection of a widget to its cell: a queue of messages from any thread."""
 
     comm_id = "one"
 
@@ -74,7 +70,7 @@ class Cell:
         )
 
     def until(self, reached: Callable[[], bool], seconds: float = 20.0) -> None:
-        """Carry messages to and fro until something is so."""
+        """Carry messages in both directions until a condition holds."""
         end = time.monotonic() + seconds
         while not reached():
             assert time.monotonic() < end, (self.text, self.asked[-5:])
@@ -103,7 +99,7 @@ def page(browser: Any) -> Iterator[Any]:
 def test_a_cell_shows_one_scan_after_another_and_closes_its_source(page: Any) -> None:
     cell = Cell(page, Viewer("sim:robosense-m1"))
     cell.until(lambda: cell.scans >= 5)
-    assert cell.most <= 1  # under way
+    assert cell.most <= 1  # being sent
     assert "RoboSense RS-LiDAR-M1" in cell.text
     assert "78,750 points" in cell.text
     assert [
@@ -159,7 +155,7 @@ def test_what_is_wrong_with_a_source_stands_in_the_cell_in_one_line(page: Any) -
 
 
 def colours(page: Any) -> int:
-    """How many colours the picture has in its middle."""
+    """Return the number of colours in the middle of the picture."""
     shot = base64.b64encode(page.locator("canvas").nth(1).screenshot()).decode()
     script = """async (png) => {
         const image = await createImageBitmap(await (await fetch("data:image/png;base64," + png)).blob());

@@ -1,6 +1,4 @@
-"""Pages that are open in a real browser, as people open them: the verb serves a source, and what
-page and server say is heard.
-"""
+"""Pages of a source in a real browser, with their messages."""
 
 from __future__ import annotations
 
@@ -19,14 +17,13 @@ from typing import Any
 
 import numpy as np
 
-#: the columns of the points that are shown, and their places in the picture, one after another.
+#: The columns of the shown points, and their positions in the picture, concatenated.
 SHOWN = """(() => {
   const { picture } = lidarspec, { columns } = picture.scan, [x, y, z] = ["x", "y", "z"].map((name) => columns.get(name));
   const places = [...x].flatMap((_, row) => picture.place(x[row], y[row], z[row]));
   return [Object.fromEntries([...columns].map(([name, column]) => [name, [...column]])), places];
 })()"""
-#: the size of the picture, and the numbers of the pixels in it that are neither black, grey nor
-#: white.
+#: The size of the picture, and the indices of its pixels that are neither black, grey nor white.
 COLOURED = """(async () => {
   const image = await createImageBitmap(await lidarspec.picture.image()), { width, height } = image;
   const context = new OffscreenCanvas(width, height).getContext("2d");
@@ -38,15 +35,19 @@ COLOURED = """(async () => {
   }
   return [width, height, coloured];
 })()"""
-#: pixels around the sensor in which its axes are drawn.
+#: Pixels around the sensor in which its axes are drawn.
 AXES = 50
-#: seconds that a machine with other work may need.
+#: Timeout in seconds for a busy machine.
 PATIENCE = 60.0
 
 
 @contextlib.contextmanager
 def served(*words: str, address: str = "127.0.0.1", folder: Path | None = None) -> Iterator[str]:
-    """The link to the page of a source; `folder`: where it is served from."""
+    """Yield the link to the page of a source.
+
+    Args:
+        folder: the working directory of the server.
+    """
     command = [sys.executable, "-m", "lidarspec", "view", *words, "--web", "--address", address]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder
@@ -63,12 +64,12 @@ def served(*words: str, address: str = "127.0.0.1", folder: Path | None = None) 
 
 
 class Visit:
-    """A page that is open, and what it and the server have said to each other.
+    """An open page, and the messages between it and the server.
 
     Attributes:
-        asked: what the page has sent, newest last.
-        told: the last message of each kind that it was sent.
-        states: how often it was told how things are.
+        asked: the messages from the page, newest last.
+        told: the last message of each kind to the page.
+        states: number of state messages to the page.
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class Visit:
         return self.page.evaluate(expression, argument)
 
     def until(self, holds: Callable[[], Any], otherwise: str) -> Any:
-        """What holds, once it does."""
+        """Return the value of `holds` once it is true."""
         end = time.monotonic() + PATIENCE
         while not (found := holds()):
             assert time.monotonic() < end, otherwise
@@ -127,7 +128,7 @@ class Visit:
         return [message for message in self.asked if message["do"] == word]
 
     def pause(self) -> None:
-        """Let the picture stand, and be on the screen."""
+        """Pause the picture, and wait until it is on the screen."""
         self.page.click("#play")
         self.until(lambda: self.text("#status") == "paused", "it is not paused")
         self.page.wait_for_timeout(500)
@@ -138,9 +139,7 @@ class Visit:
 
     @property
     def scan(self) -> dict[str, np.ndarray]:
-        """The columns of the points that are shown, and where each of them is in the picture, in
-        pixels.
-        """
+        """Return the columns of the shown points, and their positions in pixels."""
         columns, places = self.value(SHOWN)
         return {
             **{name: np.array(column) for name, column in columns.items()},
@@ -149,19 +148,20 @@ class Visit:
 
     @property
     def coloured(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which pixels of the picture have a colour, and which are nothing but points and what lies
-        under them, (height, width) each.
+        """Return which pixels of the picture are coloured, and which show only points.
+
+        Both have the shape (height, width).
         """
         width, height, pixels = self.value(COLOURED)
         coloured, looked = np.zeros(height * width, bool), np.ones((height, width), bool)
         coloured[pixels] = True
-        looked[-60:, -220:] = False  # what the colours mean
+        looked[-60:, -220:] = False  # the legend of the colours
         across, down = (round(part) for part in self.value("lidarspec.picture.place(0, 0, 0)"))
         looked[max(down - AXES, 0) : down + AXES, max(across - AXES, 0) : across + AXES] = False
         return coloured.reshape(height, width), looked
 
     def saved(self) -> list[dict[str, str]]:
-        """The scan that is shown as the server saves it, row by row."""
+        """Return the shown scan as the server saves it, row by row."""
         number = self.value("lidarspec.picture.scan.scan")
         answer = self.page.request.get(self.link.replace("?", f"save/{number}.csv?"))
         assert answer.ok, answer.text()
@@ -170,9 +170,7 @@ class Visit:
 
 @contextlib.contextmanager
 def streaming(visit: Visit) -> Iterator[None]:
-    """Let an open page play during one test only, because drawing scans in software takes much
-    processor time.
-    """
+    """Let an open page play during one test only, because drawing is slow."""
     if visit.text("#status") == "paused":
         visit.play()
     yield
