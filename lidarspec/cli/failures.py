@@ -1,7 +1,7 @@
 """Failures as one message on stderr and an exit code.
 
-The exit code depends on whose fault the failure is. A traceback is printed only with --verbose or
-LIDARSPEC_DEBUG.
+The exit code depends on the cause: the command line, the source, its data or the device. A
+traceback is printed only with --verbose or LIDARSPEC_DEBUG.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from lidarspec.sensor_operations import Sensor
     from lidarspec.spec.description import Frame
 
-#: Number of packets for which a plan is shown; a turn has at most so many, of different lengths.
+#: Number of packets to plan for: a turn may have this many, some of them shorter.
 PACKETS = 32
 
 

@@ -127,7 +127,7 @@ class Match:
 
     @property
     def odds(self) -> str:
-        """The number of wrong checksums of which one would match, as a power of ten."""
+        """The number of wrong checksums for each accidental match, as a power of ten."""
         return f"1e+{int(self.doubt * np.log10(2)):02}"
 
     @property

@@ -1,7 +1,7 @@
 """Exports of a spec to the formats of other tools, by name.
 
 In: a sensor. Out: a text, by `export`. An export walks the frame trees (`lidarspec.spec.tree`) of
-`messages`. It raises `Refused`, with the reason, if they contain Python code or the target cannot
+`messages`. It raises `ExportError`, with the reason, if they contain Python code or the target cannot
 express the spec. Modules in reading order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
@@ -73,7 +73,7 @@ def export(sensor: Sensor, kind: str) -> str:
         kind: one of `EXPORTS`.
 
     Raises:
-        Refused: if the target cannot express the spec.
+        ExportError: if the target cannot express the spec.
         UnknownExport: for an unknown kind.
     """
     if kind not in EXPORTS:
@@ -120,8 +120,7 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
         on_wire: whether the export describes the bytes as they are sent, not only the fields.
 
     Raises:
-        Refused: if there are no frames yet, or one contains Python code, or has a wire form of its
-            own.
+        ExportError: if there are no frames yet, or one contains Python code or has a wire form.
     """
     if not sensor.frames:
         raise ExportError(f"{sensor.id}: has no frames yet: configure it first")
@@ -174,7 +173,7 @@ def _message(sensor: Sensor, name: str, frame: Frame) -> ExportedFrame:
 
 
 def _check(node: tree.Node) -> None:
-    """Raise `Refused` if other languages cannot express a node."""
+    """Raise `ExportError` if other languages cannot express a node."""
     for formula in (
         *tree.formulas(node),
         *([node.condition] if isinstance(node, tree.Check) else []),

@@ -86,7 +86,7 @@ def checksum(algorithm: Checksum, name: str) -> str:
     """Return the C function that computes a checksum.
 
     Raises:
-        Refused: if C cannot compute the algorithm, e.g. if a plugin implements it in Python.
+        ExportError: if C cannot compute the algorithm, e.g. if a plugin implements it in Python.
     """
     if isinstance(algorithm, ZeroPadded):
         inner = algorithm.algorithm
@@ -467,7 +467,7 @@ def header(sensor: Sensor) -> str:
     """Return a C99 header that reads the frames of a sensor.
 
     Raises:
-        Refused: if the content of a frame depends on Python code, or if C cannot compute its
+        ExportError: if the content of a frame depends on Python code, or if C cannot compute its
             layout.
     """
     prefix = identifier(beginning(sensor))

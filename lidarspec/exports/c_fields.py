@@ -195,7 +195,7 @@ class CLayout:
         size: size of a frame, in bytes.
 
     Raises:
-        Refused: if the offset of an entry depends on all elements before it.
+        ExportError: if the offset of an entry depends on all elements before it.
     """
 
     def __init__(self, message: ExportedFrame, name: Callable[[str, str], str]) -> None:
@@ -225,7 +225,7 @@ class CLayout:
         """Return a formula as a C expression of type int64_t.
 
         Raises:
-            Refused: if its value may exceed 64-bit integers.
+            ExportError: if its value may exceed 64-bit integers.
         """
         if tree.width(value) > tree.MOST_BITS:
             raise ExportError("a formula that may pass what a 64-bit integer holds")

@@ -287,7 +287,7 @@ def svg(sensor: Sensor) -> str:
     """Return an SVG document with the diagrams of all frame types of a sensor.
 
     Raises:
-        Refused: if the content of a frame depends on Python code.
+        ExportError: if the content of a frame depends on Python code.
     """
     sheet = _Sheet()
     for message in messages(sensor, on_wire=False):

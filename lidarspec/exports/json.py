@@ -26,7 +26,7 @@ def text(sensor: Sensor) -> str:
     """Return the spec as JSON.
 
     Raises:
-        Refused: if a frame contains Python code that data cannot represent.
+        ExportError: if a frame contains Python code that data cannot represent.
     """
     return json.dumps(spec(sensor), indent=2, ensure_ascii=False) + "\n"
 
@@ -35,7 +35,7 @@ def spec(sensor: Sensor) -> dict[str, Any]:
     """Return the spec as plain data: dicts, lists, numbers, texts.
 
     Raises:
-        Refused: if a frame contains Python code that data cannot represent.
+        ExportError: if a frame contains Python code that data cannot represent.
     """
     sequence = sensor.sequence
     return {

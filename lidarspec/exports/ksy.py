@@ -93,7 +93,7 @@ def format_reference(scope: Scope, ref: tree.Ref) -> str:
     """Return a field as an integer, by its path from a type.
 
     Raises:
-        Refused: if no type around the expression contains it.
+        ExportError: if no type around the expression contains it.
     """
     for up, path in enumerate(reversed(scope)):
         if path is not None and (path == "" or ref.path.startswith(f"{path}.")):
@@ -145,7 +145,7 @@ def block_type(
     """Return the attributes and instances of a block's type, with their documentation.
 
     Raises:
-        Refused: for an integer that is too wide for Kaitai.
+        ExportError: for an integer that is too wide for Kaitai.
     """
     if any(part.bits.width > WIDEST for part in block.parts):
         raise ExportError(f"{block.info.path}: an integer of more than {WIDEST} bits")
@@ -286,7 +286,7 @@ def ksy(sensor: Sensor) -> str:
     It parses a sequence of data frames, or of the only frame type.
 
     Raises:
-        Refused: if Kaitai cannot express the spec: half-precision floats, Python code, or names
+        ExportError: if Kaitai cannot express the spec: half-precision floats, Python code, or names
             that differ only in case.
     """
     frames = messages(sensor)
@@ -327,7 +327,7 @@ class _Type:
         """Return the finished type.
 
         Raises:
-            Refused: if two members have the same name.
+            ExportError: if two members have the same name.
         """
         ids = [part["id"] for part in self.seq if "id" in part] + list(self.instances)
         twice = next((name for name in ids if ids.count(name) > 1), None)

@@ -50,7 +50,7 @@ def pyi(sensor: Sensor) -> str:
     """Return the stub of a sensor.
 
     Raises:
-        Refused: if a frame contains Python code, or two frame types have the same class name.
+        ExportError: if a frame contains Python code, or two frame types have the same class name.
     """
     frames = messages(sensor, on_wire=False)
     names = {message.name: camel(message.name) for message in frames}

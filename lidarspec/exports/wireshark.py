@@ -136,7 +136,7 @@ class _TableWriter:
 
     Attributes:
         prefix: prefix of the names of its fields in Wireshark's filters.
-        kept: paths of the fields whose values later formulas or checksums use.
+        kept: paths of the fields that later formulas or checksums use.
         marked: paths of the first and last part that a checksum covers.
         types: type family of each Wireshark field, by its filter name.
     """
@@ -580,7 +580,7 @@ def dissector(sensor: Sensor) -> str:
     It is used for the sensor's UDP and TCP ports, and for captures of a serial line.
 
     Raises:
-        Refused: if Python code decides the contents of a frame.
+        ExportError: if Python code decides the contents of a frame.
     """
     name = sensor.id.replace("-", "_")
     title = f"{sensor.vendor} {sensor.model}"

@@ -23,10 +23,10 @@ from lidarspec.testing.findings import require
 from lidarspec.testing.geometry import BACK, SMALL, make_sweep, read
 from lidarspec.testing.subject import Subject
 
-#: Numbers of the packets whose clock is checked: far along the sweep, so that the clock has
+#: Numbers of the packets for the check of the clock: far along the sweep, so that the clock has
 #: wrapped.
 FAR_PACKETS = (0, *(start * 10**power for power in range(8) for start in (1, 2, 4, 7)))
-#: Number of packets whose times of points are checked.
+#: Number of packets for the check of the times of points.
 TIMED_PACKETS = 64
 #: Maximum spread of the times of one packet's points, in clock steps from packet to packet.
 MOST_STEPS = 30

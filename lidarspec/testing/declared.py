@@ -49,11 +49,11 @@ MEASURES = frozenset(
 )
 #: Maximum share of payload offsets at which a sync pattern may match by chance.
 COMMON = 1 / 200
-#: Number of examples whose length is measured before a frame is simulated for it.
+#: Number of examples to measure before a frame is simulated for its length.
 FIRST_LENGTHS = 3
-#: Number of examples whose length is measured in all.
+#: Total number of examples to measure.
 LENGTHS = 12
-#: Number of example frames in whose payloads the sync pattern is counted, by default.
+#: Default number of example payloads in which the sync pattern is counted.
 SYNC_EXAMPLES = 12
 #: Bits of constants and checksums up to which a frame is weak: random bytes match one every few
 #: megabytes.
@@ -314,7 +314,7 @@ def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
 
 
 def _names(subject: Subject, name: str, frame: Frame) -> Findings:
-    """Yield fields without a unit whose names stand for a measured value.
+    """Yield fields without a unit with names of measured values.
 
     `Scaled(..., "")` declares a pure number.
     """

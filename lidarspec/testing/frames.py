@@ -42,7 +42,7 @@ LEAST_SPOTS = 12
 CUT_BYTES = 1 << 20
 #: Maximum total bytes of the changed copies of a long frame that plain construct reads.
 CHANGED_BYTES = 300_000
-#: Number of frames of which every bit is flipped: by default, and at least.
+#: Number of frames with every bit flipped in turn: by default, and at least.
 SAMPLES = 3
 LEAST_SAMPLES = 2
 #: Maximum number of bytes that are checked for the flipped bits of one frame; for a longer one,
@@ -480,7 +480,7 @@ def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
 
 
 def _flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequence[int]:
-    """Return the offsets of the bytes whose bits are flipped.
+    """Return the offsets of the bytes to flip bits in.
 
     These are all bytes, or for a long frame one of each field and some random ones.
     """

@@ -45,7 +45,7 @@ from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
 from lidarspec.testing.subject import Subject
 
-#: Number of packets along the sweep whose directions are checked.
+#: Number of packets along the sweep for the check of directions.
 PACKETS = 400
 #: Number of packets in a simulated room: for short frames, and for frames longer than
 #: `LONG_FRAME_BYTES`.
@@ -127,7 +127,7 @@ def trace_points(subject: Subject, name: str) -> Any:
     Returns None if the frame is not compiled.
 
     Raises:
-        Untraceable: if it cannot be traced, with the reason.
+        UntraceableError: if it cannot be traced, with the reason.
     """
     if name not in subject.traced:
         subject.traced[name] = _trace_points(subject, name)

@@ -42,7 +42,7 @@ from lidarspec.trust import document
 
 #: Tolerance of points in metres and radians, as manuals print them.
 NEAR = 2e-4
-#: Number of examples whose layouts are searched for checksums.
+#: Number of examples with layouts to search for checksums.
 LAYOUT_EXAMPLES = 8
 #: Names of fields that hold a checksum.
 CHECK = re.compile(
