@@ -1,8 +1,8 @@
 """Exports of a spec to the formats of other tools, by name.
 
 In: a sensor. Out: a text, by `export`. An export walks the frame trees (`lidarspec.spec.tree`) of
-`messages`. It raises `ExportError`, with the reason, if they contain Python code or the target cannot
-express the spec. Modules in reading order:
+`messages`. It raises `ExportError`, with the reason, if they contain Python code or the target
+cannot express the spec. Modules in reading order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
 * `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
