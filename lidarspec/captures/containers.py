@@ -183,20 +183,20 @@ def damage(file: BinaryIO) -> Damage | None:
     return None
 
 
-def opened(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
+def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
     """Open a file, decompressed if it is compressed.
 
     Raises:
-        SourceError, UsageError: as `unpacked`, and if it cannot be opened.
+        SourceError, UsageError: as `unpack`, and if it cannot be opened.
     """
     with system_errors(os.fspath(path)), ExitStack() as undo:
         file = undo.enter_context(closing(file_of(os.fspath(path))))
-        content = unpacked(os.fspath(path), file, member)
+        content = unpack(os.fspath(path), file, member)
         undo.pop_all()
     return content
 
 
-def unpacked(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
+def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
     """Return an open file, decompressed as it is read if it is compressed.
 
     Closing the result closes the file.
@@ -243,7 +243,7 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
             for item in archive.infolist()
             if not item.is_dir() and not item.filename.startswith("__MACOSX/")
         ]
-        return archive.open(_chosen(name, archive, names, member))
+        return archive.open(_choose_member(name, archive, names, member))
     except (UsageError, SourceError):
         raise
     except Exception as error:  # for damaged archives zipfile raises many types
@@ -256,7 +256,7 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
         ) from error
 
 
-def _chosen(name: str, archive: zipfile.ZipFile, names: list[str], member: str) -> str:
+def _choose_member(name: str, archive: zipfile.ZipFile, names: list[str], member: str) -> str:
     """Return the requested member, or the only one, or the only readable one.
 
     Readable are captures and recordings.

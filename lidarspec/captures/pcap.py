@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import BinaryIO
 
-from lidarspec.captures.containers import opened
+from lidarspec.captures.containers import open_capture
 from lidarspec.captures.ip import (
     MAX_PAYLOAD_BYTES,
     Headers,
@@ -152,7 +152,7 @@ class CaptureReader(Closing):
         self.stats = CaptureStats()
         self._owned: BinaryIO | None = None
         if isinstance(file, str | os.PathLike):
-            self._owned = opened(file)
+            self._owned = open_capture(file)
             file = self._owned
         self._source = Source(file, largest=self.largest)
         self._fragments = Reassembly()

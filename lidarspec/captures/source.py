@@ -220,10 +220,10 @@ def _read_into(file: BinaryIO) -> Callable[[memoryview], int | None]:
         return file.readinto1
     if isinstance(file, io.RawIOBase):
         return file.readinto
-    return functools.partial(_copied, file)
+    return functools.partial(_copy, file)
 
 
-def _copied(file: BinaryIO, buffer: memoryview) -> int:
+def _copy(file: BinaryIO, buffer: memoryview) -> int:
     data = file.read(len(buffer))
     buffer[: len(data)] = data
     return len(data)

@@ -33,7 +33,7 @@ from lidarspec.device.source_recording import recorder_like
 from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
 from lidarspec.formats import check_holds, format_of, targets, write, write_imu
 from lidarspec.formats.writing import replacing
-from lidarspec.packets.imu import joined
+from lidarspec.packets.imu import join_samples
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scan import Scan
@@ -223,7 +223,7 @@ def convert(
 
 def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]:
     """Write IMU samples; return the facts for the summary."""
-    samples = joined(list(device.imu()))[:count]
+    samples = join_samples(list(device.imu()))[:count]
     if not len(samples):
         raise _no_data_error(device, target)
     write_imu(target, samples)

@@ -173,7 +173,7 @@ def _packets(
         if time.monotonic() >= until or wanted.ended:
             break
     if wanted.first is not None and not number:
-        raise wanted.missed(device.source)
+        raise wanted.missed_error(device.source)
 
 
 def _scalar(value: Any) -> Any:

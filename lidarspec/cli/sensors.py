@@ -193,7 +193,7 @@ def _unit(sensor: Sensor, path: str) -> str:
 def _plan(sensor: Sensor, frame: str) -> list[str]:
     """Return the plan of a data frame in lines, or the reason why there is none."""
     from lidarspec.frames.frame_table import Rows
-    from lidarspec.framing.results import Counters, Found, packed
+    from lidarspec.framing.results import Counters, Found, pack_found
     from lidarspec.packets.stream import PacketStream
     from lidarspec.points.numpy_plan import describe
     from lidarspec.points.plan import Plan, plan_for
@@ -208,7 +208,7 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
         frames = made.seal(made.table([sweep(index) for index in range(PACKETS)]))
     else:
         frames = [sensor.example(frame)]
-    sent = packed([Found(frame, 0, data) for data in frames])
+    sent = pack_found([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:
         return ["plain evaluation: an example has no points"]

@@ -449,7 +449,7 @@ def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
 
 def _stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
     """Return the checksums in the frames instead of computed ones, so that all are valid."""
-    return seal.stored(rows)
+    return seal.load_stored(rows)
 
 
 def _score_each(known: Sequence[Sensor], rate: Callable[[Sensor], Score | None]) -> list[Score]:

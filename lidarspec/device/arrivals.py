@@ -246,7 +246,8 @@ def _set_arrival(
         times: of the pieces, (n,) ns since 1970; -1 if unknown.
     """
     return [
-        frames.arrived(times[ends.searchsorted(frames.offsets + frames.sizes)]) for frames in found
+        frames.with_arrivals(times[ends.searchsorted(frames.offsets + frames.sizes)])
+        for frames in found
     ]
 
 
@@ -366,7 +367,7 @@ class FileInput(Input):
             decoder = self.sensor.decoder(stream=not source.datagrams)
             if isinstance(source, CaptureTransport) and source.datagrams:
                 batches = (
-                    [decoder.placed(batch.buffer, batch.starts, batch.sizes, batch.at)]
+                    [decoder.decode_placed(batch.buffer, batch.starts, batch.sizes, batch.at)]
                     for batch in source.batches()
                 )
                 return find_first_frames(self.sensor, batches)
@@ -387,7 +388,9 @@ class FileInput(Input):
                     )
                     continue
                 for part in datagrams.parts(self._together) if self._together else [datagrams]:
-                    spans = self.decoder.placed(part.buffer, part.starts, part.sizes, part.at)
+                    spans = self.decoder.decode_placed(
+                        part.buffer, part.starts, part.sizes, part.at
+                    )
                     self.senders.see(part.sent(spans))
                     yield Arrival([spans])
             yield Arrival(self.decoder.rest())

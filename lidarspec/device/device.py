@@ -24,7 +24,7 @@ from lidarspec.device.settings import find_device
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.framing.decoder import Witness
 from lidarspec.framing.results import Counters, Found
-from lidarspec.packets.imu import ImuSamples, joined
+from lidarspec.packets.imu import ImuSamples, join_samples
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
@@ -70,7 +70,7 @@ class Device(Closing):
         self.sensor = sensor
         self.source = source
         self.mount = mount
-        self.imu_samples = joined([])
+        self.imu_samples = join_samples([])
         self._readers: dict[str | None, PacketReader] = {}
         self._latest_stream: ScanStream | None = None
         self._unseen_scans: deque[Scan] = deque()
@@ -449,10 +449,10 @@ class Device(Closing):
 
     def _get_imu_samples(self, reader: PacketReader, arrival: Arrival | None) -> ImuSamples:
         if arrival is None:
-            return joined([])
+            return join_samples([])
         if self.mount is None:
             return reader.imu_samples
-        return reader.imu_samples.turned(self.mount.rotation)
+        return reader.imu_samples.turn(self.mount.rotation)
 
     def _make_scan_stream(self) -> ScanStream:
         return ScanStream(self.sensor, self.mount, self._get_reader(None).waiting_imu)

@@ -22,7 +22,7 @@ from lidarspec.device.arrivals import Arrival, Input, answers, decode_chunks
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
 from lidarspec.device.link_state import LinkState
 from lidarspec.device.senders import SenderFilter, frame_senders
-from lidarspec.device.session import Outgoing, Pending, Reply, Session, learned
+from lidarspec.device.session import Outgoing, Pending, Reply, Session, learn_options
 from lidarspec.errors import (
     CommandError,
     LidarSpecError,
@@ -196,7 +196,7 @@ class LiveInput(Input):
                 else:
                     raise suggest(error, self._link_state.suggest_command()) from None
             else:
-                self.learned |= learned(self.sensor, reply)
+                self.learned |= learn_options(self.sensor, reply)
             if self._teachers and name == self._teachers[-1]:
                 self._adopt()
 
@@ -287,7 +287,7 @@ class LiveInput(Input):
         if command is not None and any(
             isinstance(value, Address) for value in command.filled.values()
         ):
-            peer = self._opened(command.link).peer()
+            peer = self._open_link(command.link).peer()
             self._session.host = find_own_address(peer) if peer else None
 
     def write(self, data: bytes, link: str = "data") -> None:
@@ -481,7 +481,7 @@ class LiveInput(Input):
     def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
         self.note(found)
         with self._talk:
-            awaited = self._session.awaited(link)
+            awaited = self._session.awaited_frames(link)
             for item in answers(found, awaited) if awaited else ():
                 at = self._clock.now() if item.at is None else item.at
                 self._session.receive([item], at, link=link)
@@ -508,7 +508,7 @@ class LiveInput(Input):
         self._checked = [one for one in self._checked if not one.done]
         for pending in done:
             with contextlib.suppress(CommandError):
-                again = learned(self.sensor, pending.result())
+                again = learn_options(self.sensor, pending.result())
                 others = [
                     name for name, value in again.items() if self.learned.get(name, value) != value
                 ]
@@ -528,7 +528,7 @@ class LiveInput(Input):
                 self._session.abandon(str(error))
 
     def _write(self, outgoing: Outgoing) -> None:
-        transport = self._opened(outgoing.link)
+        transport = self._open_link(outgoing.link)
         if outgoing.lines:
             try:
                 transport.lines(**outgoing.lines)
@@ -539,7 +539,7 @@ class LiveInput(Input):
             if self._recorder is not None:
                 self._recorder.write(Chunk(outgoing.data, self._clock.now()), "out")
 
-    def _opened(self, link: str) -> LiveTransport:
+    def _open_link(self, link: str) -> LiveTransport:
         """Return the transport of a link; open it on first use."""
         if link not in self._captures:
             data = self._captures["data"].transport

@@ -13,7 +13,7 @@ from lidarspec.device.arrivals import Arrival
 from lidarspec.device.first_frames import FirstFrames
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
-from lidarspec.packets.imu import Waiting, joined
+from lidarspec.packets.imu import Waiting, join_samples
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
 from lidarspec.scans.scan import Scan
@@ -54,7 +54,7 @@ class PacketReader:
             self._stream = self._make_stream(frame)
         self._imu = self._make_imu_stream()
         self.last: Packets | None = None
-        self.imu_samples = joined([])
+        self.imu_samples = join_samples([])
 
     @property
     def waiting_imu(self) -> Waiting | None:
@@ -123,7 +123,7 @@ class PacketReader:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the last packets: an unpickled reader continues with the next ones."""
-        return {**vars(self), "last": None, "imu_samples": joined([])}
+        return {**vars(self), "last": None, "imu_samples": join_samples([])}
 
     def _make_stream(self, frame: str) -> PacketStream:
         return PacketStream(

@@ -332,7 +332,7 @@ class Session:
         """
         filled = {
             path: self._next(value)
-            for path, value in self._filled(name).items()
+            for path, value in self._fill_values(name).items()
             if path not in arguments
         }
         data = self.sensor.command(name, **arguments, **filled)
@@ -366,7 +366,7 @@ class Session:
         self._out = []
         return out
 
-    def awaited(self, link: str = "data") -> frozenset[str]:
+    def awaited_frames(self, link: str = "data") -> frozenset[str]:
         """Return the frame types that `receive` needs from a link; it ignores others."""
         line = self._lines.get(link)
         if line is None:
@@ -382,7 +382,7 @@ class Session:
         if line is None:
             return
         for item in found:
-            if (line.current is not None or line.owed) and item.frame in self.awaited(link):
+            if (line.current is not None or line.owed) and item.frame in self.awaited_frames(link):
                 self._take(line, item, now)
         self._advance(link, now)
 
@@ -447,7 +447,7 @@ class Session:
             for request in waiting:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
-    def _filled(self, name: str) -> Mapping[str, Filled]:
+    def _fill_values(self, name: str) -> Mapping[str, Filled]:
         if name in self.sensor.commands:
             return self.sensor.commands[name].filled
         return {}
@@ -558,7 +558,7 @@ class Session:
             ]
 
 
-def learned(sensor: Sensor, reply: Reply) -> dict[str, Any]:
+def learn_options(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     """Return the options that a reply reports, by name.
 
     Empty if the command learns nothing.

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.explaining.wording import FieldValue
-from lidarspec.frames.arrays import counted
+from lidarspec.frames.arrays import count_up
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.results import VALID
@@ -157,7 +157,7 @@ def _rows(
     size: int,
 ) -> NDArray[np.uint8]:
     """Return the bytes with each change undone, one per row."""
-    columns = counted(size)
+    columns = count_up(size)
     places = offsets[:, None]
     if kind == "inserted byte":
         return old[columns + (columns >= places)]

@@ -24,7 +24,7 @@ from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import examine
 from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, packed
+from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, pack_found
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate_plainly
 from lidarspec.scans.ends import first_points
@@ -225,7 +225,9 @@ def _add_points(
         return rows, tuple(notes)
     try:
         packets = (
-            PacketStream(sensor, name, Counters()).add([packed([Found(name, 0, data)])]).with_points
+            PacketStream(sensor, name, Counters())
+            .add([pack_found([Found(name, 0, data)])])
+            .with_points
         )
         if not len(packets):
             return rows, tuple(notes)

@@ -15,7 +15,7 @@ import numpy as np
 from lidarspec.errors import LidarSpecError
 from lidarspec.explaining.wording import describe_losses, format_argument_type
 from lidarspec.frames.wire_table import frame_size, wire_table
-from lidarspec.framing.results import Counters, Found, packed
+from lidarspec.framing.results import Counters, Found, pack_found
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.plain import evaluate_plainly
@@ -241,7 +241,7 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
 def _cloud(sensor: Sensor, name: str) -> PointCloud | None:
     """Return the points of an example frame, None if it has none."""
     try:
-        frames = packed([Found(name, 0, sensor.example(name))])
+        frames = pack_found([Found(name, 0, sensor.example(name))])
         packets = PacketStream(sensor, name, Counters()).add([frames]).with_points
         return evaluate_plainly(packets).cloud
     except LidarSpecError:

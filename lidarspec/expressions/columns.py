@@ -12,7 +12,7 @@ where packets were lost and how long variable arrays are; and how many packets a
 stream order, without padding, which is what `previous`, `following` and `last` mean by "before" and
 "after".
 
-Arrays that are no columns line up with them, too (`aligned`): what `along` made by the name of its
+Arrays that are no columns line up with them, too (`align`): what `along` made by the name of its
 array, a plain array where its length is that of one array alone; only one that has as many axes as
 the arrays that are nested lines up by place, as in NumPy.
 """
@@ -82,7 +82,7 @@ class Batch:
     def __len__(self) -> int:
         return len(self.table)
 
-    def carried(self, ready: int) -> Carry:
+    def carry_over(self, ready: int) -> Carry:
         """What the next batch has to know, if it starts with packet `ready` of this one."""
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
 
@@ -177,9 +177,9 @@ class Column(NDArrayOperatorsMixin):
         """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as
         in NumPy.
         """
-        arrays, axes, ready = aligned(values, self.batch)
+        arrays, axes, ready = align(values, self.batch)
         try:
-            array = called(function, arrays)
+            array = call(function, arrays)
         except TypeError:
             if function in BITWISE:
                 raise SpecError(NO_BITS, rule="LS213") from None
@@ -260,7 +260,7 @@ class Column(NDArrayOperatorsMixin):
             return np.arange(most)
         return Along((axis,), np.arange(_reach(self.batch.table, axis, most)))
 
-    def gathered(self, table: NDArray[np.float64]) -> Column:
+    def gather(self, table: NDArray[np.float64]) -> Column:
         """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k
         elements that stands in theirs.
         """
@@ -284,7 +284,7 @@ class Column(NDArrayOperatorsMixin):
             ready=self.ready,
         )
 
-    def shifted(self, step: int) -> Column:
+    def shift(self, step: int) -> Column:
         """The values `step` places later (earlier if negative) in stream order, on the same axes;
         nan across a loss and at the end.
         """
@@ -327,7 +327,7 @@ class Column(NDArrayOperatorsMixin):
         Args:
             where: a condition that lines up with the column; by default where its value is finite.
         """
-        (values, flags), axes, ready = aligned(
+        (values, flags), axes, ready = align(
             (self, np.isfinite(self) if where is None else where), self.batch
         )
         shape = np.broadcast_shapes(values.shape, flags.shape)
@@ -361,7 +361,7 @@ class RowOfValues:
         else:
             full = np.broadcast_to(column.array, self._shape)
         flat = full.reshape(self._shape[0], math.prod(self._shape[1:]))
-        self._mask = unpadded(column.axes, self._shape, column.batch)
+        self._mask = padding_mask(column.axes, self._shape, column.batch)
         self.values = np.asarray(
             (flat if self._mask is None else flat[self._mask]).reshape(-1), np.float64
         )
@@ -380,7 +380,7 @@ class RowOfValues:
         return full.reshape(self._shape)
 
 
-def unpadded(
+def padding_mask(
     axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch
 ) -> NDArray[np.bool_] | None:
     """Which elements, (n, product of the other lengths), are not padding; None where none is."""
@@ -402,7 +402,7 @@ def unpadded(
     return np.broadcast_to(mask, shape).reshape(shape[0], math.prod(shape[1:]))
 
 
-def aligned(
+def align(
     values: tuple[Any, ...], batch: Batch
 ) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int]:
     """Columns and arrays as arrays that broadcast, the names of the axes they have together, and
@@ -458,7 +458,7 @@ def aligned(
             )
             arrays.append(value.lined_up(names))
         else:
-            arrays.append(_placed(np.asarray(value), axes, lengths, batch.table))
+            arrays.append(_place(np.asarray(value), axes, lengths, batch.table))
     if not len(batch):
         arrays = _cut_to_shortest(arrays)
     return arrays, tuple(axes), min((column.ready for column in columns), default=len(batch))
@@ -509,7 +509,7 @@ def _length(value: Along, axis: str) -> int:
     )
 
 
-def _placed(
+def _place(
     array: NDArray[Any], axes: list[str | None], lengths: Sequence[int], table: Table
 ) -> NDArray[Any]:
     """A plain array, lined up with axes of these lengths, which are given a name where they have
@@ -597,7 +597,7 @@ def _spot(
 def of_points(
     parts: Mapping[str, Any], batch: Batch
 ) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
-    """The parts of points as `aligned` gives them, and the shape that they have together, (n, ...).
+    """The parts of points as `align` gives them, and the shape that they have together, (n, ...).
 
     Raises:
         SpecError: where axes of different arrays meet, lengths do not fit, or a plain array is
@@ -608,7 +608,7 @@ def of_points(
         (None,) * batch.table.schema.depth(),
         batch,
     )
-    (_, *arrays), axes, ready = aligned((anchor, *parts.values()), batch)
+    (_, *arrays), axes, ready = align((anchor, *parts.values()), batch)
     named = dict(zip(parts, arrays, strict=True))
     shape = together({"": np.empty((len(batch), *(1,) * len(axes)), np.bool_), **named}, axes)
     stray = next((name.strip("?") for name in axes if name is not None and "?" in name), None)
@@ -688,7 +688,7 @@ def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
     return all(isinstance(value, Column | int | float) for value in values)
 
 
-def called(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
+def call(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
     """What a function makes of arrays that are lined up, of the shape that they broadcast to."""
     return np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
 

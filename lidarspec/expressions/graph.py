@@ -3,7 +3,7 @@ what is done to them.
 
 `trace` calls a `points`, `plausible` or clock function with `TracedFields`, and gives back what it
 returned, with the `Tape` of its steps. A step is a `Node`: a field, a state column, an elementwise
-call, or one of the steps that know packets by name (`on`, `shifted`, `latest`). Every node carries
+call, or one of the steps that know packets by name (`on`, `shift`, `latest`). Every node carries
 the plain result for two sample packets, so shapes and axes need no rules of their own. What cannot
 be noted down (a branch on data, reductions, attributes of arrays) is `UntraceableError`, with the
 reason.
@@ -33,7 +33,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.expressions.columns import NO_TRUTH, Batch, Column, Fields, aligned, called
+from lidarspec.expressions.columns import NO_TRUTH, Batch, Column, Fields, align, call
 from lidarspec.frames.frame_table import Group, Rows, Table
 from lidarspec.frames.schema import Schema
 from lidarspec.spec.tree import FieldInfo
@@ -135,7 +135,7 @@ class Node:
             known if not is_node else arg.reshape(*arg.shape, *known) if known else arg
             for arg, (is_node, known) in zip(args, self._operands, strict=True)
         ]
-        return called(self.function, arrays)
+        return call(self.function, arrays)
 
 
 @dataclass
@@ -203,12 +203,12 @@ class Traced(NDArrayOperatorsMixin):
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Traced:
         """What a function of arrays makes of the values, noted down."""
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
-        arrays, _, _ = aligned(
+        arrays, _, _ = align(
             tuple(samples), self.node.sample.batch
         )  # what is no column is noted down in its place
-        table = _folded(function, values, arrays)
+        table = _fold(function, values, arrays)
         if table is not None:
-            return Traced(table[0], self._tape).gathered(table[1])
+            return Traced(table[0], self._tape).gather(table[1])
         args = tuple(
             value if isinstance(value, Traced | int | float) else array
             for value, array in zip(values, arrays, strict=True)
@@ -238,13 +238,13 @@ class Traced(NDArrayOperatorsMixin):
             return self  # which stands on them already
         return self._tape.add("on", lambda column: column.on(*axes), (self,), sample)
 
-    def gathered(self, table: NDArray[np.float64]) -> Traced:
+    def gather(self, table: NDArray[np.float64]) -> Traced:
         """The rows of a table at these indices, noted down."""
         return self._tape.add(
             "rows",
-            lambda column, rows: column.gathered(rows),
+            lambda column, rows: column.gather(rows),
             (self, table),
-            self.node.sample.gathered(table),
+            self.node.sample.gather(table),
         )
 
     def running(self) -> Traced:
@@ -261,10 +261,10 @@ class Traced(NDArrayOperatorsMixin):
         self._tape.steps.append((self.node, len(found)))
         return found
 
-    def shifted(self, step: int) -> Traced:
+    def shift(self, step: int) -> Traced:
         """The value `step` places later (earlier if negative) in stream order, noted down."""
         return self._tape.add(
-            "shift", lambda column: column.shifted(step), (self,), self.node.sample.shifted(step)
+            "shift", lambda column: column.shift(step), (self,), self.node.sample.shift(step)
         )
 
     def latest(self, where: Any = None) -> Traced:
@@ -343,7 +343,7 @@ class TracedFields:
         )
 
 
-def _folded(
+def _fold(
     function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]
 ) -> tuple[Node, NDArray[np.float64]] | None:
     """A function of rows of tables at the same indices, of numbers and of a row that all packets
@@ -376,7 +376,7 @@ def _folded(
             known.append(np.asarray(array).reshape(-1))
         else:
             return None
-    table = called(function, known)
+    table = call(function, known)
     if table.dtype == np.float64 and table.shape == first.shape:
         return (index, table)
     return None
@@ -578,7 +578,7 @@ class _ResultPart:
     def __call__(self, table: Table) -> NDArray[np.int64]:
         columns = [table.raw(info.path) for info in self._expression.fields]
         if self._expression.node.kind == "field":
-            return self._computed(columns)
+            return self._compute(columns)
         changes = np.zeros(len(table), np.bool_)
         for column in columns:
             changes[1:] |= column[1:] != column[:-1]
@@ -586,9 +586,9 @@ class _ResultPart:
         if not len(starts):
             return self._once([column[:1] for column in columns])
         if 2 * len(starts) > len(table):
-            return self._computed(columns)
+            return self._compute(columns)
         starts = np.concatenate([[0], starts])
-        values = self._computed([column[starts] for column in columns])
+        values = self._compute([column[starts] for column in columns])
         return np.repeat(values, np.diff(starts, append=len(table)))
 
     def _once(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
@@ -596,13 +596,13 @@ class _ResultPart:
         key = tuple(column.item(0) for column in columns)
         found = self._known.get(key)
         if found is None:
-            found = self._computed(columns)
+            found = self._compute(columns)
             if len(self._known) >= REMEMBERED:
                 self._known.clear()
             self._known[key] = found
         return found
 
-    def _computed(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
+    def _compute(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
         raw = {
             info.path: column for info, column in zip(self._expression.fields, columns, strict=True)
         }
@@ -652,7 +652,7 @@ def is_full(value: Any, width: int) -> bool:
     return isinstance(value, Node) and value.width == width
 
 
-def chosen(node: Node, width: int) -> tuple[Node, Any, Any] | None:
+def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
     """The condition of a ``np.where`` that packets or blocks decide, and what it chooses from, each
     a number or full of one field.
     """
@@ -702,7 +702,7 @@ def terms(value: Any, width: int) -> list[Term]:
     args = value.args
     if value.kind == "call" and only_field(value) is None:
         if function in FACTORS:
-            return _scaled(value, terms(args[0], width), FACTORS[function])
+            return _scale(value, terms(args[0], width), FACTORS[function])
         if function in (np.add, np.subtract):
             sign = 1.0 if function is np.add else -1.0
             return terms(args[0], width) + [term.times(sign) for term in terms(args[1], width)]
@@ -711,13 +711,13 @@ def terms(value: Any, width: int) -> list[Term]:
                 factor = np.asarray(args[1], np.float64)
             else:
                 factor = 1 / np.asarray(args[1], np.float64)
-            return _scaled(value, terms(args[0], width), factor)
+            return _scale(value, terms(args[0], width), factor)
         if function is np.multiply and not isinstance(args[0], Node):
-            return _scaled(value, terms(args[1], width), np.asarray(args[0], np.float64))
+            return _scale(value, terms(args[1], width), np.asarray(args[0], np.float64))
     return [Term(np.ones(()), full=value)]
 
 
-def _scaled(value: Node, parts: list[Term], factor: Any) -> list[Term]:
+def _scale(value: Node, parts: list[Term], factor: Any) -> list[Term]:
     """A sum times a factor; in one piece where a full part would be multiplied by a row."""
     if np.ndim(factor) and any(part.full is not None for part in parts):
         return [Term(np.ones(()), full=value)]

@@ -178,7 +178,7 @@ def write(
     if organized:
         check_holds(path, "organized")
         is_alone = "scans" not in chosen.holds
-        scans = _organized(path, scans, alone=is_alone and not PLACE.search(str(path)))
+        scans = _iter_organized(path, scans, alone=is_alone and not PLACE.search(str(path)))
         every_point = True
         if is_alone:
             chosen = dataclasses.replace(chosen, write=partial(chosen.write, organized=True))
@@ -201,7 +201,7 @@ def check_holds(path: str | Path, what: str) -> None:
         )
 
 
-def _organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterator[Scan]:
+def _iter_organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterator[Scan]:
     """Yield scans, and check that they are organized.
 
     Args:
@@ -228,7 +228,7 @@ def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Sc
     """Yield each file, and the scans for it."""
     begun = set[str]()
     for name, group in itertools.groupby(
-        enumerate(scans), lambda numbered: _placed(str(path), *numbered)
+        enumerate(scans), lambda numbered: _fill_path(str(path), *numbered)
     ):
         if name in begun:
             raise UsageError(
@@ -247,7 +247,7 @@ def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Sc
         )
 
 
-def _placed(path: str, number: int, scan: Scan) -> str:
+def _fill_path(path: str, number: int, scan: Scan) -> str:
     """Return a path with the number and time of a scan in place of the placeholders.
 
     Other percent signs are kept.

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.formats.rows import NAMES, PointRows, write_rows
-from lidarspec.formats.writing import Spool, picture, written
+from lidarspec.formats.writing import Spool, picture, select_points
 from lidarspec.libraries import import_library
 from lidarspec.points.cloud import units_of
 from lidarspec.points.table_types import structured_type
@@ -71,7 +71,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
         columns = dict[str, Spool]()
         units = dict[str, str]()
         for number, scan in enumerate(scans):
-            cloud = written(scan, every_point=every_point)
+            cloud = select_points(scan, every_point=every_point)
             own = cloud.columns
             if organized:
                 height = len(picture(cloud.valid, cloud))
@@ -107,12 +107,12 @@ def write_npy(
     """
     write_rows(
         path,
-        PointRows(scans, _structured, every_point=every_point, is_picture=organized),
+        PointRows(scans, _structured_dtype, every_point=every_point, is_picture=organized),
         _npy_header,
     )
 
 
-def _structured(types: Mapping[str, Any]) -> np.dtype[Any]:
+def _structured_dtype(types: Mapping[str, Any]) -> np.dtype[Any]:
     return structured_type(
         {name: np.dtype(dtype) for name, dtype in types.items() if name not in NAMES}
     )
@@ -184,7 +184,7 @@ def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     }
     columns = {"scan": _ZarrColumn(group, "scan", np.int32)}
     for number, scan in enumerate(scans):
-        cloud = written(scan, every_point=every_point)
+        cloud = select_points(scan, every_point=every_point)
         own = {**cloud.columns, "scan": np.full(len(cloud), number, np.int32)}
         if not number:
             units = units_of(cloud)

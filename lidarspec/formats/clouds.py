@@ -67,7 +67,7 @@ def write_lzf_pcd(
             _refuse_size(rows.length * rows.dtype.itemsize)
             for name, field in fields.items():
                 field.add(
-                    _compressed(block[name], compress)
+                    _compress(block[name], compress)
                 )  # concatenated compressed blocks are a valid compressed field
         start = target.write(_pcd_header(rows, "binary_compressed")) + 8
         target.seek(start)
@@ -79,7 +79,7 @@ def write_lzf_pcd(
         target.write(np.array(sizes, "<u4").tobytes())
 
 
-def _compressed(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
+def _compress(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
     data = values.tobytes()
     return np.frombuffer(
         compress(data, len(data) + len(data) // 16 + 64) if data else b"", np.uint8
@@ -96,7 +96,10 @@ def _refuse_size(size: int) -> None:
 
 def _pcd_rows(scans: Iterable[Scan], *, every_point: bool) -> PointRows:
     return PointRows(
-        scans, lambda types: _packed(types, _PCD_TYPES), every_point=every_point, is_picture=True
+        scans,
+        lambda types: _packed_dtype(types, _PCD_TYPES),
+        every_point=every_point,
+        is_picture=True,
     )
 
 
@@ -129,7 +132,7 @@ def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """
     write_rows(
         path,
-        PointRows(scans, lambda types: _packed(types, _PLY_TYPES), every_point=every_point),
+        PointRows(scans, lambda types: _packed_dtype(types, _PLY_TYPES), every_point=every_point),
         _ply_header,
     )
 
@@ -149,7 +152,7 @@ def _ply_header(rows: PointRows) -> bytes:
     return "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
 
 
-def _packed(types: Mapping[str, Any], known: Mapping[str, str]) -> np.dtype[Any]:
+def _packed_dtype(types: Mapping[str, Any], known: Mapping[str, str]) -> np.dtype[Any]:
     """Return the type of a row without gaps, in types that a format supports."""
     codes = {name: np.dtype(dtype).str[1:] for name, dtype in types.items()}
     return np.dtype([(name, "<" + known.get(code, code)) for name, code in codes.items()])

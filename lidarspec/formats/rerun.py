@@ -90,12 +90,12 @@ class RerunRecording:
             OSError: if it cannot be written.
         """
         if os.name != "posix":
-            with _told():
+            with _translate_errors():
                 self.stream.save(path)
             return
         self._copy = _Copy(path)
         self._copy.start()
-        with _told(), os.fdopen(self._copy.end, "wb"):
+        with _translate_errors(), os.fdopen(self._copy.end, "wb"):
             self.stream.save(f"/dev/fd/{self._copy.end}")
 
     def scan(self, scan: Scan, *, every_point: bool = False) -> None:
@@ -158,7 +158,7 @@ class RerunRecording:
             OSError: if it cannot be written.
         """
         self._waiting = 0
-        with _told():
+        with _translate_errors():
             self.stream.flush()
         if self._copy is not None and self._copy.failure is not None:
             raise self._copy.failure
@@ -250,7 +250,7 @@ class _Copy(threading.Thread):
 
 
 @contextlib.contextmanager
-def _told() -> Iterator[None]:
+def _translate_errors() -> Iterator[None]:
     """Convert errors of the Rerun SDK to OSError."""
     try:
         yield

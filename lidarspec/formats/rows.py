@@ -78,14 +78,14 @@ class PointRows:
         self._scans = itertools.chain(handed_out(first), scans)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        return itertools.starmap(self.filled, self.parts())
+        return itertools.starmap(self.fill, self.parts())
 
     def parts(self) -> Iterator[tuple[Mapping[str, NDArray[Any]], PointCloud]]:
-        """Yield the columns and points of each scan, for `filled`."""
+        """Yield the columns and points of each scan, for `fill`."""
         for number, scan in enumerate(self._scans):
             yield self._columns(scan, number, self.dtype.names or ()), scan.points
 
-    def filled(self, columns: Mapping[str, NDArray[Any]], points: PointCloud) -> NDArray[Any]:
+    def fill(self, columns: Mapping[str, NDArray[Any]], points: PointCloud) -> NDArray[Any]:
         """Return the rows of a scan, and count them."""
         rows = np.zeros(len(columns["x"]), self.dtype)
         for name, column in columns.items():
@@ -116,7 +116,7 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
         file.write(header(rows))
 
         def append(part: tuple[Mapping[str, NDArray[Any]], PointCloud]) -> None:
-            data = rows.filled(*part).view(np.uint8).data
+            data = rows.fill(*part).view(np.uint8).data
             for start in range(0, len(data), PIECE):
                 file.write(data[start : start + PIECE])
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.formats.writing import behind, written
+from lidarspec.formats.writing import behind, select_points
 from lidarspec.libraries import import_library
 from lidarspec.points.cloud import PointCloud, units_of
 from lidarspec.points.table_types import arrow_schema
@@ -58,7 +58,7 @@ def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
     gathered = list[Any]()
     rows = 0
     for place, scan in enumerate(scans):
-        cloud = written(scan, every_point=every_point)
+        cloud = select_points(scan, every_point=every_point)
         schema = schema or _schema(arrow, scan, cloud, of_scans)
         gathered.append(
             _batch(arrow, schema, cloud, place if scan.number is None else scan.number, scan)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import behind, kept, written
+from lidarspec.formats.writing import behind, find_points, select_points
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
@@ -52,7 +52,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bo
     names: tuple[str, ...] = ()
     with text_file(path, is_zipped=is_zipped) as put:
         for number, scan in enumerate(scans):
-            cloud = written(scan, every_point=every_point)
+            cloud = select_points(scan, every_point=every_point)
             if not names:
                 names = tuple(cloud.columns)
                 put(",".join([*names, "scan"]) + "\n")
@@ -69,7 +69,7 @@ def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write x y z in metres, nothing else; missing points as nan."""
     with text_file(path) as put:
         for scan in scans:
-            which = kept(scan.points, every_point=every_point)
+            which = find_points(scan.points, every_point=every_point)
             columns = scan.points.read("x", "y", "z").values()
             _put_rows(
                 put,

@@ -104,15 +104,15 @@ def behind(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], Non
         last.result()
 
 
-def written(scan: Scan, *, every_point: bool) -> PointCloud:
+def select_points(scan: Scan, *, every_point: bool) -> PointCloud:
     """Return the points of a scan to write: those with a valid return, or all."""
-    which = kept(scan.points, every_point=every_point)
+    which = find_points(scan.points, every_point=every_point)
     if which is None:
         return scan.points
     return scan.points[which]
 
 
-def kept(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
+def find_points(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
     """Return the indices of the points to write, None for all.
 
     Indexing columns by numbers is several times as fast as by a mask.
@@ -134,7 +134,7 @@ def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[s
         name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name)
         for name in named
     }
-    which = kept(cloud, every_point=every_point)
+    which = find_points(cloud, every_point=every_point)
     return {
         name: column if which is None else column[which]
         for name, column in columns.items()

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: numbers that `counted` keeps.
+#: numbers that `count_up` keeps.
 COUNTED = 1 << 17
 #: bytes; what is freed at the end of the heap is kept up to twice as much.
 KEPT = 1 << 24
 
 
-def repeated(value: int, *shape: int) -> NDArray[np.int64]:
+def repeat(value: int, *shape: int) -> NDArray[np.int64]:
     """Return an array of this shape that holds one value everywhere, read-only.
 
     It equals the result of `np.broadcast_to`, at a tenth of its cost.
@@ -31,14 +31,14 @@ def repeated(value: int, *shape: int) -> NDArray[np.int64]:
 def some(
     values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice
 ) -> NDArray[np.int64]:
-    """The values, (k,), that a mask, indices or a slice pick; equal ones stay `repeated`."""
+    """The values, (k,), that a mask, indices or a slice pick; equal ones stay `repeat`."""
     value = alike(values)
     if value is None or isinstance(which, slice):
         return values[which]
-    return repeated(value, int(np.count_nonzero(which)) if which.dtype == np.bool_ else len(which))
+    return repeat(value, int(np.count_nonzero(which)) if which.dtype == np.bool_ else len(which))
 
 
-def counted(count: int) -> NDArray[np.int64]:
+def count_up(count: int) -> NDArray[np.int64]:
     """Return the numbers from 0 to `count` - 1, (count,), read-only.
 
     Small counts share the same memory.
@@ -49,7 +49,7 @@ def counted(count: int) -> NDArray[np.int64]:
 
 
 def is_counted(numbers: NDArray[np.int64]) -> bool:
-    """Whether numbers are known to ascend, because they are from `counted`."""
+    """Whether numbers are known to ascend, because they are from `count_up`."""
     return numbers.base is _numbers() and numbers.strides[0] > 0
 
 
@@ -61,7 +61,7 @@ def _numbers() -> NDArray[np.int64]:
 
 
 def alike(values: NDArray[np.int64]) -> int | None:
-    """Return the value of a zero-stride array, as from `repeated`, else None."""
+    """Return the value of a zero-stride array, as from `repeat`, else None."""
     if values.strides == (0,) and len(values):
         return values.item(0)
     return None
@@ -88,7 +88,7 @@ def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]
     return [(ordered.item(start), order[start:stop]) for start, stop in pairwise(edges)]
 
 
-def taken(
+def take_rows(
     rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
     """The rows of bytes that indices or a mask pick, (k, size), each copied as one piece."""

@@ -134,7 +134,7 @@ class _Encoder:
             return self._totals[path]
         found = self.read(path)
         if found is None:
-            raise self._uncounted(path)
+            raise self._missing_count_error(path)
         return int(found)
 
     def read(self, path: str) -> Any:
@@ -158,12 +158,12 @@ class _Encoder:
             value = value[self._indices[names]]
         info = self._schema.fields[path]
         if value is None or (info.rebuilt is not None and not info.held):
-            value = self._implied(info)
+            value = self._find_implied(info)
         if value is None:
             return None
         return raw_of(info, value)
 
-    def _implied(self, info: FieldInfo) -> Any:
+    def _find_implied(self, info: FieldInfo) -> Any:
         """Return the value that a field has if none is given; None if it has to be given."""
         if info.const is not None:
             return info.const
@@ -302,7 +302,7 @@ class _Encoder:
             column.append(0)  # written with the lengths of the layout
             return
         if value is None or info.rebuilt is not None:
-            value = self._implied(info)
+            value = self._find_implied(info)
             if info.kind == "bytes" and isinstance(value, bytes) and len(value) == 1:
                 value *= size  # a pattern that fills the field
         if value is None:
@@ -380,7 +380,7 @@ class _Encoder:
             member(self._given, leaf.info.path, None) is None for leaf in seal.leaves
         ):
             return False
-        return int(seal.stored(row)[0]) in seal.absent
+        return int(seal.load_stored(row)[0]) in seal.absent
 
     def _check(
         self, layout: Layout, row: NDArray[np.uint8], parts: Mapping[str, list[bytes]]
@@ -407,7 +407,7 @@ class _Encoder:
     def _shown(self, path: str) -> str:
         return f"{self._prefix}.{path}".strip(".")
 
-    def _uncounted(self, path: str) -> UsageError:
+    def _missing_count_error(self, path: str) -> UsageError:
         """Return why a field that decides the layout has no value."""
         for axis, counting in self._schema.counting_fields.items():
             array = member(self._given, axis, None)

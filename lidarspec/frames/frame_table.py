@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.frames.arrays import counted, deep, is_counted, repeated
+from lidarspec.frames.arrays import count_up, deep, is_counted, repeat
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf, rows_at
 from lidarspec.frames.schema import Schema, schema, without_indices
 from lidarspec.spec.syntax import leaves, member
@@ -166,7 +166,7 @@ class Rows:
     @property
     def sizes(self) -> NDArray[np.intp]:
         if len(self.groups) == 1:
-            return repeated(self.groups[0].layout.size, len(self))
+            return repeat(self.groups[0].layout.size, len(self))
         found = np.empty(len(self), np.intp)
         for group in self.groups:
             found[group.where] = group.layout.size
@@ -190,7 +190,7 @@ class Rows:
             if only.is_in_order:
                 return Rows(
                     self.schema,
-                    [Group(only.layout, counted(len(which)), only.rows[which[0] : which[-1] + 1])],
+                    [Group(only.layout, count_up(len(which)), only.rows[which[0] : which[-1] + 1])],
                 )
         new_index = np.full(len(self), -1, np.intp)
         new_index[which] = np.arange(len(which))
@@ -238,7 +238,7 @@ class Rows:
         )
 
     @staticmethod
-    def joined(tables: Sequence[Rows]) -> Rows:
+    def join(tables: Sequence[Rows]) -> Rows:
         """Return several tables of one frame type as one table, in this order."""
         alone = [table.groups[0] for table in tables if len(table.groups) == 1]
         if (
@@ -247,7 +247,7 @@ class Rows:
             and all(group.is_in_order for group in alone)
         ):
             rows = _stack_rows([group.rows for group in alone])
-            return Rows(tables[0].schema, [Group(alone[0].layout, counted(len(rows)), rows)])
+            return Rows(tables[0].schema, [Group(alone[0].layout, count_up(len(rows)), rows)])
         found: dict[int, list[Group]] = {}
         start = 0
         for table in tables:
@@ -494,7 +494,7 @@ class Records:
         )
 
     @staticmethod
-    def joined(tables: Sequence[Records]) -> Records:
+    def join(tables: Sequence[Records]) -> Records:
         """Return several tables of one frame type as one table, in this order."""
         parsed = [item for table in tables for item in table._parsed]
         return Records(

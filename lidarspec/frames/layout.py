@@ -371,7 +371,7 @@ class Seal:
             for leaf in other.leaves
         )
 
-    def stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
+    def load_stored(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """Return the checksums that the frames contain, (n,)."""
         if len(self.leaves) == 1 and self.leaves[0].info.kind != "bytes":
             return self.leaves[0].load(rows).astype(np.uint64)
@@ -392,7 +392,7 @@ class Seal:
             return powers
         return powers[::-1]
 
-    def computed(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.uint64]:
+    def compute(self, rows: Bytes2D, sums: Sums | None = None) -> NDArray[np.uint64]:
         """Compute the checksums of the frames, (n,).
 
         Args:
@@ -405,7 +405,7 @@ class Seal:
 
     def fill(self, rows: Bytes2D) -> None:
         """Compute the checksums and write them into the frames."""
-        values = self.computed(rows)
+        values = self.compute(rows)
         shift = 0
         for leaf in self.leaves:
             part = (values >> np.uint64(shift)) & np.uint64((1 << leaf.info.bits) - 1)
@@ -443,18 +443,18 @@ class Seal:
         A value that means "not filled" counts as correct.
 
         Args:
-            sums: computes the checksums, as for `computed`.
+            sums: computes the checksums, as for `compute`.
         """
-        stored = self.stored(rows)
+        stored = self.load_stored(rows)
         if self.absent:
             filled = reduce(np.logical_and, (stored != np.uint64(value) for value in self.absent))
         else:
             filled = None
         if filled is None or filled.all():
-            return np.asarray(stored == self.computed(rows, sums))
+            return np.asarray(stored == self.compute(rows, sums))
         right = np.ones(len(rows), np.bool_)
         if filled.any():
-            right[filled] = stored[filled] == self.computed(rows[filled], sums)
+            right[filled] = stored[filled] == self.compute(rows[filled], sums)
         else:
             right[filled] = True
         return right

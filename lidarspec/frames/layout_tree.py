@@ -148,7 +148,7 @@ class HeaderWalk:
 
     def layout(self) -> Layout:
         """What was found, as a value."""
-        held = self._held()
+        held = self._held_bits()
         self.asked = _unknown  # what follows from the header asks for no more of it
         seals = tuple(_in_order(self.seals))
         following = tuple(self._following())
@@ -411,7 +411,7 @@ class HeaderWalk:
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
 
-    def _held(self) -> dict[int, tuple[int, int]]:
+    def _held_bits(self) -> dict[int, tuple[int, int]]:
         """Return the bits of fields that hold lengths of parts, as constants.
 
         They are constant within one layout.
@@ -608,7 +608,7 @@ class _ValueClasses:
             )
         return cls(info.limits, low, high)
 
-    def refused(self, value: int) -> _ValueClasses:
+    def refuse(self, value: int) -> _ValueClasses:
         """The same, where the frame of a value is known to be too long."""
         if self.rises is not None and self.rises <= value < self.high:
             return replace(self, high=value)
@@ -940,7 +940,7 @@ class HeaderTree:
             is_all: there are no more bytes of this frame.
         """
 
-        def asked(leaf: Leaf | Measure, walk: HeaderWalk) -> int:
+        def size_asked(leaf: Leaf | Measure, walk: HeaderWalk) -> int:
             nonlocal node
             node.leaf, node.before, node.value_classes, node.constants = (
                 leaf,
@@ -960,7 +960,7 @@ class HeaderTree:
             return node
         self._size += not node.least  # it is known, where it was cut off before
         walk = HeaderWalk(
-            node.values, self.limit, self._given, asked, len(data) if is_all else None
+            node.values, self.limit, self._given, size_asked, len(data) if is_all else None
         )
         try:
             node.result = walk_layout(walk, self.root)
@@ -984,7 +984,7 @@ class HeaderTree:
             and isinstance(node.result, Refusal)
             and not node.result.error
         ):
-            above.value_classes = above.value_classes.refused([*node.values.values()][-1])
+            above.value_classes = above.value_classes.refuse([*node.values.values()][-1])
         return node
 
     def _behind(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:

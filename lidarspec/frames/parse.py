@@ -3,7 +3,7 @@
 A valid frame is read by its layout. An invalid frame raises a `WireError` with its first fault.
 
 For each field, the values of all array elements are unpacked at once. The containers and lists are
-then built around them, the innermost first (`unpacked`). construct parses the frames that have no
+then built around them, the innermost first (`unpack`). construct parses the frames that have no
 layout (`lidarspec.frames.plain`).
 """
 
@@ -129,7 +129,7 @@ def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
         return None
     layout = layouts.layout(decoded.struct)
     if isinstance(layout, Layout) and layout.sound(decoded.struct):
-        values = unpacked(frame.tree, layout, decoded.struct)
+        values = unpack(frame.tree, layout, decoded.struct)
         return (coder.keep_spelling(values, decoded.struct, data),)
     return None
 
@@ -257,7 +257,7 @@ def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
     if shortage is not None or examined.layout is None:
         assert shortage is not None
         raise _to_wire_error(sensor, name, data, shortage, decoded.offset)
-    return unpacked(frame.tree, examined.layout, decoded.struct[: examined.layout.size])
+    return unpack(frame.tree, examined.layout, decoded.struct[: examined.layout.size])
 
 
 def _convert_units(fields: Mapping[str, FieldInfo], value: Any, path: str) -> Any:
@@ -274,7 +274,7 @@ def _convert_units(fields: Mapping[str, FieldInfo], value: Any, path: str) -> An
     return value
 
 
-def unpacked(root: Node, layout: Layout, frame: bytes) -> Any:
+def unpack(root: Node, layout: Layout, frame: bytes) -> Any:
     """Return the Container of raw values of a frame with this layout."""
     reader = layout.notes.get(_make_reader) or layout.notes.setdefault(
         _make_reader, _make_reader(root, "", layout, 1)
@@ -368,7 +368,7 @@ def _read_lists(elements: Reader, count: int, length: int, frame: bytes) -> Sequ
 def _read_parts(region: Region, frame: bytes) -> Sequence[ListContainer]:
     return [
         ListContainer(
-            unpacked(kind.node.root, layout, part) for kind, layout, part in region.listed(frame)
+            unpack(kind.node.root, layout, part) for kind, layout, part in region.list_parts(frame)
         )
     ]
 

@@ -200,7 +200,7 @@ class Region:
         """Whether any part has a checksum or conditions of its own."""
         return any(kind.is_checked for kind in self.kinds)
 
-    def walked(
+    def walk(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> Walked:
         """Return the parts of the frames at these offsets.
@@ -212,7 +212,7 @@ class Region:
 
     def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], Walked]:
         """Return a buffer with whole frames, given as rows of bytes, and their parts."""
-        return span(rows), self.walked(span(rows), np.arange(len(rows)) * rows.strides[0])
+        return span(rows), self.walk(span(rows), np.arange(len(rows)) * rows.strides[0])
 
     def sound(self, frame: bytes) -> bool:
         """Return whether all parts of one frame are valid and fill the region exactly."""
@@ -220,10 +220,10 @@ class Region:
         return (
             not walked.status[0]
             and walked.sizes[0] == self.size
-            and all(layout.sound(data) for _, layout, data in self.listed(frame))
+            and all(layout.sound(data) for _, layout, data in self.list_parts(frame))
         )
 
-    def listed(self, frame: bytes) -> list[tuple[PartKind, Layout, bytes]]:
+    def list_parts(self, frame: bytes) -> list[tuple[PartKind, Layout, bytes]]:
         """Return kind, layout and bytes of each part of one frame."""
         _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
         pieces = ((piece, int(piece.spots[0])) for pieces in walked.rounds for piece in pieces)
@@ -478,7 +478,7 @@ class Measure:
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> tuple[Offsets | None, NDArray[Any]]:
         """Return sizes as `Leaf.read` does; the negative status if it cannot be a frame."""
-        walked = self.region.walked(buffer, offsets, stops)
+        walked = self.region.walk(buffer, offsets, stops)
         values = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))
         cut_off = walked.status == CUT_OFF
         if not np.count_nonzero(cut_off):

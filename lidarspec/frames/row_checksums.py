@@ -16,12 +16,12 @@ a byte by d is to compute its contribution d bytes later. `registers` chooses on
 * `_by_zlib`: for longer rows of the usual CRC-32. One call of `zlib.crc32` for each row.
 * `_narrow`: for registers of at most one byte. The front half of each row is advanced to the back
   half, by a table of 256 entries, and XORed onto it. This is repeated until one byte is left. For
-  many rows, `_summed` first reduces each row to one word without tables.
+  many rows, `_sum_words` first reduces each row to one word without tables.
 * `_wide`: for all others. The register of all rows advances two bytes at a time, by a table of
   65,536 entries. Long rows are split into segments that are computed side by side and then joined
   in pairs.
 
-`_summed` uses that in GF(2) the eighth power of a polynomial p(x) is p(x**8). A byte advanced by
+`_sum_words` uses that in GF(2) the eighth power of a polynomial p(x) is p(x**8). A byte advanced by
 eight is therefore the XOR of the same byte advanced by n, for each term x**n of the polynomial with
 n < 8. So each word is XORed onto some of eight sums, one for each n from 0 to 7, and these are
 advanced and combined.
@@ -66,7 +66,7 @@ BLOCK_BYTES = 1 << 20
 FEW = 1 << 13
 #: ... and up to this number of bytes in one row. Longer rows of the usual CRC-32 use zlib.
 SHORT = 1 << 7
-#: from this number of rows on, `_summed` is faster than tables.
+#: from this number of rows on, `_sum_words` is faster than tables.
 MANY = 1024
 
 #: width, polynomial and reflection of the one CRC that `zlib` has: on rows that are not short, one
@@ -396,7 +396,7 @@ def _narrow(
     if start:
         left[0] ^= np.uint64(start << 8 * (-length % 8))
     if len(rows) >= MANY and len(left) > 1:
-        left = _summed(left, poly << 8 - width)[None]
+        left = _sum_words(left, poly << 8 - width)[None]
     while len(left) > 1:
         half = len(left) // 2
         distance = (len(left) + 1) // 2
@@ -411,7 +411,7 @@ def _narrow(
     return np.frombuffer(side.tobytes().translate(_advance(1, width, poly, refin)), np.uint8)
 
 
-def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
+def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
     """Return one word of each row that gives the same register, (n,).
 
     `poly` has eight bits.
@@ -434,7 +434,7 @@ def _summed(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 @lru_cache(maxsize=256)
 def _shares(number: int, poly: int) -> tuple[int, ...]:
-    """Return for each word which of the eight sums of `_summed` it is XORed onto.
+    """Return for each word which of the eight sums of `_sum_words` it is XORed onto.
 
     Bit n of a value stands for the sum that is advanced by n bytes, n from 0 to 7.
     """
@@ -468,7 +468,7 @@ def _wide(
     found = side.reshape(count, -1)
     while found.shape[1] > 1:
         odd = found.shape[1] % 2
-        jumped = _jumped(
+        jumped = _jump(
             found[:, odd::2].ravel(), _jump_table(segment.bit_length() - 1, width, poly, refin)
         )
         found = np.hstack([found[:, :odd], jumped.reshape(count, -1) ^ found[:, odd + 1 :: 2]])
@@ -510,14 +510,14 @@ def _jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
     """
     if power:
         half = _jump_table(power - 1, width, poly, refin)
-        return _jumped(half.ravel(), half).reshape(half.shape)
+        return _jump(half.ravel(), half).reshape(half.shape)
     later_places = [
         [value << 8 * place for value in range(256)] for place in range(REGISTER_BYTES[width] - 1)
     ]
     return np.array([byte_table(width, poly, refin), *later_places], f"<u{REGISTER_BYTES[width]}")
 
 
-def _jumped(found: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
+def _jump(found: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
     """Registers, shape (k,) and contiguous, each advanced by a jump table."""
     places = found.view(np.uint8).reshape(len(found), -1).T
     return np.asarray(

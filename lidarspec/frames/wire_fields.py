@@ -134,8 +134,8 @@ class Examined:
         rows = np.frombuffer(self.data, np.uint8).reshape(1, -1)
         for seal in self.known.seals:
             if seal.end <= len(self.data):
-                stored = int(seal.stored(rows)[0])
-                computed = int(seal.computed(rows)[0])
+                stored = int(seal.load_stored(rows)[0])
+                computed = int(seal.compute(rows)[0])
                 yield PlacedSeal(seal, self.prefix, self.start, stored, computed)
         axes = [*self.known.regions]
         if isinstance(self.known, HeaderWalk):
@@ -205,7 +205,7 @@ def _examine_parts(around: Examined, axis: str) -> ExaminedParts:
     region = around.region(axis)
     assert region is not None
     data = np.frombuffer(around.data, np.uint8)
-    walked = region.walked(data, np.zeros(1, np.intp))
+    walked = region.walk(data, np.zeros(1, np.intp))
     pieces = [piece for pieces in walked.rounds for piece in pieces]
     found = list[Examined]()
     for index, piece in enumerate(pieces):

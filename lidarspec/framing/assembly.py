@@ -133,7 +133,7 @@ class Assembly:
             whole: tuple[bytes, int] | None = (datagram, base)
             if fragment is not None:
                 heads += size - len(fragment.payload)
-                whole = self._taken(fragment, base, time)
+                whole = self._store(fragment, base, time)
             if whole is not None:
                 data.append(whole[0])
                 places.append(whole[1])
@@ -181,7 +181,7 @@ class Assembly:
             return _Fragment(key, index, count, payload)
         return None
 
-    def _taken(self, fragment: _Fragment, place: int, time: int) -> tuple[bytes, int] | None:
+    def _store(self, fragment: _Fragment, place: int, time: int) -> tuple[bytes, int] | None:
         """Store a fragment and return the message that it completes, with its offset.
 
         Returns None if other fragments are missing.

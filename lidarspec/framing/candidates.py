@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.frames.arrays import repeated
+from lidarspec.frames.arrays import repeat
 from lidarspec.frames.layout import Marks, Sums, words
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
@@ -344,7 +344,7 @@ class Candidates:
 
     def _merge(self, parts: Sequence[Frames]) -> Frames:
         if parts:
-            return merged(parts)
+            return merge(parts)
         return Frames.none(self.buffer)
 
     def _wait(self, kinds: Sequence[int]) -> list[Frames]:
@@ -364,8 +364,8 @@ class Candidates:
                 self.buffer,
                 np.array([first_kinds[start] for start in starts.tolist()], np.intp),
                 starts,
-                repeated(0, number),
-                status=repeated(SHORT, number),
+                repeat(0, number),
+                status=repeat(SHORT, number),
             )
         ]
 
@@ -423,7 +423,7 @@ def alive(candidates: Frames, *, final: bool) -> Frames:
     return candidates.only(is_live)
 
 
-def merged(candidates: Sequence[Frames]) -> Frames:
+def merge(candidates: Sequence[Frames]) -> Frames:
     """Return live candidates of several types by offset, one for each offset.
 
     At the same offset, the type that comes first is kept.
@@ -431,7 +431,7 @@ def merged(candidates: Sequence[Frames]) -> Frames:
     parts = [own for own in candidates if len(own)]
     if not parts:
         return Frames.none(candidates[0].buffer)
-    live = Frames.joined(parts)
+    live = Frames.join(parts)
     if len(parts) == 1:
         return live
     order = np.lexsort((live.kinds, live.starts))

@@ -16,7 +16,7 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.arrays import alike, repeated
+from lidarspec.frames.arrays import alike, repeat
 from lidarspec.frames.layout import Layout, equal
 from lidarspec.framing.candidates import Bytes1D, Framing, Piece, SearchState
 from lidarspec.framing.results import (
@@ -50,7 +50,7 @@ def sorted_datagrams(
     steady = steady_datagrams(framing, buffer, starts, sizes, mode)
     if steady is not None and steady.is_sound:
         return Piece(steady, len(buffer))
-    return _DatagramBatch(framing, buffer, array_of(starts), sizes, steady).sorted(mode)
+    return _DatagramBatch(framing, buffer, array_of(starts), sizes, steady).sort(mode)
 
 
 class _DatagramBatch:
@@ -76,7 +76,7 @@ class _DatagramBatch:
         self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
         self._piece = Piece(Frames.none(buffer), len(buffer))
 
-    def sorted(self, mode: SearchState) -> Piece:
+    def sort(self, mode: SearchState) -> Piece:
         """All of them."""
         position = 0
         parts = list[Frames]()
@@ -85,13 +85,13 @@ class _DatagramBatch:
             parts.append(part)
             position += len(part)
         if parts:
-            self._piece.frames = Frames.joined(parts)
+            self._piece.frames = Frames.join(parts)
         return self._piece
 
     def _from(self, position: int, mode: SearchState) -> Frames:
         """The types from here up to the datagram that changes what is looked for."""
         if mode.after not in self._known:
-            frames, reasons = self._judged(self._starts[position:], self._sizes[position:], mode)
+            frames, reasons = self._judge(self._starts[position:], self._sizes[position:], mode)
             if self._framing.named:
                 spots = (
                     np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position
@@ -108,7 +108,7 @@ class _DatagramBatch:
         frames = frames.only(slice(position - first, stop - first))
         lost = np.flatnonzero(frames.kinds < 0)
         if len(lost):
-            frames = self._rejected(frames, lost, reasons[position - first :][lost], mode)
+            frames = self._count_rejected(frames, lost, reasons[position - first :][lost], mode)
         if (
             len(frames)
             and frames.kinds[-1] >= 0
@@ -117,7 +117,7 @@ class _DatagramBatch:
             mode.after = self._framing.names[int(frames.kinds[-1])]
         return frames
 
-    def _judged(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
+    def _judge(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
         """The type and layout of each datagram while nothing changes what is looked for.
 
         Returns:
@@ -135,8 +135,8 @@ class _DatagramBatch:
         else:
             least = 0
             most = 0
-        kinds = repeated(-1, number)
-        forms = repeated(-1, number)
+        kinds = repeat(-1, number)
+        forms = repeat(-1, number)
         reasons = np.zeros(number, np.uint8)
         left = np.arange(number)
         layouts: tuple[Layout, ...] = ()
@@ -148,7 +148,7 @@ class _DatagramBatch:
             if not len(left):
                 break
             own, lengths = (starts, sizes) if len(left) == number else (starts[left], sizes[left])
-            marked = self._marked(kind, own, lengths)
+            marked = self._has_constants(kind, own, lengths)
             if not np.count_nonzero(marked):
                 continue
             if not marked.all():
@@ -186,7 +186,7 @@ class _DatagramBatch:
             return steady
         return self._framing.survey(kind, self._buffer, starts, starts + sizes, gathered=False)
 
-    def _rejected(
+    def _count_rejected(
         self, frames: Frames, lost: Indices, reasons: Status, mode: SearchState
     ) -> Frames:
         """Count datagrams that are no frames; judge again those with a plugin failure.
@@ -207,7 +207,7 @@ class _DatagramBatch:
         counted = (reasons != PLUGIN) & (lost < len(frames))
         self._count(reasons[counted], frames.sizes[lost[counted]], mode)
         if parts:
-            return Frames.joined([*parts, frames.only(slice(begun, None))])
+            return Frames.join([*parts, frames.only(slice(begun, None))])
         return frames
 
     def _judged_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
@@ -217,7 +217,7 @@ class _DatagramBatch:
         size = datagram.sizes
         data = self._buffer[start.item(0) : start.item(0) + size.item(0)]
         for kind in self._framing.active(mode) if len(data) else ():
-            if not self._marked(kind, start, size).all():
+            if not self._has_constants(kind, start, size).all():
                 continue
             frame = self._framing.survey(kind, data, np.zeros(1, np.intp))
             if frame.status[0] == VALID and frame.sizes[0] == len(data):
@@ -243,7 +243,7 @@ class _DatagramBatch:
             )
         self._piece.reject(np.bincount(np.where(unknown, LENGTH, reasons)[~others]).tolist(), ())
 
-    def _marked(self, kind: int, starts: Indices, sizes: Indices) -> NDArray[np.bool_]:
+    def _has_constants(self, kind: int, starts: Indices, sizes: Indices) -> NDArray[np.bool_]:
         """Which datagrams have the constants of a type."""
         constants = self._framing.words[kind]
         end = self._framing.ends[kind]
@@ -252,7 +252,7 @@ class _DatagramBatch:
             whole = sizes >= end
             if not whole.all():
                 marked = whole.copy()
-                marked[whole] = self._marked(kind, starts[whole], sizes[whole])
+                marked[whole] = self._has_constants(kind, starts[whole], sizes[whole])
                 return marked
         marked = np.ones(len(starts), np.bool_)
         step = step_between(starts)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, UsageError, refuse_text
-from lidarspec.frames.arrays import alike, keep_freed_memory, repeated
+from lidarspec.frames.arrays import alike, keep_freed_memory, repeat
 from lidarspec.frames.layout import Sums
 from lidarspec.framing.assembly import Assembly, Joined
 from lidarspec.framing.candidates import Bytes1D, Framing, Piece, SearchState
@@ -55,7 +55,7 @@ BACKEND = "LIDARSPEC_BACKEND"
 class Witness(Protocol):
     """Who is shown what a decoder is fed, and what it finds in it."""
 
-    def fed(
+    def observe_input(
         self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
     ) -> None:
         """Observe a piece of a stream, or datagrams, given to a decoder.
@@ -178,7 +178,7 @@ class Decoder:
             return [self.datagrams([view], [at])]
         if self.witness is not None:
             buffer = np.frombuffer(data if isinstance(data, bytes) else bytes(view), np.uint8)
-            self.witness.fed(self, buffer, range(1), repeated(len(view), 1))
+            self.witness.observe_input(self, buffer, range(1), repeat(len(view), 1))
         self.stats.bytes_in += len(view)
         found: list[Frames] = []
         start = 0
@@ -219,22 +219,22 @@ class Decoder:
         """
         if isinstance(data, np.ndarray):
             buffer = data.reshape(-1)
-            sizes = repeated(data.shape[1], len(data))
+            sizes = repeat(data.shape[1], len(data))
         else:
             buffer = np.frombuffer(b"".join(data), np.uint8)
             lengths = list(map(len, data))
             is_one_size = bool(lengths) and lengths.count(lengths[0]) == len(lengths)
             if is_one_size:
-                sizes = repeated(lengths[0], len(lengths))
+                sizes = repeat(lengths[0], len(lengths))
             else:
                 sizes = np.array(lengths, np.intp)
         if at is None:
-            times = repeated(-1, len(data))
+            times = repeat(-1, len(data))
         else:
             times = np.array([-1 if one is None else one for one in at], np.int64)
-        return self.placed(buffer, _places(sizes), sizes, times)
+        return self.decode_placed(buffer, _places(sizes), sizes, times)
 
-    def placed(
+    def decode_placed(
         self,
         buffer: NDArray[np.uint8],
         starts: Numbers,
@@ -259,7 +259,7 @@ class Decoder:
         places = _places(sizes, self._base)
         joined = None
         if self.witness is not None:
-            self.witness.fed(self, buffer, starts, sizes)
+            self.witness.observe_input(self, buffer, starts, sizes)
         if self._assembly is not None:
             joined = self._assembly.join(buffer, starts, sizes, at, self._base)
             buffer = joined.buffer
@@ -274,8 +274,8 @@ class Decoder:
         frames = piece.frames
         self._base = self._base + total
         self.stats.bytes_in = self.stats.bytes_in + total
-        self._rejected(piece.rejected, piece.errors)
-        gaps = repeated(0, len(frames))
+        self._count_rejected(piece.rejected, piece.errors)
+        gaps = repeat(0, len(frames))
         kind = alike(frames.kinds)
         if kind is not None:
             is_good = kind >= 0
@@ -289,7 +289,7 @@ class Decoder:
                 places = array_of(places)[good]
                 at = at[good]
         self._count(frames.kinds)
-        return self._shown(frames.located(self.framing.names, places, gaps, at))
+        return self._shown(frames.locate(self.framing.names, places, gaps, at))
 
     def _shown(self, frames: Frames) -> Frames:
         if self.witness is not None:
@@ -308,7 +308,7 @@ class Decoder:
 
         Fillers are left out.
         """
-        lost = self._skipped(buffer, np.where(good, 0, sizes), starts + sizes)
+        lost = self._count_skipped(buffer, np.where(good, 0, sizes), starts + sizes)
         if joined is not None:
             lost = lost + joined.dropped[:-1]
             self.stats.bytes_skipped += int(joined.dropped[:-1].sum())
@@ -347,7 +347,7 @@ class Decoder:
             last = start + len(part) == len(buffer)
             part = part if lasting else part.copy()
             piece = self._piece(part, final=final and last)
-            frames = self._entered(part, piece, at)
+            frames = self._enter(part, piece, at)
             found += [frames] if len(frames) else []  # none at all would keep its bytes
             start = start + piece.end
             self._base = self._base + piece.end
@@ -370,12 +370,12 @@ class Decoder:
             piece = leftmost(self.framing, buffer, self._mode, self._base, final=final)
         return piece
 
-    def _entered(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
+    def _enter(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
         """Return the frames of a piece at their offsets in the input; count everything."""
         frames = piece.frames
         base = self._base
         gaps = self._gaps(buffer, frames, piece.end)
-        self._rejected(piece.rejected, piece.errors)
+        self._count_rejected(piece.rejected, piece.errors)
         self._count(frames.kinds)
         places = frames.places
         if isinstance(places, range):
@@ -383,8 +383,8 @@ class Decoder:
         else:
             places = places + base
         return self._shown(
-            frames.located(
-                self.framing.names, places, gaps, repeated(-1 if at is None else at, len(frames))
+            frames.locate(
+                self.framing.names, places, gaps, repeat(-1 if at is None else at, len(frames))
             )
         )
 
@@ -395,17 +395,17 @@ class Decoder:
         """
         places = frames.places
         if not self._gap and isinstance(places, range) and places.start == 0 and places.stop == end:
-            return repeated(0, len(frames))
+            return repeat(0, len(frames))
         gaps = np.empty(len(frames) + 1, np.int64)
         gaps[:-1], gaps[-1] = frames.starts, end
         stops = gaps.copy()
         gaps[1:] -= frames.starts + frames.sizes
-        gaps = self._skipped(buffer, gaps, stops)
+        gaps = self._count_skipped(buffer, gaps, stops)
         gaps[0] += self._gap
         self._gap = int(gaps[-1])
         return gaps[:-1]
 
-    def _skipped(
+    def _count_skipped(
         self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
     ) -> NDArray[np.int64]:
         """The numbers of skipped bytes that end at these stops, fillers left out; counts them."""
@@ -417,7 +417,7 @@ class Decoder:
             sizes[index] -= fillers
         return sizes
 
-    def _rejected(self, numbers: Mapping[str, int], errors: Sequence[PluginError]) -> None:
+    def _count_rejected(self, numbers: Mapping[str, int], errors: Sequence[PluginError]) -> None:
         for name, number in numbers.items():
             setattr(self.stats, name, getattr(self.stats, name) + number)
         self.stats.failures += errors[: 5 - len(self.stats.failures)]

@@ -87,7 +87,7 @@ def random_frame(
         number = min(GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1))
         rows = _random(engine, layout, number, source)
         _store_drawn(layout, rows, chosen, drawn, source)
-        found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
+        found = _plausible(sensor, frame, layout, _set_headers(rows, layout, chosen))
         if found:
             return found[0]
     return _make_along_sweep(sensor, frame, engine, source, drawn)
@@ -228,7 +228,9 @@ def _blank(values: Any, path: str) -> None:
     member(values, ".".join(parents), {}).pop(name, None) if parents else values.pop(name, None)
 
 
-def _headed(rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]) -> NDArray[np.uint8]:
+def _set_headers(
+    rows: NDArray[np.uint8], layout: Layout, chosen: dict[str, int]
+) -> NDArray[np.uint8]:
     """Random frames with the header values of their layout, constants and checksums set."""
     for path, value in chosen.items():
         layout.leaves[path].store(rows, value)
@@ -278,14 +280,14 @@ def _make_along_sweep(
         )
     for _ in range(TRIES):
         values = sweep(source.randrange(10_000))
-        layout, chosen = header(engine, source, {**_stated(engine, values), **drawn})
+        layout, chosen = header(engine, source, {**_draw_stated(engine, values), **drawn})
         rows = _random(engine, layout, 1, source)
         for path, value in values.items():
             leaf = layout.leaves.get(path)
             if leaf is not None and path not in chosen:
                 _store_swept(leaf, rows, value)
         _store_drawn(layout, rows, chosen, drawn, source)
-        found = _plausible(sensor, frame, layout, _headed(rows, layout, chosen))
+        found = _plausible(sensor, frame, layout, _set_headers(rows, layout, chosen))
         if found:
             return found[0]
     raise SpecError(
@@ -322,7 +324,7 @@ def _store_drawn(
             )
 
 
-def _stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
+def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
     """What gives the numbers of a sweep, raw, where a header asks for them."""
     fields = engine.schema.fields
     found: dict[str, Callable[[random.Random], Any]] = {}

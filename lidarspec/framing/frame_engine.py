@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.frames.arrays import alike, counted, repeated
+from lidarspec.frames.arrays import alike, count_up, repeat
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.frame_table import Group, Rows
 from lidarspec.frames.layout import Layout, Refusal, Sums, rows_at
@@ -68,18 +68,18 @@ class CompiledCodec(Codec):
         sums: Sums | None = None,
     ) -> Frames:
         groups = (
-            [(self.layout, counted(len(offsets)))]
+            [(self.layout, count_up(len(offsets)))]
             if self.layout is not None
             else self.tree.classify(buffer, offsets, stops)
         )
-        kinds = repeated(kind, len(offsets))
+        kinds = repeat(kind, len(offsets))
         errors = list[PluginError]()
         if (
             len(groups) == 1
             and len(groups[0][1]) == len(offsets)
             and isinstance(only := groups[0][0], Layout)
         ):
-            status, sizes, rows = self._judged(
+            status, sizes, rows = self._judge_layout(
                 buffer, offsets, stops, only, errors, gathered=gathered, sums=sums
             )
             return Frames(
@@ -115,7 +115,7 @@ class CompiledCodec(Codec):
         for some in together:
             left += self._judge_together(buffer, offsets, stops, some, status, sizes, sums)
         for layout, which in left:
-            status[which], own, _ = self._judged(
+            status[which], own, _ = self._judge_layout(
                 buffer,
                 offsets[which],
                 None if stops is None else stops[which],
@@ -182,7 +182,7 @@ class CompiledCodec(Codec):
         errors: list[PluginError] = []
         return layout, self.judge(layout)(rows, errors, sums), tuple(errors)
 
-    def _judged(
+    def _judge_layout(
         self,
         buffer: NDArray[np.uint8],
         offsets: NDArray[np.intp],
@@ -217,7 +217,7 @@ class CompiledCodec(Codec):
                 [judge(rows_at(buffer, block, layout.size), errors, sums) for block in blocks]
             )
         if count == number:
-            return judged, repeated(layout.size, number), kept
+            return judged, repeat(layout.size, number), kept
         status = np.empty(number, np.uint8)
         sizes = np.full(number, layout.size)
         status[whole] = judged
@@ -231,9 +231,7 @@ class CompiledCodec(Codec):
         frames = list(frames)
         joined = np.frombuffer(b"".join(frames), np.uint8)
         sizes = np.array([len(frame) for frame in frames], np.intp)
-        return self.gather(
-            Frames(joined, repeated(0, len(frames)), np.cumsum(sizes) - sizes, sizes)
-        )
+        return self.gather(Frames(joined, repeat(0, len(frames)), np.cumsum(sizes) - sizes, sizes))
 
     def gather(self, frames: Frames) -> Rows:
         """Return frames of this type as columns.
@@ -245,7 +243,7 @@ class CompiledCodec(Codec):
                 rows = frames.rows
             else:
                 rows = np.ascontiguousarray(frames.rows)
-            return Rows(self.schema, [Group(frames.layout, counted(len(rows)), rows)])
+            return Rows(self.schema, [Group(frames.layout, count_up(len(rows)), rows)])
         known = (
             frames.by_layout()
             if frames.layouts

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
-from lidarspec.frames.arrays import repeated
+from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import Records
 from lidarspec.frames.layout import Sums
 from lidarspec.framing.frame_codec import Codec
@@ -154,7 +154,7 @@ class PlainCodec(Codec):
             status[index], sizes[index] = self._judge(data, errors)
         return Frames(
             buffer,
-            repeated(kind, len(offsets)),
+            repeat(kind, len(offsets)),
             offsets,
             sizes,
             status=status,

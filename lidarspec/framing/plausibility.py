@@ -30,7 +30,7 @@ from lidarspec.expressions.graph import (
     trace,
     values_of,
 )
-from lidarspec.frames.arrays import taken
+from lidarspec.frames.arrays import take_rows
 from lidarspec.frames.frame_table import Group, Rows, Table
 from lidarspec.frames.layout import (
     Bytes2D,
@@ -121,7 +121,7 @@ class Judge:
         if self._checks is not None:
             self._check(status, rows, self._checks)
         elif self._frame.plausible is not None:
-            _among(status, rows, lambda some: self._asked(some, errors))
+            _among(status, rows, lambda some: self._ask_plugin(some, errors))
         return status
 
     def check_constants(self, status: NDArray[np.uint8], rows: Bytes2D) -> None:
@@ -139,7 +139,7 @@ class Judge:
             if np.count_nonzero(held) < len(held):
                 status[~held & (status == VALID)] = IMPLAUSIBLE
 
-    def _asked(self, rows: Bytes2D, errors: list[PluginError]) -> NDArray[np.uint8]:
+    def _ask_plugin(self, rows: Bytes2D, errors: list[PluginError]) -> NDArray[np.uint8]:
         return plausibility(
             self._frame,
             Rows(self._schema, [Group(self._layout, np.arange(len(rows)), rows)]),
@@ -156,7 +156,7 @@ def _among(
         return
     left = np.flatnonzero(status == VALID)
     if len(left):
-        status[left] = judge(taken(rows, left))
+        status[left] = judge(take_rows(rows, left))
 
 
 def _parts_among(

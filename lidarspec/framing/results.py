@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.frames.arrays import alike, by_value, counted, repeated, some, taken
+from lidarspec.frames.arrays import alike, by_value, count_up, repeat, some, take_rows
 from lidarspec.frames.layout import Bytes2D, Layout
 
 Indices = NDArray[np.intp]
@@ -220,19 +220,19 @@ class Frames:
         self.errors = errors
         self._starts = self.places = starts
         if forms is None:
-            self.forms = repeated(0 if layouts else -1, number)
+            self.forms = repeat(0 if layouts else -1, number)
         else:
             self.forms = forms
-        self.status = repeated(VALID, number) if status is None else status
+        self.status = repeat(VALID, number) if status is None else status
         self.names: tuple[str, ...] = ()
 
     @classmethod
     def none(cls, buffer: NDArray[np.uint8]) -> Frames:
         """No frames."""
-        return cls(buffer, repeated(-1, 0), range(0), repeated(0, 0))
+        return cls(buffer, repeat(-1, 0), range(0), repeat(0, 0))
 
     @classmethod
-    def joined(cls, parts: Sequence[Frames]) -> Frames:
+    def join(cls, parts: Sequence[Frames]) -> Frames:
         """Candidates in one buffer, one part after another, without their rows and tracebacks."""
         if len(parts) == 1:
             return parts[0]
@@ -248,9 +248,7 @@ class Frames:
             np.concatenate([part.starts for part in parts]),
             np.concatenate([part.sizes for part in parts]),
             layouts=tuple(layouts),
-            forms=np.concatenate(
-                [_shifted(part.forms, firsts[id(part.layouts)]) for part in parts]
-            ),
+            forms=np.concatenate([_shift(part.forms, firsts[id(part.layouts)]) for part in parts]),
             status=np.concatenate([part.status for part in parts]),
         )
 
@@ -273,12 +271,12 @@ class Frames:
 
         They are 0 until the decoder sets them.
         """
-        return repeated(0, len(self))
+        return repeat(0, len(self))
 
     @cached_property
     def at(self) -> NDArray[np.int64]:
         """The arrival time of each frame, (n,) ns, -1 where nobody knows it."""
-        return repeated(-1, len(self))
+        return repeat(-1, len(self))
 
     @property
     def layout(self) -> Layout | None:
@@ -310,17 +308,17 @@ class Frames:
             if isinstance(which, slice):
                 rows = rows[which]
             else:
-                rows = taken(rows, which[: which.searchsorted(len(rows))])
+                rows = take_rows(rows, which[: which.searchsorted(len(rows))])
         chosen = {
             name: some(getattr(self, name), which)
             for name in ("kinds", "sizes", "forms", "status", "gaps", "at")
             if name in vars(self)
         }
-        starts = _chosen(self._starts, which)
+        starts = _choose(self._starts, which)
         if self.places is self._starts:
             places = starts
         else:
-            places = _chosen(self.places, which)
+            places = _choose(self.places, which)
         return self._with(**chosen, rows=rows, _starts=starts, places=places)
 
     def by_layout(self) -> list[tuple[Layout, Indices]]:
@@ -328,7 +326,7 @@ class Frames:
         form = alike(self.forms)
         if form is not None:
             if form >= 0:
-                return [(self.layouts[form], counted(len(self)))]
+                return [(self.layouts[form], count_up(len(self)))]
             return []
         if len(self.layouts) <= FEWER:
             groups = [
@@ -340,7 +338,7 @@ class Frames:
             (self.layouts[form], which) for form, which in by_value(self.forms, FEW) if form >= 0
         ]
 
-    def located(
+    def locate(
         self,
         names: tuple[str, ...],
         places: Numbers,
@@ -364,7 +362,7 @@ class Frames:
             _starts=starts,
         )
 
-    def arrived(self, at: NDArray[np.int64]) -> Frames:
+    def with_arrivals(self, at: NDArray[np.int64]) -> Frames:
         """These frames with other times of arrival, (n,) ns."""
         return self._with(at=at)
 
@@ -394,7 +392,7 @@ class Frames:
         ]
 
 
-def packed(found: Sequence[Found]) -> Frames:
+def pack_found(found: Sequence[Found]) -> Frames:
     """Frames given one by one as arrays."""
     names = tuple(dict.fromkeys(item.frame for item in found))
     sizes = np.array([len(item.data) for item in found], np.intp)
@@ -407,7 +405,7 @@ def packed(found: Sequence[Found]) -> Frames:
     offsets, gaps, at = columns or [np.empty(0, np.int64)] * 3
     kinds = np.array([names.index(item.frame) for item in found], np.intp)
     buffer = np.frombuffer(b"".join(item.data for item in found), np.uint8)
-    return Frames(buffer, kinds, np.cumsum(sizes) - sizes, sizes).located(names, offsets, gaps, at)
+    return Frames(buffer, kinds, np.cumsum(sizes) - sizes, sizes).locate(names, offsets, gaps, at)
 
 
 def array_of(numbers: Numbers) -> NDArray[np.int64]:
@@ -417,15 +415,15 @@ def array_of(numbers: Numbers) -> NDArray[np.int64]:
     return numbers
 
 
-def _shifted(forms: Indices, first: int) -> Indices:
+def _shift(forms: Indices, first: int) -> Indices:
     """Indices of layouts that stand behind others."""
     form = alike(forms)
     if form is None:
         return np.where(forms < 0, -1, forms + first)
-    return repeated(form + first if form >= 0 else -1, len(forms))
+    return repeat(form + first if form >= 0 else -1, len(forms))
 
 
-def _chosen(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:
+def _choose(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:
     if isinstance(which, slice):
         return numbers[which]
     return array_of(numbers)[which]

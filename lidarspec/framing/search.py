@@ -69,7 +69,7 @@ def leftmost(
         stays.append((position, mode.after))
     parts = [frames for walk in walks.values() for frames in walk.frames()]
     if parts:
-        piece.frames = Frames.joined(parts)
+        piece.frames = Frames.join(parts)
         if len(parts) > 1:
             piece.frames = piece.frames.only(np.argsort(piece.frames.starts))
         _remember_size(mode, piece.frames, stays[-1][0])

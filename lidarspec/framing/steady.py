@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.arrays import alike, repeated
+from lidarspec.frames.arrays import alike, repeat
 from lidarspec.frames.layout import Bytes2D, Layout, Marks, exclude, right
 from lidarspec.framing.candidates import Framing, Piece, SearchState
 from lidarspec.framing.results import Frames, Indices, Numbers
@@ -106,9 +106,9 @@ def judge_rows(
     starts = range(first, first + number * step, step)
     return Frames(
         buffer,
-        repeated(kind, number),
+        repeat(kind, number),
         starts,
-        repeated(size, number),
+        repeat(size, number),
         layouts=(layout,),
         status=status,
         rows=rows,

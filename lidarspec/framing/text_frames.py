@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
-from lidarspec.frames.arrays import repeated
+from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import Group, Rows, Table
 from lidarspec.frames.layout import Refusal, Sums, marks, rows_at
 from lidarspec.frames.wire_coder import FormCoder
@@ -65,7 +65,7 @@ class TextCodec(Codec):
         status = np.where(offsets + number_needed > stops, SHORT, LENGTH).astype(np.uint8)
         is_complete = (sizes > 0) & (status != SHORT)
         sizes[~is_complete] = 0
-        frames = Frames(buffer, repeated(kind, len(offsets)), offsets, sizes, status=status)
+        frames = Frames(buffer, repeat(kind, len(offsets)), offsets, sizes, status=status)
         self._found = {}
         if is_complete.any():
             self._judge_whole(frames, np.flatnonzero(is_complete).tolist(), status, sums)

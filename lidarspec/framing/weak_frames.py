@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.arrays import repeated
+from lidarspec.frames.arrays import repeat
 from lidarspec.framing.results import SHORT, VALID, Frames, Indices
 
 
@@ -144,6 +144,6 @@ def find_runs(
 def _find(values: Indices, wanted: Indices) -> tuple[Indices, NDArray[np.bool_]]:
     """Return the rows of some values among ascending ones, and whether they are among them."""
     if not len(values):
-        return repeated(0, len(wanted)), np.zeros(len(wanted), np.bool_)
+        return repeat(0, len(wanted)), np.zeros(len(wanted), np.bool_)
     rows = np.minimum(values.searchsorted(wanted), len(values) - 1)
     return rows, values[rows] == wanted

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.expressions.columns import Batch, Fields
 from lidarspec.expressions.graph import header_function
-from lidarspec.frames.arrays import alike, repeated
+from lidarspec.frames.arrays import alike, repeat
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
 from lidarspec.spec.fields import factor
@@ -131,22 +131,22 @@ class Epoch:
                 self._reference, readings.item(0), times.item(0), host.item(0)
             )
         if self.ns is not None:
-            return repeated(self.ns, len(times))
+            return repeat(self.ns, len(times))
         table, which = batch.state[self.frame]
         rows = np.unique(which[which >= 0])
         if table is None or not len(rows):
-            return repeated(0, len(times))
+            return repeat(0, len(times))
         frames = table.take(rows)
         told = told_seconds(self._clock, frames)
         if not np.isfinite(told).any():
-            return repeated(0, len(times))
+            return repeat(0, len(times))
         row = int(np.isfinite(told).argmax())
         first = int(np.searchsorted(which, rows[row]))
         reading = readings_of(self._sensor, frames).item(row)
         complete = self._complete(reading, told.item(row))
         self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
         if whole or not first:
-            return repeated(self.ns, len(times))
+            return repeat(self.ns, len(times))
         return np.where(np.arange(len(times)) < first, 0, self.ns)
 
     def _ns_by_reference(
@@ -186,13 +186,13 @@ def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
     Where it stands in the parts of a frame, it is that of the first one; in a frame without any
     that of the frame before.
     """
-    which, readings = clocked(sensor, batch)
+    which, readings = read_clock(sensor, batch)
     if which is None:
         return readings
-    return held(which, readings, np.zeros(len(batch), np.int64))
+    return hold(which, readings, np.zeros(len(batch), np.int64))
 
 
-def clocked(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
+def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
     """Return the packets that have the clock (None: all), and its readings.
 
     If the clock is in parts, the first part counts.
@@ -208,10 +208,10 @@ def clocked(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] |
     if callable(source):
         terms = header_function(source, batch.table.schema, _nanoseconds)(batch)
         return None, sum(terms, np.zeros(len(batch), np.int64))
-    return None, _summed(fields, batch.table, sensor.id)
+    return None, _sum_fields(fields, batch.table, sensor.id)
 
 
-def held(which: NDArray[np.intp], times: Times, before: Times) -> Times:
+def hold(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     """Return the times of some packets, each held until the next of them, (n,).
 
     Packets before the first of them have the times `before`, (n,).
@@ -222,7 +222,7 @@ def held(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     return before
 
 
-def _summed(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
+def _sum_fields(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
     """The nanoseconds that some fields add up to, (n,)."""
     total: Times | None = None
     for path, step, zero, furthest in clock_terms(fields, table.schema, sensor):
@@ -303,7 +303,7 @@ def _in_parts(sensor: SensorDescription, place: tuple[str, str], table: Table) -
     """The clock that stands in parts, in each of them."""
     assert sensor.clock is not None
     own = tuple(path.removeprefix(f"{_prefix(place)}.") for path in paths(sensor.clock))
-    return _summed(own, table, sensor.id)
+    return _sum_fields(own, table, sensor.id)
 
 
 @lru_cache(maxsize=256)

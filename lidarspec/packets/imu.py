@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import plugin_errors
-from lidarspec.expressions.columns import Batch, Fields, of_points, unpadded
+from lidarspec.expressions.columns import Batch, Fields, of_points, padding_mask
 from lidarspec.points.conventions import vendor_turn
 from lidarspec.points.plain import flat
 from lidarspec.spec.results import Imu
@@ -61,14 +61,14 @@ class ImuSamples:
         values = np.concatenate([self.angular_velocity, self.linear_acceleration], axis=1).T
         return {"time_ns": self.time_ns, **dict(zip(UNITS, values, strict=True))}
 
-    def turned(self, rotation: NDArray[np.float64]) -> ImuSamples:
+    def turn(self, rotation: NDArray[np.float64]) -> ImuSamples:
         """The same in other axes; `rotation`: (3, 3), from these axes to those."""
         return ImuSamples(
             self.time_ns, self.angular_velocity @ rotation.T, self.linear_acceleration @ rotation.T
         )
 
 
-def joined(parts: Sequence[ImuSamples]) -> ImuSamples:
+def join_samples(parts: Sequence[ImuSamples]) -> ImuSamples:
     """Samples one after another; none of none."""
     if len(parts) != 1:
         parts = [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))]
@@ -106,7 +106,7 @@ def samples(
             )
         )
         arrays, axes, _, shape = of_points(values, batch)
-        mask = unpadded(axes, shape, batch)
+        mask = padding_mask(axes, shape, batch)
         after = np.rint(np.nan_to_num(np.asarray(arrays.pop(), np.float64)) * 1e9).astype(np.int64)
         time = flat(time_ns.reshape(-1, *(1,) * len(axes)) + after, shape, mask, len(batch))
         values_of = np.stack(
@@ -117,7 +117,7 @@ def samples(
     turn = vendor_turn(sensor)
     if turn is None:
         return found
-    return found.turned(turn)
+    return found.turn(turn)
 
 
 class Waiting:
@@ -138,11 +138,11 @@ class Waiting:
     def keep(self, most: int) -> None:
         """Let go of all but the newest ones, where no scan ends and asks for them."""
         if sum(map(len, self._parts)) > 2 * most:
-            self._parts = [joined(self._parts)[-most:]]
+            self._parts = [join_samples(self._parts)[-most:]]
 
     def until(self, ns: int | None) -> ImuSamples:
         """Hand out what was felt before a time, in the order of time; of None all there is."""
-        found = joined(self._parts)
+        found = join_samples(self._parts)
         found = found[np.argsort(found.time_ns, kind="stable")]
         if ns is not None:
             later = found.time_ns >= ns

@@ -140,7 +140,7 @@ class Packets:
         Variable arrays are padded with 0.
         """
         columns = {path: self.table.raw(path) for path in self.table.schema.fields}
-        found = np.zeros(len(self), _nested(self.table.schema, columns, ""))
+        found = np.zeros(len(self), _nested_dtype(self.table.schema, columns, ""))
         for path, column in columns.items():
             target = found
             for name in path.split("."):
@@ -287,7 +287,7 @@ class Packets:
         return Batch(self.table, self.breaks, self.state, self.sensor.state, dict(carry or {}))
 
 
-def joined(parts: Sequence[Packets]) -> Packets:
+def join_packets(parts: Sequence[Packets]) -> Packets:
     """Batches of one stream, one after another."""
     if len(parts) == 1:
         return parts[0]
@@ -328,10 +328,12 @@ def joined(parts: Sequence[Packets]) -> Packets:
 
 def joined_tables(tables: Sequence[Any]) -> Table:
     """Several tables of one frame type, one after another."""
-    return tables[0] if len(tables) == 1 else type(tables[0]).joined(tables)  # type: ignore[no-any-return]
+    return tables[0] if len(tables) == 1 else type(tables[0]).join(tables)  # type: ignore[no-any-return]
 
 
-def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) -> np.dtype[Any]:
+def _nested_dtype(
+    schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str
+) -> np.dtype[Any]:
     """Return the structured dtype of one level of the struct.
 
     Raises:
@@ -356,7 +358,7 @@ def _nested(schema: Schema, columns: Mapping[str, NDArray[Any]], prefix: str) ->
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
         shape = tuple(columns[path].shape[1 + index] for index in own)
         if below:
-            kind = _nested(schema, columns, f"{here}.")
+            kind = _nested_dtype(schema, columns, f"{here}.")
         else:
             kind = columns[path].dtype
         members.append((name, kind, shape) if shape else (name, kind))

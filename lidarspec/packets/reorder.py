@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lidarspec.expressions.columns import Batch
 from lidarspec.framing.results import Counters
 from lidarspec.packets.clock_order import ClockOrder
-from lidarspec.packets.packets import Packets, joined
+from lidarspec.packets.packets import Packets, join_packets
 
 #: packets that are held while one before them may be missing.
 WINDOW = 10
@@ -44,7 +44,7 @@ class Reorder:
         held_count = 0
         if self._held is not None:
             held_count = len(self._held)
-            packets = joined([self._held, packets])
+            packets = join_packets([self._held, packets])
             self._held = None
         order = packets.order
         is_ascending = bool((order[1:] > order[:-1]).all())

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.expressions.columns import Batch
-from lidarspec.frames.arrays import alike, repeated
+from lidarspec.frames.arrays import alike, repeat
 from lidarspec.frames.frame_table import Table
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Frames, Numbers, array_of
@@ -28,11 +28,11 @@ from lidarspec.packets.clocks import (
     ClockReference,
     Epoch,
     Unwrapper,
-    clocked,
-    held,
+    hold,
+    read_clock,
 )
 from lidarspec.packets.counter_order import CounterOrder
-from lidarspec.packets.imu import ImuSamples, Waiting, joined
+from lidarspec.packets.imu import ImuSamples, Waiting, join_samples
 from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.packet_type import find_clock, packet_type
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
@@ -80,7 +80,7 @@ class PacketStream:
         clock = self._type.clock
         self._clock = Unwrapper(clock.wraps_at) if clock else None
         self._time: int | None = None  # of the last packet with parts that have the clock
-        self._turn = repeated(0, 0)  # completes the times of the packets at hand
+        self._turn = repeat(0, 0)  # completes the times of the packets at hand
         self._epoch: Epoch | None = None
         if clock is not None and clock.told is not None and sensor.frames[frame].data:
             self._epoch = Epoch(self._type.timed_sensor, clock, reference)
@@ -102,7 +102,7 @@ class PacketStream:
                 that one as state.
         """
         parts = [OwnFrames.of(frames, self._type.frame) for frames in found if len(frames)]
-        columns = _joined([self._read(part) for part in parts])
+        columns = _join([self._read(part) for part in parts])
         if columns is None:
             columns = self._no_columns()
         table = columns.table
@@ -120,7 +120,7 @@ class PacketStream:
             batch = Batch(table, breaks, state, self._type.sensor.state)
             with np.errstate(all="ignore"):
                 if self._clock is not None:
-                    time = self._guarded("clock", self._times, None, batch, host, whole)
+                    time = self._call_plugin("clock", self._times, None, batch, host, whole)
                 index, breaks, order = self._judge(batch, time, columns.skipped)
         return Packets(
             self._type.sensor,
@@ -154,17 +154,17 @@ class PacketStream:
         unjudged = (range(len(batch)), batch.breaks)
         if self._clock_order is not None and time is not None:
             push = self._clock_order.push
-            index, order = self._guarded("clock", push, (unjudged[0], None), batch, time)
+            index, order = self._call_plugin("clock", push, (unjudged[0], None), batch, time)
             return index, batch.breaks, order
         if self._counter_order is not None:
             push_counted = self._counter_order.push
-            index, breaks = self._guarded("sequence", push_counted, unjudged, batch, time)
+            index, breaks = self._call_plugin("sequence", push_counted, unjudged, batch, time)
         else:
             push_arrived = self._arrival_order.push
-            index, breaks = self._guarded("clock", push_arrived, unjudged, batch, time, skipped)
+            index, breaks = self._call_plugin("clock", push_arrived, unjudged, batch, time, skipped)
         return index, breaks, None
 
-    def _guarded(
+    def _call_plugin(
         self, place: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any
     ) -> Any:
         """Return the result of a function that calls a plugin; count its errors."""
@@ -177,7 +177,7 @@ class PacketStream:
     def _times(self, batch: Batch, host: Integers, whole: bool) -> Integers:
         """Return the times of packets by their clock, (n,) ns."""
         assert self._clock is not None
-        which, readings = clocked(self._type.timed_sensor, batch)
+        which, readings = read_clock(self._type.timed_sensor, batch)
         if which is None:
             times = self._clock.push(readings, host)
             if self._epoch is not None:
@@ -187,10 +187,10 @@ class PacketStream:
         if self._time is None:
             before = host
         else:
-            before = repeated(self._time, len(host))
+            before = repeat(self._time, len(host))
         if len(times):
             self._time = times.item(-1)
-        return held(which, times, before)
+        return hold(which, times, before)
 
     def _complete(self, times: Integers) -> Integers:
         """Return times with the turn of the clock that other frames have told, if they have."""
@@ -211,7 +211,7 @@ class PacketStream:
         rows = part.rows
         number = len(part.frames)
         if alike(gaps) == 0 and not self._skipped:
-            return repeated(0, number)
+            return repeat(0, number)
         if isinstance(rows, slice) and number:
             skipped = gaps[rows].copy()
             skipped[0] += self._skipped + int(gaps[: rows.start].sum())
@@ -232,7 +232,7 @@ class PacketStream:
 
     def _no_columns(self) -> _Columns:
         """Return what an input without packets says of them."""
-        nothing = repeated(0, 0)
+        nothing = repeat(0, 0)
         return _Columns(self._type.codec.table([]), range(0), nothing, nothing)
 
     def _states(
@@ -269,7 +269,7 @@ class PacketStream:
         """Return the frames of another type, and which of them was the last before each packet."""
         last_frame = self._last_frames.get(name)
         if not seen:
-            return last_frame, repeated(-1 if last_frame is None else 0, number)
+            return last_frame, repeat(-1 if last_frame is None else 0, number)
         engine = codec(self._type.sensor.frames[name])
         tables: list[Table] = [engine.gather(frames) for frames, _ in seen]
         before = np.concatenate([places for _, places in seen])
@@ -336,7 +336,7 @@ class ImuStream:
                 parts.append(packets.imu())
             except SpecError as error:
                 packets.stats.error(PluginError.of(error, f"imu of {packets.frame}"), len(packets))
-        samples = joined(parts)
+        samples = join_samples(parts)
         if self.waiting is not None:
             self.waiting.add(samples)
         return samples
@@ -423,7 +423,7 @@ class _Columns(NamedTuple):
     skipped: Integers
 
 
-def _joined(parts: Sequence[_Columns]) -> _Columns | None:
+def _join(parts: Sequence[_Columns]) -> _Columns | None:
     """Return the columns of all packets, in this order; None if there are none."""
     parts = [part for part in parts if len(part.table)]
     if len(parts) < 2:
@@ -450,12 +450,12 @@ def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
 
 
 def _join_values(parts: Sequence[Integers]) -> Integers:
-    """Return arrays joined; as one `repeated` value, if all of them are of it."""
+    """Return arrays joined; as one `repeat` value, if all of them are of it."""
     values = {alike(part) for part in parts}
     if len(values) == 1:
         only = values.pop()
         if only is not None:
-            return repeated(only, sum(map(len, parts)))
+            return repeat(only, sum(map(len, parts)))
     return np.concatenate(parts)
 
 
@@ -463,7 +463,7 @@ def _host_times(at: Integers) -> Integers:
     """Return arrival times, 0 if unknown."""
     only = alike(at)
     if only is not None:
-        return repeated(max(only, 0), len(at))
+        return repeat(max(only, 0), len(at))
     if len(at) and int(at.min()) < 0:
         return np.maximum(at, 0)
     return at

@@ -23,7 +23,7 @@ from lidarspec.points.conventions import (
     TYPES,
     Grids,
     grid_of,
-    narrowed,
+    narrow,
     numbers_of,
     seconds_since,
     turned_azimuth,
@@ -146,9 +146,9 @@ class BatchColumns(ColumnSource):
             sent = []
         columns: dict[str, NDArray[Any]] = {}
         if main or sent:
-            columns = self._filled((*main, *sent), start, stop)
+            columns = self._fill((*main, *sent), start, stop)
         if main and self._turn is not None:
-            columns |= _turned(columns, self._turn)
+            columns |= _turn(columns, self._turn)
         for name in names:
             if name not in columns:
                 columns |= self._compute_single(name, start, stop)
@@ -172,13 +172,13 @@ class BatchColumns(ColumnSource):
         names: tuple[str, ...] = (name,)
         if name in ("range", "azimuth") and self._packets.backend == "jit":
             names = ("range", "azimuth")  # one kernel in place of two
-        columns = self._filled(names, start, stop)
+        columns = self._fill(names, start, stop)
         if "azimuth" in columns:
             angles = columns["azimuth"]
             if self._turn is not None:
-                columns["azimuth"] = narrowed(turned_azimuth(angles, self._turn))
+                columns["azimuth"] = narrow(turned_azimuth(angles, self._turn))
             elif angles.dtype != np.float32:
-                columns["azimuth"] = narrowed(angles)
+                columns["azimuth"] = narrow(angles)
         return columns
 
     def _compute_plainly(self, name: str, start: int, stop: int) -> NDArray[Any]:
@@ -191,14 +191,14 @@ class BatchColumns(ColumnSource):
             return column.astype(TYPES[name], copy=False)
         return numbers_of(column, TYPES[name])
 
-    def _filled(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, NDArray[Any]]:
+    def _fill(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return columns that a program or a kernel computes."""
         first, last = self._packet_range(start, stop)
         filled = []
         for share in self._shares:
             count = len(share.group.rows[first:last])
             maker = choose_maker(share.plan, names, self._packets.backend, count)
-            filled.append(share.filled(maker, first, last))
+            filled.append(share.fill(maker, first, last))
         return {
             name: self._flat([columns[name] for columns in filled], column.dtype, start, stop)
             for name, column in filled[0].items()
@@ -275,7 +275,7 @@ def spread_out(
         windows[starts] = rows.view(piece).reshape(-1)
 
 
-def _turned(columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+def _turn(columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
     """Return x, y and z in the vendor's axes, each one of REP-103's or its opposite."""
     turned = {}
     for axis, row in zip("xyz", turn, strict=True):

@@ -198,13 +198,13 @@ class PointCloud:
         picked["extra"] = {name: column[which] for name, column in self.extra.items()}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
-            shape = organised(
+            shape = find_organised_shape(
                 len(picked["x"]),
                 whole_columns(grid_of(self), which.indices(len(self))[0], len(picked["x"])),
             )
         return PointCloud(**{**picked, "shape": shape})
 
-    def organised(self, columns: int) -> PointCloud:
+    def organise(self, columns: int) -> PointCloud:
         """Return the points as a picture of `columns` columns, placed by their number.
 
         A missing column is a gap of invalid points.
@@ -237,9 +237,9 @@ class PointCloud:
         place[self.column[::each]] = np.arange(self.shape[0])
         indices = np.where(place[:, None] < 0, -1, place[:, None] * each + np.arange(each))
         numbered = np.repeat(np.arange(columns), each).astype(TYPES["column"])
-        return replace(self._rearranged(indices), column=numbered, shape=(columns, self.shape[1]))
+        return replace(self._rearrange(indices), column=numbered, shape=(columns, self.shape[1]))
 
-    def destaggered(self, shifts: Sequence[int]) -> PointCloud:
+    def destagger(self, shifts: Sequence[int]) -> PointCloud:
         """Return the points of a picture with each row shifted by some columns.
 
         Rows wrap around. Afterwards one column has one direction.
@@ -248,8 +248,8 @@ class PointCloud:
             shifts: columns for each row, (rows,), as the sensor's metadata has them.
 
         Raises:
-            UsageError: where the points are not organised (see `organised`), or there is not one
-                shift for each row.
+            UsageError: if the points are not organised (see `find_organised_shape`), or if there is
+                not one shift for each row.
         """
         if self.shape is None or np.shape(shifts) != (self.shape[1],):
             if self.shape:
@@ -261,11 +261,11 @@ class PointCloud:
         source = (np.arange(columns)[:, None] - np.asarray(shifts)) % columns
         places = source * rows + np.arange(rows)
         return replace(
-            self._rearranged(places[:, :, None] * grid.returns + np.arange(grid.returns)),
+            self._rearrange(places[:, :, None] * grid.returns + np.arange(grid.returns)),
             shape=self.shape,
         )
 
-    def _rearranged(self, indices: NDArray[np.intp]) -> PointCloud:
+    def _rearrange(self, indices: NDArray[np.intp]) -> PointCloud:
         """Return the points at some indices, which form whole columns.
 
         Index -1 is an invalid point in its row.
@@ -365,7 +365,7 @@ def grid_of(cloud: PointCloud) -> Grid:
     return Grid()
 
 
-def organised(number: int, grid: Grid) -> tuple[int, int] | None:
+def find_organised_shape(number: int, grid: Grid) -> tuple[int, int] | None:
     """The shape of a cloud of so many points."""
     if grid.rows:
         return (number // grid.column, grid.rows)
@@ -425,7 +425,7 @@ class LazyCloud(PointCloud):
         cloud.__dict__.update(
             lazy=lazy,
             stamp_ns=stamp_ns,
-            shape=organised(source.size, source.grid),
+            shape=find_organised_shape(source.size, source.grid),
             nominal=np.bool_(source.nominal),
             extra=ExtraColumns(lazy),
             units={name: kind.unit for name, kind in source.extra.items()},

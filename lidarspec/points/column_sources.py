@@ -151,7 +151,7 @@ class Stretches(ColumnSource):
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         pieces = [self._piece(part, names) for part in self._parts]
         columns = {
-            name: _joined([piece[name] for piece in pieces])
+            name: _join([piece[name] for piece in pieces])
             for name in pieces[0]
             if all(name in piece for piece in pieces)
         }
@@ -186,7 +186,7 @@ class Stretches(ColumnSource):
         return times
 
 
-def _joined(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
+def _join(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
     if len(pieces) == 1:
         return pieces[0]
     return np.concatenate(pieces)

@@ -54,9 +54,7 @@ def shown_range(measured: Any, invalid: Any) -> Any:
 
     It is inf without a return, and nan if the sensor marks the point as invalid.
     """
-    return marked(
-        np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid
-    )
+    return mark(np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid)
 
 
 def returned_range(measured: Any) -> Any:
@@ -69,7 +67,7 @@ def returned_range(measured: Any) -> Any:
     return np.where((measured > 0) & (measured < np.inf), measured, np.nan)
 
 
-def marked(measured: Any, invalid: Any) -> Any:
+def mark(measured: Any, invalid: Any) -> Any:
     """Ranges, nan where the sensor marks a point as wrong."""
     if isinstance(invalid, Traced) or np.any(invalid):
         return np.where(invalid, np.nan, measured)
@@ -100,7 +98,7 @@ def coordinates(
     return x, y, z
 
 
-def placed(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
+def place_points(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
     """Return the coordinates of points that are given by coordinates, metres.
 
     They are nan without a return, if one is not finite, or if the sensor marks the point as
@@ -303,7 +301,7 @@ def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[n
     return np.asarray(np.arctan2(direction[1], direction[0]))
 
 
-def narrowed(angle: NDArray[np.float64]) -> Floats:
+def narrow(angle: NDArray[np.float64]) -> Floats:
     """Angles in radians as float32 in [-pi, pi), of the same shape."""
     turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
     far = np.abs(angle) > _FAR

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.expressions.columns import Batch, Carry, Column
 from lidarspec.expressions.graph import Node
-from lidarspec.frames.arrays import repeated
+from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import Group, Rows
 from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.conventions import Grids, grid_of
@@ -175,7 +175,7 @@ def _source_of(
 def _counts(shares: list[Share], number: int) -> NDArray[Any]:
     """Return 1 for each point, with the axes of the arrays, and 0 in their padding."""
     if len(shares) == 1 or len({share.plan.shape for share in shares}) == 1:
-        return repeated(1, number, *shares[0].plan.shape)
+        return repeat(1, number, *shares[0].plan.shape)
     shape = tuple(
         max(lengths) for lengths in zip(*(share.plan.shape for share in shares), strict=True)
     )
@@ -186,7 +186,7 @@ def _counts(shares: list[Share], number: int) -> NDArray[Any]:
     return counts
 
 
-def guarded(
+def evaluate_guarded(
     packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int
 ) -> Evaluated | None:
     """Return the points of a batch of a stream, None if the plugin fails.

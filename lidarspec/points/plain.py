@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import plugin_errors
-from lidarspec.expressions.columns import Batch, Carry, Fields, of_points, unpadded
+from lidarspec.expressions.columns import Batch, Carry, Fields, of_points, padding_mask
 from lidarspec.frames.frame_table import Table
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
-from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud, organised
+from lidarspec.points.cloud import CloudColumns, LazyCloud, PointCloud, find_organised_shape
 from lidarspec.points.column_sources import ColumnSource
 from lidarspec.points.conventions import ExtraType
 from lidarspec.spec.results import Cartesian, Points, Polar
@@ -87,7 +87,7 @@ class Evaluated:
     @property
     def carry(self) -> Carry:
         """The values that the next batch needs, which starts with packet `ready`."""
-        return self.batch.carried(self.ready)
+        return self.batch.carry_over(self.ready)
 
     @property
     def fields(self) -> Fields:
@@ -123,7 +123,7 @@ def evaluate_plainly(
         result = function(Fields(batch))
         if not isinstance(result, Polar | Cartesian):
             raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
-        return _flattened(packets, result, batch, stamp_of(packets, epoch), final=final)
+        return _flatten(packets, result, batch, stamp_of(packets, epoch), final=final)
 
 
 def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
@@ -156,13 +156,13 @@ def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
     return {name: ExtraType.of(extra, parts[name]) for name, extra in result.extra.items()}
 
 
-def _flattened(
+def _flatten(
     packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool
 ) -> Evaluated:
     parts = parts_of(result)
     arrays, axes, ready, shape = of_points(parts, batch)
     ready = len(packets) if final else ready
-    mask = unpadded(axes, shape, batch)
+    mask = padding_mask(axes, shape, batch)
     every = {
         name: flat(array, shape, mask, ready) for name, array in zip(parts, arrays, strict=True)
     }
@@ -177,7 +177,7 @@ def _flattened(
         conventions.vendor_turn(packets.sensor),
         kinds_of(result, parts),
         stamp_ns=stamp_ns,
-        shape=organised(len(every["time"]), conventions.grid_of(shape[1:], axes)),
+        shape=find_organised_shape(len(every["time"]), conventions.grid_of(shape[1:], axes)),
         nominal=np.bool_(batch.nominal or result.nominal),
     )
     grids = None
@@ -245,7 +245,7 @@ def make_cloud(
             xyz = turn @ np.where(valid, xyz, 0)
             azimuth = conventions.turned_azimuth(azimuth, turn)
         angles = {
-            "azimuth": conventions.narrowed(azimuth),
+            "azimuth": conventions.narrow(azimuth),
             "elevation": elevation.astype(np.float32),
         }
         columns = (
@@ -288,5 +288,5 @@ def _by_coordinates(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -
         conventions.shown_range(measured, invalid),
         azimuth,
         elevation,
-        np.stack(conventions.placed(places, invalid)),
+        np.stack(conventions.place_points(places, invalid)),
     )

@@ -5,7 +5,7 @@ and which values have to be known of a batch before they are computed. It comput
 `Maker` does, which a back end compiles from it (`points.numpy_plan`, `points.numba_kernels`). Plans
 are kept with the layout that they are for, so a stream of packets traces nothing again.
 
-Points by coordinates are three expressions and a mask (`conventions.placed`), their range and
+Points by coordinates are three expressions and a mask (`conventions.place_points`), their range and
 angles further ones. They are exact: computed in float64 as they are written, whatever
 floating-point fields hold. Points by direction are computed in another order and partly in float32:
 their plan holds where what a batch has in floating-point fields is of moderate size (`MODERATE`).
@@ -33,8 +33,8 @@ from lidarspec.points.conventions import (
     coordinates,
     direction_of,
     is_zero,
-    marked,
-    placed,
+    mark,
+    place_points,
     returned_range,
     shown_range,
 )
@@ -234,7 +234,7 @@ class Plan:
         Args:
             named: the parts with named arrays.
         """
-        distance = marked(self._distance(given["range"]), given["invalid"])
+        distance = mark(self._distance(given["range"]), given["invalid"])
         azimuth, elevation, *origin = (
             named.get(name, given[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz")
         )
@@ -254,7 +254,7 @@ class Plan:
             "azimuth": azimuth,
             "elevation": elevation,
         }
-        return dict(zip("xyz", placed(places, given["invalid"]), strict=True)) | columns
+        return dict(zip("xyz", place_points(places, given["invalid"]), strict=True)) | columns
 
     def _distance(self, measured: Traced) -> Any:
         """Return the distance of a return, nan without a return.
@@ -323,7 +323,7 @@ class Plan:
         """Whether an expression is a number for every value that its field can have."""
         if node.kind == "rows":  # of a table of numbers, if the indices are in it
             return bool(np.isfinite(node.args[1][:-1]).all())
-        options = graph.chosen(node, self.width)
+        options = graph.find_choice(node, self.width)
         if options is not None:
             return all(
                 self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option))

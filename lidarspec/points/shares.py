@@ -46,7 +46,7 @@ class PlainValues:
         """The array of a node's result, (n or 1, ...)."""
         if node not in self._arrays:
             with np.errstate(all="ignore"):
-                compute(node, self._arrays, self._loaded)
+                compute(node, self._arrays, self._load)
         return self._arrays[node]  # type: ignore[no-any-return]
 
     def sent(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
@@ -85,7 +85,7 @@ class PlainValues:
             return node.function(self._fields)
         return None
 
-    def _loaded(self, node: Node) -> Any:
+    def _load(self, node: Node) -> Any:
         if node in self._columns:
             return self._columns[node].array
         if node.kind == "field":
@@ -113,7 +113,7 @@ class Share:
     def __len__(self) -> int:
         return len(self.group.where)
 
-    def filled(self, maker: Maker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
+    def fill(self, maker: Maker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
         """Return columns of the packets from `first` to `stop` (None: all)."""
         rows = self.group.rows[first:stop]
         columns = maker.columns(len(rows))

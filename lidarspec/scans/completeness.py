@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.arrays import alike, repeated
+from lidarspec.frames.arrays import alike, repeat
 from lidarspec.packets.packets import Packets
 
 Integers = NDArray[np.int64]
@@ -69,10 +69,10 @@ class PacketCounts:
                 is_broken = is_broken & (masked == 0)
             is_broken = is_broken | (missing > 0)
         else:
-            missing = repeated(0, number)
+            missing = repeat(0, number)
             if is_broken.any():
                 is_broken = is_broken.copy()
-        counts = repeated(1, number)
+        counts = repeat(1, number)
         if is_in_parts:
             counts = (steps != 0).astype(np.int64)
         sizes = points

@@ -23,7 +23,7 @@ from lidarspec.packets.masked_sector import (
     Sector,
     SectorFinder,
 )
-from lidarspec.packets.packets import Packets, joined
+from lidarspec.packets.packets import Packets, join_packets
 from lidarspec.spec.sensor import SensorDescription
 
 #: turns within which a leap has to recur.
@@ -84,7 +84,7 @@ class Masking:
             return self._release(packets)
         leap = self._find_leap(packets, angles)
         if self._held:
-            held = joined([*self._held, packets])
+            held = join_packets([*self._held, packets])
         else:
             held = packets
         if self._is_holding or leap is None:
@@ -123,7 +123,7 @@ class Masking:
         self._is_holding = False
         if not everything:
             return []
-        released = joined(everything)
+        released = join_packets(everything)
         return [released if self.sector is None else self._mark(released)]
 
     def _find_leap(self, packets: Packets, angles: Angles) -> int | None:

@@ -154,7 +154,7 @@ class Slice:
             return wanted
         return wanted & (at < end)
 
-    def missed(self, source: object, number: str = "data") -> UsageError:
+    def missed_error(self, source: object, number: str = "data") -> UsageError:
         """Return the error that no time of a source was selected.
 
         It gives the times of the source.
@@ -220,7 +220,7 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
         if wanted.ended:
             break
     if wanted.first is not None and not any_came:
-        raise wanted.missed(name)
+        raise wanted.missed_error(name)
 
 
 class Sieve:
@@ -307,9 +307,9 @@ class Sieve:
         else:
             number = f"{self._seen} scans"
         if self._selection.is_timed and self._has_skipped:
-            return self.slice.missed(self._source, "scans")
+            return self.slice.missed_error(self._source, "scans")
         if self._selection.is_timed:
-            return self.slice.missed(self._source, f"{number},")
+            return self.slice.missed_error(self._source, f"{number},")
         return UsageError(
             f"{self._source} has {number}, from 0 to {self._seen - 1}, and none of them is"
             " asked for"

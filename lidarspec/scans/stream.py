@@ -15,11 +15,11 @@ import numpy as np
 from lidarspec.expressions.columns import Carry
 from lidarspec.packets.imu import ImuSamples, Waiting
 from lidarspec.packets.masked_sector import AngleReader
-from lidarspec.packets.packets import Packets, joined
+from lidarspec.packets.packets import Packets, join_packets
 from lidarspec.packets.reorder import Reorder
 from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.column_sources import Stretch, Stretches
-from lidarspec.points.evaluate import guarded
+from lidarspec.points.evaluate import evaluate_guarded
 from lidarspec.points.mount import Mount
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.cutter import Cutter
@@ -123,7 +123,7 @@ class ScanStream:
                 self._use_sector(packets)
             ready = self._with_points(packets)
             if self._waiting is not None:
-                ready = joined([self._waiting, ready])
+                ready = join_packets([self._waiting, ready])
             if len(ready):
                 scans += self._evaluate(ready, final=False)
         return scans
@@ -161,7 +161,7 @@ class ScanStream:
         self._waiting = None
         if self._epoch is None:
             self._epoch = packets.time_ns.item(0)
-        points = guarded(packets, self._carry, final=final, epoch=self._epoch)
+        points = evaluate_guarded(packets, self._carry, final=final, epoch=self._epoch)
         if points is None:
             return []
         self._carry = points.carry
@@ -224,7 +224,7 @@ class ScanStream:
         if self._mount is not None:
             cloud = self._mount.apply(cloud)
             if samples is not None:
-                samples = samples.turned(self._mount.rotation)
+                samples = samples.turn(self._mount.rotation)
         rate_hz = np.nan
         if whole and end_ns is not None and end_ns > start.time_ns:
             rate_hz = 1 / ((end_ns - start.time_ns) * 1e-9)

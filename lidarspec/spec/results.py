@@ -117,7 +117,7 @@ class Polar:
         nominal: True if a default calibration replaces the sensor's own; `PointCloud.nominal`
             reports it.
         column: number of the column in its revolution, from 0, if points form columns of rings;
-            used by `PointCloud.organised`.
+            used by `PointCloud.organise`.
         extra: additional columns by name: values, or an `Extra` with their unit and type.
 
     Raises:
@@ -157,7 +157,7 @@ class Cartesian:
         nominal: True if a default calibration replaces the sensor's own; `PointCloud.nominal`
             reports it.
         column: number of the column in its revolution, from 0, if points form columns of rings;
-            used by `PointCloud.organised`.
+            used by `PointCloud.organise`.
         extra: additional columns by name: values, or an `Extra` with their unit and type.
 
     Raises:

@@ -293,8 +293,8 @@ def take(table: Array, index: Array) -> Array:
     if entries.ndim == 1:
         return _apply(LookUp(entries), index)
     rows = np.concatenate([entries, np.full((1, entries.shape[1]), np.nan)])
-    if hasattr(index, "gathered"):
-        return index.gathered(rows)
+    if hasattr(index, "gather"):
+        return index.gather(rows)
     return rows[row_numbers(np.asarray(index), len(rows))]
 
 
@@ -338,8 +338,8 @@ def _refuse_folded(turn: Array, full: float) -> None:
 
 
 def _shift(a: Array, step: int) -> Array:
-    if hasattr(a, "shifted"):
-        return a.shifted(step)
+    if hasattr(a, "shift"):
+        return a.shift(step)
     values = np.asarray(a, np.float64)
     flat = np.full(values.size, np.nan)
     if abs(step) < values.size:

@@ -6,7 +6,7 @@ import math
 from ipaddress import ip_address
 from typing import Any
 
-from lidarspec.device.session import Reply, Session, found_at, learned
+from lidarspec.device.session import Reply, Session, found_at, learn_options
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.wording import format_argument_type
 from lidarspec.frames.commands import argument_slot, raw_argument
@@ -186,7 +186,7 @@ def _learn(subject: Subject, name: str, reply: Reply) -> None:
     """Configure the sensor with the values that it learns from a simulated reply."""
     sensor = subject.sensor
     try:
-        if told := learned(sensor, reply):
+        if told := learn_options(sensor, reply):
             sensor.configure(**told)
     except Exception as error:  # any error of `learns` and `configure` of the plugin
         if name in sensor.simulation.answers:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
-from lidarspec.expressions.columns import Fields, aligned, unpadded
+from lidarspec.expressions.columns import Fields, align, padding_mask
 from lidarspec.expressions.graph import Node, sample_of, trace, traverse
 from lidarspec.frames.frame_table import Rows
 from lidarspec.framing.examples import header, random_frame
@@ -182,11 +182,11 @@ def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np
         polar = subject.sensor.points_of(packets.frame)(Fields(batch))
         if not isinstance(polar, Polar):
             return _declared_directions(subject, name)
-        arrays, axes, _ = aligned((polar.azimuth, polar.elevation, polar.range), batch)
+        arrays, axes, _ = align((polar.azimuth, polar.elevation, polar.range), batch)
     shape = np.broadcast_shapes(
         (len(packets), *(1,) * len(axes)), *(array.shape for array in arrays)
     )
-    mask = unpadded(axes, shape, batch)
+    mask = padding_mask(axes, shape, batch)
     whole = [
         np.broadcast_to(np.asarray(array, np.float64), shape).reshape(
             shape[0], math.prod(shape[1:])

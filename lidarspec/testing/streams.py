@@ -8,7 +8,7 @@ of a batch. The engine itself is proved by lidarspec's own tests.
 from __future__ import annotations
 
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.results import Found, packed
+from lidarspec.framing.results import Found, pack_found
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.plain import evaluate_plainly
 from lidarspec.scans.scan import Scan
@@ -100,7 +100,7 @@ def _scans_in_batches(sensor: Sensor, found: list[Found], size: int) -> list[Sca
     stats = Decoder(sensor, stream=True).stats
     stream = PacketStream(sensor, sensor.data_frame, stats)
     starts = range(0, len(found), size)
-    batches = [stream.add([packed(found[start : start + size])]) for start in starts]
+    batches = [stream.add([pack_found(found[start : start + size])]) for start in starts]
     scans = list(scans_of(sensor, batches))
     require(not stats.plugin_errors, "LS414", str(stats.failure("")))
     return scans

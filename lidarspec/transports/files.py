@@ -19,7 +19,7 @@ from shlex import quote
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import CaptureBatches, CapturedDatagrams, StreamBatches
-from lidarspec.captures.containers import HEAD, damage, head, opened, refuse_container, unpacked
+from lidarspec.captures.containers import HEAD, damage, head, open_capture, refuse_container, unpack
 from lidarspec.captures.pcap import CaptureStats, is_stream_capture
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
@@ -64,7 +64,7 @@ class RecordingTransport(Transport):
         sender: str | None = None,
         salvage: bool = False,
     ) -> None:
-        self._file = file or (sys.stdin.buffer if path == "-" else opened(path))
+        self._file = file or (sys.stdin.buffer if path == "-" else open_capture(path))
         self._recording = Recording(path, self._file, salvage=salvage)
         self.header: Header = self._recording.header
         self.datagrams = self.header.datagrams
@@ -374,7 +374,7 @@ def open_file(
             plain = sys.stdin.buffer
         else:
             plain = undo.enter_context(contextlib.closing(file_of(path)))
-        file = unpacked(name, plain, member)
+        file = unpack(name, plain, member)
         start = head(file)
         log = log_of(path, start)
         if log is not None and (file is not plain or path == "-"):

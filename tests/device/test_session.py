@@ -281,7 +281,11 @@ def test_links_do_not_wait_for_each_other() -> None:
     session = Session(sensor)
     start, ask = session.request("start", 0), session.request("ask", 0)
     assert [out.link for out in session.outgoing()] == ["data", "control"]
-    assert (session.awaited(), session.awaited("control"), session.awaited("none")) == (
+    assert (
+        session.awaited_frames(),
+        session.awaited_frames("control"),
+        session.awaited_frames("none"),
+    ) == (
         frozenset({"ack"}),
         frozenset({"ack"}),
         frozenset(),

@@ -18,7 +18,7 @@ from lidarspec.drafting.checksum_search import Changed
 from lidarspec.drafting.draft import Draft, Names, draft, make_template_values as text_of
 from lidarspec.drafting.periods import candidates
 from lidarspec.drafting.samples import Place
-from lidarspec.expressions.columns import aligned
+from lidarspec.expressions.columns import align
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksum, Crc, Fold15, Sequence, Sum, WordXor, Xor
 from lidarspec.transports.open_url import transport
@@ -425,7 +425,7 @@ def test_points_may_depend_on_no_field() -> None:
     """As those of a draft without an angle do."""
     shape = SHAPES["shape-count"]
     batch = shape.decode(shape.example("data") * 3).batch()
-    arrays, axes, ready = aligned((np.zeros(1), 0.0), batch)
+    arrays, axes, ready = align((np.zeros(1), 0.0), batch)
     assert ([array.tolist() for array in arrays], axes, ready) == ([[0.0], 0.0], (), 3)
 
 

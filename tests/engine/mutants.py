@@ -8,7 +8,7 @@ import re
 from typing import Any
 
 from lidarspec import Counters, Found, Sensor, WireError
-from lidarspec.framing.results import packed
+from lidarspec.framing.results import pack_found
 from tests.broken import sound
 
 HEADERS = {b"\xaa\x55\xc3": "data", b"\x17\x71\x44": "ack"}
@@ -40,11 +40,11 @@ class Parser:
 
     def frames(self, data: bytes, at: int | None = None) -> list[Any]:
         """The frames that these bytes complete, as the engine asks for them."""
-        return [packed(self.feed(data, at))]
+        return [pack_found(self.feed(data, at))]
 
     def rest(self) -> list[Any]:
         """The frames in what waits, as the engine asks for them."""
-        return [packed(self.idle())]
+        return [pack_found(self.idle())]
 
     def cut(self, *, final: bool) -> list[Found]:
         """The frames in the buffer."""

@@ -32,7 +32,7 @@ from lidarspec import Sensor, SpecError
 from lidarspec.frames import layout_tree
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import HeaderTree, frame_layouts
-from lidarspec.frames.parse import unpacked
+from lidarspec.frames.parse import unpack
 from lidarspec.spec import Checksum, Checksummed, Frame
 from lidarspec.spec.syntax import clean
 from tests.engine import against_construct
@@ -70,13 +70,13 @@ def same(one: Any, other: Any) -> None:
         assert one == other
 
 
-def unpack(frame: Frame, data: bytes) -> Any:
+def unpack_by_layout(frame: Frame, data: bytes) -> Any:
     """What the layout of a frame gives, None where it is left to construct."""
     layouts = frame_layouts(frame)
     assert isinstance(layouts, HeaderTree)
     layout = layouts.layout(data)
     return (
-        unpacked(frame.tree, layout, data)
+        unpack(frame.tree, layout, data)
         if isinstance(layout, Layout) and layout.sound(data)
         else None
     )
@@ -88,7 +88,7 @@ def test_frames_unpack_to_what_construct_parses(name: str) -> None:
     for frame in compiled_frames(sensor):
         for seed in range(SHAPE_EXAMPLES if name in SHAPES else REPRESENTATIVE_EXAMPLES):
             data = sensor.example(frame, seed=seed)
-            found = unpack(sensor.frames[frame], data)
+            found = unpack_by_layout(sensor.frames[frame], data)
             assert found is not None, "left to construct"
             same(found, clean(sensor.frames[frame].prepared.parse(data)))
 
@@ -101,7 +101,7 @@ def test_damaged_frames_are_left_to_construct(name: str) -> None:
         count = SHAPE_DAMAGED_BYTES if name in SHAPES else REPRESENTATIVE_DAMAGED_BYTES
         for offset in range(min(len(data), count)):
             damaged = data[:offset] + bytes([data[offset] ^ 0x41]) + data[offset + 1 :]
-            found = unpack(sensor.frames[frame], damaged)
+            found = unpack_by_layout(sensor.frames[frame], damaged)
             try:
                 expected = clean(sensor.frames[frame].prepared.parse(damaged))
             except construct.ConstructError:
@@ -150,11 +150,11 @@ def test_arrays_of_all_kinds(name: str) -> None:
     rows = np.frombuffer(random.Random(name).randbytes(3 * size), np.uint8).reshape(3, size).copy()
     layout.seal(rows)
     for data in map(np.ndarray.tobytes, rows):
-        found = unpack(frame, data)
+        found = unpack_by_layout(frame, data)
         assert found is not None
         same(found, clean(frame.prepared.parse(data)))
-        assert unpack(frame, data + b"\0") is None
-        assert unpack(frame, data[:-1]) is None
+        assert unpack_by_layout(frame, data + b"\0") is None
+        assert unpack_by_layout(frame, data[:-1]) is None
 
 
 def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(
@@ -177,11 +177,11 @@ def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(
             data = bytes([0x5A, kind, count]) + random.Random(count).randbytes(
                 2 * count + {1: 1, 2: 2}.get(kind, 3) + 1
             )
-            same(unpack(frame, data), clean(frame.prepared.parse(data)))
-            assert unpack(frame, data[:-1]) is None
-            assert unpack(frame, b"\x5b" + data[1:]) is None
-    assert unpack(frame, b"\x5a\x02") is None
-    assert unpack(frame, b"") is None
+            same(unpack_by_layout(frame, data), clean(frame.prepared.parse(data)))
+            assert unpack_by_layout(frame, data[:-1]) is None
+            assert unpack_by_layout(frame, b"\x5b" + data[1:]) is None
+    assert unpack_by_layout(frame, b"\x5a\x02") is None
+    assert unpack_by_layout(frame, b"") is None
 
 
 def test_units_are_those_that_build_takes() -> None:

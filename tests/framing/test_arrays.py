@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 import lidarspec
 from lidarspec import Counters
 from lidarspec.expressions.columns import Batch
-from lidarspec.frames.arrays import repeated
+from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import Rows
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import Unwrapper, clock_ns
-from lidarspec.packets.packets import joined
+from lidarspec.packets.packets import join_packets
 from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Fields, Frame
 from tests.engine.engines import is_compiled
@@ -76,7 +76,7 @@ def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance
     buffer = np.random.default_rng(2).integers(0, 256, int(starts[-1]) + size, np.uint8)
     for start, row in zip(starts, rows, strict=True):
         buffer[start : start + size] = row
-    found = together.placed(
+    found = together.decode_placed(
         buffer, starts.astype(np.intp), np.full(count, size, np.intp), np.full(count, -1, np.int64)
     )
     assert facts(found) == wanted
@@ -115,7 +115,7 @@ def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(name: str) -
     )
     streams = [PacketStream(sensor, sensor.data_frame, Counters()) for _ in range(3)]
     whole, wanted = streams[0].add(found, whole=True), streams[1].add(listed, whole=True)
-    parts = joined([streams[2].add([spans], whole=True) for spans in found])
+    parts = join_packets([streams[2].add([spans], whole=True) for spans in found])
     for packets in (whole, parts):
         assert packets.raw.tobytes() == wanted.raw.tobytes()
         for column in ("offset", "time_ns", "host_ns", "index", "breaks"):
@@ -147,7 +147,7 @@ def test_clocks_run_on_over_wraps_and_steps_back(wraps_at: float) -> None:
     np.testing.assert_array_equal(np.concatenate(pieces), found)
     silent = Unwrapper(wraps_at)
     pieces = [
-        silent.push(true[a:b] % turn, repeated(0, b - a))
+        silent.push(true[a:b] % turn, repeat(0, b - a))
         for a, b in pairwise([*range(0, 5000, 3), 5000])
     ]
     np.testing.assert_array_equal(np.concatenate(pieces), found)

@@ -138,7 +138,7 @@ def test_what_computes_checksums_is_asked_for_all_lengths() -> None:
     for layouts in (many_lengths.MANY_LAYOUTS, NEVER):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(many_lengths, "MANY_LAYOUTS", layouts)
-            decoder = Decoder(sensor, stream=True, sums=lambda seal, rows: seal.stored(rows))
+            decoder = Decoder(sensor, stream=True, sums=lambda seal, rows: seal.load_stored(rows))
             frames = decoder.feed(data) + decoder.finish()
             found.append(([(item.offset, item.data) for item in frames], str(decoder.stats)))
     assert found[0] == found[1]

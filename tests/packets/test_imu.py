@@ -15,7 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SpecError
-from lidarspec.packets.imu import ImuSamples, Waiting, joined
+from lidarspec.packets.imu import ImuSamples, Waiting, join_samples
 from lidarspec.points.mount import Mount
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
@@ -73,7 +73,7 @@ def test_both_engines_and_single_packets_read_alike(frame: str) -> None:
     bulk = SENSOR.decode(data, frame).imu()
     ways = [
         reader(SENSOR, "construct").decode(data, frame).imu(),
-        joined([SENSOR.decode([each], frame).imu() for each in data]),
+        join_samples([SENSOR.decode([each], frame).imu() for each in data]),
     ]
     for other in ways:
         for name in ("time_ns", "angular_velocity", "linear_acceleration"):
@@ -122,7 +122,7 @@ def test_scans_have_what_was_felt_during_them(tmp_path: Path) -> None:
             if packets.time_ns[-1] > 2_000_000_000:
                 break
     with ls.open(tmp_path / "a.lsr", written(tmp_path)) as device:
-        recorded = joined(list(device.imu()))
+        recorded = join_samples(list(device.imu()))
         assert device.stats.frames["imu"] > RATE
         assert len(recorded) == device.stats.frames["imu"] + SAMPLES * device.stats.frames["data"]
     with ls.open(tmp_path / "a.lsr", written(tmp_path)) as device:
@@ -150,7 +150,7 @@ def written(folder: Path) -> str:
 
 def test_a_mount_and_the_axes_of_the_vendor_turn_it() -> None:
     found = SENSOR.decode([sample(0, 1, 2, 3, 4, 5, 6)], "imu").imu()
-    turned = found.turned(Mount(yaw_deg=90.0).rotation)
+    turned = found.turn(Mount(yaw_deg=90.0).rotation)
     np.testing.assert_allclose(turned.linear_acceleration, [[-5, 4, 6]], atol=1e-6)
     vendor = dataclasses.replace(SENSOR, vendor_axes=("right", "forward", "up")).configure(
         frame="vendor"

@@ -25,7 +25,7 @@ from lidarspec.frames.row_checksums import batch
 from lidarspec.points import backends
 from lidarspec.points.evaluate import evaluate
 from lidarspec.points.numba_kernels import checksums as kernelsums
-from lidarspec.points.numba_kernels.source import written
+from lidarspec.points.numba_kernels.source import write_kernel
 from lidarspec.points.plain import evaluate_plainly
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.simulation.simulator import opening
@@ -153,7 +153,7 @@ def test_every_installed_sensor_has_a_kernel(module: str) -> None:
         made = plan(
             simulated(sensor, answer, "numpy", number=max(sensor.frames[answer].confirm, 2))
         )
-        assert "def kernel(" in written(made, tuple(made.expressions), made.varying).source, (
+        assert "def kernel(" in write_kernel(made, tuple(made.expressions), made.varying).source, (
             sensor.id
         )
 

@@ -75,7 +75,7 @@ def test_the_shape_is_columns_and_rows_for_two_returns_too(backend: str) -> None
     assert cloud.range.reshape(*cloud.shape, -1)[20, 3].tolist() == pytest.approx([1.03, 2.03])
     half = cloud[COLUMNS * PIXELS * 2 :]
     assert (half.shape, cloud[1:].shape) == ((COLUMNS, PIXELS), None)
-    picture = half.organised(TURN)
+    picture = half.organise(TURN)
     assert picture.shape == (TURN, PIXELS)
     assert picture.return_index.reshape(TURN, PIXELS, 2)[50, 9].tolist() == [0, 1]  # type: ignore[union-attr]
     assert picture.range.reshape(TURN, PIXELS, 2)[33, 4].tolist() == pytest.approx([1.04, 2.04])
@@ -93,7 +93,7 @@ def test_rows_of_tables_are_looked_at_where_they_are_or_gathered() -> None:
 
 @EVERY_BACKEND
 def test_lost_columns_leave_gaps_in_the_place_of_their_numbers(backend: str) -> None:
-    cloud = cloud_of(frame(48), frame(16), backend=backend).organised(TURN)
+    cloud = cloud_of(frame(48), frame(16), backend=backend).organise(TURN)
     assert (cloud.shape, len(cloud)) == ((TURN, PIXELS), TURN * PIXELS)
     valid = cloud.valid.reshape(TURN, PIXELS)
     assert valid.all(axis=1).nonzero()[0].tolist() == [*range(16, 32), *range(48, 64)]
@@ -102,7 +102,7 @@ def test_lost_columns_leave_gaps_in_the_place_of_their_numbers(backend: str) -> 
     assert np.array_equal(cloud.ring.reshape(TURN, PIXELS)[40], np.arange(PIXELS))  # type: ignore[union-attr]
     assert np.array_equal(cloud.column.reshape(TURN, PIXELS)[:, 0], np.arange(TURN))  # type: ignore[union-attr]
     shifts = [row % 3 * 8 - 8 for row in range(PIXELS)]
-    straight = cloud.destaggered(shifts)
+    straight = cloud.destagger(shifts)
     for row, shift in enumerate(shifts):
         expected = np.roll(cloud.x.reshape(TURN, PIXELS)[:, row], shift)
         np.testing.assert_array_equal(straight.x.reshape(TURN, PIXELS)[:, row], expected)
@@ -112,11 +112,11 @@ def test_lost_columns_leave_gaps_in_the_place_of_their_numbers(backend: str) -> 
 def test_what_cannot_be_a_picture_is_refused() -> None:
     cloud = cloud_of(frame(0), frame(16))
     for wrong, said in (
-        (lambda: cloud_of(frame(0), frame(0)).organised(TURN), "column 0 comes 2 times"),
-        (lambda: cloud.organised(20), "column 20 is not one of 20"),
-        (lambda: cloud[cloud.valid].organised(TURN), r"Polar\(..., column=...\)"),
-        (lambda: cloud.destaggered([1, 2]), "2 shifts for 32 rows"),
-        (lambda: cloud[3:].destaggered([1, 2]), "2 shifts for points that are not organised"),
+        (lambda: cloud_of(frame(0), frame(0)).organise(TURN), "column 0 comes 2 times"),
+        (lambda: cloud.organise(20), "column 20 is not one of 20"),
+        (lambda: cloud[cloud.valid].organise(TURN), r"Polar\(..., column=...\)"),
+        (lambda: cloud.destagger([1, 2]), "2 shifts for 32 rows"),
+        (lambda: cloud[3:].destagger([1, 2]), "2 shifts for points that are not organised"),
     ):
         with pytest.raises(UsageError, match=said):
             wrong()
@@ -130,6 +130,6 @@ def test_a_lost_packet_is_a_gap_of_its_scan() -> None:
         (TURN - COLUMNS, PIXELS),
         (TURN, PIXELS),
     ]
-    valid = scans[1].points.organised(TURN).valid.reshape(TURN, PIXELS)
+    valid = scans[1].points.organise(TURN).valid.reshape(TURN, PIXELS)
     assert not valid[2 * COLUMNS : 3 * COLUMNS].any()
     assert valid[: 2 * COLUMNS].any(axis=1).all()

@@ -256,7 +256,7 @@ def assert_place_of_packets_does_not_matter(sensor: Sensor, backend: str) -> Non
     ):
         decoder = Decoder(sensor, stream=False, backend=backend)
         stream = PacketStream(sensor, sensor.data_frame, decoder.stats, backend=backend)
-        found.append(stream.add([decoder.placed(buffer, places, sizes, unknown)]))
+        found.append(stream.add([decoder.decode_placed(buffer, places, sizes, unknown)]))
     together, separate = found
     assert len(together) == len(separate)
     if isinstance(separate.table, Rows) and len(separate):

@@ -110,7 +110,7 @@ def test_ten_minutes_of_a_blocked_rotor_keep_no_more_than_one_scan() -> None:
             .view(np.uint8)
             .reshape(-1, 4)
         )
-        found = reading.decoder.placed(
+        found = reading.decoder.decode_placed(
             stamped.reshape(-1), starts, sizes, np.ones(number, np.int64)
         )
         assert len(reading.scans_of(found)) in (13, 14)

@@ -15,7 +15,7 @@ that runs, not with this package. Modules in reading order:
 
 from __future__ import annotations
 
-from lidarspec.points.numba_kernels.checksums import compiled as compiled_sums
+from lidarspec.points.numba_kernels.checksums import compile_sums as compiled_sums
 from lidarspec.points.numba_kernels.kernels import is_available, kernel_of as compile
 
 __all__ = ["compile", "compiled_sums", "is_available"]

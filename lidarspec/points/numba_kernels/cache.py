@@ -73,7 +73,7 @@ class Kept:
         from numba.core.serialize import dumps
 
         try:
-            folder = _made(cache_folder())
+            folder = _make_folder(cache_folder())
             key = _key(folder) or _new_key(folder)
             data = dumps(result._reduce())
             path = _path(folder, key, self._name, result.target_context)
@@ -106,7 +106,7 @@ def cache_folder() -> Path:
     return base / "lidarspec"
 
 
-def _made(folder: Path) -> Path:
+def _make_folder(folder: Path) -> Path:
     """The folder, made where it is missing.
 
     Raises:

@@ -71,7 +71,7 @@ def kernel(rows, size, places, lows, highs, start, found):
 _SIDE = "abcd"
 
 
-def _sliced(name: str) -> str:
+def _slice(name: str) -> str:
     """A register after eight more bytes, by what it and they are together."""
     return " ^ ".join(
         f"at(table, {256 * byte} + ({name} >> {8 * byte} & 255))" for byte in range(8)
@@ -98,7 +98,7 @@ def kernel(rows, size, spans, table, start, found):
             place, stop = at(spans, k), at(spans, k + 1)
             while place + 8 <= stop:
                 {"; ".join(f"{name} ^= word_at(rows, at_{name} + place)" for name in _SIDE)}
-                {"; ".join(f"{name} = {_sliced(name)}" for name in _SIDE)}
+                {"; ".join(f"{name} = {_slice(name)}" for name in _SIDE)}
                 place += 8
             while place < stop:
                 {"; ".join(f"{name} = {_single(name)}" for name in _SIDE)}
@@ -216,7 +216,7 @@ def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
     return known.values(rows)
 
 
-def compiled() -> Sums:
+def compile_sums() -> Sums:
     """The function that a decoder computes checksums by; the values are the same.
 
     Raises:

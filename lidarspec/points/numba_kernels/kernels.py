@@ -29,7 +29,7 @@ from lidarspec.errors import UsageError
 from lidarspec.frames.layout import Bytes2D, span
 from lidarspec.libraries import import_library
 from lidarspec.points.numba_kernels.cache import Kept, is_kept
-from lidarspec.points.numba_kernels.source import KernelText, written
+from lidarspec.points.numba_kernels.source import KernelText, write_kernel
 from lidarspec.points.plan import Maker, Plan, PointsFunction, Values
 
 THREADS = "LIDARSPEC_THREADS"
@@ -89,11 +89,9 @@ class Kernel(Maker):
             *(columns[name] for name in self._text.columns),
         )
         data = span(rows)
-        self._shared(
-            count, lambda first, number: self._function(data, stride, first, number, *rest)
-        )
+        self._share(count, lambda first, number: self._function(data, stride, first, number, *rest))
 
-    def _shared(self, count: int, run: Callable[[int, int], Any]) -> None:
+    def _share(self, count: int, run: Callable[[int, int], Any]) -> None:
         """Call for all frames, by parts where there are threads and enough for them."""
         number = min(threads(), max(count * self._width // SHARE, 1), count)
         if number < 2:
@@ -134,7 +132,7 @@ def kernel_of(plan: Plan, names: tuple[str, ...]) -> Kernel:
             not plan.varying or _OWN.setdefault(plan.function, plan.layout.size) == plan.layout.size
         )
         kernel = plan.kernels[names] = Kernel(
-            written(plan, names, set() if is_own else plan.varying), plan.width
+            write_kernel(plan, names, set() if is_own else plan.varying), plan.width
         )
     return kernel
 

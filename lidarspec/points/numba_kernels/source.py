@@ -130,7 +130,7 @@ class Expressions(KernelWriter):
     def _double(self, node: Node) -> Value:
         if node.kind == "field":
             return self._physical(node)
-        if node.kind == "call" and not self.shared(node):
+        if node.kind == "call" and not self.is_shared(node):
             source = only_field(node)
             if source is not None and is_full(source, self.width) and not is_cheap(node):
                 found = self.looked_up(node, source, np.float64, 1.0)
@@ -139,9 +139,9 @@ class Expressions(KernelWriter):
                         return self.let(found.level, f"{found.text} != 0")
                     return found
             return self._call(node)
-        if node.kind == "rows" and not self.shared(node.args[0]):
+        if node.kind == "rows" and not self.is_shared(node.args[0]):
             return self._row(node, "float64")
-        return self.given(node)
+        return self.add_argument(node)
 
     def _row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> Value:
         """An element of the row of a table, by default the node's own, at an index."""
@@ -166,18 +166,18 @@ class Expressions(KernelWriter):
         )
         return self.let(1 + last_axis(node.shape), f"at({name}, {start.text} + {place})")
 
-    def shared(self, node: Node) -> bool:
+    def is_shared(self, node: Node) -> bool:
         """Return whether an expression uses fields of other frames only.
 
         NumPy computes it then, mostly once for all packets.
         """
-        return self.once(("shared", node), lambda: self._shared(node))  # type: ignore[no-any-return]
+        return self.once(("shared", node), lambda: self._is_shared(node))  # type: ignore[no-any-return]
 
-    def _shared(self, node: Node) -> bool:
+    def _is_shared(self, node: Node) -> bool:
         if node.kind in ("state", "on"):
-            return node.kind == "state" or self.shared(node.args[0])
+            return node.kind == "state" or self.is_shared(node.args[0])
         return node.kind == "call" and all(
-            self.shared(arg) for arg in node.args if isinstance(arg, Node)
+            self.is_shared(arg) for arg in node.args if isinstance(arg, Node)
         )
 
     def _call(self, node: Node) -> Value:
@@ -187,7 +187,7 @@ class Expressions(KernelWriter):
             for arg in node.args
             if not isinstance(arg, Node)
         ):
-            return self.given(node)
+            return self.add_argument(node)
         if node.function is side_by_side and len(node.shape) == depth + 1:
             parts = [self.double(arg, depth) for arg in node.args]
             chain = "".join(
@@ -197,7 +197,7 @@ class Expressions(KernelWriter):
                 return self.let(2 + depth, f"{chain}{parts[-1].text}")
             return parts[0]
         if len(node.shape) != depth:
-            return self.given(node)
+            return self.add_argument(node)
         if isinstance(node.function, LookUp) and len(node.function.entries):
             index = self.double(node.args[0])
             table = self.array(node.function.entries)
@@ -206,7 +206,7 @@ class Expressions(KernelWriter):
             return self._where(*(self.double(arg, depth) for arg in node.args))
         template = self._template(node)
         if template is None:
-            return self.given(node)
+            return self.add_argument(node)
         args = [self.double(arg, depth) for arg in node.args]
         return self.let(
             max(arg.level for arg in args), template.format(*(arg.text for arg in args))
@@ -242,7 +242,7 @@ class Expressions(KernelWriter):
         leaf = self.layout.leaves.get(node.path)
         raw = self.raw(leaf) if leaf is not None else None
         if raw is None or leaf is None:
-            return self.given(node)
+            return self.add_argument(node)
         info = leaf.info
         return self.let(
             raw.level,
@@ -270,7 +270,7 @@ class Expressions(KernelWriter):
         found = self._of_field(node, exact=exact)
         if found is not None:
             return found
-        found = None if exact else self._marked(node)
+        found = None if exact else self._mark(node)
         if found is not None:
             return found
         if is_full(node, self.width) and node.kind == "call" and not exact:
@@ -280,10 +280,10 @@ class Expressions(KernelWriter):
                 return along
             if node.function is np.multiply or (root and node.function in (np.add, np.subtract)):
                 sign = {np.multiply: "*", np.add: "+", np.subtract: "-"}[node.function]
-                return self.combined(sign, *(self.single(arg) for arg in node.args))
+                return self.combine(sign, *(self.single(arg) for arg in node.args))
             if node.function in (np.cos, np.sin) and is_full(node.args[0], self.width):
                 return Trig(node.function.__name__, self.angle_of(node.args[0]))
-        if node.kind == "rows" and not self.shared(node.args[0]) and not exact:
+        if node.kind == "rows" and not self.is_shared(node.args[0]) and not exact:
             return self._row(node, "float32")
         made = self.double(node)
         return self.let(
@@ -296,9 +296,13 @@ class Expressions(KernelWriter):
         It is the raw distance times a direction in two halves, plus the start of the beam. Returns
         None if NumPy reads these.
         """
-        sent = self._marked(beam.distance, raw=True)
+        sent = self._mark(beam.distance, raw=True)
         table = beam.direction.args[1]
-        if sent is None or self.shared(beam.direction.args[0]) or self.shared(beam.start.args[0]):
+        if (
+            sent is None
+            or self.is_shared(beam.direction.args[0])
+            or self.is_shared(beam.start.args[0])
+        ):
             return None
         high, low, _ = self.once(
             ("halves", id(table), beam.step), lambda: (*_halves(table * beam.step), table)
@@ -310,7 +314,7 @@ class Expressions(KernelWriter):
             f" {self._row(beam.start, 'float32').text}))",
         )
 
-    def _marked(self, node: Node, *, raw: bool = False) -> Value | None:
+    def _mark(self, node: Node, *, raw: bool = False) -> Value | None:
         """Return a distance in float32.
 
         It is nan without a return, or if a condition says so. Returns None for other expressions,
@@ -341,9 +345,7 @@ class Expressions(KernelWriter):
             return None
         if node.function is not returned_range and not is_nan_where(node):
             return None
-        made = self.once(
-            ("marked", node.args[-1], raw), lambda: self._marked(node.args[-1], raw=raw)
-        )
+        made = self.once(("marked", node.args[-1], raw), lambda: self._mark(node.args[-1], raw=raw))
         if made is None or node.function is returned_range:
             if made is None:
                 return None
@@ -353,7 +355,7 @@ class Expressions(KernelWriter):
         flag = self.double(node.args[0], len(node.shape))
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
-    def combined(self, sign: str, first: Any, second: Any) -> Any:
+    def combine(self, sign: str, first: Any, second: Any) -> Any:
         """A product or sum; in the loops where both parts are there."""
         if isinstance(first, Value) and isinstance(second, Value):
             return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
@@ -391,14 +393,14 @@ class Expressions(KernelWriter):
         """An angle times a factor that makes half turns of it, in float64."""
         if not isinstance(value, Node):
             return self.constant(np.asarray(value) * factor, depth)
-        if not is_full(value, self.width) or value.kind != "call" or self.shared(value):
-            return self._scaled(value, factor)
+        if not is_full(value, self.width) or value.kind != "call" or self.is_shared(value):
+            return self._scale(value, factor)
         source = only_field(value)
         if source is not None and not is_cheap(value):
             found = self._small_angle(value, source, factor)
             if found is not None:
                 return found
-            return self._scaled(value, factor)
+            return self._scale(value, factor)
         return self._sum(value, factor)
 
     def _sum(self, node: Node, factor: float) -> Value:
@@ -424,9 +426,9 @@ class Expressions(KernelWriter):
             return self._where(
                 self.double(args[0], depth), *(self.angle(arg, factor, depth) for arg in args[1:])
             )
-        return self._scaled(node, factor)
+        return self._scale(node, factor)
 
-    def _scaled(self, node: Node, factor: float) -> Value:
+    def _scale(self, node: Node, factor: float) -> Value:
         made = self.double(node)
         return self.let(made.level, f"{made.text} * {factor!r}")
 
@@ -516,9 +518,9 @@ class KernelAssembly:
             return f"{made.name}{made.angle}"
         if made.level == 0:
             return str(made.text)
-        return self._stored(made, "float32")
+        return self._store(made, "float32")
 
-    def _stored(self, made: Value, kind: str) -> str:
+    def _store(self, made: Value, kind: str) -> str:
         """A value of the loops, kept for the flat one."""
         if made.text not in self._kept:
             name = self._kept[made.text] = f"h{len(self.scratch)}"
@@ -529,12 +531,12 @@ class KernelAssembly:
     def turns(self) -> list[str]:
         """The cosines and sines that the flat loop begins with."""
         return [
-            f"cos{index}, sin{index} = cos_sin({self._stored(made, 'float64')})"
+            f"cos{index}, sin{index} = cos_sin({self._store(made, 'float64')})"
             for index, made in enumerate(self.writer.angles)
         ]
 
 
-def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> KernelText:
+def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> KernelText:
     """The kernel of some columns of a plan.
 
     Args:
@@ -544,7 +546,7 @@ def written(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> KernelText
     writer = Expressions(plan.layout, plan.shape, plan.tables, varying)
     assembly = KernelAssembly(writer)
     writer.both = _both(expressions.values())
-    made = {name: _made(writer, plan, name, value) for name, value in expressions.items()}
+    made = {name: _make_value(writer, plan, name, value) for name, value in expressions.items()}
     columns = {
         name: plan.extra[name].dtype if name in plan.sent else np.dtype(np.float32) for name in made
     }
@@ -576,7 +578,7 @@ def _both(expressions: Iterable[Any]) -> set[Node]:
     return {node for node in cosines & sines if isinstance(node, Node)}
 
 
-def _made(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
+def _make_value(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
     exact = plan.is_exact(name)
     if name in plan.sent:
         raw = writer.raw(plan.sent[name])

@@ -317,11 +317,11 @@ class KernelWriter:
 
     def place(self, shape: tuple[int, ...]) -> str:
         """The index of an element of an array of this shape in the loops."""
-        return self.strided(
+        return self.format_index(
             shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape)))
         )
 
-    def strided(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
+    def format_index(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
         """The index of an element in the loops, of an array with these steps along each axis."""
         parts = [
             f"i{axis}" if stride == "1" else f"i{axis} * {stride}"
@@ -357,7 +357,7 @@ class KernelWriter:
         )
         return element
 
-    def given(self, node: Node) -> Value:
+    def add_argument(self, node: Node) -> Value:
         """What NumPy has computed before."""
         if node not in self.wanted.nodes:
             self.wanted.nodes.append(node)
@@ -413,7 +413,7 @@ class KernelWriter:
         level = 1 + last_axis(leaf.shape[: len(leaf.strides)])
         steps = self.once(
             ("element", shape, leaf.strides),
-            lambda: self.let(level, f"base + {self.strided(shape, self._strides(leaf))}"),
+            lambda: self.let(level, f"base + {self.format_index(shape, self._strides(leaf))}"),
         )
         if self._stays(leaf):
             place = str(offset)

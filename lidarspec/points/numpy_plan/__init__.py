@@ -22,11 +22,11 @@ from lidarspec.points.plan import Maker, Plan
 def compile(plan: Plan, names: tuple[str, ...]) -> Maker:
     """Return a program for these columns of the plan's points; the plan keeps it."""
     if names not in plan.programs:
-        plan.programs[names] = _compiled(plan, names, plan.tables).program
+        plan.programs[names] = _compile(plan, names, plan.tables).program
     return plan.programs[names]
 
 
-def _compiled(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Compiler:
+def _compile(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]) -> Compiler:
     compiler = Compiler(plan, tables)
     for name in names:
         if name in plan.sent:
@@ -48,7 +48,7 @@ def describe(plan: Plan) -> list[str]:
         if name in plan.expressions and not (name == "z" and plan.level)
     )
     tables: dict[Any, NDArray[Any]] = {}
-    compiler = _compiled(plan, names, tables)
+    compiler = _compile(plan, names, tables)
     program = compiler.program
     axes = " x ".join(
         f"{axis} {length}" for axis, length in zip(plan.axes, plan.shape, strict=True)

@@ -123,11 +123,11 @@ class Compiler:
         parts = terms(value, self._width)
         is_fixed = all(part.low is None or part.row.size == 1 for part in parts)
         if is_fixed and all(part.full is None for part in parts):
-            return self._turned(function, parts)
+            return self._compile_turned(function, parts)
         angle = self._once(("angle", value), lambda: self._full_angle(value))
         return self.program.call(function.__name__, "single", function, Read(angle))
 
-    def _turned(self, function: np.ufunc, parts: list[Term]) -> int:
+    def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
         """Compile the cosine or sine of angles that are not full plus constants.
 
         By the theorem of addition this takes no trigonometry for each point.
@@ -209,7 +209,7 @@ class Compiler:
         seen = window(leaf)
         is_long = seen is None or (self._is_exact and seen.size > 1)
         if node is source and (is_long or not leaf.info.scaled):
-            return self._loaded(leaf, kind)
+            return self._load_whole(leaf, kind)
         if seen is None or (is_long and node.function in _FASTER_THAN_TABLE):
             return None
         index = Read(
@@ -235,7 +235,7 @@ class Compiler:
             self._tables[name] = np.ascontiguousarray(values, TYPES[kind])
         return self._tables[name]
 
-    def _loaded(self, leaf: Leaf, kind: str) -> int | None:
+    def _load_whole(self, leaf: Leaf, kind: str) -> int | None:
         """Load a field in its unit; None if it requires float64 first."""
         info = leaf.info
         assert info.dtype is not None
@@ -374,7 +374,7 @@ class Compiler:
         """Broadcast a constant or a plain result to all points."""
         shape = self._shape
         if not isinstance(value, Node):
-            return self.program.tiled(np.broadcast_to(np.asarray(value, TYPES[kind]), shape), kind)
+            return self.program.tile(np.broadcast_to(np.asarray(value, TYPES[kind]), shape), kind)
         self.low.append(value)
         depth = len(shape)
 

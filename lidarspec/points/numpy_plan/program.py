@@ -128,7 +128,7 @@ class Program(Maker):
             text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads
         )
 
-    def tiled(self, row: NDArray[Any], kind: str) -> int:
+    def tile(self, row: NDArray[Any], kind: str) -> int:
         """Return a new register with the same values in every packet."""
         register = self.register(kind)
         self._tiles[register] = np.tile(row.reshape(-1), self.chunk)

@@ -64,7 +64,7 @@ class Unit:
         rate: turns a second; 0 where nobody says it.
         elevation, azimuth: (rows,) degrees, of each beam; azimuth counted clockwise.
         shifts: (rows,) by how many columns each row lies behind, for a picture:
-            `PointCloud.destaggered`.
+            `PointCloud.destagger`.
         beam, lidar, imu: (4, 4), millimetres: where the beams leave in the lidar, the lidar in the
             sensor, and the IMU in it.
         samples: of an IMU packet; 0 for those of LEGACY.

@@ -225,7 +225,7 @@ def test_lost_and_invalid_columns_leave_gaps() -> None:
     parsed = sensor.parse(packets[5], "data")
     parsed.columns[3].status = 0
     packets[5] = sensor.build("data", {**parsed, "crc": None})
-    cloud = sensor.decode([*packets[:2], *packets[3:]]).points().organised(512)
+    cloud = sensor.decode([*packets[:2], *packets[3:]]).points().organise(512)
     valid = cloud.valid.reshape(cloud.shape)
     missing = {*range(32, 48), 83}
     assert cloud.shape == (512, 16)

@@ -152,7 +152,7 @@ class Backlog:
         self._end = 0  # end of the last frame, an offset in the input
         self._damaged = deque[Damaged](maxlen=MAX_DAMAGED)
 
-    def fed(
+    def observe_input(
         self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
     ) -> None:
         """Store the input of the decoder."""
