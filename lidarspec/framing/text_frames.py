@@ -20,7 +20,7 @@ from lidarspec.frames.wire_coder import FormCoder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Frames
 from lidarspec.spec.description import Frame
-from lidarspec.spec.wire_forms import NO_END
+from lidarspec.spec.wire_forms import NO_END, find_ends
 
 #: Candidates of a piece that are remembered with their structs.
 MAX_REMEMBERED = 64
@@ -60,7 +60,7 @@ class TextCodec(Codec):
         if stops is None:
             stops = np.full(len(offsets), len(buffer))
         stops = np.minimum(offsets + self.frame.max_length, stops)
-        sizes = self._coder.form.find_ends(buffer, offsets, stops)
+        sizes = find_ends(self._coder.form, buffer, offsets, stops)
         number_needed = np.where(sizes == NO_END, self.frame.max_length, self._prefix_size)
         status = np.where(offsets + number_needed > stops, SHORT, LENGTH).astype(np.uint8)
         is_complete = (sizes > 0) & (status != SHORT)

@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,16 +205,6 @@ class WireForm(Protocol):
         among these bytes, and `NO_FRAME` if no frame begins here, whatever follows.
         """
 
-    def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
-        """Return the size of the frame at each of many offsets, `NO_END` or `NO_FRAME`, (n,).
-
-        This is `find_end` in bulk, and may be `NO_FRAME` for bytes with an end, too.
-
-        Args:
-            offsets: ascending.
-            stops: where the bytes of each end that may belong to it.
-        """
-
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
         """Decode one frame, or what there is of it; see `decode_runs`."""
 
@@ -227,6 +217,35 @@ class WireForm(Protocol):
 
     def largest(self, size: int) -> int:
         """Return the largest number that can be written for a field of so many bytes."""
+
+
+@runtime_checkable
+class BulkEnds(Protocol):
+    """A wire form that finds the ends of many candidates at once, for speed."""
+
+    def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
+        """Return the size of the frame at each of many offsets, `NO_END` or `NO_FRAME`, (n,).
+
+        This is `find_end` in bulk, and may be `NO_FRAME` for bytes with an end, too.
+
+        Args:
+            offsets: ascending.
+            stops: where the bytes of each end that may belong to it.
+        """
+
+
+def find_ends(
+    form: WireForm, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets
+) -> Offsets:
+    """Return the size of the frame at each of many offsets, as `BulkEnds.find_ends` does.
+
+    Forms that cannot do this in bulk are asked for one candidate at a time.
+    """
+    if isinstance(form, BulkEnds):
+        return form.find_ends(buffer, offsets, stops)
+    spans = zip(offsets.tolist(), stops.tolist(), strict=True)
+    sizes = [form.find_end(buffer[offset:stop].tobytes()) for offset, stop in spans]
+    return np.array(sizes, np.intp)
 
 
 class RunReader(Protocol):
