@@ -180,8 +180,8 @@ class FilePiece:
 @functools.lru_cache(maxsize=64)
 def _configure_sensor(name: str, options: tuple[tuple[str, Any], ...]) -> Sensor:
     """Return one sensor for all files, because its compiled code is cached with it."""
-    known = named_sensor(name)
-    configured: Sensor = known.configure(**dict(options)) if options else known
+    named = named_sensor(name)
+    configured: Sensor = named.configure(**dict(options)) if options else named
     return configured
 
 
@@ -540,9 +540,9 @@ def convert(
             )
             raise suggest(error, "the same with --force, or into another folder")
         if not force:
-            known = {piece.source: manifest.find_records(piece) for piece in todo}
-            yield from ((record, True) for records in known.values() for record in records)
-            todo = [piece for piece in todo if not known[piece.source]]
+            finished = {piece.source: manifest.find_records(piece) for piece in todo}
+            yield from ((record, True) for records in finished.values() for record in records)
+            todo = [piece for piece in todo if not finished[piece.source]]
         for piece in todo:
             manifest.clear(piece)
         with _swept(folder, to), _executor(jobs, scheduler) as executor:
@@ -611,8 +611,8 @@ def _try(to: str) -> None:
 
     This happens before any input is read.
     """
-    with tempfile.TemporaryDirectory() as place, contextlib.suppress(ValueError, IndexError):
-        write(Path(place) / f"none.{to}", [])
+    with tempfile.TemporaryDirectory() as folder, contextlib.suppress(ValueError, IndexError):
+        write(Path(folder) / f"none.{to}", [])
 
 
 @contextlib.contextmanager
@@ -674,12 +674,12 @@ def _cut(piece: FilePiece) -> list[FilePiece]:
     """Return all pieces of a file."""
     if not _is_large(piece):
         return [piece]
-    found = list[FilePiece]()
+    pieces = list[FilePiece]()
     following = [piece]
     while following:
         first, *following = survey(following[0])
-        found.append(first)
-    return found
+        pieces.append(first)
+    return pieces
 
 
 def _partition(piece: FilePiece) -> Any:

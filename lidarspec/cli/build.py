@@ -126,12 +126,12 @@ def send(
     if as_json:
         emit_json(_reply_to_dict(sensor, reply), output)
     else:
-        said, rows = describe_reply(sensor, reply)
+        result, rows = describe_reply(sensor, reply)
         if rows:
             shown = f"\n{table(['field', 'value', 'meaning'], rows, output)}"
         else:
             shown = ""
-        emit(f"{sensor.id} {reply.command}: {said}{shown}", output)
+        emit(f"{sensor.id} {reply.command}: {result}{shown}", output)
 
 
 def _bytes(digits: str) -> bytes:
@@ -165,11 +165,11 @@ class _Answer:
         Waits until nothing has arrived for `QUIET` seconds, at most `seconds`.
         """
         end = time.monotonic() + seconds
-        heard = number
+        count = number
         quiet = math.inf
         while (now := time.monotonic()) < min(end, quiet):
-            if len(self.chunks) > heard:
-                heard = len(self.chunks)
+            if len(self.chunks) > count:
+                count = len(self.chunks)
                 quiet = now + QUIET
             time.sleep(QUIET / 10)
         return self.chunks[number:]
@@ -238,13 +238,13 @@ def _refuse_file(device: Device, source: str) -> None:
 
 
 def _reply_to_dict(sensor: Sensor, reply: Reply) -> dict[str, Any]:
-    told: dict[str, Any] = {
+    head: dict[str, Any] = {
         "sensor": sensor.id,
         "command": reply.command,
         "confirmed": reply.confirmed,
         "frame": reply.frame,
     }
     if reply.frame is None:
-        return {**told, "hex": None, "fields": None, "values": []}
+        return {**head, "hex": None, "fields": None, "values": []}
     values = [value.to_dict() for value in explain(reply.data, sensor, reply.frame).fields.values()]
-    return {**told, "hex": reply.data.hex(" "), "fields": plain(reply.values), "values": values}
+    return {**head, "hex": reply.data.hex(" "), "fields": plain(reply.values), "values": values}

@@ -88,13 +88,13 @@ def attach(command: click.Command) -> None:
 def _items(
     names: Callable[[click.Context, str], Iterable[str]], ctx: click.Context, incomplete: str
 ) -> list[CompletionItem]:
-    found = [
+    items = [
         CompletionItem(name)
         for name in names(ctx, incomplete)
         if name.startswith(incomplete) and name != incomplete
     ]
-    if found or names in LISTED:
-        return found
+    if items or names in LISTED:
+        return items
     return [CompletionItem(incomplete, type="file")]
 
 
@@ -111,11 +111,11 @@ def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
         simulated = [f"sim:{name}" for name in registry().names()]
     else:
         simulated = ["sim:"]
-    places = [*devices(), *(port.path for port in serial_ports()), "udp://", "tcp://", *simulated]
-    if not any(place.startswith(incomplete) for place in places):
+    sources = [*devices(), *(port.path for port in serial_ports()), "udp://", "tcp://", *simulated]
+    if not any(source.startswith(incomplete) for source in sources):
         return []
     return [
-        *places,
+        *sources,
         *(
             name + "/" * os.path.isdir(name)
             for name in sorted(glob.glob(glob.escape(incomplete) + "*"))
@@ -131,9 +131,9 @@ def _sensor(ctx: click.Context) -> Sensor | None:
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])
     source = ctx.params.get("source") or ""
-    known = find_device(source)
-    if known:
-        return known.configure()
+    device = find_device(source)
+    if device:
+        return device.configure()
     return find_declared_sensor(source)
 
 

@@ -138,21 +138,21 @@ def crc(
     of a long file is read.
     """
     frames = _frames(words, period, offset)
-    found = search(frames)
+    matches = search(frames)
     if as_json:
         emit_json(
-            {"frames": len(frames), "matches": [checksum_told(match) for match in found]}, output
+            {"frames": len(frames), "matches": [checksum_told(match) for match in matches]}, output
         )
-    elif found:
-        shown = [match for match in found if match.open == found[0].open][:PRINTED]
+    elif matches:
+        shown = [match for match in matches if match.open == matches[0].open][:PRINTED]
         emit("\n\n".join(_text(match, len(frames[0])) for match in shown), output)
-    if not found:
+    if not matches:
         note(
             f"no checksum of {len(frames)} frame{'s' * (len(frames) != 1)} was found: are they"
             " whole, and do they begin where they should?"
         )
         raise click.exceptions.Exit(FINDINGS)
-    if found[0].doubt < WEAK:
+    if matches[0].doubt < WEAK:
         note("this may be chance: give more frames")
 
 
@@ -573,11 +573,11 @@ def _structure_text(found: Structure) -> str:
     ]
     for match in found.checksums[:TOLD]:
         if "\n" not in match.paste:
-            told = match.paste
+            checksum = match.paste
         else:
-            told = match.algorithm.describe()
+            checksum = match.algorithm.describe()
         lines.append(
-            f"  checksum  {told} in {match.place}: right in {match.right} of {match.total}"
+            f"  checksum  {checksum} in {match.place}: right in {match.right} of {match.total}"
         )
     return "\n".join(
         lines if found.checksums else [*lines, "  checksum  none was found at the usual places"]
@@ -616,19 +616,19 @@ def doctor(
     if source is not None and not as_json:
         note(f"listening to {source}")
     if source is None:
-        found = list(computer())
+        diagnoses = list(computer())
     else:
-        found = list(examine(source, sensor, seconds=duration))
+        diagnoses = list(examine(source, sensor, seconds=duration))
     if as_json:
-        emit_json([vars(finding) for finding in found], output)
+        emit_json([vars(finding) for finding in diagnoses], output)
     else:
         lines = [
             f"{'ok   ' if one.ok else 'wrong'}  {one.text}"
             + (f"\n       next: {one.mend}" if one.mend else "")
-            for one in found
+            for one in diagnoses
         ]
         emit("\n".join(lines) or "nothing is wrong with the ports of this computer", output)
     if sensor is None and not sensors():
         note(no_sensors())
-    if any(not finding.ok for finding in found):
+    if any(not finding.ok for finding in diagnoses):
         raise click.exceptions.Exit(FINDINGS)

@@ -76,10 +76,10 @@ def _fields(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
 
 def _tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | None) -> Iterator[str]:
     for index, piece in enumerate(frames):
-        found = values(piece.data, sensor, piece.frame).values()
+        field_values = values(piece.data, sensor, piece.frame).values()
         rows = [
             [value.path, _raw_text(value.raw), str(value) if value.unit or value.label else ""]
-            for value in found
+            for value in field_values
         ]
         yield (
             "\n" * bool(index)
@@ -404,14 +404,14 @@ def _sensor(
         fitting,
     )  # not needed for a named sensor, and slow to import
 
-    found = fitting(given.chunks, datagrams=given.datagrams)
-    if found:
-        fits = [sensor.id for sensor in found]
+    sensors = fitting(given.chunks, datagrams=given.datagrams)
+    if sensors:
+        fits = [sensor.id for sensor in sensors]
         note(
             f"these bytes fit {fits[0]}"
             + (f"; so do {', '.join(fits[1:])}: choose with -s" if fits[1:] else "")
         )
-        return found[0], fits
+        return sensors[0], fits
     fault = nearest_fault(given)
     if not damaged or not fault.sensor:
         raise fault

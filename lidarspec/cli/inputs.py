@@ -335,11 +335,11 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
             error = WireError(f"{source} is text, and has no data frame: {stats}", sensor=sensor.id)
             return suggest(error, f"lidarspec detect {quote(source)}")
         if stats.bytes_in:
-            said = "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
+            reason = "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
         else:
-            said = no_bytes(source, device.warnings)
+            reason = no_bytes(source, device.warnings)
         return suggest(
-            WireError(said, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}"
+            WireError(reason, sensor=sensor.id), f"lidarspec explain {quote(source)} -s {sensor.id}"
         )
     if seconds is None:
         waited = ""
@@ -406,15 +406,15 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
     from lidarspec.detect.identification import format_sensor_options, verdict
 
     given = again(source)
-    found = verdict(given).scores if given is not None else ()
-    own = next((score.sensor.options for score in found if score.sensor.id == sensor.id), None)
+    scores = verdict(given).scores if given is not None else ()
+    own = next((score.sensor.options for score in scores if score.sensor.id == sensor.id), None)
     if own:
-        told = " and ".join(f"{name}={value}" for name, value in own.items())
+        assignments = " and ".join(f"{name}={value}" for name, value in own.items())
         return (
-            f"does not say which data frames it holds: they are found with {told}",
+            f"does not say which data frames it holds: they are found with {assignments}",
             format_sensor_options(sensor.configure(**own)),
         )
-    others = [score.sensor for score in found if score.sensor.id != sensor.id]
+    others = [score.sensor for score in scores if score.sensor.id != sensor.id]
     if not others:
         return None
     return (

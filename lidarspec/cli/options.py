@@ -54,8 +54,8 @@ def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _add_sensor_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    told = "The sensor: an id, an alias, or a file ./mysensor.py."
-    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=told)(function)
+    help_text = "The sensor: an id, an alias, or a file ./mysensor.py."
+    return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=help_text)(function)
 
 
 def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -64,9 +64,11 @@ def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
         metavar="FILE",
         help="The unit's own calibration, short for -O calibration=FILE.",
     )(function)
-    told = "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
+    help_text = (
+        "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
+    )
     return click.option(
-        "-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=told
+        "-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=help_text
     )(unit)
 
 
@@ -93,11 +95,11 @@ def configure_sensor(
     given = dict(option.partition("=")[::2] for option in options)
     if unset := [option for option in options if "=" not in option]:
         raise UsageError(f"-O {unset[0]}: an option has a value: NAME=VALUE")
-    known: Sensor = sensor(sensor_id)
-    found: Sensor = known.configure(
-        **{name: _value(known, name, text) for name, text in given.items()}
+    named: Sensor = sensor(sensor_id)
+    configured: Sensor = named.configure(
+        **{name: _value(named, name, text) for name, text in given.items()}
     )
-    return found
+    return configured
 
 
 def _value(sensor: Sensor, name: str, text: str) -> Any:
@@ -128,7 +130,7 @@ def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
 
 def colour_option(function: Function) -> Function:
     """Add ``--colour`` for pictures, in both spellings."""
-    told = "What colours show: range, intensity, or a further column of the points."
+    help_text = "What colours show: range, intensity, or a further column of the points."
     return click.option(
         "--colour",
         "--color",
@@ -136,7 +138,7 @@ def colour_option(function: Function) -> Function:
         metavar="COLUMN",
         default="range",
         show_default=True,
-        help=told,
+        help=help_text,
     )(function)
 
 
@@ -207,10 +209,10 @@ def _between(text: str, parse: Callable[[str], Any]) -> tuple[Any, Any]:
 
     Every colon is tried, because dates contain colons.
     """
-    for place in (place for place, mark in enumerate(text) if mark == ":"):
+    for index in (index for index, mark in enumerate(text) if mark == ":"):
         try:
             low, high = (
-                parse(part) if part else None for part in (text[:place], text[place + 1 :])
+                parse(part) if part else None for part in (text[:index], text[index + 1 :])
             )
         except (ValueError, UsageError):
             continue
@@ -341,5 +343,5 @@ def selecting(*names: str) -> Callable[[Function], Function]:
 
 def points_option(function: Function) -> Function:
     """Add ``--all`` and ``--valid``."""
-    told = "Points without a valid return as well, or not.  [default: --valid]"
-    return click.option("--all/--valid", "every_point", default=False, help=told)(function)
+    help_text = "Points without a valid return as well, or not.  [default: --valid]"
+    return click.option("--all/--valid", "every_point", default=False, help=help_text)(function)

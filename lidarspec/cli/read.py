@@ -164,11 +164,11 @@ def _packets(
         }
         units = {path: info.unit for path, info in fields.items()}
         columns = {path: packets[path] for path in fields}
-        for place in range(len(packets)):
-            times = {"offset": int(packets.offset[place]), "time_ns": int(packets.time_ns[place])}
+        for index in range(len(packets)):
+            times = {"offset": int(packets.offset[index]), "time_ns": int(packets.time_ns[index])}
             yield (
                 units,
-                {**times, **{path: _scalar(column[place]) for path, column in columns.items()}},
+                {**times, **{path: _scalar(column[index]) for path, column in columns.items()}},
             )
         if time.monotonic() >= until or wanted.ended:
             break
@@ -347,14 +347,14 @@ def stats(
         if len(sources) > 1 and not as_json:
             say(f"{source}:")
         with open_device(source, sensor_id, period=LOOK_S) as device:
-            found = _print_stats(
+            reading = _print_stats(
                 source,
                 Feed(device, select=selection),
                 StatsPrinter(device, as_json),
                 interval,
                 lasting,
             )
-            worst = max(found.error_rate, found.loss_rate or 0.0)
+            worst = max(reading.error_rate, reading.loss_rate or 0.0)
             if max_errors is not None and worst > max_errors:
                 note(f"{worst:.3%} of the frames are wrong or lost, more than {max_errors:.3%}")
                 has_findings = True
@@ -383,11 +383,11 @@ def _print_stats(
     except KeyboardInterrupt:
         lines.summary(_summary(feed, start))
         raise
-    found = _summary(feed, start)
-    if found.packets == 0:
-        raise nothing_came(feed.device, source, found.seconds)
-    lines.summary(found)
-    return found
+    reading = _summary(feed, start)
+    if reading.packets == 0:
+        raise nothing_came(feed.device, source, reading.seconds)
+    lines.summary(reading)
+    return reading
 
 
 def _summary(feed: Feed, start: float) -> MeterReading:

@@ -85,14 +85,14 @@ def record(
     if times is not None:
         raise _slice_error(source, target, times)
     refuse_overwriting(target, source, sensor_id)
-    known = find_device(source)
+    configured_device = find_device(source)
     sensor: Sensor | None = None
     if sensor_id:
         sensor = named_sensor(sensor_id)
     elif is_live(source):
         sensor = find_declared_sensor(source)
-    elif known:
-        sensor = known.configure()
+    elif configured_device:
+        sensor = configured_device.configure()
     task = SourceRecording(
         source,
         target,

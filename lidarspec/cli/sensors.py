@@ -50,15 +50,15 @@ def guide() -> str:
     from lidarspec.device.settings import devices
     from lidarspec.transports.ports import serial_ports
 
-    known, _ = list_sensors()
+    installed, _ = list_sensors()
     ports = [port.path for port in serial_ports()]
     named = list(devices())
-    example = known[0].id if known else "ID"
+    example = installed[0].id if installed else "ID"
     source = (named or ports or [f"sim:{example}"])[0]
-    vendors = {sensor.vendor for sensor in known}
+    vendors = {sensor.vendor for sensor in installed}
     lines = [
         f"lidarspec {__version__}",
-        f"{len(known)} sensors of {len(vendors)} vendors" if vendors else no_sensors(),
+        f"{len(installed)} sensors of {len(vendors)} vendors" if vendors else no_sensors(),
         f"serial ports: {', '.join(ports) or 'none'}",
     ]
     if named:
@@ -84,11 +84,11 @@ def guide() -> str:
 @output_options
 def sensors(as_json: bool, output: str | None) -> None:
     """List the installed sensors, and how each was verified."""
-    known, broken = list_sensors()
+    installed, broken = list_sensors()
     if as_json:
         from lidarspec.plugins import registry
 
-        homes = {row.id: row.distribution for row in known}
+        homes = {row.id: row.distribution for row in installed}
         loaded = registry().sensors()
         broken = registry().failures
         emit_json(
@@ -98,13 +98,13 @@ def sensors(as_json: bool, output: str | None) -> None:
             ],
             output,
         )
-    elif known:
+    elif installed:
         rows = [
             [row.id, f"{row.vendor} {row.model}", _links(row.links), row.status, row.distribution]
-            for row in known
+            for row in installed
         ]
         emit(table(["id", "device", "link", "status", "distribution"], rows, output), output)
-    if not known:
+    if not installed:
         note(no_sensors())
     if broken:
         note(
@@ -213,10 +213,10 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
     if not isinstance(packets.table, Rows) or not packets.table.groups:
         return ["plain evaluation: an example has no points"]
     largest = max(packets.table.groups, key=lambda group: group.layout.size)
-    found = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)
-    if isinstance(found, Plan):
-        return describe(found)
-    return [f"plain evaluation: {found}"]
+    plan = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)
+    if isinstance(plan, Plan):
+        return describe(plan)
+    return [f"plain evaluation: {plan}"]
 
 
 @click.command()
@@ -231,10 +231,10 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
     """
     from lidarspec.plugins import try_plugins
 
-    found = try_plugins()
-    rows = [[p.distribution, p.version, p.entry_point, _describe_plugin(p)] for p in found]
+    tried = try_plugins()
+    rows = [[p.distribution, p.version, p.entry_point, _describe_plugin(p)] for p in tried]
     if as_json:
-        emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in found], output)
+        emit_json([{**vars(plugin), "sensors": list(plugin.sensors)} for plugin in tried], output)
     else:
         emit(
             table(["distribution", "version", "entry point", "sensors"], rows, output)
@@ -242,7 +242,7 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
             else no_sensors(),
             output,
         )
-    if any(plugin.error or plugin.remark for plugin in found):
+    if any(plugin.error or plugin.remark for plugin in tried):
         ctx.exit(FINDINGS)
 
 

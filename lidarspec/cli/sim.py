@@ -194,8 +194,8 @@ def _tell(
         )
         return
     say(where)
-    asked = "".join(f"\n  asked over {name}: {place}" for name, place in controls.items())
-    note(f"{sensor.id}, simulated{asked}\n  next: {following}")
+    control_lines = "".join(f"\n  asked over {name}: {place}" for name, place in controls.items())
+    note(f"{sensor.id}, simulated{control_lines}\n  next: {following}")
 
 
 def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Callable[[], None]:
@@ -275,7 +275,7 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
     else:
         where = result.place
     passed = f"{errors:.1%} {harm}, {result.intact} came through unharmed"
-    told = [
+    lines = [
         f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
         *(str(reply) for reply in result.replies if reply.confirmed),
         (
@@ -288,7 +288,7 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
         rate = f" at {facts['rate_hz']:.1f} Hz"
     else:
         rate = ""
-    told.append(
+    lines.append(
         f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the"
         f" last one: {whole[-1]}"
     )
@@ -296,10 +296,10 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
         same = "the same points"
     else:
         same = "OTHER points"
-    told.append(
+    lines.append(
         f"recorded ({size(result.recorded)}) and read again: {same}, SHA-256 {result.again[:16]}..."
     )
-    return [*told, f"next: lidarspec view sim:{name}"]
+    return [*lines, f"next: lidarspec view sim:{name}"]
 
 
 def _facts(result: Demonstration, whole: list[Scan]) -> dict[str, object]:

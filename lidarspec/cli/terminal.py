@@ -85,15 +85,15 @@ def streams() -> Iterator[None]:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError):
             stream.reconfigure(errors="replace")  # type: ignore[union-attr]
-    told: set[str] = set()
+    reported: set[str] = set()
     with warnings.catch_warnings():
         shown = warnings.showwarning
 
         def tell(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
             if category is not UserWarning:
                 shown(message, category, *rest, **more)
-            elif str(message) not in told:
-                told.add(str(message))
+            elif str(message) not in reported:
+                reported.add(str(message))
                 note(str(message))
 
         warnings.showwarning = tell

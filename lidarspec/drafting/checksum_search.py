@@ -141,12 +141,12 @@ def search(
     samples = Samples(frames)
     if samples.shortest < 3 or not any(map(any, samples.frames)):
         return []
-    found = list(plain_matches(samples, stands))
-    if not any(match.sure for match in found):
-        found += crc_matches(samples, quick=quick, stands=stands)
-    if not found and not quick:
-        found += crc_matches(samples, mixed=True, stands=stands)
-    return best_first(found)[:TOLD]
+    matches = list(plain_matches(samples, stands))
+    if not any(match.sure for match in matches):
+        matches += crc_matches(samples, quick=quick, stands=stands)
+    if not matches and not quick:
+        matches += crc_matches(samples, mixed=True, stands=stands)
+    return best_first(matches)[:TOLD]
 
 
 def format_algorithm(algorithm: Checksum) -> str:
@@ -201,27 +201,27 @@ def _fitting(
     orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
     for order in orders:
         there = few.fields(place, order)
-        found: list[Checksum]
+        algorithms: list[Checksum]
         if isinstance(algorithm, Fold15):
             if enough(int((there == computed).sum()), len(few)):
-                found = [algorithm]
+                algorithms = [algorithm]
             else:
-                found = []
+                algorithms = []
         elif isinstance(algorithm, Xor | WordXor):
-            found = [_change(algorithm, constant) for constant in _constant(there ^ computed)]
+            algorithms = [_change(algorithm, constant) for constant in _constant(there ^ computed)]
         elif few.alone:
             if not there.any():
                 return
-            found = [algorithm, Changed(algorithm, int(mask), negative=True)]
+            algorithms = [algorithm, Changed(algorithm, int(mask), negative=True)]
         else:
-            found = [
+            algorithms = [
                 _change(algorithm, constant) for constant in _constant((there - computed) & mask)
             ]
-            found += [
+            algorithms += [
                 Changed(algorithm, constant, negative=True)
                 for constant in _constant((there + computed) & mask)
             ]
-        for one in found:
+        for one in algorithms:
             constant = one.constant if isinstance(one, Changed) else 0
             fitted = int(constant not in (0, int(mask)))
             right = samples.right(one, place, span, order)

@@ -58,11 +58,11 @@ def remainder(a: int, b: int) -> int:
 def quotient(a: int, b: int) -> int:
     """Return a divided by b, without the remainder; b must not be 0."""
     size = b.bit_length()
-    found = 0
+    result = 0
     while (shift := a.bit_length() - size) >= 0:
         a ^= b << shift
-        found |= 1 << shift
-    return found
+        result |= 1 << shift
+    return result
 
 
 def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
@@ -71,14 +71,14 @@ def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
     Args:
         floor: stop early if the degree of the divisor falls below this.
     """
-    found = 0
+    divisor = 0
     for polynomial in polynomials:
         other = polynomial
         while other:
-            found, other = other, remainder(found, other) if found else 0
-        if found and found.bit_length() <= floor:
+            divisor, other = other, remainder(divisor, other) if divisor else 0
+        if divisor and divisor.bit_length() <= floor:
             break
-    return found
+    return divisor
 
 
 def divisors(polynomial: int, degree: int) -> list[int]:
@@ -94,13 +94,13 @@ def divisors(polynomial: int, degree: int) -> list[int]:
     if spare < 0:
         return []
     if spare <= MAX_COFACTOR_DEGREE:
-        found = (
+        quotients = (
             quotient(polynomial, small)
             for small in range((1 << spare) | 1, 2 << spare, 2)
             if remainder(polynomial, small) == 0
         )
         if spare:
-            return sorted(found)
+            return sorted(quotients)
         return [polynomial]
     if degree <= 16:
         return _try_all(polynomial, degree)
@@ -140,7 +140,10 @@ def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[i
             if row:
                 return None
             continue
-        rows = {place: other ^ row if other >> lead & 1 else other for place, other in rows.items()}
+        rows = {
+            other_lead: other ^ row if other >> lead & 1 else other
+            for other_lead, other in rows.items()
+        }
         rows[lead] = row
     solution = sum(1 << lead for lead, row in rows.items() if row >> width & 1)
     free = [bit for bit in range(width) if bit not in rows]
@@ -263,7 +266,7 @@ def _varies_like_crc(samples: Samples, place: Place) -> bool:
         return True
     wanted = max(min(len(samples) // 2, 24), 2)
     columns = (
-        samples.fields(Place(place.offset + spot, 1), "little") for spot in range(place.size)
+        samples.fields(Place(place.offset + index, 1), "little") for index in range(place.size)
     )
     return all(len(np.unique(column)) >= wanted for column in columns)
 
@@ -301,9 +304,9 @@ def _fitting(
         candidates = _candidates(_codewords(few, place, span, reading), reading)
     for crc, fitted, remarks in candidates:
         right = samples.right(crc, place, span, reading.order)
-        known = crc.poly in KNOWN[crc.width]
+        is_known = crc.poly in KNOWN[crc.width]
         doubtful = doubt(
-            crc.width, stored, fitted + (not known), tried * (len(CRCS) if known else 1)
+            crc.width, stored, fitted + (not is_known), tried * (len(CRCS) if is_known else 1)
         )
         if enough(right, len(samples)) and doubtful > 0:
             open_ = bool(remarks)
@@ -368,13 +371,13 @@ def _differences(words: Codewords) -> list[int]:
 def _polynomials(multiples: Sequence[int], width: int) -> list[int]:
     """Return the possible CRC polynomials that divide all multiples, known ones first."""
     xor_polynomial = (1 << width) | 1  # its CRC is a plain XOR, which is searched elsewhere
-    found = [
+    polynomials = [
         poly
         for poly in divisors(common_divisor(multiples, floor=width), width)
         if poly != xor_polynomial
     ]
-    known = [poly for poly in found if poly & ((1 << width) - 1) in KNOWN[width]]
-    return (known + [poly for poly in found if poly not in known])[:MAX_POLYNOMIALS]
+    known = [poly for poly in polynomials if poly & ((1 << width) - 1) in KNOWN[width]]
+    return (known + [poly for poly in polynomials if poly not in known])[:MAX_POLYNOMIALS]
 
 
 def _registers(

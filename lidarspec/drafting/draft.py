@@ -221,8 +221,8 @@ def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None
         frames = [part for part in parts if len(part) == first.size]
     elif first.size is not None:
         frames = [
-            parts[0][at : at + first.size]
-            for at in range(start, len(parts[0]) - first.size + 1, first.size)
+            parts[0][offset : offset + first.size]
+            for offset in range(start, len(parts[0]) - first.size + 1, first.size)
         ]
     else:
         return None
@@ -246,14 +246,14 @@ def _walk(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
     """
     base = 0
     for part in parts:
-        at = part.find(known.sync)
-        while 0 <= at < len(part):
-            size = _frame_size(known, part, at)
+        offset = part.find(known.sync)
+        while 0 <= offset < len(part):
+            size = _frame_size(known, part, offset)
             if size:
-                yield base + at, part[at : at + size]
+                yield base + offset, part[offset : offset + size]
             if known.datagrams:
                 break
-            at = part.find(known.sync, at + (size or 1))
+            offset = part.find(known.sync, offset + (size or 1))
         base += len(part)
 
 
@@ -292,8 +292,8 @@ def _find_count(known: Draft, data: bytes) -> Draft:
     """
     if known.size is None or known.datagrams or not known.frames:
         return known
-    at, last = known.frames[-1]
-    rest = data[at + len(last) :]
+    offset, last = known.frames[-1]
+    rest = data[offset + len(last) :]
     for place in range(len(known.sync), HEADER):
         same = len({frame[: place + 1] for _, frame in known.frames}) == 1
         if (
@@ -411,23 +411,23 @@ def _find_flagged_blocks(rows: NDArray[np.uint8]) -> Blocks | None:
     """Return blocks that begin with the same two bytes and fill much of the frame."""
     first, steady = rows[0], (rows == rows[0]).mean(axis=0) >= STEADY
     pairs: dict[tuple[int, int], list[int]] = {}
-    for spot in np.flatnonzero(steady[:-1] & steady[1:]).tolist():
-        pairs.setdefault((int(first[spot]), int(first[spot + 1])), []).append(spot)
-    found = []
-    for pair, spots in pairs.items():
-        steps = np.diff(spots)
+    for offset in np.flatnonzero(steady[:-1] & steady[1:]).tolist():
+        pairs.setdefault((int(first[offset]), int(first[offset + 1])), []).append(offset)
+    blocks_found = []
+    for pair, offsets in pairs.items():
+        steps = np.diff(offsets)
         if (
             pair in ((0, 0), (255, 255))
-            or len(spots) < MIN_BLOCKS
+            or len(offsets) < MIN_BLOCKS
             or (steps != steps[0]).any()
             or steps[0] <= 2
         ):
             continue
         size = int(steps[0])
-        count = min(len(spots), (rows.shape[1] - spots[0]) // size)
+        count = min(len(offsets), (rows.shape[1] - offsets[0]) // size)
         if count >= MIN_BLOCKS and count * size >= MIN_BLOCKS_SHARE * rows.shape[1]:
-            found.append(Blocks(spots[0], size, count, bytes(pair)))
-    return max(found, key=lambda blocks: blocks.count * blocks.size, default=None)
+            blocks_found.append(Blocks(offsets[0], size, count, bytes(pair)))
+    return max(blocks_found, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
 def _find_blocks_of_fields(found: Sequence[Candidate], length: int) -> Blocks | None:
@@ -549,19 +549,19 @@ def _fields(draft: Draft) -> Iterator[Field]:
             *(edge for one in known for edge in (one.start, one.start + one.size)),
         }
     )
-    at = 0
+    offset = 0
     for field in [*known, Field(draft.head, 0, "", "")]:
-        yield from _gap(rows, at, field.start, cuts)
+        yield from _gap(rows, offset, field.start, cuts)
         if field.name:
             yield field
-        at = field.start + field.size
+        offset = field.start + field.size
     if draft.size is None and draft.length is not None:
         yield from _varying(draft)
 
 
 def _known_fields(draft: Draft) -> list[Field]:
     """Return the fields with evidence, without overlaps, by offset."""
-    found = list(_header(draft))
+    fields = list(_header(draft))
     if (length := draft.length) is not None:
         sizes = sorted({len(frame) for _, frame in draft.frames})
         of_one = f"whole frames of {sizes[0]} bytes, and the beginning of another"
@@ -569,7 +569,7 @@ def _known_fields(draft: Draft) -> list[Field]:
             f"frames are as long as {length} says: "
             f"{of_one if len(sizes) == 1 else f'frames of {sizes[0]} to {sizes[-1]} bytes'}"
         )
-        found.append(
+        fields.append(
             Field(
                 length.place,
                 length.size,
@@ -579,12 +579,12 @@ def _known_fields(draft: Draft) -> list[Field]:
             )
         )
     if draft.seal is not None and not draft.tail:
-        found.append(_check(draft, draft.seal, draft.seal.place.start(draft.head)))
+        fields.append(_check(draft, draft.seal, draft.seal.place.start(draft.head)))
     if draft.blocks is not None:
-        found.append(_block_field(draft, draft.blocks))
-    found += [_rising(draft, one) for one in draft.candidates]
+        fields.append(_block_field(draft, draft.blocks))
+    fields += [_rising(draft, one) for one in draft.candidates]
     chosen: list[Field] = []
-    for field in found:
+    for field in fields:
         if all(
             field.start + field.size <= other.start or other.start + other.size <= field.start
             for other in chosen
@@ -862,11 +862,11 @@ def _imports(text: dict[str, str]) -> dict[str, str]:
     construct = sorted(
         set(re.findall(r"\b(Array|Bytes|Const|Int\d+u[lb]|this(?=\.))\b", code)) | {"Struct"}
     )
-    asked = re.findall(
+    names = re.findall(
         r"\b(Check(?:sum|summed)|Crc|Every|Fold15|OnWrap|Scaled|Sequence|Serial|Sum|Udp|WordXor|Xor)\b",
         code,
     )
-    own = {"Fields", "Frame", "Polar", "Sensor", "hookimpl", *asked}
+    own = {"Fields", "Frame", "Polar", "Sensor", "hookimpl", *names}
     return {
         "construct_names": ", ".join(sorted(construct, key=_case)),
         "own_import": _import("lidarspec.spec", sorted(own, key=_case)),
@@ -1000,9 +1000,9 @@ def make_draft_files(
             "frame": "data",
             "hex": data.hex(" "),
             "values": {},
-            "source": f"{origin}, at byte {at}",
+            "source": f"{origin}, at byte {offset}",
         }
-        for at, data in draft.frames[:VECTORS]
+        for offset, data in draft.frames[:VECTORS]
     ]
     return _files(
         names,

@@ -176,7 +176,7 @@ def _iter_rising_fields(rows: NDArray[np.uint8]) -> Iterator[Candidate]:
                     from_low = range(size)
                 else:
                     from_low = range(size - 1, -1, -1)
-                if all(varied[offset + spot] for spot in list(from_low)[: size // 2 + 1]):
+                if all(varied[offset + index] for index in list(from_low)[: size // 2 + 1]):
                     yield from _counter(rows, offset, size, order)
                     yield from _rising(rows, offset, size, order)
 
@@ -579,5 +579,5 @@ def _find_length_field(
 
 
 def _most_frequent(numbers: NDArray[np.int64]) -> tuple[int, int]:
-    found, counts = np.unique(numbers, return_counts=True)
-    return int(found[counts.argmax()]), int(counts.max())
+    distinct, counts = np.unique(numbers, return_counts=True)
+    return int(distinct[counts.argmax()]), int(counts.max())

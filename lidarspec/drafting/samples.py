@@ -274,7 +274,7 @@ class Samples:
         has a larger weight.
         """
         columns = [
-            self.fields(Place(place.offset + spot, 1), "little") for spot in range(place.size)
+            self.fields(Place(place.offset + index, 1), "little") for index in range(place.size)
         ]
         distinct = min(len(np.unique(column)) for column in columns) / min(len(self), 256)
         apart = min(int(np.ptp(column)) for column in columns) >= APART
@@ -295,7 +295,7 @@ def spans(place: Place, samples: Samples) -> Iterator[Span]:
     before = start
     behind = samples.shortest - start - place.size
     at_end = behind <= TAIL
-    told: set[tuple[tuple[int, int], ...]] = set()
+    seen: set[tuple[tuple[int, int], ...]] = set()
     parts: tuple[tuple[Part, int, int], ...] = (
         ("all", HEAD if at_end else 2, 1),
         ("before", HEAD if at_end else 2, 0),
@@ -310,8 +310,8 @@ def spans(place: Place, samples: Samples) -> Iterator[Span]:
                 fits = (part == "behind" or head < before or head == 0) and (
                     tail == 0 or tail < behind
                 )
-                if fits and ranges not in told and sum(b - a for a, b in ranges) >= 2:
-                    told.add(ranges)
+                if fits and ranges not in seen and sum(b - a for a, b in ranges) >= 2:
+                    seen.add(ranges)
                     yield span
 
 
@@ -352,7 +352,7 @@ def best_first(matches: Sequence[Match]) -> list[Match]:
             len(match.paste),
         )
 
-    told = dict[object, Match]()
+    unique = dict[object, Match]()
     for match in sorted(matches, key=key):
-        told.setdefault((match.paste, match.place, match.order), match)
-    return list(told.values())
+        unique.setdefault((match.paste, match.place, match.order), match)
+    return list(unique.values())

@@ -35,10 +35,10 @@ def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, A
             hold.
     """
     parsed = [_assignment(table, text, place) for text in assignments]
-    found: dict[str, Any] = {}
+    raw_values: dict[str, Any] = {}
     for names, value in sorted(parsed, key=lambda item: any(is_index(step) for step in item[0])):
-        put(found, names, value, lambda path: _length(table, found, path, place))
-    return found
+        put(raw_values, names, value, lambda path: _length(table, raw_values, path, place))
+    return raw_values
 
 
 def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
@@ -161,7 +161,7 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
         hint = "" if sensor.commands else "; it takes no commands"
         raise UnknownCommand(name, sensor.commands, place=sensor.id, hint=hint)
     command = sensor.commands[name]
-    found: dict[str, Any] = {}
+    given: dict[str, Any] = {}
     for text in assignments:
         argument, equals, value = text.partition("=")
         if not equals:
@@ -176,7 +176,7 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
             number, _ = _number(
                 value.strip(), unit, place, f"a number in {unit}" if unit else "a number"
             )
-            found[argument] = int(number) if number.denominator == 1 else float(number)
+            given[argument] = int(number) if number.denominator == 1 else float(number)
         else:
-            found[argument] = _octets(value, place) if isinstance(kind, Octets) else value
-    return found
+            given[argument] = _octets(value, place) if isinstance(kind, Octets) else value
+    return given

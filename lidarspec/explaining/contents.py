@@ -213,11 +213,11 @@ def contents(path: str | Path) -> Contents:
             header = opened.header
         else:
             header = None
-        found = Contents(str(path), kind, _size(Path(file)), header)
-        _count(found, opened)
-        found.warnings += opened.warnings
-    found.contents += _sent(found) if found.bytes else []
-    return found
+        described = Contents(str(path), kind, _size(Path(file)), header)
+        _count(described, opened)
+        described.warnings += opened.warnings
+    described.contents += _sent(described) if described.bytes else []
+    return described
 
 
 def duration(path: str | Path) -> float | None:
@@ -229,9 +229,9 @@ def duration(path: str | Path) -> float | None:
         SourceError: if the file cannot be opened.
     """
     with contextlib.closing(transport(path)) as opened:
-        found = Contents(str(path), "", 0)
-        _count(found, opened)
-    return found.seconds
+        described = Contents(str(path), "", 0)
+        _count(described, opened)
+    return described.seconds
 
 
 def _size(path: Path) -> int:
@@ -336,10 +336,10 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
     else:
         rate = ""
     if any(flow.sender for flow in found.flows):
-        what = "packets"
+        unit = "packets"
     else:
-        what = "pieces"
-    lines.append(("holds", f"{found.packets} {what}, {found.bytes} bytes{rate}"))
+        unit = "pieces"
+    lines.append(("holds", f"{found.packets} {unit}, {found.bytes} bytes{rate}"))
     for flow in found.flows[:FLOWS]:
         if flow.sender is not None:
             if flow.receiver is not None:

@@ -81,9 +81,9 @@ def changes(
         if (
             fits
             and 0 < size <= _most(engine, values)
-            and (found := list(_found(kind, values, data, size, engine, offsets)))
+            and (matching := list(_found(kind, values, data, size, engine, offsets)))
         ):
-            return found
+            return matching
     return []
 
 
@@ -102,8 +102,8 @@ def _most(engine: Codec, values: int) -> int:
 @functools.cache
 def _deciding(frame: Frame) -> int:
     """Return the number of fields that decide the layout of a frame."""
-    asked = (formula for node in nodes(frame.tree) for formula in formulas(node))
-    return len({ref.path for formula in asked for ref in refs(formula)})
+    used = (formula for node in nodes(frame.tree) for formula in formulas(node))
+    return len({ref.path for formula in used for ref in refs(formula)})
 
 
 def _found(
@@ -132,8 +132,8 @@ def _found(
         part = slice(first, first + step)
         rows = _rows(kind, old, offsets[part], numbers[part], size)
         fits = np.ones(len(rows), np.bool_)
-        for spot, (mask, value) in engine.prefix.items():
-            fits &= rows[:, spot] & mask == value
+        for offset, (mask, value) in engine.prefix.items():
+            fits &= rows[:, offset] & mask == value
         which = np.flatnonzero(fits)
         if len(which):
             survey = engine.survey(rows.reshape(-1), which * size)
@@ -178,17 +178,17 @@ def describe_damage(
     Args:
         values: returns the values of a frame by path.
     """
-    found = changes(frame, data)
-    if len(found) > TOLD:
+    matching = changes(frame, data)
+    if len(matching) > TOLD:
         yield (
-            f"one {found[0].kind} would explain it, but in any of {len(found)} places, so that"
-            " nothing can be said of where"
+            f"one {matching[0].kind} would explain it, but in any of {len(matching)} places, so"
+            " that nothing can be said of where"
         )
         return
-    before = values(data) if found else {}
-    for change in found:
+    before = values(data) if matching else {}
+    for change in matching:
         explains = (
-            f"{'one' if len(found) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'}"
+            f"{'one' if len(matching) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'}"
             f" {change.kind} would explain it"
         )
         yield f"{explains}: {_place(change, before, values(change.repair(data)))}"

@@ -143,8 +143,8 @@ class FrameRows:
     def _info(self, each: WireField) -> FieldInfo:
         docs = "constant" if each.path.endswith(UNNAMED) else ""
         unknown = replace(each.info, path=without_indices(each.path)[0], docs=docs)
-        found: FieldInfo = self._schema.all_fields.get(without_indices(each.path)[0], unknown)
-        return found
+        info: FieldInfo = self._schema.all_fields.get(without_indices(each.path)[0], unknown)
+        return info
 
     def _remark(self, each: WireField, info: FieldInfo) -> str:
         """Return the fault of a value; "" if there is none."""

@@ -126,17 +126,17 @@ def _split_input(
     start = 0
     for chunk in itertools.chain(chunks, [None]):
         if chunk is None or chunk.gap:
-            found = decoder.finish()
+            frames = decoder.finish()
         else:
-            found = []
+            frames = []
         if chunk is not None:
             held += chunk.data
-            found += decoder.feed(chunk.data)
+            frames += decoder.feed(chunk.data)
         if decoder.joins:  # a joined message has no contiguous bytes in the input
-            yield from (InputPiece(item.offset, item.data, item.frame) for item in found)
+            yield from (InputPiece(item.offset, item.data, item.frame) for item in frames)
             continue
         end = start
-        for item in found:
+        for item in frames:
             if item.offset > end:
                 yield InputPiece(end, bytes(held[end - start : item.offset - start]), "", datagrams)
             yield InputPiece(item.offset, item.data, item.frame)
@@ -215,7 +215,7 @@ def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
         if size >= MIN_SYNC_BYTES:
             magic = bytes(prefix[index][1] for index in range(size))
             starts |= {
-                found.start() for found in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)
+                match.start() for match in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)
             }
     return sorted(starts)
 

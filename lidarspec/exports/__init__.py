@@ -142,13 +142,13 @@ def find_references(node: tree.Node) -> list[tree.Ref]:
     These are the fields in formulas of the node and its descendants, and those that lengths and
     conditions are compared with.
     """
-    found = [
+    formulas = [
         value
         for below in tree.nodes(node)
         for value in (*tree.formulas(below), *find_held_formulas(below).values())
     ]
-    found += [below.condition for below in tree.nodes(node) if isinstance(below, tree.Check)]
-    return [ref for value in found for ref in tree.refs(value)]
+    formulas += [below.condition for below in tree.nodes(node) if isinstance(below, tree.Check)]
+    return [ref for value in formulas for ref in tree.refs(value)]
 
 
 def find_held_formulas(node: tree.Node) -> dict[str, tree.Formula]:

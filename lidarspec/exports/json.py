@@ -87,14 +87,14 @@ def _plain(fact: Any) -> Any:
 
 def link_data(link: Link) -> dict[str, Any]:
     """Return a link as JSON data: its kind, then the attributes of its class."""
-    said = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
+    data = {"kind": type(link).__name__.lower(), **facts(link, *vars(link))}
     if isinstance(link, Udp) and (rule := link.assembled) is not None:
         fragment = node_data(Frame(rule.struct, max_length=65_535).tree)
-        said["assembled"] = {
+        data["assembled"] = {
             **facts(rule, "keys", "index", "count", "payload", "first", "in_bytes"),
             "fragment": fragment,
         }
-    return said
+    return data
 
 
 def _clock(sensor: Sensor) -> dict[str, Any] | None:
@@ -279,7 +279,7 @@ def _seal(node: tree.Sealed) -> dict[str, Any]:
     own: dict[str, Any] = (
         dataclasses.asdict(algorithm) if dataclasses.is_dataclass(algorithm) else {}
     )
-    known = {
+    parameters = {
         name: value for name, value in own.items() if isinstance(value, int | str | bool | tuple)
     }
     kind = {
@@ -287,4 +287,4 @@ def _seal(node: tree.Sealed) -> dict[str, Any]:
         "width": algorithm.width,
         "describe": algorithm.describe(),
     }
-    return {**facts(node, "fields", "over", "absent"), "algorithm": {**kind, **known}}
+    return {**facts(node, "fields", "over", "absent"), "algorithm": {**kind, **parameters}}

@@ -81,10 +81,10 @@ def _link(link: Link) -> str:
         )
     if isinstance(link, Udp):
         ports = [f"port {' and '.join(str(port) for port in link.ports)}"] * bool(link.ports)
-        asked = [f"broadcast to port {link.broadcast}"] * bool(link.broadcast) + [
+        details = [f"broadcast to port {link.broadcast}"] * bool(link.broadcast) + [
             f"from port {link.local}"
         ] * bool(link.local)
-        return ", ".join(["UDP", *ports, *asked, *["a byte stream in datagrams"] * link.stream])
+        return ", ".join(["UDP", *ports, *details, *["a byte stream in datagrams"] * link.stream])
     kind = type(link).__name__
     if isinstance(link, Tcp | Http):
         return f"{kind.upper()}, port {link.port}"
@@ -131,16 +131,16 @@ def _commands(sensor: Sensor) -> Iterator[str]:
 
 def _find_request(sensor: Sensor, name: str) -> str:
     command = sensor.commands[name]
-    said = _levels(command.lines)
+    parts = _levels(command.lines)
     if command.frame and command.args:
         args = " and ".join(
             f"`{name}` {format_argument_type(argument.kind, ' to ')}"
             for name, argument in command.arguments.items()
         )
-        said.insert(0, f"`{command.frame}` with {args}")
+        parts.insert(0, f"`{command.frame}` with {args}")
     elif command.frame:
-        said.insert(0, f"`{sensor.command(name).hex(' ')}`")
-    return ", ".join(said)
+        parts.insert(0, f"`{sensor.command(name).hex(' ')}`")
+    return ", ".join(parts)
 
 
 def _answer(command: Command) -> str:
@@ -152,7 +152,7 @@ def _answer(command: Command) -> str:
 def effect(sensor: Sensor, name: str) -> str:
     """Return the effect of a command and when it is sent, in words."""
     command = sensor.commands[name]
-    said = {
+    effects = {
         "starts the data": command.starts,
         "stops the data": command.stops,
         "answered only while no data are sent": command.only_stopped,
@@ -162,7 +162,7 @@ def effect(sensor: Sensor, name: str) -> str:
         "sent on closing": name in sensor.on_close,
         f"over the link `{command.link}`": command.link != "data",
     }
-    return "; ".join(text for text, holds in said.items() if holds)
+    return "; ".join(text for text, holds in effects.items() if holds)
 
 
 def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
@@ -174,23 +174,23 @@ def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
         kind = "from the sensor"
     yield f"## `{name}`: {kind}"
     size = frame_size(frame)
-    said = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
-    said += [f"looked for after a `{frame.after}`"] * (frame.after is not None)
-    said += [f"believed in runs of {frame.confirm} or more"] * (frame.confirm > 1)
-    said += ["a plausibility test turns down what no sensor would send"] * (
+    remarks = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
+    remarks += [f"looked for after a `{frame.after}`"] * (frame.after is not None)
+    remarks += [f"believed in runs of {frame.confirm} or more"] * (frame.confirm > 1)
+    remarks += ["a plausibility test turns down what no sensor would send"] * (
         frame.plausible is not None
     )
-    yield "; ".join(said) + "."
+    yield "; ".join(remarks) + "."
     if picture:
         yield f"![{name}: packet diagram]({picture})"
     rows = [
         (row.offset, row.size, row.type, f"`{row.field}`", row.unit, row.meaning)
         for row in wire_table(frame)
     ]
-    told = [
+    escaped_rows = [
         [cell if "`" in cell else cell.replace("[", r"\[") for cell in row] for row in rows
     ]  # an index is not a link
-    yield "\n".join(_table(["offset", "size", "type", "field", "unit", "meaning"], told))
+    yield "\n".join(_table(["offset", "size", "type", "field", "unit", "meaning"], escaped_rows))
 
 
 def _geometry(sensor: Sensor) -> Iterator[str]:

@@ -126,7 +126,7 @@ class _Classes:
                 infos = [node.info]
             else:
                 infos = []
-        said = "; ".join(
+        description = "; ".join(
             filter(None, (text(info) for info in infos[:1] for text in (unit_text, meaning)))
         )
         line = f"    {name}: {kind}" + (
@@ -134,7 +134,7 @@ class _Classes:
         )
         return [
             line if not keyword.iskeyword(name) else f"    # {line.strip()}",
-            *([f'    """{_quote(said)}"""'] if said else []),
+            *([f'    """{_quote(description)}"""'] if description else []),
         ]
 
     def _type(self, owner: str, name: str, node: Node) -> str:

@@ -392,9 +392,9 @@ class SimulatedDevice:
         for link, frame, data in self._due(self._time):
             packets.setdefault(link, []).append((frame, data))
         out: list[tuple[str, str, bytes]] = []
-        for link, mine in packets.items():
-            self.sent.update(frame for frame, _ in mine if frame)
-            arrived = self.lines[link].carry(mine)
+        for link, link_packets in packets.items():
+            self.sent.update(frame for frame, _ in link_packets if frame)
+            arrived = self.lines[link].carry(link_packets)
             if is_datagram(self.sensor.links[link]):
                 out += [(link, frame, data) for frame, data in arrived]
             elif arrived:
@@ -424,19 +424,19 @@ class SimulatedDevice:
 
     def _due(self, upto: float) -> list[tuple[str, str, bytes]]:
         """Return the data that is due by a time, in order, as (link, type, bytes)."""
-        found: list[tuple[float, str, str, bytes]] = []
+        sendings: list[tuple[float, str, str, bytes]] = []
         while self._plan and self._plan[0].at <= upto:
             due = heapq.heappop(self._plan)
-            found.append((due.at, due.link, due.frame, due.data))
+            sendings.append((due.at, due.link, due.frame, due.data))
             self._again(due)
-        planned = len(found)
+        planned = len(sendings)
         if self._stream is not None:
-            found += [
+            sendings += [
                 (at, "data", self._stream.frame, data) for at, data in self._stream.take(upto)
             ]
-        if planned and len(found) > planned:
-            found.sort(key=lambda item: item[0])
-        return [item[1:] for item in found]
+        if planned and len(sendings) > planned:
+            sendings.sort(key=lambda item: item[0])
+        return [item[1:] for item in sendings]
 
     def _again(self, due: _Due) -> None:
         """Plan the next frame of a type that is sent unasked."""
@@ -460,7 +460,7 @@ class SimulatedDevice:
         """
         self.heard.append(request.name)
         command = request.command
-        at = now
+        time_ns = now
         mode = None
         if command.only_stopped and self._stream is not None:
             return
@@ -475,9 +475,9 @@ class SimulatedDevice:
         announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
         for answer in self._answering.answers(request):
             if answer.pause:
-                at = self._settle(at, answer.pause, command.link)
+                time_ns = self._settle(time_ns, answer.pause, command.link)
             else:
-                self._put(at, command.link, answer.frame, answer.data)
+                self._put(time_ns, command.link, answer.frame, answer.data)
                 mode = answer.frame if answer.frame in announcing else mode
         if command.starts:
             kinds = [
@@ -491,7 +491,7 @@ class SimulatedDevice:
                 else next(iter(kinds), None)
             )
             if chosen is not None:
-                self._begin(at, chosen)
+                self._begin(time_ns, chosen)
 
     def _settle(self, at: float, seconds: float, link: str) -> float:
         """Send fillers during a pause, and return the time of its end."""

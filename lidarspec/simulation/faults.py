@@ -161,9 +161,9 @@ class FaultyLink:
         out = bytearray()
         start = 0
         while start + self._valid_bytes_left < len(frame):
-            spot = start + self._valid_bytes_left
-            out += frame[start:spot] + self._corrupt_byte(frame[spot])
-            start = spot + 1
+            offset = start + self._valid_bytes_left
+            out += frame[start:offset] + self._corrupt_byte(frame[offset])
+            start = offset + 1
             self._valid_bytes_left = self._draw_gap()
         self._valid_bytes_left -= len(frame) - start
         return bytes(out + frame[start:])

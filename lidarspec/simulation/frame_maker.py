@@ -80,9 +80,9 @@ class FrameMaker:
             if count is not None
         }
         self._counts = {
-            axis: asked[0]
-            for axis, asked in formulas.items()
-            if asked and asked[0] in self.schema.fields
+            axis: paths[0]
+            for axis, paths in formulas.items()
+            if paths and paths[0] in self.schema.fields
         }
         self._layouts: dict[tuple[int, ...], Layout] = {}
         self._asked: list[str] = []
@@ -139,7 +139,9 @@ class FrameMaker:
     def _with_counts(self, values: Values) -> Values:
         """Return the values of a frame with the missing counts of its arrays and bytes."""
         missing = [
-            axis for axis, asked in self._counts.items() if axis in values and asked not in values
+            axis
+            for axis, count_path in self._counts.items()
+            if axis in values and count_path not in values
         ]
         given = dict(values) if missing else values
         for axis in missing:
@@ -189,15 +191,15 @@ class FrameMaker:
     ) -> None:
         """Set the first field of a formula, if it is not given, so that it gives `number`."""
         if formula is None:
-            asked = []
+            paths = []
         else:
-            asked = [ref.path for ref in refs(formula) if ref.path in self.schema.fields]
-        if asked and asked[0] not in values:
+            paths = [ref.path for ref in refs(formula) if ref.path in self.schema.fields]
+        if paths and paths[0] not in values:
             raw: dict[str, Any] = {}
-            for path in asked[1:]:
+            for path in paths[1:]:
                 set_nested(raw, path, self._raw(values, path))
             fill_in(formula, raw, number, self.schema.fields, axis)
-            values[asked[0]] = self.schema.fields[asked[0]].physical(member(raw, asked[0]))
+            values[paths[0]] = self.schema.fields[paths[0]].physical(member(raw, paths[0]))
 
     def _layout(self, values: Values) -> Layout:
         """Return the layout for these values of header fields."""
@@ -281,6 +283,6 @@ def seal_frames(table: Rows) -> list[bytes]:
         group.layout.seal(group.rows)
         size = group.layout.size
         data = group.rows.tobytes()
-        for spot, place in enumerate(group.where.tolist()):
-            frames[place] = data[spot * size : (spot + 1) * size]
+        for row, index in enumerate(group.where.tolist()):
+            frames[index] = data[row * size : (row + 1) * size]
     return frames

@@ -94,12 +94,12 @@ class Mover:
 
         x and y have the shape of `time`.
         """
-        places = np.array(self.path, np.float64)
-        along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
+        points = np.array(self.path, np.float64)
+        along = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         whole = along[-1]
         gone = np.asarray(time, np.float64) * self.speed % (2 * whole)
         gone = np.minimum(gone, 2 * whole - gone)
-        x, y = (np.interp(gone, along, column) for column in places.T)
+        x, y = (np.interp(gone, along, column) for column in points.T)
         half = [side / 2 for side in self.size]
         return (x - half[0], y - half[1], self.floor), (
             x + half[0],
@@ -144,21 +144,21 @@ class Room:
         level = np.cos(elevation)
         beams = (level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation))
         shape = np.broadcast_shapes(*(np.shape(part) for part in (*beams, *origin, time)))
-        found = np.full(shape, np.inf)
+        ranges = np.full(shape, np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.walls is not None:
                 for low, high, start, beam in zip(
                     self.walls.low, self.walls.high, origin, beams, strict=True
                 ):
                     np.minimum(
-                        found,
+                        ranges,
                         np.where(beam >= 0, high - start, start - low) / np.abs(beam),
-                        out=found,
+                        out=ranges,
                     )
             bodies: tuple[Box | Mover, ...] = (*self.boxes, *self.movers)
             for body in bodies:
-                _meet(found, body, beams, origin, time)
-        return found
+                _meet(ranges, body, beams, origin, time)
+        return ranges
 
 
 def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value) -> None:
@@ -269,18 +269,18 @@ def _mover(table: Mapping[str, Any], place: str) -> Mover:
     path = table.get("path")
     if not isinstance(path, list) or len(path) < 2:
         raise UsageError(f"{place}.path: two places or more, such as [[1, -1], [1, 1]]")
-    places = [
-        _numbers({f"path[{index}]": spot}, f"path[{index}]", 2, place)
-        for index, spot in enumerate(path)
+    points = [
+        _numbers({f"path[{index}]": point}, f"path[{index}]", 2, place)
+        for index, point in enumerate(path)
     ]
-    if len(set(map(tuple, places))) < 2:
+    if len(set(map(tuple, points))) < 2:
         raise UsageError(f"{place}.path: it leads nowhere")
     others = {
         name: _number(table[name], f"{place}.{name}")
         for name in ("speed", "floor")
         if name in table
     }
-    return Mover((size[0], size[1], size[2]), tuple((x, y) for x, y in places), **others)
+    return Mover((size[0], size[1], size[2]), tuple((x, y) for x, y in points), **others)
 
 
 def _entries(

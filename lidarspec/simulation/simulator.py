@@ -157,7 +157,7 @@ class Measurement:
         steps = [self._step(table, target) for target in self._targets]
         before = np.zeros(1)
         blind = np.zeros(1, np.bool_)
-        known: dict[str, NDArray[Any]] = {}
+        written: dict[str, NDArray[Any]] = {}
         for attempt in range(ROUNDS):
             beams = self.beams(table)
             ranges = self._measure(beams, scene, times)
@@ -166,15 +166,15 @@ class Measurement:
             before = ranges
             ranges = np.where(blind, 0, ranges)
             values = self._values(table, beams, ranges, steps)
-            if known and all(np.array_equal(known[path], raw) for path, raw in values.items()):
+            if written and all(np.array_equal(written[path], raw) for path, raw in values.items()):
                 break
-            known = values
+            written = values
             for path, raw in values.items():
                 store(table, path, raw)
             if not self._coupled or attempt >= ROUNDS - 2:
                 break
         if self._intensity and not self._encode:
-            self._shine(table, known[self._targets[0].path])
+            self._shine(table, written[self._targets[0].path])
 
     def _shine(self, table: Rows, ranges: NDArray[Any]) -> None:
         """Write an intensity for each range."""
@@ -219,13 +219,13 @@ class Measurement:
 
         It is 0 outside the sensor's range limits, and for unknown directions.
         """
-        known = np.isfinite(beams.azimuth) & np.isfinite(beams.elevation)
-        at = times.reshape(-1, *(1,) * (beams.range.ndim - 1)) + beams.time
+        has_direction = np.isfinite(beams.azimuth) & np.isfinite(beams.elevation)
+        seconds = times.reshape(-1, *(1,) * (beams.range.ndim - 1)) + beams.time
         metres = scene.measure(
-            np.nan_to_num(beams.azimuth), np.nan_to_num(beams.elevation), beams.origin, at
+            np.nan_to_num(beams.azimuth), np.nan_to_num(beams.elevation), beams.origin, seconds
         )
         near, far = self._sensor.range_limits
-        metres = np.where(known & (metres >= near) & (metres <= far), metres, 0)
+        metres = np.where(has_direction & (metres >= near) & (metres <= far), metres, 0)
         return np.asarray(
             np.broadcast_to(metres, np.broadcast_shapes(metres.shape, beams.range.shape))
         )
@@ -242,16 +242,16 @@ class Measurement:
             )
             with plugin_errors(f"encode of {self._frame}", self._sensor.id, self._encode):
                 return {path: np.asarray(values) for path, values in self._encode(polar).items()}
-        found: dict[str, NDArray[Any]] = {}
+        raw_values: dict[str, NDArray[Any]] = {}
         for target, (step, zero) in zip(self._targets, steps, strict=True):
             info = table.schema.fields[target.path]
             part = _part(ranges, target.inner)
             with np.errstate(all="ignore"):
                 raw = whole(info, (part - zero) / step)
-            found[target.path] = np.where(
+            raw_values[target.path] = np.where(
                 (part > 0) & (raw > 0) & (raw <= self._most(table, target.path)), raw, 0
             )
-        return found
+        return raw_values
 
     def _most(self, table: Rows, path: str) -> float:
         """Return the largest raw value that a field and the wire form can hold."""
@@ -266,7 +266,7 @@ class Measurement:
 
     def _trace_targets(self, table: Rows) -> tuple[Target, ...]:
         """Return the fields in metres that the ranges of the points depend on."""
-        found: list[Target] = []
+        targets: list[Target] = []
         for path, info in table.schema.fields.items():
             if factor(info.unit, "m") is None or not any(
                 path in group.layout.leaves for group in table.groups
@@ -274,8 +274,8 @@ class Measurement:
                 continue
             answer = self._probe(table, [path], PROBE)[0].range
             expected = info.physical(PROBE)
-            for spot in self._inner(table, answer):
-                part = _part(answer, spot)
+            for inner in self._inner(table, answer):
+                part = _part(answer, inner)
                 near = part[
                     np.isclose(part, expected)
                 ]  # a direction with a length of nearly 1 is part of the range
@@ -283,14 +283,14 @@ class Measurement:
                     step = info.scale
                 else:
                     step = None
-                found += [Target(path, spot, step, info.offset)] if near.size else []
-        found = found or self._linear(table)
-        if not found:
+                targets += [Target(path, inner, step, info.offset)] if near.size else []
+        targets = targets or self._linear(table)
+        if not targets:
             reason = (
                 "no field in metres makes the range of a point: the sensor has to give `encode`"
             )
             raise SpecError(reason, path="points", sensor=self._sensor.id)
-        return tuple(found)
+        return tuple(targets)
 
     def _linear(self, table: Rows) -> list[Target]:
         """Return the fields that ranges are linear in with another scale than their own.
@@ -298,7 +298,7 @@ class Measurement:
         These are fields in metres that a correction shifts or stretches, and elements of arrays
         without a unit that are proportional to ranges, since the header has the unit.
         """
-        found = []
+        targets = []
         for path, info in table.schema.fields.items():
             metres = factor(info.unit, "m") is not None
             if not metres and (info.unit or info.kind != "int" or not info.axes):
@@ -306,12 +306,12 @@ class Measurement:
             answers = [
                 beams.range for beams in self._probe(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
             ]
-            for spot in self._inner(table, answers[0]):
-                once, twice, thrice = (_part(answer, spot) for answer in answers)
+            for inner in self._inner(table, answers[0]):
+                once, twice, thrice = (_part(answer, inner) for answer in answers)
                 even = np.isclose(thrice - twice, twice - once) & (twice > once) & (once > 0)
                 if (even & (metres | np.isclose(twice, 2 * once))).any():
-                    found.append(Target(path, spot, None))
-        return found
+                    targets.append(Target(path, inner, None))
+        return targets
 
     def _probe(self, table: Rows, paths: Iterable[str], *probes: int) -> list[Beams]:
         """Return the beams for each of some values of fields, then restore the table."""
@@ -383,7 +383,7 @@ class Placement(Measurement):
                 " declared"
             )
             raise SpecError(reason, path="simulation", sensor=self._sensor.id)
-        found = np.full((2, len(numbers), *shape), np.nan)
+        directions = np.full((2, len(numbers), *shape), np.nan)
         with plugin_errors(f"directions of {self._frame}", self._sensor.id, declared):
             for index, number in enumerate(numbers):
                 azimuth, elevation = np.broadcast_arrays(*declared(number))
@@ -400,15 +400,15 @@ class Placement(Measurement):
                 corner: Any = tuple(
                     slice(0, length if length > 1 else None) for length in given.shape[1:]
                 )
-                found[:, index][(slice(None), *corner)] = given
-        return found[0], found[1]
+                directions[:, index][(slice(None), *corner)] = given
+        return directions[0], directions[1]
 
     def _values(
         self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]
     ) -> dict[str, NDArray[Any]]:
         if self._encode is not None:
             return super()._values(table, beams, ranges, steps)
-        found: dict[str, NDArray[Any]] = {}
+        raw_values: dict[str, NDArray[Any]] = {}
         aims = ranges * beams.unit()
         for inner in dict.fromkeys(target.inner for target in self._targets):
             paths = [target.path for target in self._targets if target.inner == inner]
@@ -428,10 +428,10 @@ class Placement(Measurement):
                     if info.kind == "int"
                     else np.isfinite(column)
                 )
-            found |= {
+            raw_values |= {
                 path: np.where(kept, column, 0) for path, column in zip(paths, raw, strict=True)
             }
-        return found
+        return raw_values
 
     def _move(self, table: Rows, paths: Sequence[str]) -> list[Floats]:
         """Return coordinates with all fields at 0, then with each at its probe value.
@@ -448,7 +448,7 @@ class Placement(Measurement):
 
     def _trace_targets(self, table: Rows) -> tuple[Target, ...]:
         """Return the fields, in metres or without a unit, that coordinates are linear in."""
-        found = []
+        targets = []
         for path, info in table.schema.fields.items():
             metres = not info.unit or factor(info.unit, "m") is not None
             if (
@@ -463,14 +463,14 @@ class Placement(Measurement):
                 for beams in self._probe(table, [path], PROBE, 2 * PROBE, 3 * PROBE)
                 if beams.places is not None
             ]
-            for spot in self._inner(table, places[0][0]):
-                once, twice, thrice = (_part(place, spot) for place in places)
+            for inner in self._inner(table, places[0][0]):
+                once, twice, thrice = (_part(place, inner) for place in places)
                 if (twice != once).any() and np.allclose(thrice - twice, twice - once):
-                    found.append(Target(path, spot, None))
-        if not found:
+                    targets.append(Target(path, inner, None))
+        if not targets:
             reason = "no field of a point makes its coordinates: the sensor has to give `encode`"
             raise SpecError(reason, path="points", sensor=self._sensor.id)
-        return tuple(found)
+        return tuple(targets)
 
     def _turning(self, table: Rows) -> bool:
         return False
@@ -553,19 +553,19 @@ class PartRows(Rows):
         """Write the parts, with their checksums, into their frames."""
         left = iter(seal_frames(self))
         axis, kind = self.place
-        spots = list[tuple[int, int, NDArray[np.uint8]]]()
+        destinations = list[tuple[int, int, NDArray[np.uint8]]]()
         for group, buffer, walked in self.frames.walks(axis):
             kinds = [one.node.name for one in group.layout.regions[axis].kinds]
             for piece in (
                 piece for pieces in walked.rounds for piece in pieces if kinds[piece.kind] == kind
             ):
-                spots += [
-                    (int(group.where[owner]), int(spot), buffer)
-                    for owner, spot in zip(piece.owners, piece.spots, strict=True)
+                destinations += [
+                    (int(group.where[owner]), int(offset), buffer)
+                    for owner, offset in zip(piece.owners, piece.spots, strict=True)
                 ]
-        for _, spot, buffer in sorted(spots, key=lambda found: found[:2]):
+        for _, offset, buffer in sorted(destinations, key=lambda found: found[:2]):
             part = next(left)
-            buffer[spot : spot + len(part)] = np.frombuffer(part, np.uint8)
+            buffer[offset : offset + len(part)] = np.frombuffer(part, np.uint8)
 
 
 def store(table: Rows, path: str, values: NDArray[Any]) -> None:
@@ -657,7 +657,7 @@ class Rest:
     def _answering(self, table: Rows) -> list[str]:
         """Return the fields that the readings are linear in."""
         zero = self._read_motion(table)
-        found = list[str]()
+        paths = list[str]()
         for path, info in table.schema.fields.items():
             if info.kind not in ("int", "float") or info.const is not None or path in self._given:
                 continue
@@ -669,21 +669,21 @@ class Rest:
             store(table, path, before)
             none, once, twice = answers
             if (once != none).any() and np.allclose(twice - once, once - none):
-                found.append(path)
-        if not found or zero.shape[0] != 6:
+                paths.append(path)
+        if not paths or zero.shape[0] != 6:
             raise SpecError(
                 "no field makes what the IMU feels: it cannot be simulated",
                 path=f"{self._frame}.imu",
                 sensor=self._sensor.id,
             )
-        return found
+        return paths
 
     def _probe(self, table: Rows, path: str) -> Floats:
         """Return the readings with one field at its probe value, and the others at 0."""
         store(table, path, np.array(PROBE))
-        felt = self._read_motion(table)
+        readings = self._read_motion(table)
         store(table, path, np.array(0))
-        return felt
+        return readings
 
     def _read_motion(self, table: Rows) -> Floats:
         """Return angular velocities, then accelerations, (6, n, ...)."""

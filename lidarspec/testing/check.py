@@ -256,15 +256,15 @@ def loading(error: BaseException, files: list[Path]) -> Finding:
         cause = error.__cause__
     else:
         cause = error
-    spots = [
-        (spot.filename, spot.lineno or 0)
+    locations = [
+        (location.filename, location.lineno or 0)
         for each in (error, cause)
-        for spot in traceback.extract_tb(each.__traceback__)
+        for location in traceback.extract_tb(each.__traceback__)
     ]
     own = [
-        spot
-        for spot in spots
-        if any(Path(spot[0]) == file.resolve() or Path(spot[0]) == file for file in files)
+        location
+        for location in locations
+        if any(Path(location[0]) == file.resolve() or Path(location[0]) == file for file in files)
     ]
     if isinstance(cause, SyntaxError) and cause.filename:
         own = [(cause.filename, cause.lineno or 0)]
@@ -283,7 +283,7 @@ def loading(error: BaseException, files: list[Path]) -> Finding:
 
 def _loading_rule(error: BaseException, cause: BaseException) -> str:
     """Return the rule of a loading error."""
-    functions = [spot.name for spot in traceback.extract_tb(cause.__traceback__)]
+    functions = [location.name for location in traceback.extract_tb(cause.__traceback__)]
     if isinstance(error, SpecError) and error.rule:
         return error.rule
     if "sizeof" in functions or "_sizeof" in functions:
@@ -305,12 +305,12 @@ def module_files(value: str) -> list[Path]:
     Returns an empty list if there is none.
     """
     try:
-        found = importlib.util.find_spec(value.partition("[")[0].partition(":")[0].strip())
+        module = importlib.util.find_spec(value.partition("[")[0].partition(":")[0].strip())
     except (Exception, SystemExit):
         return []
-    if found is None or not found.origin or not found.origin.endswith(".py"):
+    if module is None or not module.origin or not module.origin.endswith(".py"):
         return []
-    file = Path(found.origin)
+    file = Path(module.origin)
     if file.name == "__init__.py":
         return sorted(file.parent.rglob("*.py"))
     return [file]

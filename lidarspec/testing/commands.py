@@ -186,8 +186,8 @@ def _learn(subject: Subject, name: str, reply: Reply) -> None:
     """Configure the sensor with the values that it learns from a simulated reply."""
     sensor = subject.sensor
     try:
-        if told := learn_options(sensor, reply):
-            sensor.configure(**told)
+        if values := learn_options(sensor, reply):
+            sensor.configure(**values)
     except Exception as error:  # any error of `learns` and `configure` of the plugin
         if name in sensor.simulation.answers:
             which = "its reply, as given by"
@@ -225,11 +225,11 @@ def _ask(subject: Subject, name: str, given: dict[str, float]) -> Reply:
         for out in session.outgoing():
             device.receive(out.data, now, out.link)
         now += STEP
-        mine = [data for arrived, data in device.outgoing(now) if arrived == command.link]
-        if mine:
-            found = [item for data in mine for item in decoder.feed(data)]
+        received = [data for arrived, data in device.outgoing(now) if arrived == command.link]
+        if received:
+            frames = [item for data in received for item in decoder.feed(data)]
         else:
-            found = decoder.idle()
-        session.receive(found, now, link=command.link)
+            frames = decoder.idle()
+        session.receive(frames, now, link=command.link)
         session.tick(now)
     return pending.result()

@@ -48,8 +48,10 @@ def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
     except LidarSpecError:  # another property reports the failure
         return
     most = int(readings.max(initial=0))
-    said = f"along the sweep it reads {most / 1e9:g} s, and wraps_at is {float(clock.wraps_at):g} s"
-    require(most <= exact(clock.wraps_at) * 10**9, "LS512", said, "clock")
+    message = (
+        f"along the sweep it reads {most / 1e9:g} s, and wraps_at is {float(clock.wraps_at):g} s"
+    )
+    require(most <= exact(clock.wraps_at) * 10**9, "LS512", message, "clock")
 
 
 def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
@@ -63,12 +65,15 @@ def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
     step = float(packets.time_ns[-1] - packets.time_ns[0]) / (len(packets) - 1) / 1e9
     times = packets.points().time
     spread = float(np.ptp(times)) if len(times) else 0.0
-    said = (
+    message = (
         f"the points of {len(packets)} packets are spread over {spread:.3g} s, and the clock runs"
         f" on by {step:.3g} s a packet"
     )
     require(
-        step <= 0 or spread <= (len(packets) + MOST_STEPS) * step, "LS513", said, f"{name}.points"
+        step <= 0 or spread <= (len(packets) + MOST_STEPS) * step,
+        "LS513",
+        message,
+        f"{name}.points",
     )
 
 
@@ -155,8 +160,8 @@ def _angles_between(
     """
     if one is None or other is None or one.shape != other.shape:
         return None
-    known = np.isfinite(one) & np.isfinite(other)
-    return _fold(one[known] - other[known])
+    finite = np.isfinite(one) & np.isfinite(other)
+    return _fold(one[finite] - other[finite])
 
 
 def _fold(angles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -127,12 +127,12 @@ def _check_required_fields(sensor: Sensor) -> Findings:
         clock = sensor.clock.source
     else:
         clock = ()
-    asked = {
+    field_names = {
         "scan": getattr(sensor.scan, "name", ""),
         "sequence": sensor.sequence.field if sensor.sequence is not None else "",
     }
     given = [
-        *asked.items(),
+        *field_names.items(),
         *(
             ("clock", path)
             for path in ((clock,) if isinstance(clock, str) else () if callable(clock) else clock)
@@ -237,10 +237,10 @@ def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
         yield from _plausible(subject, name, frame)
     if isinstance(engine, CompiledCodec):
         try:
-            found = [engine.tree.layout(subject.example(name, seed=seed)) for seed in range(3)]
+            candidates = [engine.tree.layout(subject.example(name, seed=seed)) for seed in range(3)]
         except LidarSpecError:
             return
-        layouts = [layout for layout in found if isinstance(layout, Layout)]
+        layouts = [layout for layout in candidates if isinstance(layout, Layout)]
         yield from _find_uncovered(name, layouts)
         if frame.direction == "in":
             yield from _sync(subject, name, frame, engine)
@@ -343,8 +343,8 @@ def _find_multiplied(subject: Subject, name: str) -> set[str]:
         ]
     except Exception:  # another check reports it
         return set()
-    known = any(info is not None and factor(info.unit, "m") is not None for info in infos)
-    if known:
+    has_metres = any(info is not None and factor(info.unit, "m") is not None for info in infos)
+    if has_metres:
         return {info.path for info in infos if info is not None}
     return set()
 
@@ -588,11 +588,11 @@ def _column(
                 ),
             )
             if first.unit:
-                said = f"{first.unit!r} is no unit of it: {' or '.join(units)}"
+                problem = f"{first.unit!r} is no unit of it: {' or '.join(units)}"
             else:
-                said = f"it has no unit: {' or '.join(units)}"
+                problem = f"it has no unit: {' or '.join(units)}"
             yield (
                 "LS201",
-                f"the {column} of points comes from it, and {said}",
+                f"the {column} of points comes from it, and {problem}",
                 f"{name}.{first.path}",
             )

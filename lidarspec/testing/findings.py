@@ -242,17 +242,19 @@ def left_over(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[F
             for place in (frame, "")
             for key in (finding.code, f"{finding.code} {field if place else finding.path}")
         ]
-        known = [(place, key) for place, key in keys if given.get(place, {}).get(key, "").strip()]
-        used.update(known)
-        left += [] if known else [finding]
+        acknowledging = [
+            (place, key) for place, key in keys if given.get(place, {}).get(key, "").strip()
+        ]
+        used.update(acknowledging)
+        left += [] if acknowledging else [finding]
     for place, entries in given.items() if whole else ():
         for key, reason in entries.items():
             if (place, key) not in used:
                 if not reason.strip():
-                    said = "has no reason"
+                    problem = "has no reason"
                 else:
-                    said = "is not found"
+                    problem = "is not found"
                 left.append(
-                    Finding("LS209", f"{key!r} is acknowledged, and {said}", place, sensor.id)
+                    Finding("LS209", f"{key!r} is acknowledged, and {problem}", place, sensor.id)
                 )
     return left

@@ -48,10 +48,10 @@ def virtual_port(
         SourceError: if the port cannot be opened.
     """
     if isinstance(sensor, Sensor):
-        known = sensor
+        resolved = sensor
     else:
-        known = named_sensor(sensor)
-    device = SimulatedDevice(known, scene=scene, seed=seed, rate=rate, faults=faults)
+        resolved = named_sensor(sensor)
+    device = SimulatedDevice(resolved, scene=scene, seed=seed, rate=rate, faults=faults)
     with contextlib.ExitStack() as stack:
         if to == "pty" and link is None:
             # The system gives each pseudo-terminal a new name, and may give the old name to another
@@ -60,4 +60,4 @@ def virtual_port(
                 Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarspec-port-")))
                 / "port"
             )
-        yield stack.enter_context(Served(device, simulated_outlet(known, to, link)))
+        yield stack.enter_context(Served(device, simulated_outlet(resolved, to, link)))

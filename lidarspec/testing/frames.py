@@ -57,7 +57,7 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
     """
     frame = subject.sensor.frames[name]
     try:
-        found = [subject.example(name, seed=seed) for seed in subject.seeds(name)]
+        examples = [subject.example(name, seed=seed) for seed in subject.seeds(name)]
     except SpecError as error:
         if error.path.startswith(name):
             path = error.path
@@ -67,25 +67,25 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
             path = name
         raise Violation(error.rule or "LS301", error.reason, path) from error
     if not subject.drawers(name):
-        again = [subject.sensor.example(name, seed=seed) for seed in range(min(3, len(found)))]
+        again = [subject.sensor.example(name, seed=seed) for seed in range(min(3, len(examples)))]
     else:
-        again = found[:3]
-    require(found[:3] == again, "LS311", "two examples of one seed differ", name)
-    longest = max(map(len, found))
+        again = examples[:3]
+    require(examples[:3] == again, "LS311", "two examples of one seed differ", name)
+    longest = max(map(len, examples))
     require(
         longest <= frame.max_length,
         "LS203",
         f"an example has {longest} bytes, and max_length is {frame.max_length}",
         name,
     )
-    fixed = material.seals(subject.sensor, name, found[0])
+    fixed = material.seals(subject.sensor, name, examples[0])
     free = [
         info
         for info in codec(frame).schema.fields.values()
         if info.const is None and not info.held and info.path not in fixed
     ]
     require(
-        len(set(found)) > 1 or not free or len(found) < 2,
+        len(set(examples)) > 1 or not free or len(examples) < 2,
         "LS301",
         "all examples are the same",
         name,
@@ -133,12 +133,12 @@ def _changed_examples(subject: Subject, name: str) -> Iterator[bytes]:
     """Yield copies of examples with one changed byte each."""
     source = subject.source(f"raw {name}")
     changes = subject.limit_to_bytes(name, subject.scale_rounds(CHANGES), CHANGED_BYTES)
-    spots = subject.limit_to_bytes(
+    offset_count = subject.limit_to_bytes(
         name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CHANGED_BYTES
     )
     for seed in range(subject.limit_to_bytes(name, CHANGED_EXAMPLES)):
         example = subject.example(name, seed=seed)
-        for offset in material.places(len(example), source, spots):
+        for offset in material.places(len(example), source, offset_count):
             for _ in range(changes):
                 data = bytearray(example)
                 data[offset] = source.randrange(256)
@@ -179,14 +179,14 @@ def what_follows_is_held(subject: Subject, name: str) -> None:
             for seal in layout.seals:
                 seal.fill(rows)
             other = rows.tobytes()
-            place = f"{name}.{leaf.info.path}"
+            path = f"{name}.{leaf.info.path}"
             if other != data and engine.survey(rows[0], np.zeros(1, np.intp)).status[0] == VALID:
                 built = sensor.build(name, sensor.parse(other, frame=name))
                 require(
                     built == other,
                     "LS312",
                     f"{leaf.scalar(other)} passes, and {leaf.scalar(built)} is built",
-                    place,
+                    path,
                 )
 
 
@@ -243,12 +243,12 @@ def same(one: Any, other: Any) -> bool:
 
 def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> None:
     """Raise the violation for bytes that changed, with the field in which they differ."""
-    spot = next(
+    offset = next(
         (index for index, pair in enumerate(zip(data, built, strict=False)) if pair[0] != pair[1]),
         min(len(data), len(built)),
     )
     one, other = (subject.sensor.parse(part, frame=name, verify=False) for part in (data, built))
-    found = next(
+    difference = next(
         (
             (path, a, b)
             for (path, a), (_, b) in zip(leaves(one), leaves(other), strict=False)
@@ -256,12 +256,12 @@ def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> 
         ),
         None,
     )
-    if found is None:
-        was, became = (part[spot : spot + 1].hex() for part in (data, built))
+    if difference is None:
+        was, became = (part[offset : offset + 1].hex() for part in (data, built))
         raise Violation(
-            code, f"byte {spot} of {len(data)} is {was} and comes back as {became}", name
+            code, f"byte {offset} of {len(data)} is {was} and comes back as {became}", name
         )
-    path, before, after = found
+    path, before, after = difference
     raise Violation(
         "LS303" if is_cut(before, after) else code,
         f"{before!r} comes back as {after!r}",
@@ -393,10 +393,10 @@ def free(info: FieldInfo | None) -> bool:
 def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
     """Check that a frame that is cut short raises `WireError` with its offset."""
     data = subject.example(name, seed=2)
-    spots = subject.limit_to_bytes(
+    offset_count = subject.limit_to_bytes(
         name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CUT_BYTES
     )
-    for end in material.places(len(data), subject.source("cut"), spots):
+    for end in material.places(len(data), subject.source("cut"), offset_count):
         try:
             subject.sensor.parse(data[:end], frame=name)
         except WireError as error:

@@ -348,12 +348,12 @@ def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
         )
         axes = subject.sensor.vendor_axes
         expected = _sense_of(axes, first) if axes else 0
-        said = (
+        message = (
             f"points turn {words[sense]} as {path} grows, and with vendor_axes of"
             f" {', '.join(axes or ())} angles run {words.get(expected)}"
         )
         is_proven = name in subject.placed
-        require(is_proven or expected in (0, sense), "LS511", said, f"{name}.points")
+        require(is_proven or expected in (0, sense), "LS511", message, f"{name}.points")
         return
 
 
@@ -384,18 +384,18 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
     )
     if not frames:
         return
-    found = evaluate_plainly(read(subject, name, frames).with_points)
-    if found.counts.ndim > 1:
-        counts = found.counts.reshape(len(found.counts), -1).sum(axis=1)
+    evaluated = evaluate_plainly(read(subject, name, frames).with_points)
+    if evaluated.counts.ndim > 1:
+        counts = evaluated.counts.reshape(len(evaluated.counts), -1).sum(axis=1)
     else:
-        counts = found.counts
-    cloud = found.cloud
-    packet = np.repeat(np.arange(found.ready), counts)
+        counts = evaluated.counts
+    cloud = evaluated.cloud
+    packet = np.repeat(np.arange(evaluated.ready), counts)
     rings = cloud.ring if cloud.ring is not None else np.zeros(len(cloud))
     for ring in np.unique(rings)[:4]:
-        mine = (rings == ring) & np.isfinite(cloud.azimuth)
-        angle = cloud.azimuth[mine].astype(np.float64)
-        number = packet[mine]
+        selected = (rings == ring) & np.isfinite(cloud.azimuth)
+        angle = cloud.azimuth[selected].astype(np.float64)
+        number = packet[selected]
         steps = (np.diff(angle) + np.pi) % (2 * np.pi) - np.pi
         moving = np.abs(steps) > 1e-9
         if moving.sum() < 8:
@@ -410,19 +410,21 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
         one_way = float((np.sign(steps[moving]) == np.sign(median)).mean())
         back = steps * np.sign(median) < -max(BACK, MEDIANS * abs(median))
         if one_way < ONE_WAY:
-            said = (
+            message = (
                 f"only {one_way:.0%} of the steps go the same way, and scans are cut where it wraps"
             )
-            require(not isinstance(subject.sensor.scan, OnWrap), "LS506", said, f"{name}.points")
+            require(not isinstance(subject.sensor.scan, OnWrap), "LS506", message, f"{name}.points")
         elif back.any():
-            spot = int(np.flatnonzero(back)[0])
-            before, after = np.rad2deg(angle[spot : spot + 2])
-            said = (
-                f"from {before:.1f} to {after:.1f} degrees in packet {number[spot + 1]} of the"
+            index = int(np.flatnonzero(back)[0])
+            before, after = np.rad2deg(angle[index : index + 2])
+            message = (
+                f"from {before:.1f} to {after:.1f} degrees in packet {number[index + 1]} of the"
                 " sweep"
             )
             raise Violation(
-                "LS504" if number[spot] == number[spot + 1] else "LS506", said, f"{name}.points"
+                "LS504" if number[index] == number[index + 1] else "LS506",
+                message,
+                f"{name}.points",
             )
 
 
@@ -443,23 +445,23 @@ def counters_run_on(subject: Subject, name: str) -> None:
         stats = read(
             subject, name, frames, by_clock=False
         ).stats  # the clock would compensate for the counter
-        said = (
+        message = (
             f"along the sweep {stats.lost} packets are lost, {stats.late} late, {stats.duplicates}"
             " doubled"
         )
         require(
             (stats.lost, stats.late, stats.duplicates) == (0, 0, 0),
             "LS510",
-            said,
+            message,
             f"{name}.{subject.sensor.sequence.field}",
         )
     if subject.sensor.clock is not None and len(packets) > 1:
         back = np.diff(packets.time_ns)
-        spot = int(back.argmin())
+        index = int(back.argmin())
         require(
             back.min() >= 0,
             "LS509",
-            f"packet {spot + 1} of the sweep is {-back.min() / 1e9:g} s before the one in front"
+            f"packet {index + 1} of the sweep is {-back.min() / 1e9:g} s before the one in front"
             " of it",
             name,
         )
@@ -585,15 +587,15 @@ def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Does not use the simulator's geometry.
     """
-    found = np.full(len(xyz), np.inf)
+    distances = np.full(len(xyz), np.inf)
     for body in (room.walls, *room.boxes):
         if body is None:
             continue
         middle = (np.array(body.low) + body.high) / 2
         beyond = np.abs(xyz - middle) - (np.array(body.high) - body.low) / 2
         outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
-        found = np.minimum(found, np.abs(outside + np.minimum(beyond.max(axis=1), 0)))
-    return found
+        distances = np.minimum(distances, np.abs(outside + np.minimum(beyond.max(axis=1), 0)))
+    return distances
 
 
 def half_step(subject: Subject, name: str) -> float:
@@ -632,15 +634,15 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
         subject.picture[f"{name}: rate"] = f"{len(cloud) / seconds:.0f} points a second, simulated"
     else:
         subject.picture[f"{name}: rate"] = "nothing tells it"
-    known = len(cloud) - 2 * len(cloud) // len(
+    count = len(cloud) - 2 * len(cloud) // len(
         block.frames
     )  # directions of the last packet may depend on the next one
-    valid = cloud.valid[:known]
-    share = float(valid.mean()) if known else 0.0
+    valid = cloud.valid[:count]
+    share = float(valid.mean()) if count else 0.0
     require(
         share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points"
     )
-    apart = off(room, cloud.xyz[:known][valid].astype(np.float64))
+    apart = off(room, cloud.xyz[:count][valid].astype(np.float64))
     worst = float(apart.max(initial=0))
     if subject.sensor.simulation_of(name).directions:
         each = np.sqrt(3)
@@ -654,7 +656,7 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
         f"{name}.points",
     )
     near, far = subject.sensor.range_limits
-    ranges = cloud.range[:known][valid]
+    ranges = cloud.range[:count][valid]
     inside = not len(ranges) or (ranges.min() >= near - UNTOLD and ranges.max() <= far + UNTOLD)
     require(
         inside,

@@ -270,16 +270,20 @@ def _unexpected_error(error: Exception, path: str, subject: Subject) -> Finding:
 
     Its location is the plugin's own line if the exception was raised there.
     """
-    spots = [spot for spot in traceback.extract_tb(error.__traceback__) if not _ours(spot.filename)]
-    spot = spots[-1] if spots else None
+    locations = [
+        location
+        for location in traceback.extract_tb(error.__traceback__)
+        if not _ours(location.filename)
+    ]
+    location = locations[-1] if locations else None
     text = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
     return Finding(
         "LS308",
         text,
         path,
         subject.sensor.id,
-        spot.filename if spot else "",
-        (spot.lineno or 0) if spot else 0,
+        location.filename if location else "",
+        (location.lineno or 0) if location else 0,
     )
 
 

@@ -78,13 +78,13 @@ def scans_do_not_depend_on_batches(subject: Subject) -> None:
     """Check that scans do not depend on the number of packets that arrive at a time."""
     for rounds in (None, MORE_ROUNDS):
         data = material.delivery(subject.sensor, subject.conversation(rounds=rounds))
-        found = subject.sensor.split(data)
-        whole = _scans_in_batches(subject.sensor, found, len(found))
+        frames = subject.sensor.split(data)
+        whole = _scans_in_batches(subject.sensor, frames, len(frames))
         if whole:
             break
     require(whole, "LS404", "there is no scan")
     for size in BATCH_SIZES:
-        parts = _scans_in_batches(subject.sensor, found, size)
+        parts = _scans_in_batches(subject.sensor, frames, size)
         require(
             [_cut(scan) for scan in parts] == [_cut(scan) for scan in whole],
             "LS404",

@@ -70,27 +70,27 @@ def mutate(
             of a range, or pieces of other inputs.
         spots: offsets for half of the changes, such as those of fields; by default all are random.
     """
-    found = bytearray(data)
+    mutated = bytearray(data)
     for _ in range(source.choice((1, 1, 2, 4))):
         if spots and source.random() < 0.5:
-            spot = source.choice(spots)
+            offset = source.choice(spots)
         else:
-            spot = source.randrange(len(found) + 1)
+            offset = source.randrange(len(mutated) + 1)
         kind = source.randrange(6 if words else 5)
         if kind == 0:
-            found[spot : spot + 1] = source.randbytes(1)
+            mutated[offset : offset + 1] = source.randbytes(1)
         elif kind == 1:
-            del found[spot : spot + source.randint(1, 3)]
+            del mutated[offset : offset + source.randint(1, 3)]
         elif kind == 2:
-            found[spot:spot] = source.randbytes(source.randint(1, 3))
+            mutated[offset:offset] = source.randbytes(source.randint(1, 3))
         elif kind == 3:
-            found[spot : spot + 1] = source.choice((b"\x00", b"\xff", b"\x7f", b"\x80"))
+            mutated[offset : offset + 1] = source.choice((b"\x00", b"\xff", b"\x7f", b"\x80"))
         elif kind == 4:
-            found[spot:spot] = found[max(spot - 4, 0) : spot]
+            mutated[offset:offset] = mutated[max(offset - 4, 0) : offset]
         else:
             word = source.choice(words)
-            found[spot : spot + source.choice((0, len(word)))] = word
-    return bytes(found)
+            mutated[offset : offset + source.choice((0, len(word)))] = word
+    return bytes(mutated)
 
 
 def integers(
@@ -151,8 +151,10 @@ def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
             if isinstance(node, Sealed)
             for path in node.fields
         }
-    found = layout.layout(data)
-    return {leaf.info.path for seal in getattr(found, "seals", ()) for leaf in seal.leaves}
+    layout_or_refusal = layout.layout(data)
+    return {
+        leaf.info.path for seal in getattr(layout_or_refusal, "seals", ()) for leaf in seal.leaves
+    }
 
 
 #: Default number of examples of each frame type for each property; numbers of rounds refer to it.
@@ -287,14 +289,14 @@ class Subject:
     def drawers(self, frame: str) -> dict[str, Callable[[random.Random], int]]:
         """Return the author's functions for raw values of fields of this frame, by path."""
         if frame not in self._drawers:
-            mine = {
+            own = {
                 path.removeprefix(f"{frame}."): how
                 for path, how in self.strategies.items()
                 if path.partition(".")[0] == frame
             }
             self._drawers[frame] = {
                 path: _make_pool(how) if hasattr(how, "example") else how
-                for path, how in mine.items()
+                for path, how in own.items()
             }
         return self._drawers[frame]
 

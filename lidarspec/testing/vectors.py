@@ -190,13 +190,13 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
         for path, info in subject.fields(name).items()
         if info.const is None and info.kind in ("int", "float")
     ]
-    asked = [
+    required = [
         path for path in free if path not in sealing and not IDLE.search(path.rpartition(".")[2])
     ]
-    said = {"no vector gives a value of": [path for path in asked if path not in pinned]}
-    said["0 alone is given of"] = [path for path in asked if pinned.get(path) is False]
-    told = "; ".join(f"{words} {', '.join(paths)}" for words, paths in said.items() if paths)
-    require(not told, "LS711", told, name)
+    problems = {"no vector gives a value of": [path for path in required if path not in pinned]}
+    problems["0 alone is given of"] = [path for path in required if pinned.get(path) is False]
+    message = "; ".join(f"{words} {', '.join(paths)}" for words, paths in problems.items() if paths)
+    require(not message, "LS711", message, name)
 
 
 def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
@@ -402,15 +402,15 @@ def _read_entries(subject: Subject) -> dict[str, Any]:
         raise Violation("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(found, list):
         raise Violation("LS702", "the file is no list of vectors", str(subject.vectors))
-    mine: dict[str, Any] = {}
+    own_entries: dict[str, Any] = {}
     for index, vector in enumerate(found):
         place = f"vectors[{index}]"
         try:
             if _check_entry(subject, vector, place):
-                mine[place] = vector
+                own_entries[place] = vector
         except Violation as error:
-            mine[place] = error
-    return mine
+            own_entries[place] = error
+    return own_entries
 
 
 def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
@@ -423,14 +423,14 @@ def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
     unknown = sorted(vector.keys() - KEYS.keys())
     require(not unknown, "LS702", f"unknown keys {unknown}; known are {sorted(KEYS)}", place)
     for key, value in vector.items():
-        told, fits = KEYS[key]
-        require(fits(value), "LS702", f"{key} is {told}, not {shown(value)}", place)
+        expected, fits = KEYS[key]
+        require(fits(value), "LS702", f"{key} is {expected}, not {shown(value)}", place)
     if not _is_of(subject, vector, place):
         return False
     if "command" in vector:
-        known = subject.sensor.commands.get(vector["command"])
-        vector.setdefault("frame", known.frame if known is not None else None)
-        sends = known is not None and known.frame == vector["frame"]
+        command = subject.sensor.commands.get(vector["command"])
+        vector.setdefault("frame", command.frame if command is not None else None)
+        sends = command is not None and command.frame == vector["frame"]
         require(sends, "LS702", f"no command {vector['command']!r} sends such a frame", place)
     require(
         vector.get("frame") in subject.sensor.frames,
@@ -455,11 +455,11 @@ def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
     named = vector.get("sensor", [])
     family = subject.family
     ids = [named] if isinstance(named, str) else named
-    told = (
+    message = (
         f'it names no sensor, and the file is shared by {", ".join(family)}: "sensor":'
         f' "{subject.sensor.id}"'
     )
-    require(ids or len(family) < 2, "LS702", told, place)
+    require(ids or len(family) < 2, "LS702", message, place)
     nobody = [one for one in ids if family and one not in family]
     require(
         not nobody,
@@ -493,13 +493,15 @@ def _values(
 ) -> None:
     """Compare the fields of a vector with its raw and physical values."""
     fields = subject.fields(name)
-    found = dict(leaves(parsed))
+    parsed_values = dict(leaves(parsed))
     wanted = [(path, value, False) for path, value in vector.get("values", {}).items()]
     wanted += [(path, value, True) for path, value in vector.get("units", {}).items()]
     for path, value, in_units in wanted:
-        require(path in found, "LS702", f"the frame has no field {path!r}", f"{place} {name}")
+        require(
+            path in parsed_values, "LS702", f"the frame has no field {path!r}", f"{place} {name}"
+        )
         info = fields.get(re.sub(r"\[\d+\]", "", path))
-        raw = found[path]
+        raw = parsed_values[path]
         plain: Any = (
             raw.hex(" ")
             if isinstance(raw, bytes)
@@ -547,19 +549,24 @@ def _points(
 ) -> None:
     """Compare single points of a vector's frame with their expected columns."""
     cloud = read(subject, name, [data] * subject.sensor.frames[name].confirm).points()
-    known = cloud.columns.keys() - {"time"}
+    columns_of_points = cloud.columns.keys() - {"time"}
     for index, columns in wanted.items():
-        spot = int(index)
+        number = int(index)
         require(
-            -len(cloud) <= spot < len(cloud),
+            -len(cloud) <= number < len(cloud),
             "LS708",
-            f"there is no point {spot} among {len(cloud)}",
+            f"there is no point {number} among {len(cloud)}",
             f"{place} {name}",
         )
         got = {}
         for column in columns:
-            require(column in known, "LS702", f"points have no {column!r}", f"{place} {name}")
-            got[column] = float(cloud.columns[column][spot])
+            require(
+                column in columns_of_points,
+                "LS702",
+                f"points have no {column!r}",
+                f"{place} {name}",
+            )
+            got[column] = float(cloud.columns[column][number])
         wrong = [
             column
             for column, value in columns.items()
@@ -569,12 +576,12 @@ def _points(
             column in ("y", "azimuth") and np.isclose(got[column], -columns[column], atol=NEAR)
             for column in wrong
         )
-        said = ", ".join(
+        message = ", ".join(
             f"{column} is {got[column]:.5g}, and {columns[column]:g} is printed" for column in wrong
         )
         require(
             not wrong,
             "LS709" if mirrored else "LS708",
-            f"point {spot}: {said}",
+            f"point {number}: {message}",
             f"{place} {name}.points",
         )
