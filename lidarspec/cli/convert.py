@@ -139,8 +139,8 @@ def convert(
     number of the scan, in metres, radians, and seconds since the scan's stamp. .npy, .ply, .pcd and
     the compressed .lzf.pcd hold x y z intensity ring time, further columns and, for several scans,
     their number; .bin, as in KITTI, x y z intensity; .xyz x y z. To write one file for each scan,
-    put a number into the name: scans/%05d.pcd. With %F, %H, %M and %S (date, hour, minute, second)
-    the scans of one such time share a file.
+    put a number into the name: scans/%05d.pcd. With %F, %H, %M or %S in the name, all
+    scans of one date, hour, minute or second share a file.
 
     .lsr, .pcap and .pcapng hold the packets as they were received.
 
