@@ -213,13 +213,13 @@ static inline uint64_t {name}_computed({parameters})
     const int64_t spans[][2] = {{{spans}}};
     return {algorithm}(p, spans, sizeof spans / sizeof spans[0]);
 }}
-static inline uint64_t {name}_format_stored_checksum({parameters})
+static inline uint64_t {name}_stored({parameters})
 {{
     return {stored};
 }}
 static inline int {name}_ok({parameters})
 {{
-    const uint64_t stored = {name}_format_stored_checksum({arguments});
+    const uint64_t stored = {name}_stored({arguments});
     return {absent}stored == {name}_computed({arguments});
 }}
 """
@@ -434,7 +434,7 @@ _HEAD = """\
  * For every frame type F:
  *   {prefix}_F_frame_length(p, n)  bytes of the frame that begins at p, of which n are there; 0 where the header does not tell
  *   {prefix}_F_is_frame(p, n)      whether a whole, sound frame begins at p
- *   {prefix}_F_checksum_ok(p)      whether its checksum is right; ..._computed(p), ..._format_stored_checksum(p)
+ *   {prefix}_F_checksum_ok(p)      whether its checksum is right; ..._computed(p), ..._stored(p)
  *   {prefix}_F_FIELD(p, i, ...)    the raw number of a field, with an index for each array that it is in
  *   {prefix}_F_FIELD_present(p)    whether a field that not every header has is there; without, it reads as 0
  *   {prefix}_F_ARRAY_count(p)      elements of an array

@@ -31,6 +31,7 @@ from tests.exports.trees import (
     recoded,
     values,
 )
+from tests.shapes import SHAPES
 
 GCC = shutil.which("gcc")
 needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc is not installed")
@@ -334,3 +335,16 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
         sensor.parse(data, frame=name)
         return True
     return False
+
+
+def test_the_functions_of_a_frame_have_the_names_that_the_header_documents() -> None:
+    header = str(export(SHAPES["shape-count"], "c"))
+    for ending in (
+        "frame_length",
+        "is_frame",
+        "checksum_ok",
+        "checksum_computed",
+        "checksum_stored",
+    ):
+        assert f" shape_count_data_{ending}(" in header
+    assert "..._computed(p), ..._stored(p)" in header
