@@ -40,25 +40,25 @@ MOST = 1 << 22
     "--into",
     metavar="DIR",
     default=".",
-    help="Where the distribution's folder goes; by default into this one.",
+    help="Create the distribution in this folder; default: the current one.",
 )
 @click.option(
     "--distribution",
     metavar="NAME",
-    help="What is installed, such as lidarspec-acme; one that is there gets this sensor as well.",
+    help="Name of the distribution, such as lidarspec-acme; an existing one gets this sensor too.",
 )
-@click.option("--vendor", metavar="NAME", help="As people write it; by default after the id.")
-@click.option("--model", metavar="NAME", help="As people write it; by default after the id.")
+@click.option("--vendor", metavar="NAME", help="As the vendor writes it; default: from the id.")
+@click.option("--model", metavar="NAME", help="As the vendor writes it; default: from the id.")
 @click.option(
     "--link",
     type=click.Choice(["serial", "udp"]),
-    help="What the sensor sends over; serial by default.",
+    help="Link of the sensor's data; default: serial.",
 )
 @click.option(
     "--from-capture",
     "capture",
     metavar="FILE",
-    help="Draft the frames from their bytes: raw, .pcap, .lsr, .hex.",
+    help="Draft the frames from a capture: raw bytes, .pcap, .lsr or .hex.",
 )
 def new(
     sensor_id: str,
@@ -146,13 +146,18 @@ def _draft_files(names: Names, link: str | None, capture: str) -> dict[str, str]
     type=click.IntRange(1),
     default=EXAMPLES,
     show_default=True,
-    help="Examples of each frame type.",
+    help="Number of examples of each frame type.",
 )
 @click.option(
-    "--vectors", metavar="FILE", help="Golden vectors; by default vectors.json beside the modules."
+    "--vectors",
+    metavar="FILE",
+    help="File of golden vectors; default: vectors.json beside the modules.",
 )
 @click.option(
-    "-v", "--verbose", is_flag=True, help="Also what was skipped and why, and what was measured."
+    "-v",
+    "--verbose",
+    is_flag=True,
+    help="Also print skipped checks with the reason, and measured values.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @output_option
@@ -220,7 +225,7 @@ def _format_report(report: Report, *, verbose: bool) -> list[str]:
     "-f",
     "--frame",
     metavar="NAME",
-    help="One frame type alone; by default all, or the one that carries the points.",
+    help="Export this frame type only; default: all, or the one with the points.",
 )
 def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> None:
     """Export a sensor's spec: wireshark, c, ksy (Kaitai), md, svg, json, pyi.

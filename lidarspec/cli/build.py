@@ -86,13 +86,13 @@ def build(
     "--hex",
     "digits",
     metavar="HEX",
-    help="Send these bytes in the place of a command, and explain what comes back.",
+    help="Send these bytes instead of a command, and explain the reply.",
 )
 @click.option(
     "--timeout",
     type=DURATION,
     metavar="TIME",
-    help="How long to wait for the reply; by default what the sensor declares.",
+    help="Reply timeout; default: the sensor's own.",
 )
 @output_options
 def send(

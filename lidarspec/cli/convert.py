@@ -83,36 +83,39 @@ class _Counts:
 @click.option(
     "--organized",
     is_flag=True,
-    help="All points of a scan, as rows and columns; missing ones are nan.",
+    help="Write all points of a scan as rows and columns; missing points are nan.",
 )
 @click.option(
     "--packets",
     "with_packets",
     is_flag=True,
-    help="The packets of IN as well, in a log of ROS, which is a SOURCE then.",
+    help="Also write the packets of IN, for a ROS log that lidarspec can read again.",
 )
+@click.option("--imu", "is_imu", is_flag=True, help="Write the IMU samples instead of the points.")
 @click.option(
-    "--imu", "is_imu", is_flag=True, help="What the sensor's IMU felt, in place of the points."
+    "--force", is_flag=True, help="Overwrite OUT; with --to, also convert finished files again."
 )
-@click.option("--force", is_flag=True, help="Overwrite OUT; with --to also what was done before.")
 @click.option(
     "--to",
     "suffix",
     metavar="FORMAT",
-    help="Write each IN to a file of this format in the folder OUT, such as parquet.",
+    help="Convert each IN to this format, such as parquet, in the folder OUT.",
 )
 @click.option(
-    "--jobs", type=click.IntRange(min=1), metavar="N", help="With --to: so many processes."
+    "--jobs", type=click.IntRange(min=1), metavar="N", help="With --to: number of processes."
 )
 @click.option(
-    "--dask", "scheduler", metavar="ADDRESS", help="With --to: the workers of this Dask scheduler."
+    "--dask",
+    "scheduler",
+    metavar="ADDRESS",
+    help="With --to: address of a Dask scheduler whose workers convert.",
 )
 @click.option(
     "--piece",
     "piece_size",
     type=BYTES,
     metavar="SIZE",
-    help="With --to: cut larger files into such pieces.  [default: 256MB]",
+    help="With --to: split larger files into pieces of this size.  [default: 256MB]",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
 def convert(

@@ -121,11 +121,9 @@ def _udp(port: int, users: tuple[User, ...] | None) -> dict[str, Any]:
 @click.option(
     "--period",
     type=click.IntRange(min=3),
-    help="The length of the frames, for a file in which they follow each other.",
+    help="Length of the frames in bytes, for a file of consecutive frames.",
 )
-@click.option(
-    "--offset", type=click.IntRange(min=0), default=0, help="Where the first of them begins."
-)
+@click.option("--offset", type=click.IntRange(min=0), default=0, help="Offset of the first frame.")
 @output_options
 def crc(
     words: Sequence[str], period: int | None, offset: int, as_json: bool, output: str | None
@@ -248,12 +246,12 @@ def _text(match: Match, length: int) -> str:
     type=DURATION,
     default=LISTEN,
     metavar="TIME",
-    help="How long to listen for, each time.",
+    help="Time to listen at each port and baud rate.",
 )
 @click.option(
     "--start",
     is_flag=True,
-    help="Also send the start commands of sensors that keep silent until they are started.",
+    help="Also send the start commands of sensors that are silent until started.",
 )
 @output_options
 def detect(
@@ -593,7 +591,7 @@ def _structure_text(found: Structure) -> str:
     type=DURATION,
     default=LISTEN,
     metavar="TIME",
-    help="How long to listen for, each time.",
+    help="Time to listen at each port and baud rate.",
 )
 @output_options
 def doctor(

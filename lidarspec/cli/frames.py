@@ -96,29 +96,27 @@ def _tables(sensor: Sensor, frames: Iterable[InputPiece], output: str | None) ->
     "-f",
     "--frame",
     metavar="NAME",
-    help="The frame type, where the bytes do not tell; of many frames, this type alone.",
+    help="Frame type, if the bytes are ambiguous; with many frames, only this type.",
 )
 @count_option("frames")
-@click.option("--bad", is_flag=True, help="What is damaged, or in no frame, alone.")
-@click.option(
-    "--at", type=OFFSET, metavar="OFFSET", help="What stands at this byte of the input alone."
-)
+@click.option("--bad", is_flag=True, help="Show only damaged frames and bytes outside frames.")
+@click.option("--at", type=OFFSET, metavar="OFFSET", help="Explain only the byte at this offset.")
 @click.option(
     "--bytes",
     "stretch",
     metavar="FROM:TO",
-    help="What stands in these bytes of the input alone, whole frames.",
+    help="Explain only the frames in this range of bytes.",
 )
 @selecting("times")
 @click.option(
     "--bits",
     is_flag=True,
-    help="Draw the bits of every element of an array, not of the first alone.",
+    help="Draw the bits of every array element; default: of the first one.",
 )
 @click.option(
     "--diff",
     metavar="HEX|FILE|next",
-    help="What differs from this frame, to the bit; 'next': from the second frame of the input.",
+    help="Compare with this frame, bit by bit; 'next': with the second frame of the input.",
 )
 @output_options
 def explain(

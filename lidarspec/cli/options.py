@@ -62,7 +62,7 @@ def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
     unit = click.option(
         "--calibration",
         metavar="FILE",
-        help="The unit's own calibration, short for -O calibration=FILE.",
+        help="Calibration file of this unit; short for -O calibration=FILE.",
     )(function)
     help_text = (
         "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
@@ -123,7 +123,7 @@ def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
         "-n",
         "--count",
         type=click.IntRange(min=1),
-        help=f"So many {what}, and then it ends.",
+        help=f"Stop after this many {what}.",
         **more,
     )
 
@@ -278,43 +278,43 @@ SELECTING: dict[str, Callable[[Any], Any]] = {
         "times",
         type=SLICE,
         metavar="FROM:TO",
-        help="By time from the first scan, 10s:20s, or by date.",
+        help="Select by time since the first scan, such as 10s:20s, or by date.",
     ),
     "scans": click.option(
         "--scans",
         "scans",
         type=INDICES,
         metavar="FROM:TO",
-        help="By number from 0 on, without the last: 5:10.",
+        help="Select by number: 5:10 is scans 5 to 9; the first scan is 0.",
     ),
     "every": click.option(
-        "--every", type=click.IntRange(min=1), metavar="N", help="Each Nth scan of those."
+        "--every", type=click.IntRange(min=1), metavar="N", help="Keep every Nth selected scan."
     ),
     "ranges": click.option(
         "--range",
         "ranges",
         type=DISTANCES,
         metavar="NEAR:FAR",
-        help="Returns from elsewhere are none: 0.5m:30m.",
+        help="Drop returns outside this range, such as 0.5m:30m.",
     ),
     "columns": click.option(
         "--columns",
         metavar="NAME,...",
-        help="Columns of the points, in this order: x,y,z,intensity.",
+        help="Columns in this order, such as x,y,z,intensity.",
     ),
     "time": click.option(
         "--time",
         type=click.Choice(["device", "host"]),
-        help="Whose clock stamps and --slice are by.  [default: device]",
+        help="Clock of the stamps and of --slice.  [default: device]",
     ),
     "beams": click.option(
         "--beams",
         type=click.IntRange(min=1),
         metavar="N",
-        help="Ranges of a LaserScan: always so many.",
+        help="Number of ranges in each LaserScan.",
     ),
     "frame_id": click.option(
-        "--frame-id", metavar="NAME", help="The frame that ROS's messages name.  [default: laser]"
+        "--frame-id", metavar="NAME", help="frame_id of the ROS messages.  [default: laser]"
     ),
 }
 

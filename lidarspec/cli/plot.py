@@ -34,7 +34,7 @@ from lidarspec.view.svg import svg
     "--output",
     metavar="FILE",
     required=True,
-    help="Where to: .svg, .png or .pdf; - is standard output, as SVG.",
+    help="Output file: .svg, .png or .pdf; - is standard output, as SVG.",
 )
 @sensor_option
 @click.option(
@@ -42,7 +42,7 @@ from lidarspec.view.svg import svg
     type=click.Choice(["scan", "intensity", "ranges", "rates"]),
     default="scan",
     show_default=True,
-    help="What of it.",
+    help="Kind of plot.",
 )
 @click.option(
     "--scan",
@@ -51,13 +51,13 @@ from lidarspec.view.svg import svg
     metavar="NUMBER",
     default=1,
     show_default=True,
-    help="Which whole scan.",
+    help="Number of the complete scan to plot.",
 )
 @click.option(
     "-t",
     "--duration",
     type=DURATION,
-    help="Of a live source so long.  [default: 10s, but for a scan]",
+    help="Time to read a live source.  [default: 10s, except for a scan]",
 )
 @selecting("times", "scans", "every", "ranges", "time")
 @colour_option
@@ -65,7 +65,7 @@ from lidarspec.view.svg import svg
     "--max-range",
     type=click.FloatRange(min=0, min_open=True),
     metavar="METRES",
-    help="From the middle to the edge.",
+    help="Range at the edge of the plot.",
 )
 def plot(
     source: str,

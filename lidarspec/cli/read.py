@@ -69,11 +69,11 @@ ROUNDED = 1e-6
     "--packets",
     "whole",
     is_flag=True,
-    help="A row for each packet of the data frame, not for each point.",
+    help="Print one row per packet instead of one per point.",
 )
-@click.option("-f", "--frame", metavar="NAME", help="The packets of this frame type.")
+@click.option("-f", "--frame", metavar="NAME", help="Print the packets of this frame type.")
 @count_option("rows")
-@click.option("-t", "--duration", type=DURATION, help="How long at most, such as 10s.")
+@click.option("-t", "--duration", type=DURATION, help="Stop after this time, such as 10s.")
 @selecting("times", "scans", "every", "ranges", "columns", "time")
 @points_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
@@ -313,15 +313,15 @@ class StatsPrinter:
     "-t",
     "--duration",
     type=DURATION,
-    help="How long, such as 10s; without it until the input ends.",
+    help="Stop after this time, such as 10s; default: at the end of the input.",
 )
 @click.option(
-    "--interval", type=DURATION, default="1s", show_default=True, help="From line to line."
+    "--interval", type=DURATION, default="1s", show_default=True, help="Time between lines."
 )
 @click.option(
     "--max-errors",
     type=SHARE,
-    help="Exit code 1 where more of the frames are wrong or lost, such as 1%.",
+    help="Exit with code 1 if more frames are invalid or lost, such as 1%.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object on each line.")
 def stats(

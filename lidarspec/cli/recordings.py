@@ -46,7 +46,7 @@ from lidarspec.transports.replays import LATE_NS, Replay
     "target",
     metavar="FILE",
     required=True,
-    help="The file: .lsr, .pcap and .pcapng for Wireshark, .bin for bytes.",
+    help="Output file: .lsr, .pcap or .pcapng for Wireshark, .bin for raw bytes.",
 )
 @sensor_option
 @click.option(
@@ -54,13 +54,13 @@ from lidarspec.transports.replays import LATE_NS, Replay
     "--duration",
     "seconds",
     type=DURATION,
-    help="How long, such as 10s; until Ctrl-C by default.",
+    help="Stop after this time, such as 10s; default: at Ctrl-C.",
 )
-@count_option("packets (the sensor's data packets, or datagrams) at least")
-@click.option("--no-start", is_flag=True, help="Send the sensor no commands.")
+@count_option("packets or more: data packets of the sensor, or datagrams")
+@click.option("--no-start", is_flag=True, help="Send no commands to the sensor.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
 @click.option(
-    "--salvage", is_flag=True, help="Go on behind damaged places, where SOURCE is a recording."
+    "--salvage", is_flag=True, help="Continue after damaged records if SOURCE is a recording."
 )
 @click.option("--slice", "times", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="Print a summary as JSON.")
@@ -220,15 +220,15 @@ def _view_of(kept: Appender, sensor: Sensor | None) -> str:
     default="pty",
     show_default=True,
     metavar="PLACE",
-    help="pty, udp://host[:port], tcp://host:port, or a new file.",
+    help="Destination: pty, udp://host[:port], tcp://host:port, or a new file.",
 )
 @click.option(
     "--speed",
     type=SPEED,
-    help="1 as it came, 0.5 half as fast, max as fast as possible.  [default: 1; max into a file]",
+    help="1 as recorded, 0.5 at half speed, max without pauses.  [default: 1; max to a file]",
 )
-@click.option("--loop", is_flag=True, help="Begin again at the end, until Ctrl-C.")
-@click.option("--force", is_flag=True, help="Overwrite a file to play to.")
+@click.option("--loop", is_flag=True, help="Repeat until Ctrl-C.")
+@click.option("--force", is_flag=True, help="Overwrite the destination file.")
 @sensor_option
 @selecting("times")
 @click.option(

@@ -122,16 +122,13 @@ SPOKEN = (
         -1,
         "-q",
         "--quiet",
-        help="No remarks, and nothing on how far it is; failures are told all the same.",
+        help="Print no remarks and no progress; errors are still printed.",
     ),
     _make_verbosity_option(
         1,
         "-v",
         "--verbose",
-        help=(
-            "Also how long it took, the memory that it needed, and where in the code a failure"
-            " arose."
-        ),
+        help=("Also print time and memory used, and the place in the code of an error."),
     ),
 )
 

@@ -119,7 +119,7 @@ def sensors(as_json: bool, output: str | None) -> None:
     "--plan",
     "as_plan",
     is_flag=True,
-    help="How its points are computed, and what falls back to plain evaluation.",
+    help="Show how points are computed, and what uses plain evaluation.",
 )
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:

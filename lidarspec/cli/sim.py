@@ -56,65 +56,73 @@ PLACES = (
 @click.argument("sensor_id", metavar="SENSOR")
 @configuring
 @click.option("--to", metavar="PLACE", help=PLACES)
-@click.option("--link", metavar="PATH", help="A symbolic link that leads to the pty.")
+@click.option("--link", metavar="PATH", help="Path of a symbolic link to the pty.")
 @click.option(
     "-t",
     "--duration",
     type=DURATION,
-    help="End after so long; of a file, how much goes in.  [default: never; 10s]",
+    help="Stop after this time; for a file, its duration.  [default: never; 10s]",
 )
 @click.option(
     "--rate",
     metavar="FACTOR",
     default="1",
     show_default=True,
-    help="How many times faster than in reality, or max.",
+    help="Speed relative to the real sensor, or max.",
 )
 @click.option(
-    "--scene", metavar="FILE", help="What the sensor sees, a TOML file.  [default: a room]"
+    "--scene",
+    metavar="FILE",
+    help="Scene that the sensor measures, a TOML file.  [default: a room]",
 )
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help="Of the room and of what goes wrong.",
+    help="Random seed of the room and of the errors.",
 )
 @click.option(
     "--errors",
     type=SHARE,
     default="0%",
     show_default=True,
-    help="Share of the bytes that the line damages.",
+    help="Share of bytes to corrupt.",
 )
 @click.option(
     "--loss",
     type=SHARE,
     default="0%",
     show_default=True,
-    help="Share of the packets that get lost.",
+    help="Share of packets to drop.",
 )
 @click.option(
     "--reorder",
     type=click.IntRange(0, 1000),
     default=0,
     show_default=True,
-    help="How many places late a datagram may come.",
+    help="Delay datagrams by up to this many places.",
 )
-@click.option("--unplug", type=DURATION, help="Pull the plug after so long, again and again.")
+@click.option("--unplug", type=DURATION, help="Disconnect repeatedly after this time.")
 @click.option(
     "--shake",
     type=click.FloatRange(min=0),
     default=0.0,
     metavar="NOISE",
-    help="Deviation of what an IMU feels: m/s2 and rad/s.",
+    help="Standard deviation of IMU noise, m/s2 and rad/s.",
 )
 @click.option(
-    "--absent", type=DURATION, default="2s", show_default=True, help="How long it is out then."
+    "--absent",
+    type=DURATION,
+    default="2s",
+    show_default=True,
+    help="With --unplug: time until reconnection.",
 )
-@click.option("--rotor", type=click.Choice([BLOCKED]), help="It does not turn.")
-@click.option("--force", is_flag=True, help="Write over a file that exists.")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON where the sensor is.")
+@click.option("--rotor", type=click.Choice([BLOCKED]), help="Simulate a blocked rotor.")
+@click.option("--force", is_flag=True, help="Overwrite an existing file.")
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print the address of the simulated sensor as JSON."
+)
 def sim(
     sensor_id: str | Sensor,
     to: str | None,
@@ -231,7 +239,7 @@ def _sent(device: SimulatedDevice) -> str:
     type=SHARE,
     default="1%",
     show_default=True,
-    help="Share of the bytes that the line damages.",
+    help="Share of bytes to corrupt.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:

@@ -39,42 +39,42 @@ from lidarspec.view.window import Window
     "-t",
     "--duration",
     type=DURATION,
-    help="How long at most, such as 30s; for a first picture 10s.",
+    help="Stop after this time, such as 30s; with --once: timeout for the first scan, 10s.",
 )
 @click.option(
     "--once",
     is_flag=True,
-    help="Print one picture and end, as where standard output is no terminal.",
+    help="Print one picture and exit; the default if standard output is not a terminal.",
 )
 @selecting("times", "scans", "every", "ranges", "time")
 @colour_option
 @click.option(
     "--web",
     is_flag=True,
-    help="A page in the browser; its link, with the token that it needs, is printed.",
+    help="Show a page in the browser; the link with its token is printed.",
 )
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")
 @click.option(
     "--address",
     metavar="HOST[:PORT]",
-    help="Where the page is; by default 127.0.0.1 and a free port.",
+    help="Address of the page; default: 127.0.0.1 and a free port.",
 )
 @click.option(
     "--control",
     is_flag=True,
-    help="Let the page send commands to the sensor; to a simulated one it always may.",
+    help="Allow the page to send commands; always allowed for simulated sensors.",
 )
 @click.option(
     "--rerun",
     "in_rerun",
     is_flag=True,
-    help="In Rerun's 3D viewer, which is opened, and not in the terminal.",
+    help="Show the scans in Rerun's 3D viewer instead of the terminal.",
 )
 @click.option(
     "-o",
     "--output",
     metavar="FILE.rrd|URL",
-    help="With --rerun: into a file, or a viewer that runs, rerun+http://HOST:9876/proxy.",
+    help="With --rerun: write a file, or use a running viewer, rerun+http://HOST:9876/proxy.",
 )
 def view(
     source: str,
