@@ -187,7 +187,7 @@ def delay(share: float) -> Figure:
             for found in decoder.feed(data[spot : spot + 1]):
                 worst_share = max(worst_share, (spot + 1 - found.offset - len(found.data)) / bound)
     return Figure(
-        f"a frame is out {worst_share:.2f} longest frames after its last byte, or earlier",
+        f"a frame is returned at most {worst_share:.2f} longest frames after its last byte",
         worst_share < 1,
     )
 
@@ -226,8 +226,8 @@ def in_any_order(share: float) -> Figure:
         if not is_same:
             differing.append(name)
     words = (
-        f"{len(few(sensors, share))} sensors, 1,000 packets each, 10 % of them doubled, every one"
-        " displaced by up to 3 places: "
+        f"{len(few(sensors, share))} sensors, 1,000 packets each, 10 % of them duplicated,"
+        " every one displaced by up to 3 places: "
     )
     return Figure(
         words
@@ -267,7 +267,7 @@ def blocked(share: float) -> Figure:
         packets = len(frames) / max(len(scans), 1)
         told.append(
             f"{name}: {len(scans)} scans of {len(frames)} packets,"
-            f" {sum(scan.complete for scan in scans)} said to be complete"
+            f" {sum(scan.complete for scan in scans)} complete"
         )
         kept &= len(scans) > 1 and packets < 500 and not any(scan.complete for scan in scans)
     return Figure("rotor blocked, " + "; ".join(told), kept)
@@ -365,7 +365,7 @@ def strangers(share: float) -> Figure:
             return Figure(f"the session ended: {error}"[:160], False)
         foreign = device.stats.foreign
     return Figure(
-        f"{number - 1} frames of a stranger among {number}: {points} read, {foreign} counted as"
+        f"{number - 1} frames of another sender among {number}: {points} read, {foreign} counted as"
         " foreign",
         (points, foreign) == (number, number - 1),
     )
@@ -412,8 +412,8 @@ def nothing_runs(share: float) -> Figure:
             )
         ran = Path(place, "ran").exists()
     words = (
-        f"5 files of others: {'Python ran' if ran else 'no Python ran'}, {opened} read a descriptor"
-        " or failed"
+        f"5 files from others: {'Python ran' if ran else 'no Python ran'}, {opened} read a"
+        " descriptor or failed"
     )
     return Figure(words, not ran and not opened)
 
@@ -443,8 +443,7 @@ def complete(share: float) -> Figure:
             len(whole(sensor, left)),
         )
         told.append(
-            f"{name} without {number} packets: lost {lost}, {before - after} scans fewer are"
-            " complete"
+            f"{name} without {number} packets: lost {lost}, {before - after} fewer scans complete"
         )
         kept &= abs(lost - number) <= 1 and after < before
     return Figure("; ".join(told), kept)
@@ -491,8 +490,8 @@ def not_in_silence(share: float) -> Figure:
                 else [f"{name} (exit code {done.returncode})"]
             )
     return Figure(
-        f"{len(cases)} files, cut off, damaged, and with guessed angles:"
-        f" {', '.join(silent) or 'each said'}",
+        f"{len(cases)} files, truncated, damaged, and with nominal angles:"
+        f" {', '.join(silent) or 'each reported'}",
         not silent,
     )
 

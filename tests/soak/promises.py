@@ -1,6 +1,4 @@
-"""The promises: what is said, the tests that hold it, the long ones among them too, and what is
-measured besides.
-"""
+"""The promises, with the tests that hold each, long ones included, and additional measurements."""
 
 from __future__ import annotations
 
@@ -17,10 +15,10 @@ class Promise:
 
     Attributes:
         name: "P1" and so on.
-        words: what is promised.
-        tests: files, or tests of them, that hold it.
-        told: what those tests show, said where all of them pass.
-        measured: makes a figure; given the share of the full effort, from 0 to 1.
+        words: the promise.
+        tests: test files, or tests in them, that hold it.
+        told: the result of these tests, printed if all of them pass.
+        measured: returns a figure, given the share of the full effort, from 0 to 1.
     """
 
     name: str
@@ -62,10 +60,18 @@ EVERY = (
         figures.linear,
     ),
     Promise(
-        "P6", "a frame is out before one longest frame more has come", (LIMITS,), "", figures.delay
+        "P6",
+        "a frame is returned before the longest frame's number of bytes more has arrived",
+        (LIMITS,),
+        "",
+        figures.delay,
     ),
     Promise(
-        "P7", "exact round trip", ("tests/testing/test_conformance.py",), "", figures.round_trips
+        "P7",
+        "round trips are exact",
+        ("tests/testing/test_conformance.py",),
+        "",
+        figures.round_trips,
     ),
     Promise(
         "P8",
@@ -81,7 +87,7 @@ EVERY = (
     ),
     Promise(
         "P10",
-        "survives unplug and replug",
+        "devices survive unplugging",
         (f"{DEVICE}",),
         "unplugged 100 times: no frame spliced, no descriptor or thread left",
     ),
@@ -94,7 +100,7 @@ EVERY = (
     ),
     Promise(
         "P12",
-        "a slow consumer is handled openly",
+        "chunks dropped for a slow consumer are counted",
         (f"{PROMISES}::TestQueue",),
         "1,000,000 chunks, both policies: produced = consumed + dropped",
     ),
@@ -106,26 +112,26 @@ EVERY = (
     ),
     Promise(
         "P14",
-        "hostile captures take no memory, and move on or stop",
+        "hostile captures use little memory, and reading continues or stops",
         (HOSTILE, "tests/captures/test_memory.py"),
         "20,000 mutations of each format: no exception but SourceError; a capture of 1 GB below"
         " 200 MB",
     ),
     Promise(
         "P15",
-        "disk full, short writes: one error, a whole file",
+        "a full disk gives one error and an intact file",
         (f"{PROMISES}::TestFiles", RECORDINGS),
         "whole to the last record on a full disk",
     ),
     Promise(
         "P16",
-        "clocks run on",
+        "clocks are unwrapped",
         (f"{PROMISES}::TestClocks", "tests/packets/test_clocks.py"),
         "100 turns of 30 s, an hour, and 16 bits, late packets among them: exact",
     ),
     Promise(
         "P17",
-        "late, doubled and reordered packets give the same scan",
+        "late, duplicate and reordered packets give the same scan",
         (CONTINUITY, REORDER, SCANS),
         "",
         figures.in_any_order,
@@ -134,26 +140,26 @@ EVERY = (
         "P18",
         "decoders are independent",
         ("tests/framing/test_framing.py",),
-        "in turn, and in 8 threads: as alone",
+        "in turns and in 8 threads: the same results as alone",
     ),
     Promise("P19", "a scan always ends", (SCANS,), "", figures.blocked),
     Promise(
         "P20",
-        "no stream is slower than its line: 10 times its rate, under 64 bytes kept for each",
+        "streams are decoded at 10 times the line rate or faster; under 64 bytes kept per byte",
         (RULE,),
         "",
         figures.slowest,
     ),
     Promise(
         "P21",
-        "strangers do not disturb",
+        "other senders do not disturb",
         (DEVICE, "tests/device/test_source_recording.py"),
         "",
         figures.strangers,
     ),
     Promise(
         "P22",
-        "other people's files run nothing",
+        "files from others run no code",
         (
             "tests/device/test_settings.py",
             RECORDINGS,
@@ -165,21 +171,21 @@ EVERY = (
     ),
     Promise(
         "P23",
-        "complete means complete, lost is what was lost",
+        "complete scans miss nothing, and losses are counted exactly",
         (CONTINUITY, SCANS),
         "",
         figures.complete,
     ),
     Promise(
         "P24",
-        "nothing is lost in silence",
+        "every loss is reported",
         ("tests/cli/test_captures.py", "tests/cli/test_terminal.py"),
         "",
         figures.not_in_silence,
     ),
     Promise(
         "",
-        "the other long tests: exports, engines and points agree on what is drawn at random",
+        "the other long tests: exports, engines and points agree on random input",
         (
             "tests/exports",
             "tests/engine/test_random_specs.py",
