@@ -74,7 +74,7 @@ def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
     assert "next: lidarspec survey --help" in ran(site, "survey").stderr
     assert "did you mean 'survey'?" in ran(site, "surveys").stderr
     assert (
-        "The points that a sensor sends" in ran(site, "read", "--help").stdout
+        "Print the points that a sensor sends" in ran(site, "read", "--help").stdout
     )  # ours comes first
 
 
