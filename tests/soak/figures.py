@@ -277,6 +277,8 @@ def blocked(share: float) -> Figure:
 PIECE_BYTES = 4096
 #: CPU seconds after which a stream is not measured any longer.
 MAX_STREAM_SECONDS = 0.5
+#: Runs of each stream; the best one counts, since others include a collection of all garbage.
+RATE_RUNS = 3
 #: Bytes a second of a link that is no serial port.
 OTHER_LINE_RATE = 1e6
 
@@ -293,8 +295,10 @@ def slowest(share: float) -> Figure:
         line = fastest[_frames_key(sensor)]
         for what, data in hostile_streams(subject, int(16_000 * share) + 4000):
             sensor.decoder().feed(data)  # what is made once, and for all decoders
-            rates[f"{name}, {what}"] = decoding_rate(sensor, data) / line
+            best = max(decoding_rate(sensor, data) for _ in range(RATE_RUNS))
+            rates[f"{name}, {what}"] = best / line
         data = (subject.stream(rounds=2) * 200)[:16_000]
+        sensor.decoder().feed(data)  # as above: layouts that are new to the sensor
         tracemalloc.start()
         found = sensor.decoder().feed(data)
         held[name] = tracemalloc.get_traced_memory()[0] / len(data)
