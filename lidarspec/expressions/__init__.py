@@ -1,9 +1,7 @@
-"""What a plugin's functions are given: the fields of a batch of packets as columns that line up by
-themselves.
+"""Columns: the fields of a batch of packets, aligned by the arrays that they are in.
 
-In: tables of frames (`frames.frame_table`). Out: what `points`, `plausible` and clock functions
-make of their columns, or the graph of what
-they do. Modules in reading order:
+In: tables of frames (`frames.frame_table`). Out: the results of `points`, `plausible` and clock
+functions for their columns, or the graph of their steps. Modules in reading order:
 
 * `columns`: `Batch`, `Fields` and `Column`: the plain evaluation, ordinary NumPy on arrays with
   named axes.

@@ -83,7 +83,7 @@ class Batch:
         return len(self.table)
 
     def carry_over(self, ready: int) -> Carry:
-        """What the next batch has to know, if it starts with packet `ready` of this one."""
+        """Return the state for the next batch, if it starts with packet `ready` of this one."""
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
 
     def of(self, group: Group) -> Batch:
@@ -383,7 +383,10 @@ class RowOfValues:
 def padding_mask(
     axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch
 ) -> NDArray[np.bool_] | None:
-    """Which elements, (n, product of the other lengths), are not padding; None where none is."""
+    """Return the mask of elements that are not padding, (n, product of the other lengths).
+
+    Return None if there is no padding.
+    """
     mask: NDArray[np.bool_] | None = None
     for index, axis in enumerate(axes):
         name = (axis or "<").strip("?")
@@ -501,7 +504,7 @@ def _met(known: str | None, name: str | None) -> str | None:
 
 
 def _length(value: Along, axis: str) -> int:
-    """How many numbers there are along an array."""
+    """Return the number of elements along an array."""
     return int(
         value.array.shape[
             [name.rpartition(".")[2] for name in value.axes].index(axis.rpartition(".")[2])
@@ -689,7 +692,7 @@ def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
 
 
 def call(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
-    """What a function makes of arrays that are lined up, of the shape that they broadcast to."""
+    """Return the result of a function of aligned arrays, in the shape that they broadcast to."""
     return np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
 
 

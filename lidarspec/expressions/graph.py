@@ -123,8 +123,8 @@ class Node:
         ]
 
     def value(self, args: list[Any]) -> Any:
-        """What it comes to, from what its arguments do: a column where these are columns, else an
-        array where they are arrays.
+        """Return the value, computed from the arguments: a column if these are columns, else an
+        array.
         """
         if self.kind != "call":
             return self.function(*args)
@@ -201,7 +201,7 @@ class Traced(NDArrayOperatorsMixin):
         )
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Traced:
-        """What a function of arrays makes of the values, noted down."""
+        """Record the call of a function of arrays."""
         samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
         arrays, _, _ = align(
             tuple(samples), self.node.sample.batch
@@ -307,7 +307,7 @@ class Traced(NDArrayOperatorsMixin):
 
 
 class TracedFields:
-    """What `points` is given while it is traced: the fields of the sample, noted down."""
+    """The fields of the sample while `points` is traced; operations on them are recorded."""
 
     def __init__(
         self,
@@ -390,7 +390,7 @@ def node_of(value: Any) -> Any:
 
 
 def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
-    """What the function returns for traced columns, and what it did.
+    """Return the result of a function of traced columns, and the tape of its steps.
 
     Raises:
         Untraceable: where that cannot be noted down.
@@ -428,7 +428,7 @@ def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> 
 def compute(
     node: Node, known: dict[Node, Any], source: Callable[[Node], Any] = lambda node: None
 ) -> Any:
-    """What a node comes to, by what the fields are.
+    """Return the value of a node, given the fields.
 
     Args:
         known: the values of nodes: columns, or arrays whose first axis is for the packets; added
@@ -484,8 +484,9 @@ class Expression:
         return cls(node, infos)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """What it comes to, element by element, by the raw values of its fields; one that is left
-        out is nan.
+        """Return the values, element by element, given the raw values of the fields.
+
+        Fields without a value are nan.
         """
         (values,) = values_of([self], raw)
         return values
@@ -494,7 +495,7 @@ class Expression:
 def values_of(
     expressions: Sequence[Expression], raw: Mapping[str, NDArray[Any]]
 ) -> list[NDArray[Any]]:
-    """What expressions come to, as `Expression.values`; what they share is computed once."""
+    """Return the values of expressions, as `Expression.values`; common nodes are computed once."""
     infos = {info.path: info for expression in expressions for info in expression.fields}
     known = dict[Node, Any]()
     with np.errstate(all="ignore"):
@@ -683,7 +684,7 @@ def is_nan_where(node: Node) -> bool:
 
 
 def key(node: Node) -> tuple[Any, ...]:
-    """What makes two expressions of one field the same."""
+    """Return a key that is equal for equal expressions of one field."""
     if node.kind == "field":
         return ("field", node.path)
     return (

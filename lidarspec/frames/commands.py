@@ -78,7 +78,7 @@ class Slot:
 
 
 def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Slot:
-    """Where an argument of a command goes.
+    """Return the place of a command argument in its frame.
 
     Raises:
         SpecError: where its kind of value cannot stand there.

@@ -147,7 +147,7 @@ class HeaderWalk:
     parts: dict[str, Leaf | Measure | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
-        """What was found, as a value."""
+        """The layout that the walk found."""
         held = self._held_bits()
         self.asked = _unknown  # what follows from the header asks for no more of it
         seals = tuple(_in_order(self.seals))
@@ -693,7 +693,7 @@ class _CandidateSet:
         self.refuted: list[NDArray[np.intp]] = []
 
     def longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
-        """What there is of the one that has the most bytes, up to the longest frame."""
+        """Return the available bytes of the longest candidate, up to the longest frame."""
         first = which.item(0)
         if self.stops is not None and len(which) > 1:
             first = which.item((self.stops[which] - self._offsets[which]).argmax())
@@ -708,7 +708,7 @@ class _CandidateSet:
     def read(
         self, node: HeaderNode, which: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """As `Reader`; those whose field is cut off are looked at here."""
+        """Read a field, as `Reader`; candidates whose field is incomplete are handled here."""
         assert node.leaf is not None
         there, values = node.leaf.read(
             self._buffer, self._offsets[which], None if self.stops is None else self.stops[which]
@@ -725,7 +725,7 @@ class _CandidateSet:
     def wrong(
         self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
-        """Which candidates have a wrong constant, as far as their bytes go, (n,)."""
+        """Return the mask of candidates with a wrong constant among their available bytes, (n,)."""
         if len(which) == 1:  # each random header has constants of its own
             data = self.longest(which)
             return np.array([_is_refuted(constants, data)])
@@ -915,7 +915,7 @@ class HeaderTree:
     def _end(
         self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False
     ) -> HeaderNode:
-        """Where the header of a frame leads from a node, as `_explore` has it."""
+        """Return the end of the header of a frame from a node on, as `_explore` does."""
         while node.leaf is not None:
             value = node.leaf.of(data)
             if value is None:
@@ -1008,7 +1008,7 @@ class HeaderTree:
 def kinds_of(
     node: tree.PartSequence, given: tuple[tuple[str, int], ...], limit: int
 ) -> tuple[PartKind, ...]:
-    """What the parts of frames can be in which fields around them have these values."""
+    """Return the possible kinds of parts for given values of the fields around them."""
     values = dict(given)
     return tuple(
         PartKind(kind, HeaderTree(kind.root, limit, values), prefix_of(kind.root, limit))

@@ -176,7 +176,7 @@ class Schema:
 
     @cached_property
     def places(self) -> Mapping[str, int]:
-        """How many arrays each array stands in, by its path."""
+        """The number of arrays around each array, by its path."""
         return {
             axis: index for info in self.fields.values() for index, axis in enumerate(info.axes)
         }
@@ -205,7 +205,7 @@ class Schema:
         return [other for other in self.arrays if axis.startswith((f"{other}.", f"{other}["))]
 
     def depth(self) -> int:
-        """How many arrays are nested at most."""
+        """The largest number of nested arrays."""
         return len(self.chain)
 
 
@@ -265,7 +265,7 @@ def _element(
 
 
 def _docs_around(path: str, structs: Mapping[str, str]) -> str:
-    """What the author says of the innermost struct around a field of which nothing is said."""
+    """Return the documentation of the innermost struct around an undocumented field."""
     while path and structs:
         path = path.rpartition(".")[0]
         if path in structs:

@@ -150,7 +150,7 @@ def _member(shown: str, member: tree.Node) -> str:
 
 
 def _element(shown: str) -> tuple[str, str]:
-    """How an element of an array is shown, "points[i]", and its index."""
+    """Return the path of an array element, "points[i]", and its index."""
     index = INDICES[shown.count("[") % len(INDICES)]
     return f"{shown}[{index}]", index
 
@@ -274,7 +274,7 @@ def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
 
 
 def describe_end(node: tree.PartSequence) -> str:
-    """What says where the last one of some parts is, in words."""
+    """Describe what determines the last one of some parts."""
     if node.count is not None:
         return f"{phrase(node.count)} parts of sizes of their own"
     if node.within is not None:
@@ -374,7 +374,7 @@ def format_hex(value: object, bits: int) -> str:
 
 
 def _describe_seal(node: tree.Sealed) -> str:
-    """What is said of the fields that hold a checksum."""
+    """Describe the fields that hold a checksum."""
     if node.declared:
         name = node.declared.describe()
     else:

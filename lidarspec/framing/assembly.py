@@ -163,7 +163,7 @@ class Assembly:
         return dropped
 
     def _fragment(self, datagram: bytes) -> _Fragment | None:
-        """What a datagram says as a fragment; None where it is none."""
+        """Return the fragment in a datagram; None if it is not one."""
         rule = self._rule
         layout = self._layouts.layout(datagram)
         if not isinstance(layout, Layout) or not layout.sound(datagram[: layout.size]):

@@ -179,7 +179,7 @@ class _DatagramBatch:
         return Frames(self._buffer, kinds, starts, sizes, layouts=layouts, forms=forms), reasons
 
     def _survey(self, kind: int, starts: Indices, sizes: Indices) -> Frames:
-        """What datagrams are, if they are of a type."""
+        """Return the verdict on datagrams as frames of a type."""
         steady = self._steady
         self._steady = None
         if steady is not None and steady.kinds[0] == kind and len(starts) == len(steady):
@@ -244,7 +244,7 @@ class _DatagramBatch:
         self._piece.reject(np.bincount(np.where(unknown, LENGTH, reasons)[~others]).tolist(), ())
 
     def _has_constants(self, kind: int, starts: Indices, sizes: Indices) -> NDArray[np.bool_]:
-        """Which datagrams have the constants of a type."""
+        """Return the mask of datagrams that have the constants of a type."""
         constants = self._framing.words[kind]
         end = self._framing.ends[kind]
         size = alike(sizes)

@@ -53,7 +53,7 @@ BACKEND = "LIDARSPEC_BACKEND"
 
 
 class Witness(Protocol):
-    """Who is shown what a decoder is fed, and what it finds in it."""
+    """Observer of the input and the results of a decoder."""
 
     def observe_input(
         self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
@@ -448,7 +448,7 @@ def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums | Non
 
 
 def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
-    """Where pieces of these sizes begin that stand back to back from `first` on."""
+    """Return the offsets of consecutive pieces of these sizes, from `first` on."""
     if size := alike(sizes):
         return range(first, first + len(sizes) * size, size)
     starts = np.cumsum(sizes)

@@ -325,7 +325,7 @@ def _store_drawn(
 
 
 def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
-    """What gives the numbers of a sweep, raw, where a header asks for them."""
+    """Return a function that draws the raw numbers of a sweep for header fields."""
     fields = engine.schema.fields
     found: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():

@@ -94,7 +94,7 @@ class Codec:
         return self.prefix
 
     def judge(self, layout: Layout) -> Judge:
-        """What judges candidates of a layout that have the constants at the start."""
+        """Return the judge of candidates of a layout that have the constants at the start."""
         judge = layout.notes.get(Judge)
         if judge is None:
             self._conditions = self._conditions or Conditions(

@@ -52,7 +52,7 @@ BLOCK_BYTES = 1 << 19
 
 @dataclass(frozen=True)
 class Likeness:
-    """Which other layouts one is like.
+    """The key by which layouts that differ only in the length of an array are grouped.
 
     Attributes:
         number: the same for all that are alike.

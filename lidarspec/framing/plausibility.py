@@ -244,7 +244,7 @@ class Conditions:
         self._tables: dict[tuple[Any, ...], _LookupTable] = {}
 
     def met(self, layout: Layout) -> list[Check]:
-        """What the struct asks of the values of frames of a layout, as rows of bytes."""
+        """Return the conditions of the struct on the values of frames of a layout, as checks."""
         every = (
             (
                 one,

@@ -1,4 +1,4 @@
-"""What is found in an input: frames as one struct of arrays, one by one, and the counters.
+"""The results of framing: frames as one struct of arrays, single frames, and counters.
 
 `Frames` is what every part of the framing passes on to the next: a frame type's engine says which
 candidates are frames and of which layout, the search takes some of them, the decoder adds where in
@@ -115,7 +115,7 @@ class Counters:
 
     @property
     def tracebacks(self) -> list[str]:
-        """Those of the first few failures, as text."""
+        """The tracebacks of the first few failures, as text."""
         return [failure.traceback for failure in self.failures]
 
     def failure(self, sensor: str) -> PluginError | None:
@@ -257,12 +257,12 @@ class Frames:
 
     @cached_property
     def starts(self) -> Indices:
-        """Where each frame begins in the buffer, (n,)."""
+        """The offset of each frame in the buffer, (n,)."""
         return array_of(self._starts)
 
     @cached_property
     def offsets(self) -> NDArray[np.int64]:
-        """Where each frame begins in the input, (n,)."""
+        """The offset of each frame in the input, (n,)."""
         return array_of(self.places)
 
     @cached_property

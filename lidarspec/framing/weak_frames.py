@@ -45,7 +45,7 @@ class Runs:
 
     @cached_property
     def ends(self) -> Indices:
-        """Where the run of each candidate ends, (n,)."""
+        """The offset of the end of the run of each candidate, (n,)."""
         ends = self.frames.starts + self.frames.sizes
         if self._jumps:
             return ends[self._jumps[-1]]

@@ -308,7 +308,7 @@ def _in_parts(sensor: SensorDescription, place: tuple[str, str], table: Table) -
 
 @lru_cache(maxsize=256)
 def _turn(seconds: float) -> int:
-    """So many seconds in nanoseconds, as the number is written."""
+    """Return seconds as nanoseconds, rounded as the number is written."""
     return int(exact(seconds) * 10**9)
 
 

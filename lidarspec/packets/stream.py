@@ -408,7 +408,7 @@ def data_frame(sensor: SensorDescription, found: Sequence[Frames]) -> str | None
 
 
 class _Columns(NamedTuple):
-    """What the frames of one type say of their packets, (n,) each.
+    """The columns of some frames of one type, (n,) each.
 
     Attributes:
         table: the raw columns.

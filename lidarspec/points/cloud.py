@@ -359,7 +359,7 @@ def _pick(value: Any, which: Any) -> Any:
 
 
 def grid_of(cloud: PointCloud) -> Grid:
-    """How the points of a cloud are organised."""
+    """Return the organisation of the points of a cloud."""
     if cloud.shape:
         return Grid(cloud.shape[1], len(cloud) // max(cloud.shape[0] * cloud.shape[1], 1) or 1)
     return Grid()

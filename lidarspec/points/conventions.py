@@ -176,7 +176,7 @@ def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
 
 
 class Grids(NamedTuple):
-    """How the points of packets of several shapes are organised, in stream order.
+    """The organisation of the points of packets of several shapes, in stream order.
 
     Attributes:
         ends: (n,) the point after the last one of each packet.
@@ -215,14 +215,14 @@ def whole_columns(grid: Grid, first: int, number: int) -> Grid:
 
 
 class ExtraType(NamedTuple):
-    """What a further column of points holds: its type, and its unit, "" for a plain number."""
+    """The type of an additional column of points, and its unit, "" for a plain number."""
 
     dtype: np.dtype[Any]
     unit: str
 
     @classmethod
     def of(cls, extra: Extra, values: Any) -> ExtraType:
-        """What is declared, and else follows from the field that the values are."""
+        """Return the declared type and unit; those of the field if the values are a field."""
         is_own = isinstance(values, Column) and not values.frame
         if is_own:
             info = values.batch.table.schema.fields.get(values.source)

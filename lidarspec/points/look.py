@@ -1,4 +1,4 @@
-"""How to draw a cloud: its extent, its colours and the values that they show.
+"""The look of a drawn cloud: its extent, its colours and the values that they show.
 
 All drawings use this module, so that a scan looks the same in a terminal, on paper and in other
 tools.
@@ -42,7 +42,7 @@ WORTH = 0.93
 
 @dataclass(frozen=True)
 class Look:
-    """How a cloud is drawn.
+    """The look of a drawn cloud.
 
     Attributes:
         ramp: what colours show: "range", "intensity", or a column in `PointCloud.extra`.
@@ -70,7 +70,7 @@ class Look:
 
 
 def ramps(cloud: PointCloud) -> list[str]:
-    """What colours can show of a cloud."""
+    """Return the values that colours can show of a cloud."""
     return ["range", *["intensity"] * (cloud.intensity is not None), *cloud.extra]
 
 
@@ -172,7 +172,7 @@ def ring_step(reach: float) -> float:
 
 
 def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
-    """How far along the ramp each point is, (n,), from 0."""
+    """Return the position of each point along the ramp, (n,), from 0."""
     if look.ramp == "range":
         return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
     return np.nan_to_num((_shown(cloud, look.ramp) - look.low) / (look.full - look.low))

@@ -33,7 +33,7 @@ _OPTIONAL = ("intensity", "ring", "return_index", "column")
 
 
 class PacketBatch(Protocol):
-    """What points are made of: packets of one frame type in stream order, as `packets.Packets` are.
+    """Packets of one frame type in stream order, as evaluation needs them.
 
     Attributes:
         sensor, frame: whose, and of which type.
@@ -152,7 +152,7 @@ def parts_of(result: Points) -> dict[str, Any]:
 
 
 def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
-    """What the further columns of points hold, by name; `parts`: those of the result."""
+    """Return the types of the additional columns, by name; `parts`: those of the result."""
     return {name: ExtraType.of(extra, parts[name]) for name, extra in result.extra.items()}
 
 

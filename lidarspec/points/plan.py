@@ -73,7 +73,7 @@ class Maker(Protocol):
 
 
 class Plan:
-    """How the points of frames of one layout are made.
+    """The plan by which the points of frames of one layout are computed.
 
     Attributes:
         function: the `points` function.

@@ -23,7 +23,7 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class PacketCounts:
-    """What packets add to a scan, (n,) each.
+    """The counts by which packets extend a scan, (n,) each.
 
     Attributes:
         times: ns.

@@ -39,7 +39,7 @@ MIN_DATE_NS = 10**18
 
 @dataclass(frozen=True)
 class Selection:
-    """Which scans to read, and which parts of them.
+    """The selected scans, and the selected parts of them.
 
     A scan is selected if `times`, `scans` and `every` all select it.
 

@@ -90,7 +90,7 @@ class NumberRun:
 
     @cached_property
     def remaining(self) -> Offsets:
-        """How many bytes of the same number follow each byte of the run, (bytes,)."""
+        """The number of bytes of the same number after each byte of the run, (bytes,)."""
         return self.ends[self.owners] - 1 - np.arange(len(self.owners))
 
     @cached_property
@@ -112,7 +112,7 @@ class NumberRun:
 
     @cached_property
     def _word_offsets(self) -> Offsets:
-        """Where each byte of the run is among the big-endian words of eight bytes."""
+        """The offset of each byte of the run in big-endian words of eight bytes."""
         significance = np.where(
             self.is_little[self.owners],
             self.sizes[self.owners] - 1 - self.remaining,
@@ -177,7 +177,7 @@ class Decoded:
 
     @property
     def offsets(self) -> list[int]:
-        """Where in the frame the field of each byte of the struct begins, and at last `end`."""
+        """The offset in the frame of the field of each byte of the struct, and finally `end`."""
         starts = [begins.repeat(sizes) for begins, sizes in self.spans]
         return [*np.concatenate([np.zeros(0, np.intp), *starts]).tolist(), self.end]
 
@@ -187,7 +187,7 @@ class Decoded:
 
 
 class WireForm(Protocol):
-    """How the frames of one type stand on the wire.
+    """The form of the frames of one type on the wire.
 
     Attributes:
         is_text: whether fields of bytes are printable characters, so that examples are letters.

@@ -93,7 +93,7 @@ def is_kept(name: str) -> bool:
 
 
 def cache_folder() -> Path:
-    """Where kernels are kept: LIDARSPEC_CACHE, or what the system calls the user's cache."""
+    """Return the folder of kernels: LIDARSPEC_CACHE, or the user's cache of the system."""
     named = os.environ.get(CACHE)
     if named:
         return Path(named)
@@ -153,7 +153,7 @@ def _path(folder: Path, key: bytes, name: str, target: Any) -> Path:
 
 
 def _read(path: Path) -> bytes:
-    """What a file holds that is its user's alone.
+    """Return the content of a file that belongs to the user alone.
 
     Raises:
         OSError: where it is not, or cannot be read.

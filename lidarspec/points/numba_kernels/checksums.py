@@ -121,7 +121,7 @@ def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) ->
 
 
 class _Shares:
-    """What each byte of a frame changes about one checksum, once it is worth asking.
+    """The share of each byte of a frame in one checksum, computed on first use.
 
     Attributes:
         words: where eight bytes are loaded at a time.

@@ -138,7 +138,7 @@ def kernel_of(plan: Plan, names: tuple[str, ...]) -> Kernel:
 
 
 def threads() -> int:
-    """How many threads a kernel is given: LIDARSPEC_THREADS, by default 1.
+    """Return the number of threads of a kernel: LIDARSPEC_THREADS, by default 1.
 
     Raises:
         UsageError: where that is no number of at least 1.

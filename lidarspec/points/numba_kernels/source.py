@@ -492,7 +492,7 @@ class KernelAssembly:
         self.scratch: list[str] = []
 
     def column(self, name: str, made: Any) -> None:
-        """Where a column goes."""
+        """Return the text of the array of a column."""
         if isinstance(made, Value):
             self.writer.lines[-1].append(f"put(out_{name}, o, {made.text})")
         else:
@@ -649,7 +649,7 @@ def _function(
 
 
 def _loops(writer: KernelWriter, width: str) -> list[str]:
-    """What is done for a packet: its own values, then the loops over its arrays."""
+    """Write the work for a packet: its own values, then the loops over its arrays."""
     lines = [*writer.lines[1]]
     depth = 0
     for level in range(2, writer.inner + 1):
@@ -666,5 +666,5 @@ def _loops(writer: KernelWriter, width: str) -> list[str]:
 
 
 def _spot(writer: KernelWriter, width: str) -> list[str]:
-    """Where a point stands among those under way, and among all."""
+    """Return the index of a point among those in progress, and among all."""
     return [f"k = (p - begin) * {width} + {writer.place(writer.shape)}", "o = start + k"]

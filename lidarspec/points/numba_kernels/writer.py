@@ -304,7 +304,7 @@ class KernelWriter:
         return f"n{len(self.wanted.numbers) - 1}"
 
     def once(self, name: Any, make: Callable[[], Any]) -> Any:
-        """What was made under this name."""
+        """Return the value made under this key; make it on first use."""
         if name not in self._known:
             self._known[name] = make()
         return self._known[name]
@@ -358,7 +358,7 @@ class KernelWriter:
         return element
 
     def add_argument(self, node: Node) -> Value:
-        """What NumPy has computed before."""
+        """Add an argument of the kernel that NumPy computes before."""
         if node not in self.wanted.nodes:
             self.wanted.nodes.append(node)
         name = self.wanted.nodes.index(node)

@@ -422,7 +422,7 @@ class _Builder:
         return size
 
     def _filling(self, con: construct.GreedyRange, place: _Context) -> tree.Node:
-        """As many elements as fill a part, where all are of one size."""
+        """Return the number of elements of one size that fill a part."""
         axis = axis_path(place.info)
         element = self.node(
             con.subcon, replace(place.inside(axes=(*place.info.axes, axis)), room=None)
@@ -740,7 +740,7 @@ def integer_type(bits: int, *, signed: bool = False) -> np.dtype[Any]:
 
 
 def _add_type(con: Construct, info: tree.FieldInfo) -> tree.FieldInfo:
-    """What is known of a field, with the type of its values."""
+    """Return the description of a field, with the type of its values."""
     if isinstance(con, FormatField):
         code = con.fmtstr[-1]
         if code in "efd":
@@ -785,7 +785,7 @@ def _is_text(con: Construct) -> bool:
 
 
 def _form(con: Construct) -> str:
-    """How a field without a size of its own stands on the wire."""
+    """Return the form on the wire of a field without a size of its own."""
     below = con
     while isinstance(below, Subconstruct):
         if isinstance(below, construct.NullTerminated):

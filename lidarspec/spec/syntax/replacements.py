@@ -350,7 +350,7 @@ class Describing(Subconstruct):  # type: ignore[misc]
     """A part that only says something of the field below it: parses and builds what that does."""
 
     def describe(self, info: tree.FieldInfo) -> tree.FieldInfo:
-        """What is known of the field, with what this part says of it."""
+        """Return the description of the field below, extended by this part."""
         raise NotImplementedError
 
 
@@ -392,11 +392,11 @@ class Sizing(Subconstruct):  # type: ignore[misc]
 
     @property
     def out(self) -> int:
-        """How many structs further out the one is that has the part."""
+        """The number of structs between this field and the one that has the part."""
         return self.of.count("_")
 
     def value(self, obj: Any) -> int:
-        """What it has to say, of the struct that has the part, parsed or built."""
+        """Return the size of the part, given the parsed or built struct that has it."""
         *parents, name = self.of[self.out :] or ("",)
         try:
             marks = (member(obj, ".".join(parents)) if parents else obj)["_marks"]

@@ -222,7 +222,7 @@ def _spelled_out(con: Construct) -> list[Construct]:
 
 
 class _Compared:
-    """What stands for a value that a validator is given, and remembers what it is compared with."""
+    """A stand-in for the value of a validator that records what it is compared with."""
 
     __hash__ = None  # type: ignore[assignment]
 
