@@ -417,6 +417,10 @@ class LazyCloud(PointCloud):
 
     lazy: LazyColumns
 
+    def __new__(cls, *args: Any, **columns: Any) -> PointCloud:  # type: ignore[misc]
+        """Return a cloud of given columns, which is not lazy: `dataclasses.replace` makes one."""
+        return PointCloud(*args, **columns)
+
     @classmethod
     def of(cls, source: ColumnSource, stamp_ns: int) -> LazyCloud:
         """Return the cloud of a source; its times count from `stamp_ns`."""

@@ -19,6 +19,7 @@ from lidarspec.expressions.columns import Column
 from lidarspec.packets.masked_sector import FULL_TURNS, AngleReader, Sector
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import COLUMNS
+from lidarspec.points.column_sources import LazyColumns
 from lidarspec.points.plain import Evaluated
 from lidarspec.scans.rotation import (
     MIN_TURNS_AWAY,
@@ -105,8 +106,7 @@ class EndFinder:
         """Return the ends at which a column or a field passes an angle."""
         rows: Indices | None = None
         if rule.name in COLUMNS:
-            columns = points.source.columns((rule.name,), 0, points.source.size)
-            values = np.asarray(columns[rule.name], np.float64)
+            values = np.asarray(LazyColumns(points.source).read(rule.name), np.float64)
             full = 2 * np.pi
             ends, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
         else:

@@ -115,6 +115,16 @@ def assert_carried(cloud: PointCloud, whole: PointCloud, which: object) -> None:
         np.testing.assert_array_equal(cloud.extra[name], column[which])  # type: ignore[call-overload]
 
 
+def test_replace_gives_a_cloud_with_the_other_columns() -> None:
+    cloud, reader = packets().points(), packets().points()
+    replaced = dataclasses.replace(cloud, intensity=reader.range)
+    assert len(replaced) == len(reader)
+    assert_carried(replaced, reader, slice(None))
+    np.testing.assert_array_equal(replaced.intensity, reader.range)
+    np.testing.assert_array_equal(replaced.x, reader.x)
+    assert replaced.columns.keys() == {*reader.columns, "intensity"}
+
+
 def test_masks_slices_scans_mounts_and_pickles_carry_them() -> None:
     cloud, reader = packets().points(), packets().points()
     mask = reader.extra["near_ir"] > 20_000

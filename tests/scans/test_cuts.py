@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from lidarspec import Sensor
+from lidarspec import Sensor, simulate
 from lidarspec.scans.stream import scans_of
 from lidarspec.spec import OnChange, OnFlag, OnJump, OnRewind, OnWrap
 from tests.shapes import SHAPES
@@ -73,3 +73,12 @@ def test_a_period_begins_with_its_first_instant(frames_per_batch: int) -> None:
     starts = range(0, len(packets), frames_per_batch)
     batches = [packets.take(slice(start, start + frames_per_batch)) for start in starts]
     assert [len(scan) // POINTS_PER_FRAME for scan in scans_of(sensor, batches)] == [3, 2, 2, 1]
+
+
+def test_a_rule_may_name_any_column_of_points() -> None:
+    sensor = SHAPES["shape-lines"]
+    data = b"".join(simulate(sensor, 20))
+    points = len(sensor.decode(data).points())
+    for name in ("z", "elevation"):  # of a planar sensor neither passes an angle
+        scans = list(replace(sensor, scan=OnWrap(name)).scans(data))
+        assert [len(scan.points) for scan in scans] == [points]
