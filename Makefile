@@ -45,7 +45,7 @@ MODULES := $(PAGE)/node_modules/.installed
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 BUILD_TOOLS := pip 'hatchling>=1.26' 'editables>=0.5'
 
-.PHONY: demo page page-test test test-all test-ros2 test-ros2-here test-long soak fuzz referee lint types docs wheels reference known-sensors bench bench-here clean
+.PHONY: demo page page-test test test-all test-ros2 test-ros2-here test-long soak fuzz referee lint types docs wheels reference known-sensors messages bench bench-here clean
 
 demo: $(USERS)
 	@$(BIN)/lidarspec demo -s ldrobot-stl27l
@@ -124,6 +124,10 @@ bench-here: $(PEERS)
 # The table of the core that names the sensors of all distributions, from the plugins.
 known-sensors: $(USERS)
 	@$(BIN)/python -m tools.make_known_sensors
+
+# Every text that a user may read, for review: errors, warnings, help texts, labels and rules.
+messages:
+	@$(PYTHON) tools/list_messages.py
 
 clean:
 	rm -rf $(PAGE)/node_modules $(PAGE)/dist-check $(PAGE)/dist-tests

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from lidarspec.framing import examples
+from lidarspec.framing import example_frames
 from lidarspec.sensor_operations import Sensor
 from tests.missing import describe_missing
 
@@ -68,7 +68,7 @@ def _examples_are_made_once() -> Iterator[None]:
     made: weakref.WeakKeyDictionary[Sensor, dict[tuple[str, int], bytes]] = (
         weakref.WeakKeyDictionary()
     )
-    original = examples.example
+    original = example_frames.example
 
     def example(sensor: Sensor, frame: str, *, seed: int = 0) -> bytes:
         frames = made.setdefault(sensor, {})
@@ -77,7 +77,7 @@ def _examples_are_made_once() -> Iterator[None]:
         return frames[frame, seed]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(examples, "example", example)
+        patch.setattr(example_frames, "example", example)
         yield
 
 

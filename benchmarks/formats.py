@@ -22,7 +22,7 @@ import numpy as np
 from inputs import Inputs
 from libraries import Missing, library
 from measure import Contender, Rates
-from works import Facts, Work
+from packet_workloads import Facts, Work
 
 import lidarspec as ls
 from lidarspec import formats

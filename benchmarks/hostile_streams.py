@@ -15,9 +15,9 @@ import random
 from collections.abc import Callable
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.examples import random_frame
+from lidarspec.framing.example_frames import random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 
 #: Examples of each frame type that streams are made of.
 EXAMPLES = 6

@@ -1,6 +1,7 @@
 """The libraries for one format each that a user would install instead.
 
-Nothing of lidarspec is imported here: a worker in another environment (`remote`) runs these too.
+Nothing of lidarspec is imported here: a worker in another environment (`remote_contender`) also
+runs these functions.
 """
 
 from __future__ import annotations

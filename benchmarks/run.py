@@ -17,16 +17,16 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from capture_workloads import ELSEWHERE
 from environments import NOT_INSTALLED, find_version, read_failures
 from formats import CONVERSIONS
 from inputs import Inputs
 from libraries import Missing
-from live_works import ON_LINES
+from live_workloads import ON_LINES
 from measure import Clock, Contender, Rates, cpu_seconds, memcpy, raced, times
-from more_works import ELSEWHERE
-from remote import RemoteContender
+from packet_workloads import ON_BYTES, Work
+from remote_contender import RemoteContender
 from report import shown
-from works import ON_BYTES, Work
 
 import lidarspec as ls
 from lidarspec.framing.decoder import BACKENDS

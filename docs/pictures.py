@@ -27,11 +27,11 @@ from screens import svg as drawn
 import lidarspec as ls
 from lidarspec.exports import select_frame
 from lidarspec.exports.diagram import svg as diagram
-from lidarspec.points.look import fit, look
+from lidarspec.points.appearance import fit, look
 from lidarspec.simulation.simulator import simulate
-from lidarspec.view.feed import Feed
+from lidarspec.view.live_scans import Feed
 from lidarspec.view.svg import svg
-from lidarspec.view.window import FIGURES_PERIOD_S, Window
+from lidarspec.view.terminal_window import FIGURES_PERIOD_S, Window
 
 HERE = Path(__file__).parent / "pictures"
 #: pixels of the page, light or dark, milliseconds that it is let run, and colours of the PNG.

@@ -23,8 +23,8 @@ from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.view.canvas import BLANK, INKS, Cells
-from lidarspec.view.feed import Feed
-from lidarspec.view.window import Window
+from lidarspec.view.live_scans import Feed
+from lidarspec.view.terminal_window import Window
 
 HERE = Path(__file__).parent / "how-to" / "screens"
 #: pixels of a cell, of the margin, and of a dot.

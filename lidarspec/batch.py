@@ -50,13 +50,10 @@ from lidarspec.errors import (
     system_errors,
 )
 from lidarspec.formats import format_of, write
-from lidarspec.formats.tables import tables
-from lidarspec.libraries import import_library
+from lidarspec.formats.arrow_tables import tables
+from lidarspec.optional_libraries import import_library
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
-from lidarspec.sensor_operations import Sensor
-from lidarspec.stores import (
+from lidarspec.remote_files import (
     digest,
     file_of,
     files_in,
@@ -67,6 +64,9 @@ from lidarspec.stores import (
     stamp,
     take_away,
 )
+from lidarspec.scans.scan import Scan
+from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
+from lidarspec.sensor_operations import Sensor
 
 #: Bytes of a piece that is written to a file, and of a piece that is a partition in memory.
 PIECE = 256_000_000

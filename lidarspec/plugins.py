@@ -51,7 +51,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.results import Points
 from lidarspec.spec.syntax import prepare, seals
-from lidarspec.trust import document, own_settings
+from lidarspec.trusted_files import document, own_settings
 
 if TYPE_CHECKING:
     from pathlib import Path

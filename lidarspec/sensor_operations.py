@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from lidarspec.display import drawn
+from lidarspec.notebook_display import drawn
 from lidarspec.spec.sensor import SensorDescription
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class Sensor(SensorDescription):
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
         """
-        from lidarspec.framing.examples import example
+        from lidarspec.framing.example_frames import example
 
         return example(self, frame, seed=seed)
 

@@ -13,7 +13,7 @@ from lidarspec import Packets, PointCloud, Sensor, SpecError
 from lidarspec.framing.decoder import Decoder, frames_of, is_stream
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.packets.stream import PacketStream
-from lidarspec.testing.clouds import ULPS, assert_same_places, assert_well_formed, same
+from lidarspec.testing.cloud_assertions import ULPS, assert_same_places, assert_well_formed, same
 from tests.by_construct import by_construct
 
 

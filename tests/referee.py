@@ -29,7 +29,7 @@ import numpy as np
 import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.errors import LidarSpecError
-from lidarspec.testing.subject import mutate
+from lidarspec.testing.sensor_under_test import mutate
 from tests.every_sensor import every_sensor
 
 RECORD = Path(__file__).parents[1] / ".referee" / "record.json.xz"

@@ -22,10 +22,10 @@ BY_HAND = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-import by_hand, by_hand_serial
+import handwritten_packets, handwritten_serial
 import numpy as np
 from inputs import Inputs
-from works import BY_HAND, FIXED
+from packet_workloads import BY_HAND, FIXED
 from lidarspec.simulation.simulator import opening
 
 inputs = Inputs(Path(sys.argv[2]), quick=True)
@@ -39,14 +39,14 @@ def alike(key, data, found):
 
 for key, function in BY_HAND.items():
     alike(key, inputs.array(key), function(inputs.array(key)))
-alike("stl27l", inputs.noisy("stl27l").data, by_hand_serial.stl27l_stream(inputs.noisy("stl27l").data))
-alike("m1c1", inputs.stream("m1c1"), by_hand_serial.m1c1_stream(inputs.stream("m1c1")))
+alike("stl27l", inputs.noisy("stl27l").data, handwritten_serial.stl27l_stream(inputs.noisy("stl27l").data))
+alike("m1c1", inputs.stream("m1c1"), handwritten_serial.m1c1_stream(inputs.stream("m1c1")))
 first = len(opening(inputs.sensor("rplidar")))
-alike("rplidar", inputs.stream("rplidar"), by_hand_serial.rplidar_stream(inputs.stream("rplidar"), first))
-assert by_hand.payloads(inputs.capture("m1")).tobytes() == b"".join(inputs.frames("m1"))
+alike("rplidar", inputs.stream("rplidar"), handwritten_serial.rplidar_stream(inputs.stream("rplidar"), first))
+assert handwritten_packets.payloads(inputs.capture("m1")).tobytes() == b"".join(inputs.frames("m1"))
 print("payloads")
 scans = [scan.points for scan in inputs.sensor("m1").scans(inputs.array("m1"))]
-np.testing.assert_array_equal(np.hstack(by_hand.m1_scans(inputs.capture("m1")))[0], np.concatenate([cloud.x for cloud in scans]))
+np.testing.assert_array_equal(np.hstack(handwritten_packets.m1_scans(inputs.capture("m1")))[0], np.concatenate([cloud.x for cloud in scans]))
 print("scans")
 for key, (_, fixed, is_stream) in FIXED.items():
     data = b"".join(inputs.frames(key)) if is_stream else inputs.frames(key)
@@ -176,8 +176,10 @@ def test_the_reason_is_taken_from_what_the_installer_prints(
 
 def test_a_contender_runs_in_another_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     measure = load_module("measure", monkeypatch)
-    remote = load_module("remote", monkeypatch)
-    contender = remote.RemoteContender(Path(sys.executable), partial(measure.memcpy, quick=True))
+    remote_contender = load_module("remote_contender", monkeypatch)
+    contender = remote_contender.RemoteContender(
+        Path(sys.executable), partial(measure.memcpy, quick=True)
+    )
     try:
         assert contender.amount == measure.memcpy(quick=True).amount
         assert 0 < contender.seconds(2, time.perf_counter) < 10
@@ -190,9 +192,9 @@ def test_a_library_that_is_missing_in_the_other_environment_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     libraries = load_module("libraries", monkeypatch)
-    remote = load_module("remote", monkeypatch)
+    remote_contender = load_module("remote_contender", monkeypatch)
     with pytest.raises(libraries.Missing, match="not installed"):
-        remote.prepare_in(Path(sys.executable), libraries.library, "no_such_library")
+        remote_contender.prepare_in(Path(sys.executable), libraries.library, "no_such_library")
 
 
 def test_an_unknown_work_is_refused_with_the_names_there_are() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lidarspec.detect.uninstalled import signatures
+from lidarspec.detect.uninstalled_sensors import signatures
 from lidarspec.plugins import registry, summarize
 
 ROOT = Path(__file__).resolve().parents[1]

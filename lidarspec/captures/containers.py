@@ -22,9 +22,9 @@ from typing import Any, BinaryIO, NamedTuple, cast
 
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownName, UsageError, suggest, system_errors
-from lidarspec.libraries import import_library
+from lidarspec.optional_libraries import import_library
 from lidarspec.recording.format import MAGIC
-from lidarspec.stores import file_of
+from lidarspec.remote_files import file_of
 
 #: bytes at the start that determine the kind of a file.
 HEAD = 512

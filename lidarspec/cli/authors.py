@@ -11,7 +11,7 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, output_option
 from lidarspec.cli.terminal import note, say
-from lidarspec.detect.heard import beginning
+from lidarspec.detect.sample_bytes import beginning
 from lidarspec.drafting.draft import (
     Link,
     Names,
@@ -23,10 +23,10 @@ from lidarspec.drafting.draft import (
 )
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, ExportError, export as exported, select_frame
-from lidarspec.libraries import import_library
+from lidarspec.optional_libraries import import_library
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.testing.check import Report, reports, target
-from lidarspec.testing.subject import EXAMPLES
+from lidarspec.testing.sensor_under_test import EXAMPLES
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 

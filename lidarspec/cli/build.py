@@ -20,11 +20,11 @@ from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageError, suggest
 from lidarspec.explaining.assignments import arguments, values
 from lidarspec.explaining.explanation import describe_reply, explain
-from lidarspec.explaining.pieces import explain_piece, pieces
+from lidarspec.explaining.input_segments import explain_piece, pieces
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.hexadecimal import parse_hex
+from lidarspec.transports.hex_text import parse_hex
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Chunk
 

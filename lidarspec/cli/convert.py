@@ -32,14 +32,14 @@ from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import recorder_like
 from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
 from lidarspec.formats import check_holds, format_of, targets, write, write_imu
-from lidarspec.formats.writing import replacing
+from lidarspec.formats.common import replacing
 from lidarspec.packets.imu import join_samples
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
+from lidarspec.remote_files import found
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Times, iter_received
 from lidarspec.sensor_operations import Sensor
-from lidarspec.stores import found
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 

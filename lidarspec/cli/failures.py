@@ -88,7 +88,7 @@ def _message(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {errors.failure_reason(error.filename, error)}"
     if isinstance(error, errors.WireError) and error.data:
-        from lidarspec.explaining.wording import hexdump
+        from lidarspec.explaining.formatting import hexdump
 
         return f"{error}\n{hexdump(error)}"
     return str(error)

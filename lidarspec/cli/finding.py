@@ -18,7 +18,6 @@ from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, voice
 from lidarspec.detect.doctor import computer, examine
-from lidarspec.detect.heard import Heard
 from lidarspec.detect.identification import (
     Verdict,
     best,
@@ -29,7 +28,8 @@ from lidarspec.detect.identification import (
     verdicts,
 )
 from lidarspec.detect.listen import LISTEN, hear, ignore, probe, started_first, udp_ports
-from lidarspec.detect.uninstalled import describe, install_commands, recognize
+from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.uninstalled_sensors import describe, install_commands, recognize
 from lidarspec.drafting.checksum_search import search
 from lidarspec.drafting.periods import Structure, cut, structure
 from lidarspec.drafting.samples import Match

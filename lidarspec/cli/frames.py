@@ -15,12 +15,12 @@ from lidarspec.cli.listing import emit_lines
 from lidarspec.cli.options import OFFSET, count_option, selecting, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_options, table
 from lidarspec.cli.terminal import note
-from lidarspec.detect.heard import Heard
+from lidarspec.detect.sample_bytes import Heard
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, values
+from lidarspec.explaining.formatting import TextSpan, number
+from lidarspec.explaining.input_segments import InputPiece, explain_piece, pieces
 from lidarspec.explaining.listing import LINED, Line, list_differences
-from lidarspec.explaining.pieces import InputPiece, explain_piece, pieces
-from lidarspec.explaining.wording import TextSpan, number
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import selection as scans
 from lidarspec.sensor_operations import Sensor

@@ -10,7 +10,7 @@ import click
 from lidarspec.cli.failures import NO_DATA
 from lidarspec.cli.output import emit_parts, output_options, size
 from lidarspec.cli.terminal import note
-from lidarspec.explaining.contents import contents, shown
+from lidarspec.explaining.file_contents import contents, shown
 
 
 @click.command()

@@ -26,7 +26,7 @@ import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.terminal import note
-from lidarspec.detect.heard import LOOKED_AT, Heard, beginning, leading
+from lidarspec.detect.sample_bytes import LOOKED_AT, Heard, beginning, leading
 from lidarspec.errors import (
     CommandError,
     LidarSpecError,
@@ -41,7 +41,7 @@ from lidarspec.plugins import sensors
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Times, iter_received
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal, parse_hex
+from lidarspec.transports.hex_text import hex_chunks, is_hexadecimal, parse_hex
 from lidarspec.transports.protocol import Chunk, no_bytes
 
 if TYPE_CHECKING:
@@ -279,7 +279,7 @@ def nearest_fault(given: Heard) -> WireError:
     It is the error of the sensor that parsed most of the input, or a general one.
     """
     from lidarspec.detect.identification import nearest
-    from lidarspec.detect.uninstalled import suggest_installation
+    from lidarspec.detect.uninstalled_sensors import suggest_installation
 
     if not given.data:
         return suggest(WireError(no_bytes(given.source, given.warnings)), "lidarspec sensors")

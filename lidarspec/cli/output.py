@@ -201,7 +201,7 @@ def emit_parts(
         for part in parts:
             say(part, nl=isinstance(part, str), colour=colour)
         return
-    from lidarspec.formats.writing import (
+    from lidarspec.formats.common import (
         replacing,
     )  # imports the modules of scans, which only verbs that write a file need
 

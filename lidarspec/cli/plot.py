@@ -17,13 +17,13 @@ from lidarspec.cli.output import emit
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError
-from lidarspec.formats.writing import replacing
-from lidarspec.points.look import fit, look
+from lidarspec.formats.common import replacing
+from lidarspec.points.appearance import fit, look
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
-from lidarspec.view import figures
-from lidarspec.view.feed import Feed
+from lidarspec.view import matplotlib_figures
+from lidarspec.view.live_scans import Feed
 from lidarspec.view.svg import svg
 
 
@@ -89,8 +89,10 @@ def plot(
         suffix = ".svg"
     else:
         suffix = Path(output).suffix.lower()
-    if suffix not in figures.SUFFIXES:
-        raise UsageError(f"{output}: pictures are written as {', '.join(figures.SUFFIXES)}")
+    if suffix not in matplotlib_figures.SUFFIXES:
+        raise UsageError(
+            f"{output}: pictures are written as {', '.join(matplotlib_figures.SUFFIXES)}"
+        )
     refuse_overwriting(output, source, sensor_id)
     with open_device(source, sensor_id) as device:
         if kind == "scan":
@@ -116,7 +118,7 @@ def _draw_scan(
     if suffix == ".svg":
         emit(svg(scan.points, view, title), output)
     else:
-        _save(figures.of_scan(scan, view, title), output, suffix)
+        _save(matplotlib_figures.of_scan(scan, view, title), output, suffix)
 
 
 def _find_scan(device: Device, source: str, selection: Selection, number: int) -> Scan:
@@ -150,9 +152,9 @@ def _draw_over_time(
     """Return a figure of the data until a time of `time.monotonic`."""
     title = f"{device.sensor.id}, {Path(source).name if device.place else source}"
     if kind == "rates":
-        rates = figures.Rates(Feed(device, select=selection), end_s)
+        rates = matplotlib_figures.Rates(Feed(device, select=selection), end_s)
         conclude(device)
-        return figures.of_rates(rates, title)
+        return matplotlib_figures.of_rates(rates, title)
     scans = scans_of(device, source, selection, until=end_s)
     first = next(scans, None)
     if first is None:
@@ -164,15 +166,15 @@ def _draw_over_time(
         conclude(device)
 
     if kind == "ranges":
-        return figures.of_ranges(iter_scans(), title)
-    return figures.of_intensities(iter_scans(), title)
+        return matplotlib_figures.of_ranges(iter_scans(), title)
+    return matplotlib_figures.of_intensities(iter_scans(), title)
 
 
 def _save(figure: Any, output: str, suffix: str) -> None:
     if output == "-":
         text = io.BytesIO()
-        figures.save(figure, text, suffix)
+        matplotlib_figures.save(figure, text, suffix)
         emit(text.getvalue().decode(), output)
         return
     with replacing(Path(output)) as part:
-        figures.save(figure, part, suffix)
+        matplotlib_figures.save(figure, part, suffix)

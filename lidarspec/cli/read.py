@@ -31,8 +31,8 @@ from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Slice
 from lidarspec.sensor_operations import Sensor
-from lidarspec.view.feed import LOOK_S, Feed
-from lidarspec.view.meter import MeterReading, format_figure
+from lidarspec.view.live_scans import LOOK_S, Feed
+from lidarspec.view.rate_meter import MeterReading, format_figure
 
 #: Width and decimals of the columns of points.
 POINTS = {

@@ -26,7 +26,7 @@ from lidarspec.errors import (
 )
 from lidarspec.framing.results import Counters
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.recording.appending import Appender
+from lidarspec.recording.background_writer import Appender
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor

@@ -18,7 +18,7 @@ from lidarspec.cli.output import emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, say
 from lidarspec.errors import SpecError
 from lidarspec.known_sensors import KnownLink, KnownSensor, list_described_sensors, no_sensors
-from lidarspec.trust import FILE, TRUSTED, trust as trusted, user_folder
+from lidarspec.trusted_files import FILE, TRUSTED, trust as trusted, user_folder
 
 if TYPE_CHECKING:
     from lidarspec.plugins import Plugin
@@ -139,7 +139,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         commands = {name: _command(sensor, name) for name in sensor.commands}
         emit_json({**_facts(sensor), "frames": frames, "commands": commands}, output)
         return
-    from lidarspec.explaining.wording import describe_losses
+    from lidarspec.explaining.formatting import describe_losses
 
     low, high = sensor.range_limits
     losses = describe_losses(sensor).replace("`", "")
@@ -313,7 +313,7 @@ def _command(sensor: Sensor, name: str) -> Mapping[str, Any]:
 
 
 def _command_text(sensor: Sensor, name: str) -> str:
-    from lidarspec.explaining.wording import format_argument_type
+    from lidarspec.explaining.formatting import format_argument_type
 
     command = _command(sensor, name)
     args = "".join(

@@ -21,7 +21,7 @@ from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.errors import UsageError, suggest
 from lidarspec.known_sensors import no_sensors
 from lidarspec.plugins import registry, sensor as named_sensor
-from lidarspec.points.look import look
+from lidarspec.points.appearance import look
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scan import Scan
 from lidarspec.sensor_operations import Sensor

@@ -18,18 +18,18 @@ from lidarspec.cli.output import drawn
 from lidarspec.cli.terminal import ended_by_terminate, note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError
-from lidarspec.points.look import look
-from lidarspec.recording.switch import RecordingSwitch
+from lidarspec.points.appearance import look
+from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Origin
 from lidarspec.view.canvas import Cells
-from lidarspec.view.feed import LOOK_S, Feed
+from lidarspec.view.live_scans import LOOK_S, Feed
 from lidarspec.view.page_server import PageServer, open_page_server
 from lidarspec.view.polar import picture
-from lidarspec.view.screen import Screen, Terminated, encodable, interactive, keyboard
-from lidarspec.view.window import Window
+from lidarspec.view.terminal_screen import Screen, Terminated, encodable, interactive, keyboard
+from lidarspec.view.terminal_window import Window
 
 
 @click.command()

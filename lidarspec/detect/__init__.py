@@ -3,9 +3,9 @@
 In: a SOURCE, or bytes. Out: a verdict, and findings with the command that fixes them. Modules
 in reading order:
 
-* `heard`: the bytes of one source.
+* `sample_bytes`: the bytes of one source.
 * `listen`: read some bytes from any source.
 * `identification`: which installed sensor sent them.
-* `uninstalled`: sensors that are not installed and may have sent them.
+* `uninstalled_sensors`: sensors that are not installed and may have sent them.
 * `doctor`: why no bytes, or no valid frames, arrive.
 """

@@ -26,9 +26,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.detect.heard import Heard
 from lidarspec.detect.listen import LISTEN, hear, ignore
-from lidarspec.detect.uninstalled import suggest_installation
+from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.uninstalled_sensors import suggest_installation
 from lidarspec.device.settings import find_device
 from lidarspec.drafting.checksum_search import search
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidarspec.detect.heard import LOOKED_AT, Heard, beginning
+from lidarspec.detect.sample_bytes import LOOKED_AT, Heard, beginning
 from lidarspec.device.session import Pending, Session
 from lidarspec.errors import LidarSpecError, SourceError
 from lidarspec.framing.decoder import Decoder

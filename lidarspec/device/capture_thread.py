@@ -20,7 +20,7 @@ from dataclasses import replace
 from enum import Enum
 
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.appending import TrafficLog
+from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 

@@ -16,7 +16,7 @@ from shlex import quote
 from typing import Any, NoReturn, overload
 
 from lidarspec.detect.identification import contradiction, detect, read_info, simulated_sensor
-from lidarspec.device.arrivals import Arrival, FileInput, Input
+from lidarspec.device.device_input import Arrival, FileInput, Input
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.packet_reader import PacketReader
 from lidarspec.device.session import Reply
@@ -28,7 +28,7 @@ from lidarspec.packets.imu import ImuSamples, join_samples
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
-from lidarspec.recording.appending import TrafficLog
+from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, Sieve

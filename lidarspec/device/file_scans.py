@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.device.arrivals import FileInput
+from lidarspec.device.device_input import FileInput
 from lidarspec.device.packet_reader import PacketReader
 from lidarspec.errors import UsageError
 from lidarspec.expressions.columns import AROUND

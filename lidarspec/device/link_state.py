@@ -11,7 +11,7 @@ from pathlib import Path
 from shlex import quote
 
 from lidarspec.device.capture_thread import Capture
-from lidarspec.device.senders import SenderFilter
+from lidarspec.device.sender_filter import SenderFilter
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
 from lidarspec.sensor_operations import Sensor

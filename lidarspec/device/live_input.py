@@ -18,10 +18,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lidarspec.device.arrivals import Arrival, Input, answers, decode_chunks
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
+from lidarspec.device.device_input import Arrival, Input, answers, decode_chunks
 from lidarspec.device.link_state import LinkState
-from lidarspec.device.senders import SenderFilter, frame_senders
+from lidarspec.device.sender_filter import SenderFilter, frame_senders
 from lidarspec.device.session import Outgoing, Pending, Reply, Session, learn_options
 from lidarspec.errors import (
     CommandError,
@@ -34,7 +34,7 @@ from lidarspec.errors import (
 )
 from lidarspec.framing.decoder import Decoder, backend as backend_named
 from lidarspec.framing.results import Counters, Frames
-from lidarspec.recording.appending import TrafficLog
+from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Address
 from lidarspec.spec.links import Http, Link, Udp

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
-from lidarspec.device.arrivals import Arrival
+from lidarspec.device.device_input import Arrival
 from lidarspec.device.first_frames import FirstFrames
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames

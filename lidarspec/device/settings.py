@@ -28,9 +28,9 @@ from typing import Any
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggest
 from lidarspec.plugins import names_file, sensor as named_sensor
 from lidarspec.points.mount import Mount
+from lidarspec.remote_files import is_stored
 from lidarspec.sensor_operations import Sensor
-from lidarspec.stores import is_stored
-from lidarspec.trust import FILE, beside, document, foreign, is_trusted, own_settings
+from lidarspec.trusted_files import FILE, beside, document, foreign, is_trusted, own_settings
 
 #: a valid name: no suffix, scheme or folder, and not the name of a port on Windows.
 _NAME = re.compile(r"(?!(?i:com|lpt)\d+$)[A-Za-z][A-Za-z0-9_-]*")

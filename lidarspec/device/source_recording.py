@@ -22,7 +22,7 @@ import numpy as np
 from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
 from lidarspec.device.device import Device
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.appending import Appender
+from lidarspec.recording.background_writer import Appender
 from lidarspec.recording.format import Header
 from lidarspec.recording.recorders import MadeFor, recorder
 from lidarspec.sensor_operations import Sensor

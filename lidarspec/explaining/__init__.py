@@ -5,10 +5,10 @@ each frame, and its lines; or the contents of a file. Modules in reading order:
 
 * `explanation`: `explain`: from bytes to rows, verdict and points.
 * `frame_rows`: one frame as rows of values.
-* `damage`: the flipped bit, or the lost or inserted byte, that explains damage.
-* `pieces`: a stream in pieces: valid frames, damaged frames, and other bytes.
-* `wording`: the texts for values, bits, rows, points and differences.
-* `contents`: the contents of a file.
+* `damage_search`: the flipped bit, or the lost or inserted byte, that explains damage.
+* `input_segments`: a stream in pieces: valid frames, damaged frames, and other bytes.
+* `formatting`: the texts for values, bits, rows, points and differences.
+* `file_contents`: the contents of a file.
 * `assignments`: text from users as raw values.
 * `listing`: rows and differences as lines, with roles for colours.
 """

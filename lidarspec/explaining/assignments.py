@@ -21,7 +21,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Octets, Range
 from lidarspec.spec.fields import factor, split_unit
 from lidarspec.spec.tree import FieldInfo, evaluate
-from lidarspec.transports.hexadecimal import parse_hex
+from lidarspec.transports.hex_text import parse_hex
 
 _STEP = r"\w+(?:\[(?:\d+|\*)\])*"
 _PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")

@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 
 from lidarspec.device.session import Reply
-from lidarspec.display import drawn
 from lidarspec.errors import LidarSpecError, WireError
-from lidarspec.explaining.damage import describe_damage
+from lidarspec.explaining.damage_search import describe_damage
+from lidarspec.explaining.formatting import Difference, FieldValue, Point, Row, TextSpan
 from lidarspec.explaining.frame_rows import FrameRows
 from lidarspec.explaining.listing import Line, Listing, text
-from lidarspec.explaining.wording import Difference, FieldValue, Point, Row, TextSpan
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import examine
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, pack_found
+from lidarspec.notebook_display import drawn
 from lidarspec.packets.stream import PacketStream
-from lidarspec.points.plain import evaluate_plainly
-from lidarspec.scans.ends import first_points
+from lidarspec.points.reference_evaluator import evaluate_plainly
+from lidarspec.scans.scan_ends import first_points
 from lidarspec.spec import Sensor
 
 #: Maximum number of points in the notes of a frame without arrays.

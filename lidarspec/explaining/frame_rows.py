@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from lidarspec.errors import WireError
-from lidarspec.explaining.wording import FieldValue, Row
+from lidarspec.explaining.formatting import FieldValue, Row
 from lidarspec.frames.compilability import NotCompilable
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import plain_fields

@@ -11,7 +11,14 @@ import re
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 
-from lidarspec.explaining.wording import Difference, FieldValue, Row, TextSpan, bit_picture, number
+from lidarspec.explaining.formatting import (
+    Difference,
+    FieldValue,
+    Row,
+    TextSpan,
+    bit_picture,
+    number,
+)
 from lidarspec.frames.wire_table import format_hex
 
 #: Bytes in a line, spaces of a level of nesting, and the maximum widths of the columns of bits and

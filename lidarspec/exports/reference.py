@@ -13,12 +13,12 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.explaining.wording import describe_losses, format_argument_type
+from lidarspec.explaining.formatting import describe_losses, format_argument_type
 from lidarspec.frames.wire_table import frame_size, wire_table
 from lidarspec.framing.results import Counters, Found, pack_found
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Command, Frame, Sensor
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.timing import Clock, Every, OnFlag, Split

@@ -3,13 +3,13 @@
 In: scans. Out: a file, which gets its name only when it is complete. `write` is the function
 for callers. `formats` includes the formats of plugins. Modules in reading order:
 
-* `writing`: functions shared by the formats.
+* `common`: functions shared by the formats.
 * `text`: .csv, .csv.gz and .xyz, one row per point.
 * `arrays`: .npz, one array per column; .npy, a structured array; .zarr, a folder with one array per
   column.
-* `tables`: .parquet, .arrow and .feather, for data tools.
-* `rows`: points as rows of bytes after a header.
-* `clouds`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
+* `arrow_tables`: .parquet, .arrow and .feather, for data tools.
+* `point_rows`: points as rows of bytes after a header.
+* `point_cloud_files`: .pcd, .lzf.pcd, .ply and KITTI's .bin.
 * `las`: .las and .laz, for surveying tools.
 * `e57`: .e57, with a header and points for each scan.
 * `messages`: ROS messages of scans, packets and IMU samples.
@@ -39,15 +39,15 @@ from lidarspec.errors import (
     system_errors,
 )
 from lidarspec.formats.arrays import NPY, NPZ, ZARR
+from lidarspec.formats.arrow_tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
-from lidarspec.formats.clouds import KITTI, LZF_PCD, PCD, PLY
+from lidarspec.formats.common import replacing
 from lidarspec.formats.e57 import E57
 from lidarspec.formats.foxglove import FOXGLOVE
 from lidarspec.formats.las import LAS, LAZ
+from lidarspec.formats.point_cloud_files import KITTI, LZF_PCD, PCD, PLY
 from lidarspec.formats.rerun import RERUN
-from lidarspec.formats.tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.text import CSV, CSV_GZ, XYZ, write_columns
-from lidarspec.formats.writing import replacing
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.plugins import registry
 from lidarspec.scans.scan import Scan

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.formats.rows import NAMES, PointRows, write_rows
-from lidarspec.formats.writing import Spool, picture, select_points
-from lidarspec.libraries import import_library
+from lidarspec.formats.common import Spool, picture, select_points
+from lidarspec.formats.point_rows import NAMES, PointRows, write_rows
+from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import units_of
 from lidarspec.points.table_types import structured_type
 from lidarspec.scans.scan import Scan

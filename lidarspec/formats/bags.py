@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.formats.messages import CLOUD, SCAN, Message, Messages
-from lidarspec.libraries import import_library
-from lidarspec.scans.planes import Planes
+from lidarspec.optional_libraries import import_library
+from lidarspec.scans.beams import Planes
 from lidarspec.scans.scan import Scan
-from lidarspec.transports.bags import RAW
 from lidarspec.transports.protocol import Chunk, Format
+from lidarspec.transports.robotics_logs import RAW
 
 #: message type -> topic.
 TOPICS = {CLOUD: "/points", SCAN: "/scan", RAW: "/packets"}

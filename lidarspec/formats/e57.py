@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import GPS_EPOCH, columns_of
-from lidarspec.libraries import import_library
+from lidarspec.formats.common import GPS_EPOCH, columns_of
+from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 

@@ -14,10 +14,10 @@ from typing import Any
 from lidarspec.errors import UsageError
 from lidarspec.formats.bags import CHUNK, TOPICS
 from lidarspec.formats.messages import CLOUD, SCAN, fields_of, records
-from lidarspec.libraries import import_library
+from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import PointCloud
+from lidarspec.scans.beams import Planes
 from lidarspec.scans.laserscan import LaserScan
-from lidarspec.scans.planes import Planes
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
-from lidarspec.formats.writing import GPS_EPOCH, behind, columns_of
-from lidarspec.libraries import import_library
+from lidarspec.formats.common import GPS_EPOCH, behind, columns_of
+from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 

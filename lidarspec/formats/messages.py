@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
-from lidarspec.formats.writing import picture
-from lidarspec.libraries import import_library
+from lidarspec.formats.common import picture
+from lidarspec.optional_libraries import import_library
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.scan import Scan
-from lidarspec.transports.bags import DATAGRAM, RAW, STAMP, STREAM
 from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.robotics_logs import DATAGRAM, RAW, STAMP, STREAM
 
 CLOUD, SCAN, IMU = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "LaserScan", "Imu"))
 #: the numbers of types in PointField; other types are written as float64.
@@ -58,7 +58,7 @@ class Messages:
         self._counts = release.startswith("ROS1")
 
     def raw(self, packet: Chunk, *, datagram: bool = True) -> Message:
-        """Return a raw packet as a message, which `transports.bags` reads again.
+        """Return a raw packet as a message, which `transports.robotics_logs` reads again.
 
         Args:
             datagram: whether it is a datagram, not a piece of a stream.

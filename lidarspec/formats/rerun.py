@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import columns_of
-from lidarspec.libraries import import_library
+from lidarspec.formats.common import columns_of
+from lidarspec.optional_libraries import import_library
+from lidarspec.points.appearance import STEPS, Look, look, steps
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp
-from lidarspec.points.look import STEPS, Look, look, steps
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.writing import behind, find_points, select_points
+from lidarspec.formats.common import behind, find_points, select_points
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 

@@ -2,11 +2,11 @@
 
 The rule of streams, without the search: at the first byte of a datagram the order of the types
 decides, a type with `after` only counts while it is announced, and a frame has to be as long as its
-datagram. Datagrams that are all alike are judged as rows (`lidarspec.framing.steady`); of others
-each type judges those that no type before it has taken. Only what makes a plugin fail is judged
-alone, so that one datagram does not cost the others.
+datagram. Datagrams that are all alike are judged as rows (`lidarspec.framing.regular_rows`). Of the
+others, each type judges the datagrams that no earlier type has taken. Only a datagram that makes a
+plugin fail is judged alone, so that it does not cost the others.
 
-A message in several datagrams is joined before this (`lidarspec.framing.assembly`).
+A message in several datagrams is joined before this (`lidarspec.framing.datagram_assembly`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.arrays import alike, repeat
 from lidarspec.frames.layout import Layout, equal
 from lidarspec.framing.candidates import Bytes1D, Framing, Piece, SearchState
+from lidarspec.framing.regular_rows import steady_datagrams, step_between
 from lidarspec.framing.results import (
     CONSTANT,
     LENGTH,
@@ -31,7 +32,6 @@ from lidarspec.framing.results import (
     Status,
     array_of,
 )
-from lidarspec.framing.steady import steady_datagrams, step_between
 
 
 def sorted_datagrams(

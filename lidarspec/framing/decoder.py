@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, UsageError, refuse_text
 from lidarspec.frames.arrays import alike, keep_freed_memory, repeat
 from lidarspec.frames.layout import Sums
-from lidarspec.framing.assembly import Assembly, Joined
 from lidarspec.framing.candidates import Bytes1D, Framing, Piece, SearchState
+from lidarspec.framing.datagram_assembly import Assembly, Joined
 from lidarspec.framing.datagrams import sorted_datagrams
 from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.regular_rows import steady_stream
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
 from lidarspec.framing.search import leftmost
-from lidarspec.framing.steady import steady_stream
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Udp
 from lidarspec.spec.sensor import SensorDescription

@@ -22,7 +22,6 @@ from lidarspec.frames.layout import Layout, Refusal, Sums, rows_at
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.wire_coder import FormCoder, frame_coder
 from lidarspec.framing.frame_codec import Codec
-from lidarspec.framing.many_lengths import AlikeLayouts, LayoutGroup, Together
 from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.framing.results import (
     CONSTANT,
@@ -34,6 +33,7 @@ from lidarspec.framing.results import (
     Status,
 )
 from lidarspec.framing.text_frames import TextCodec
+from lidarspec.framing.variable_lengths import AlikeLayouts, LayoutGroup, Together
 from lidarspec.spec.description import Frame
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import plugin_errors
 from lidarspec.expressions.columns import Batch, Fields, of_points, padding_mask
 from lidarspec.points.conventions import vendor_turn
-from lidarspec.points.plain import flat
+from lidarspec.points.reference_evaluator import flat
 from lidarspec.spec.results import Imu
 from lidarspec.spec.sensor import SensorDescription
 

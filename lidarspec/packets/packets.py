@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.display import drawn
 from lidarspec.errors import SpecError, UnknownField
 from lidarspec.expressions.columns import AROUND, Batch, physical
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.results import Counters, Numbers, array_of
+from lidarspec.notebook_display import drawn
 from lidarspec.packets.clocks import part_times
 from lidarspec.packets.imu import ImuSamples, samples
 from lidarspec.points.cloud import PointCloud

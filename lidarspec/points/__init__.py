@@ -1,8 +1,8 @@
-"""From packets to points: what a sensor's `points` function says, for a batch at a time.
+"""Convert packets to points by the sensor's `points` function, a batch at a time.
 
-In: `Packets`. Out: a `PointCloud`, whose columns are made when they are read. There are three ways
-to compute them, with one meaning:
-plainly, by NumPy on a plan, and by compiled kernels. Modules in reading order:
+In: `Packets`. Out: a `PointCloud`, whose columns are computed when they are first read. Three
+evaluators give the same columns: the reference evaluator, a NumPy plan, and compiled kernels.
+Modules in reading order:
 
 * `conventions`: what the columns mean: axes, ranges, coordinates, types.
 * `column_sources`: where the columns of consecutive points come from.
@@ -10,13 +10,13 @@ plainly, by NumPy on a plan, and by compiled kernels. Modules in reading order:
 * `cloud`: point clouds.
 * `mount`: how a sensor is mounted on its carrier.
 * `colours`: the scale of colours for values, on a dark and on a light ground.
-* `look`: how a cloud is looked at: what a picture shows of it, and what its colours stand for.
-* `plain`: the reference: `points` evaluated with ordinary NumPy, and its result flattened.
-* `windows`: fields by their one or two bytes, and tables of what they can hold.
+* `appearance`: the extent and the colours of a drawn cloud.
+* `reference_evaluator`: `points` evaluated with ordinary NumPy; other evaluators must agree.
+* `lookup_tables`: fields by their one or two bytes, and tables of what they can hold.
 * `plan`: `points` traced once for a layout, as expressions of the columns.
-* `shares`: the packets of one layout in a batch, with their plan and plain results.
+* `layout_groups`: the packets of one layout in a batch, with their plan and plain results.
 * `batch_columns`: the columns of planned points, computed when they are first read.
-* `evaluate`: the points of a batch, by plans where there are such, else plainly.
+* `evaluate`: the points of a batch, by plans if `points` can be traced.
 * `numpy_plan`, `numba_kernels`: back ends, each behind one function `compile(plan, names)`.
 * `backends`: the choice between them.
 """

@@ -29,8 +29,8 @@ from lidarspec.points.conventions import (
     turned_azimuth,
     vendor_turn,
 )
-from lidarspec.points.plain import PacketBatch
-from lidarspec.points.shares import Share
+from lidarspec.points.layout_groups import Share
+from lidarspec.points.reference_evaluator import PacketBatch
 
 #: columns that one program or kernel computes.
 COMPILED_TOGETHER = ("x", "y", "z", "intensity")

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.display import drawn
 from lidarspec.errors import UnknownName, UsageError
-from lidarspec.libraries import import_library
+from lidarspec.notebook_display import drawn
+from lidarspec.optional_libraries import import_library
 from lidarspec.points.column_sources import ColumnSource, LazyColumns, Stretch, Stretches
 from lidarspec.points.conventions import TYPES, UNITS, ExtraType, Floats, Grid, Grids, whole_columns
 from lidarspec.points.table_types import STRUCTURED, arrow_schema, structured_type

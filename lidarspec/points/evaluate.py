@@ -21,9 +21,9 @@ from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import Group, Rows
 from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.conventions import Grids, grid_of
-from lidarspec.points.plain import Evaluated, PacketBatch, evaluate_plainly, stamp_of
+from lidarspec.points.layout_groups import PlainValues, Share
 from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
-from lidarspec.points.shares import PlainValues, Share
+from lidarspec.points.reference_evaluator import Evaluated, PacketBatch, evaluate_plainly, stamp_of
 
 #: numbers that are checked together, so that they stay in the cache.
 CHECKED_AT_ONCE = 1 << 15

@@ -38,8 +38,8 @@ from lidarspec.points.conventions import (
     returned_range,
     shown_range,
 )
-from lidarspec.points.plain import kinds_of, parts_of
-from lidarspec.points.windows import is_number
+from lidarspec.points.lookup_tables import is_number
+from lidarspec.points.reference_evaluator import kinds_of, parts_of
 from lidarspec.spec.results import Cartesian, Polar
 from lidarspec.spec.vocabulary import Along, row_numbers
 

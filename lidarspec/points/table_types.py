@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.libraries import import_library
+from lidarspec.optional_libraries import import_library
 
 #: x y z intensity ring time at PCL's offsets.
 STRUCTURED = np.dtype(

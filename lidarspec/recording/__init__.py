@@ -6,6 +6,6 @@ file. Modules in reading order:
 * `format`: reads and writes the bytes of .lsr files, also of damaged ones.
 * `recorders`: `Recorder` and others, by the suffix of the file: all data, packets for Wireshark,
   raw bytes.
-* `switch`: a recorder that is switched on and off while a source is read.
-* `appending`: the thread that writes whole records, so that a slow disk delays nothing.
+* `recorder_switch`: a recorder that is switched on and off while a source is read.
+* `background_writer`: the thread that writes whole records, so that a slow disk delays nothing.
 """

@@ -47,9 +47,9 @@ from typing import Any, BinaryIO, Literal
 
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
+from lidarspec.remote_files import file_of
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.options import Learned
-from lidarspec.stores import file_of
 from lidarspec.transports.protocol import Closing
 
 VERSION = 1

@@ -22,7 +22,7 @@ from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
 from lidarspec.plugins import registry, sensor as named_sensor
-from lidarspec.recording.appending import Appender, TrafficLog
+from lidarspec.recording.background_writer import Appender, TrafficLog
 from lidarspec.recording.format import (
     DATAGRAM,
     EVENT,

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from lidarspec.packets.masked_sector import Sector
 from lidarspec.packets.packets import Packets
-from lidarspec.points.plain import Evaluated
+from lidarspec.points.reference_evaluator import Evaluated
 from lidarspec.scans.completeness import OpenScan, PacketCounts
-from lidarspec.scans.ends import End, EndFinder, first_points
 from lidarspec.scans.limits import ScanLimits
+from lidarspec.scans.scan_ends import End, EndFinder, first_points
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 

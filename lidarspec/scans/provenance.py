@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from lidarspec.packets.packets import Packets
-from lidarspec.points.plain import Evaluated
-from lidarspec.scans.ends import first_points
+from lidarspec.points.reference_evaluator import Evaluated
+from lidarspec.scans.scan_ends import first_points
 
 
 class PointOrigin(NamedTuple):

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.display import drawn
 from lidarspec.errors import UsageError
+from lidarspec.notebook_display import drawn
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axes_of

@@ -21,12 +21,12 @@ from lidarspec.points.cloud import LazyCloud, PointCloud
 from lidarspec.points.column_sources import Stretch, Stretches
 from lidarspec.points.evaluate import evaluate_guarded
 from lidarspec.points.mount import Mount
-from lidarspec.points.plain import Evaluated
+from lidarspec.points.reference_evaluator import Evaluated
 from lidarspec.scans.cutter import Cutter
-from lidarspec.scans.ends import first_points
 from lidarspec.scans.masking import Masking, describe
 from lidarspec.scans.provenance import PointRun, Provenance, find_part
 from lidarspec.scans.scan import Scan
+from lidarspec.scans.scan_ends import first_points
 from lidarspec.spec.sensor import SensorDescription
 
 

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, did_you_mean
-from lidarspec.trust import document
+from lidarspec.trusted_files import document
 
 Floats = NDArray[np.float64]
 #: A value that broadcasts against the beams: an array, or one number for all.

@@ -30,11 +30,11 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.expressions.columns import AROUND, Batch, Column, Fields, of_points
 from lidarspec.frames.frame_table import Group, Rows, Table
-from lidarspec.framing.examples import example
+from lidarspec.framing.example_frames import example
 from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.points.conventions import coordinates, direction_of
-from lidarspec.points.plain import parts_of
+from lidarspec.points.reference_evaluator import parts_of
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.frame_maker import FrameMaker, seal_frames
 from lidarspec.simulation.scenes import Room, Scene

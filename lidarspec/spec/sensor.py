@@ -43,7 +43,7 @@ from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.options import Learned, OptionType, option_types
 from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.timing import Clock, OnChange, OnWrap, Sequence, Split
-from lidarspec.trust import beside
+from lidarspec.trusted_files import beside
 
 if TYPE_CHECKING:
     from pathlib import Path

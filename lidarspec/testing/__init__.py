@@ -11,17 +11,17 @@ order:
 * `properties`: the table of properties that every sensor must have.
 * `conformance`: everything that `check` checks, as one test for pytest.
 * `findings`: the rules, and the exception of a property that does not hold.
-* `subject`: a sensor under test, with its examples.
-* `declared`: checks of the declaration alone.
+* `sensor_under_test`: a sensor under test, with its examples.
+* `declaration`: checks of the declaration alone.
 * `frames`: checks of single frames, valid and damaged.
 * `consistency`: agreement of angles, clock and times of points.
 * `geometry`: directions and positions of points.
 * `commands`: requests, replies, and the replies of the simulated sensor.
 * `streams`: streams of frames, decoded twice and in batches.
-* `clouds`: assertions about point clouds.
+* `cloud_assertions`: assertions about point clouds.
 * `vectors`: golden frames from a manual or capture.
 * `check`: all of it without pytest, for a name, file, distribution or folder.
-* `plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.
+* `pytest_plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
-from lidarspec.libraries import import_library
+from lidarspec.optional_libraries import import_library
 
 if TYPE_CHECKING:
     from lidarspec.testing.conformance import SensorConformance, assert_conformance
@@ -43,8 +43,8 @@ def __getattr__(name: str) -> Any:
     import_library("hypothesis", "testing")
     pytest = import_library("pytest", "testing")
     # pytest warns if the module is imported already
-    if "lidarspec.testing.clouds" not in sys.modules:
-        pytest.register_assert_rewrite("lidarspec.testing.clouds")
+    if "lidarspec.testing.cloud_assertions" not in sys.modules:
+        pytest.register_assert_rewrite("lidarspec.testing.cloud_assertions")
     from lidarspec.testing import conformance
 
     return getattr(conformance, name)

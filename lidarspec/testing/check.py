@@ -25,12 +25,12 @@ from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import SourceError, SpecError, UnknownSensor
 from lidarspec.plugins import Registry, file_and_id, file_module, registry
 from lidarspec.sensor_operations import Sensor
-from lidarspec.testing.declared import check_declaration
+from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import Finding, left_over
 from lidarspec.testing.properties import PROPERTIES
-from lidarspec.testing.subject import EXAMPLES, Subject
+from lidarspec.testing.sensor_under_test import EXAMPLES, Subject
 from lidarspec.testing.vectors import lacking
-from lidarspec.trust import document
+from lidarspec.trusted_files import document
 
 #: Name of a file of golden vectors.
 VECTORS = "vectors.json"

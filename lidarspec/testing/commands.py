@@ -8,7 +8,7 @@ from typing import Any
 
 from lidarspec.device.session import Reply, Session, found_at, learn_options
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
-from lidarspec.explaining.wording import format_argument_type
+from lidarspec.explaining.formatting import format_argument_type
 from lidarspec.frames.commands import argument_slot, raw_argument
 from lidarspec.frames.parse import identify
 from lidarspec.framing.results import Found
@@ -17,7 +17,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.spec.arguments import Address, Range, Text
 from lidarspec.spec.links import is_datagram
 from lidarspec.testing.findings import Violation, require
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 
 #: Nanoseconds of one step of a simulated exchange.
 STEP = 20_000_000

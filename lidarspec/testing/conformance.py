@@ -14,7 +14,7 @@ import pytest
 
 from lidarspec.sensor_operations import Sensor
 from lidarspec.testing.check import CheckTarget, Report, reports, target
-from lidarspec.testing.subject import EXAMPLES
+from lidarspec.testing.sensor_under_test import EXAMPLES
 
 #: The rule about an id that another installed plugin has.
 ID_TAKEN = "LS005"

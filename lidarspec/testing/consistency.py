@@ -21,7 +21,7 @@ from lidarspec.spec import Clock
 from lidarspec.spec.tree import exact
 from lidarspec.testing.findings import require
 from lidarspec.testing.geometry import BACK, SMALL, make_sweep, read
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 
 #: Numbers of the packets for the check of the clock: far along the sweep, so that the clock has
 #: wrapped.

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 
 from lidarspec.errors import SpecError, UsageError, WireError
-from lidarspec.explaining.damage import changes
+from lidarspec.explaining.damage_search import changes
 from lidarspec.explaining.explanation import fits
 from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.testing import subject as material
+from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.findings import Violation, require
-from lidarspec.testing.subject import MANY, Subject
+from lidarspec.testing.sensor_under_test import MANY, Subject
 
 #: Number of examples, read by plain construct, in which bytes are changed.
 CHANGED_EXAMPLES = 3

@@ -25,13 +25,13 @@ from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.expressions.columns import Fields, align, padding_mask
 from lidarspec.expressions.graph import Node, sample_of, trace, traverse
 from lidarspec.frames.frame_table import Rows
-from lidarspec.framing.examples import header, random_frame
+from lidarspec.framing.example_frames import header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axis_matrix
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Room, make_room
 from lidarspec.simulation.simulator import simulation
@@ -39,11 +39,11 @@ from lidarspec.spec import OnWrap, Polar
 from lidarspec.spec.fields import factor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import LookUp
-from lidarspec.testing import subject as material
-from lidarspec.testing.clouds import assert_well_formed
+from lidarspec.testing import sensor_under_test as material
+from lidarspec.testing.cloud_assertions import assert_well_formed
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import acceptable
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 
 #: Number of packets along the sweep for the check of directions.
 PACKETS = 400

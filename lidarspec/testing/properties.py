@@ -18,7 +18,7 @@ from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import commands, consistency, frames, geometry, streams, vectors
 from lidarspec.testing.findings import Finding, Violation
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 
 
 def _no_sweep(subject: Subject) -> str:

@@ -10,14 +10,14 @@ from __future__ import annotations
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found, pack_found
 from lidarspec.packets.stream import PacketStream
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import scans_of
 from lidarspec.sensor_operations import Sensor
-from lidarspec.testing import subject as material
-from lidarspec.testing.clouds import assert_same_places, assert_well_formed
+from lidarspec.testing import sensor_under_test as material
+from lidarspec.testing.cloud_assertions import assert_same_places, assert_well_formed
 from lidarspec.testing.findings import Violation, require
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 
 #: Rounds of a conversation if a shorter one has no scan, since few random frames of a sensor have
 #: points.

@@ -36,9 +36,9 @@ from lidarspec.testing.commands import an_exchange_holds
 from lidarspec.testing.findings import Violation, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
-from lidarspec.testing.subject import SHORT, Subject, seals
-from lidarspec.transports.hexadecimal import parse_hex
-from lidarspec.trust import document
+from lidarspec.testing.sensor_under_test import SHORT, Subject, seals
+from lidarspec.transports.hex_text import parse_hex
+from lidarspec.trusted_files import document
 
 #: Tolerance of points in metres and radians, as manuals print them.
 NEAR = 2e-4

@@ -10,15 +10,15 @@ Modules in reading order:
 * `serial`, `udp`, `tcp`: live sources.
 * `http`: requests to the web server of a sensor.
 * `simulated`: `sim:`, a simulated sensor in this process.
-* `bags`: robotics logs with packets in ROS messages.
-* `hexadecimal`: bytes as hexadecimal text.
+* `robotics_logs`: robotics logs with packets in ROS messages.
+* `hex_text`: bytes as hexadecimal text.
 * `files`: recordings, captures, raw bytes, standard input.
 * `ports`: the serial and UDP ports of this computer, and the programs that use them.
 
 In the opposite direction, to send like a sensor:
 
 * `outlets`: pseudo-terminals, UDP and TCP in one loop.
-* `http_line`: HTTP in the same loop.
+* `http_server`: HTTP in the same loop.
 * `destinations`: makes the outlet of a destination.
 * `serving`: a simulated sensor at an outlet, in real time.
 * `simulated_files`: a simulated sensor written to a file.

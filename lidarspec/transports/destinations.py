@@ -138,7 +138,7 @@ def _make_control_line(link: Link) -> Line | None:
             if isinstance(link, Udp):
                 return UdpLine.replying(LOCALHOST, port)
             if isinstance(link, Http):
-                from lidarspec.transports.http_line import HttpLine
+                from lidarspec.transports.http_server import HttpLine
 
                 return HttpLine(LOCALHOST, port)
     return None

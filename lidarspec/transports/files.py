@@ -24,12 +24,12 @@ from lidarspec.captures.pcap import CaptureStats, is_stream_capture
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
+from lidarspec.remote_files import file_of, is_stored
 from lidarspec.sensor_operations import Sensor
-from lidarspec.stores import file_of, is_stored
 from lidarspec.transports.addresses import parse_origin
-from lidarspec.transports.bags import BagTransport, log_of
-from lidarspec.transports.hexadecimal import hex_chunks, is_hexadecimal
+from lidarspec.transports.hex_text import hex_chunks, is_hexadecimal
 from lidarspec.transports.protocol import Chunk, Transport
+from lidarspec.transports.robotics_logs import BagTransport, log_of
 
 #: Events that interrupt the stream: an incomplete frame does not continue after them.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})

@@ -15,9 +15,9 @@ from urllib.parse import parse_qs
 from lidarspec.device.settings import find_device
 from lidarspec.errors import SpecError, UnknownOption, UsageError
 from lidarspec.plugins import registry
+from lidarspec.remote_files import is_stored
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Http, Link, Tcp, Udp
-from lidarspec.stores import is_stored
 from lidarspec.transports.addresses import SourceAddress, resolve_host
 from lidarspec.transports.base import source_error
 from lidarspec.transports.files import open_file

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 
 from lidarspec.errors import UsageError, WireError
-from lidarspec.recording.appending import Appender
+from lidarspec.recording.background_writer import Appender
 from lidarspec.scans.selection import Times, iter_received
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import Outlet

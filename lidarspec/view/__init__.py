@@ -3,15 +3,15 @@
 In: a device, or points. Out: pictures. The distribution `lidarspec-web` draws the page in a
 browser. Modules in reading order:
 
-* `window`: shows a sensor at work in the terminal: keys in, pictures and figures out.
-* `window_parts`: title, figures, colours and keys around the picture.
-* `feed`: reads, counts and plays the scans of a device.
-* `meter`: speed, rates, losses and jitter of a sensor at work.
+* `terminal_window`: shows a sensor at work in the terminal: keys in, pictures and figures out.
+* `terminal_window_parts`: title, figures, colours and keys around the picture.
+* `live_scans`: reads, counts and plays the scans of a device.
+* `rate_meter`: speed, rates, losses and jitter of a sensor at work.
 * `polar`: points from above and from the side.
 * `canvas`: pictures in character cells, and their colours.
-* `screen`: the terminal: writes changed cells, reads single keys.
+* `terminal_screen`: the terminal: writes changed cells, reads single keys.
 * `svg`: one scan as a file.
-* `figures`: a scan, intensities, ranges and rates over time, for reports.
+* `matplotlib_figures`: a scan, intensities, ranges and rates over time, for reports.
 * `rerun`: scans in the Rerun viewer.
 * `notebook`: scans, packets, explained frames and sensors in notebooks.
 * `page_server`: the interface of the server of `view --web`, a plugin.

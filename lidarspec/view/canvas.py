@@ -18,8 +18,8 @@ from rich.color import Color, ColorSystem
 from rich.text import Text
 
 from lidarspec.errors import printable
+from lidarspec.points.appearance import STEPS
 from lidarspec.points.colours import Rgb, make_ramp
-from lidarspec.points.look import STEPS
 
 Depth = Literal["truecolor", "256", "standard", "none"]
 

@@ -1,9 +1,9 @@
 """HTML and SVG for notebooks.
 
 Scans and clouds are pictures, packets and explained frames tables, sensors packet diagrams.
-`lidarspec.display` calls the functions here by the kind of value. Their output is limited in size,
-escaped, and readable on light and dark pages: pictures have their own background, tables use the
-text colour of the page.
+`lidarspec.notebook_display` calls the functions here by the kind of value. Their output is limited
+in size, escaped, and readable on light and dark pages: pictures have their own background, tables
+use the text colour of the page.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from lidarspec.explaining.listing import parents
 from lidarspec.exports import select_frame
 from lidarspec.exports.diagram import svg as diagram
 from lidarspec.packets.packets import Packets
+from lidarspec.points.appearance import fit, look
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.look import fit, look
 from lidarspec.scans.scan import Scan
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo

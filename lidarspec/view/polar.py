@@ -10,8 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.points.appearance import MOST, Look, ring_step, shade
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.look import MOST, Look, ring_step, shade
 from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, Cells
 
 #: dots between two dots of a ring.

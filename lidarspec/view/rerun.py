@@ -8,7 +8,7 @@ import time
 
 from lidarspec.errors import UsageError, suggest, system_errors
 from lidarspec.formats.rerun import RerunRecording
-from lidarspec.view.feed import LOOK_S, Feed
+from lidarspec.view.live_scans import LOOK_S, Feed
 
 #: seconds between two readings of the statistics, by the time of the scans.
 FIGURES = 1.0

@@ -13,9 +13,9 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from lidarspec.points.appearance import STEPS, Look, bounds, ring_step, steps
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp, to_hex
-from lidarspec.points.look import STEPS, Look, bounds, ring_step, steps
 
 #: in pixels: a side of the view from above, the margins, the header, a line above each view, and a
 #: dot.

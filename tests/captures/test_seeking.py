@@ -16,7 +16,7 @@ from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import UNKNOWN_ENDPOINT, Datagram, StreamReader, datagram_frame
 from lidarspec.captures.records import WRITINGS
-from lidarspec.explaining import contents
+from lidarspec.explaining import file_contents as contents
 from lidarspec.scans import selection
 from lidarspec.transports.files import CaptureTransport, open_file
 from tests import made_captures as made

@@ -20,7 +20,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.records import WRITINGS
-from lidarspec.recording.appending import RecordFile
+from lidarspec.recording.background_writer import RecordFile
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import transport
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran

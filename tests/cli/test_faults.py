@@ -116,7 +116,7 @@ def test_an_address_in_use_cannot_be_played_to(folder: Path, words: tuple[str, .
 #: A sensor that is simulated slowly, because all verbs at work share the processor.
 SLOW_SIM = f"{SIM}?rate=0.1"
 #: verbs at work, which Ctrl-C ends; SILENT is a port behind which nobody says anything. Interrupts
-#: of `view`, `stats` and `read` while they print are in tests/view/test_window.py and
+#: of `view`, `stats` and `read` while they print are in tests/view/test_terminal_window.py and
 #: test_live_verbs, of `parse` in test_failures.
 WORKING: tuple[tuple[str, ...], ...] = (
     ("view", "SILENT", *STL),

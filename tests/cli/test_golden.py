@@ -30,7 +30,7 @@ from click.testing import CliRunner
 
 import lidarspec as ls
 from lidarspec.cli.root import VERBS, main
-from lidarspec.libraries import release_numbers
+from lidarspec.optional_libraries import release_numbers
 from lidarspec.spec import Chunk
 from tests.cli.running import APART, EXAMPLE
 

@@ -11,7 +11,7 @@ import lidarspec as ls
 from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
-from lidarspec.explaining import contents as looking
+from lidarspec.explaining import file_contents as looking
 from lidarspec.recording.recorders import Recorder
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.protocol import Chunk

@@ -19,8 +19,8 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.heard import Heard
 from lidarspec.detect.identification import Verdict
+from lidarspec.detect.sample_bytes import Heard
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port

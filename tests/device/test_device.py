@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-import lidarspec.device.arrivals
+import lidarspec.device.device_input
 import lidarspec.transports.files
-from lidarspec.device.arrivals import decode_chunks
+from lidarspec.device.device_input import decode_chunks
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.format import Recording
 from lidarspec.spec import Chunk, Udp
@@ -650,7 +650,7 @@ def test_a_long_file_goes_on_behind_what_was_read_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lidarspec.transports.files, "BLOCK", 1 << 13)
-    monkeypatch.setattr(lidarspec.device.arrivals, "BATCH_BYTES", 1 << 13)
+    monkeypatch.setattr(lidarspec.device.device_input, "BATCH_BYTES", 1 << 13)
     path = tmp_path / "raw.bin"
     frames = turning(TURNING, 400) * 8
     path.write_bytes(b"".join(frames))

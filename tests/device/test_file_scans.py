@@ -15,7 +15,7 @@ import pytest
 
 import lidarspec as ls
 import lidarspec.captures.bulk
-import lidarspec.device.arrivals
+import lidarspec.device.device_input
 import lidarspec.transports.files
 from lidarspec.captures.pcap import USER_LINKS, Datagram, datagram_record
 from lidarspec.captures.records import capture_head, packet_record
@@ -124,7 +124,7 @@ def test_pieces_have_the_scans_of_one_pass(
         (lidarspec.transports.files, "BLOCK"),
     ):
         monkeypatch.setattr(module, size, 1 << 13)
-    monkeypatch.setattr(lidarspec.device.arrivals, "BATCH_BYTES", 1 << 13)
+    monkeypatch.setattr(lidarspec.device.device_input, "BATCH_BYTES", 1 << 13)
     sensor = SHAPES[name] if name in SHAPES else ls.sensor(name)
     path = tmp_path / ("made.pcap" if sensor.datagrams or name in CAPTURED else "made.bin")
     made(sensor, path)

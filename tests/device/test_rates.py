@@ -24,7 +24,7 @@ pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="counts what the kernel of Linux drops"
 )
 
-SENDING = Path(__file__).parents[2] / "benchmarks" / "sending.py"
+SENDING = Path(__file__).parents[2] / "benchmarks" / "rate_sender.py"
 M1_RATE = 6300
 STL_RATE = 1800
 #: datagrams that a sensor sends at once in the long test.

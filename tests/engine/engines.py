@@ -11,9 +11,9 @@ from lidarspec import Sensor
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.spec import Frame
-from lidarspec.testing import subject as material
+from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.frames import acceptable, free
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from tests.agreement import assert_backends_agree
 
 DAMAGED_CONVERSATIONS = 2

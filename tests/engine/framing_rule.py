@@ -9,8 +9,8 @@ slow one `streams.LENGTH`.
 from __future__ import annotations
 
 from lidarspec import Sensor
-from lidarspec.testing import subject as material
-from lidarspec.testing.subject import Subject
+from lidarspec.testing import sensor_under_test as material
+from lidarspec.testing.sensor_under_test import Subject
 from tests.agreement import cuts
 from tests.engine.oracle import Cut, Oracle
 from tests.engine.streams import (

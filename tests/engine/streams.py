@@ -11,10 +11,10 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 
 from lidarspec import Counters, Sensor, SpecError
-from lidarspec.framing.examples import header, random_frame
+from lidarspec.framing.example_frames import header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.testing import subject as material
-from lidarspec.testing.subject import Subject
+from lidarspec.testing import sensor_under_test as material
+from lidarspec.testing.sensor_under_test import Subject
 from tests.agreement import cuts
 from tests.by_construct import reader
 from tests.engine.oracle import Cut

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from tests.engine.cost import (
     MAX_CALLS_PER_BYTE,
     MAX_KEPT_PER_BYTE,

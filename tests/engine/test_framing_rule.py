@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from tests.engine import framing_rule as rule, mutants
 from tests.engine.streams import LENGTH
 from tests.installed import distinct_sensors_in, sensor_modules

@@ -12,8 +12,8 @@ import contextlib
 import pytest
 
 from lidarspec import WireError
-from lidarspec.testing import subject as material
-from lidarspec.testing.subject import Subject
+from lidarspec.testing import sensor_under_test as material
+from lidarspec.testing.sensor_under_test import Subject
 from tests.representatives import REPRESENTATIVES, each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lidarspec import Sensor
-from lidarspec.testing import subject as material
-from lidarspec.testing.subject import Subject
+from lidarspec.testing import sensor_under_test as material
+from lidarspec.testing.sensor_under_test import Subject
 from tests.engine.engines import is_compiled
 from tests.engine.streams import MEGABYTE, peak, worst
 from tests.installed import distinct_sensors_in, sensor_modules

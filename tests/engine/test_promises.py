@@ -32,7 +32,7 @@ TURNING = SHAPES["shape-commands"]
 #: `transports.host_clock.HostClock` continues a stamp.
 WALL = {"time.time", "time.time_ns", "datetime.now", "datetime.utcnow"}
 STAMPED = {
-    ("unfinished.py", "time.time"),
+    ("unfinished_files.py", "time.time"),
     ("recording/recorders.py", "datetime.now"),
     ("recording/recorders.py", "time.time_ns"),
     ("transports/simulated_files.py", "time.time_ns"),

@@ -32,7 +32,7 @@ import lidarspec as ls
 from lidarspec import Sensor, WireError
 from lidarspec.errors import UnknownFrame
 from lidarspec.explaining.explanation import Explanation, explain
-from lidarspec.explaining.wording import hexdump
+from lidarspec.explaining.formatting import hexdump
 from lidarspec.spec import Checksummed, Frame, Polar, Scaled, Simulation, Sum, Xor
 from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES

@@ -10,8 +10,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import explain
+from lidarspec.explaining.formatting import TextSpan, bit_picture
 from lidarspec.explaining.listing import fold, list_differences, parents, text
-from lidarspec.explaining.wording import TextSpan, bit_picture
 from tests.cli.running import EXAMPLE, printed, process, ran
 from tests.representatives import load_sensor
 

@@ -22,7 +22,7 @@ from lidarspec import Sensor, WireError
 from lidarspec.exports import ExportError, beginning, export
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import codec
-from lidarspec.testing import subject as material
+from lidarspec.testing import sensor_under_test as material
 from tests.exports.trees import (
     SHAPED,
     distinct_frames,

@@ -16,8 +16,8 @@ from lidarspec import Sensor
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.exports import ExportError, export
 from lidarspec.framing.frame_engine import codec
-from lidarspec.testing import subject as material
-from lidarspec.testing.subject import Subject
+from lidarspec.testing import sensor_under_test as material
+from lidarspec.testing.sensor_under_test import Subject
 from tests import made_captures as made
 from tests.exports.sharks import captured, columns, dissector, judged, tshark, written
 from tests.exports.trees import SHAPED, installed_sensors, is_recoded, recoded, values

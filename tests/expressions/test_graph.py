@@ -23,7 +23,7 @@ from lidarspec.expressions.graph import (
     traverse,
 )
 from lidarspec.points.evaluate import evaluate
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Fields, Polar, stack, take
 from tests.agreement import assert_same_points
 

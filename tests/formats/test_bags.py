@@ -280,7 +280,8 @@ from tests.formats.test_formats import scan
 resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
 for suffix in {SUFFIXES}:
     try:
-        write(Path({str(tmp_path)!r}) / f"a.{{suffix}}", (scan(number, points=3000) for number in range(20)))
+        scans = (scan(number, points=3000) for number in range(20))
+        write(Path({str(tmp_path)!r}) / f"a.{{suffix}}", scans)
     except SourceError as error:
         print(error)
 """

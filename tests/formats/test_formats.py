@@ -21,8 +21,8 @@ import pytest
 import lidarspec as ls
 from lidarspec import PointCloud, Scan, SourceError, simulate
 from lidarspec.errors import LibraryError, ReplyTimeout, UnknownFormat
-from lidarspec.formats import arrays, format_of, formats, tables, write
-from lidarspec.formats.writing import replacing
+from lidarspec.formats import arrays, arrow_tables as tables, format_of, formats, write
+from lidarspec.formats.common import replacing
 from tests.libraries import needs
 from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lidarspec import UsageError
-from lidarspec.formats.writing import replacing
+from lidarspec.formats.common import replacing
 
 OWN_FILES = {
     "out.zarr": ["zarr.json", "x/zarr.json", "x/c/0", "x/c/1/2"],

@@ -18,7 +18,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.formats import write
-from lidarspec.points.look import look, shade
+from lidarspec.points.appearance import look, shade
 from lidarspec.points.mount import Mount
 from tests.cli.running import ran
 from tests.formats.test_formats import scan

@@ -54,7 +54,7 @@ from construct import (
 
 from lidarspec import SpecError, UsageError, WireError, export
 from lidarspec.testing.properties import PROPERTIES
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, agree, plain, sensor
 from tests.engine.engines import (

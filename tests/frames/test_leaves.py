@@ -11,7 +11,7 @@ import pytest
 from construct import Array, BitsInteger, Bitwise, Const, Struct
 
 from lidarspec.frames.layout import Layout, Leaf
-from lidarspec.framing.examples import header
+from lidarspec.framing.example_frames import header
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
 from tests.shapes import SHAPES

@@ -17,7 +17,7 @@ import lidarspec.spec
 from lidarspec import Sensor, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Checksummed, Frame, Sum, tree
-from lidarspec.testing.subject import Subject, mutate
+from lidarspec.testing.sensor_under_test import Subject, mutate
 from tests.agreement import assert_backends_agree
 from tests.by_construct import reader
 from tests.engine import against_construct

@@ -39,20 +39,20 @@ from lidarspec.recording.format import (
     Recording,
     pack_record,
 )
+from lidarspec.remote_files import digest, stamp
 from lidarspec.simulation.scenes import read_scene
-from lidarspec.stores import digest, stamp
-from lidarspec.testing import subject as material
+from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.findings import Violation
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from lidarspec.testing.vectors import vectors_hold
-from lidarspec.transports.hexadecimal import parse_hex
+from lidarspec.transports.hex_text import parse_hex
 from lidarspec.transports.open_url import is_port, live_address
 from tests import made_captures as made
 from tests.calibration_files import write_velodyne_xml
 from tests.every_sensor import distinct_frames, distinct_sensors
 from tests.fuzz.words import HOSTILE, commanded, spoken
 from tests.shapes import SHAPES
-from tests.transports import test_bags
+from tests.transports import test_robotics_logs
 
 #: longest input.
 LONGEST = 1 << 16
@@ -374,7 +374,7 @@ def _file(folder: Path) -> Target:
         with tempfile.TemporaryDirectory() as place:
             topics = {"/p": ("nebula_msgs/msg/NebulaPackets", velodyne)}
             logs = [
-                test_bags.recorded(Path(place), kind, topics).read_bytes()
+                test_robotics_logs.recorded(Path(place), kind, topics).read_bytes()
                 for kind in ("bag", "mcap")
             ]
         return [
@@ -410,7 +410,7 @@ def _log(folder: Path, kind: str) -> Target:
     def examples() -> list[bytes]:
         frames = [ls.sensor(VLP).example("data", seed=seed) for seed in range(3)]
         with tempfile.TemporaryDirectory() as place:
-            log = test_bags.recorded(
+            log = test_robotics_logs.recorded(
                 Path(place), kind, {"/p": ("nebula_msgs/msg/NebulaPackets", frames)}
             )
             return [log.read_bytes()]

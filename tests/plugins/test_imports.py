@@ -19,7 +19,7 @@ ALLOWED = {
         "_version",
         "expressions",
         "expressions.columns",
-        "display",
+        "notebook_display",
         "entry_points",
         "errors",
         "known_sensors",
@@ -45,7 +45,7 @@ ALLOWED = {
     *(
         "spec.vocabulary",
         "spec.wire_forms",
-        "trust",
+        "trusted_files",
         "frames",
         "frames.arrays",
         "frames.frame_table",

@@ -26,7 +26,7 @@ from lidarspec.entry_points import EntryPoint, entry_points
 from lidarspec.errors import UnknownSensor
 from lidarspec.plugins import HookedPoints, Registry, named_owners, try_plugins
 from lidarspec.spec import hookimpl
-from lidarspec.trust import own_settings
+from lidarspec.trusted_files import own_settings
 from tests.shapes import SHAPES
 
 

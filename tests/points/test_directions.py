@@ -13,7 +13,7 @@ import lidarspec
 from lidarspec import Sensor, simulate
 from lidarspec.expressions.columns import remainder
 from lidarspec.points.evaluate import evaluate
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Fields, Polar, spread
 from tests.agreement import assert_same_points
 

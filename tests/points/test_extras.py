@@ -29,9 +29,9 @@ from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.cloud import LazyCloud
 from lidarspec.points.evaluate import evaluate
 from lidarspec.points.mount import Mount
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Cartesian, Extra, Fields, Frame, Polar, Scaled, Simulation, along, take
-from lidarspec.testing.clouds import assert_well_formed
+from lidarspec.testing.cloud_assertions import assert_well_formed
 from tests.agreement import assert_same_points
 from tests.by_construct import reader
 from tests.points.backends import BACKENDS, EVERY_BACKEND

@@ -16,9 +16,9 @@ from lidarspec import Sensor, simulate
 from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.cloud import LazyCloud
 from lidarspec.points.evaluate import evaluate
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Cartesian
-from lidarspec.testing.clouds import assert_well_formed
+from lidarspec.testing.cloud_assertions import assert_well_formed
 from tests.agreement import assert_same_points
 from tests.points.backends import BACKENDS
 from tests.shapes import SHAPES

@@ -26,12 +26,12 @@ from lidarspec.points import backends
 from lidarspec.points.evaluate import evaluate
 from lidarspec.points.numba_kernels import checksums as kernelsums
 from lidarspec.points.numba_kernels.source import write_kernel
-from lidarspec.points.plain import evaluate_plainly
 from lidarspec.points.plan import Plan, plan_for
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.simulation.simulator import opening
 from lidarspec.spec import Checksum, Checksummed, Crc, Fields, Polar, WordXor, Xor
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from tests.agreement import assert_same_points
 from tests.engine import against_construct
 from tests.installed import sensor_modules, sensors_in

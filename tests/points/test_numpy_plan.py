@@ -18,11 +18,11 @@ import lidarspec
 from lidarspec import Packets, Sensor, simulate
 from lidarspec.frames.frame_table import Rows
 from lidarspec.points.evaluate import evaluate
-from lidarspec.points.plain import evaluate_plainly
 from lidarspec.points.plan import Plan, plan_for
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Fields, Polar, Scaled, take
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from tests.agreement import assert_same_points
 from tests.broken import sound
 from tests.by_construct import reader

@@ -13,7 +13,7 @@ import pytest
 
 from lidarspec import PointCloud, UsageError, simulate
 from lidarspec.points.evaluate import evaluate
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Fields, Polar, stack
 from tests.agreement import assert_same_points
 from tests.by_construct import reader

@@ -15,8 +15,8 @@ import pytest
 import lidarspec
 from lidarspec import Packets, simulate
 from lidarspec.points.evaluate import evaluate
-from lidarspec.points.plain import evaluate_plainly
 from lidarspec.points.plan import Plan, plan_for
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Fields, Polar, following, previous, spread, take, wrap
 from tests.agreement import assert_same_points
 

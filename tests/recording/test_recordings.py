@@ -21,7 +21,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError, WireError
-from lidarspec.recording import appending
+from lidarspec.recording import background_writer
 from lidarspec.recording.format import (
     _HEAD,
     HEADER,
@@ -433,7 +433,7 @@ def test_a_recording_that_cannot_even_begin_says_so() -> None:
 def test_a_disk_that_does_not_keep_up_holds_up_nobody(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(appending, "BACKLOG", 300_000)
+    monkeypatch.setattr(background_writer, "BACKLOG", 300_000)
     os.mkfifo(path)
     taken = bytearray()
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", 0) as slow:

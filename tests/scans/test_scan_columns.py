@@ -28,7 +28,7 @@ from lidarspec.packets.stream import PacketStream
 from lidarspec.points import batch_columns
 from lidarspec.points.cloud import COLUMNS, CloudColumns, LazyCloud
 from lidarspec.points.column_sources import Stretch, Stretches
-from lidarspec.points.plain import evaluate_plainly
+from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.scans.stream import ScanStream, scans_of
 from lidarspec.spec import OnChange, OnWrap, Udp
 from tests.agreement import assert_same_points

@@ -21,7 +21,7 @@ from lidarspec.simulation.simulator import Rest
 from lidarspec.spec import Command, Frame, Scaled
 from lidarspec.spec.fields import duration
 from lidarspec.testing.commands import the_simulated_sensor_answers
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from tests.broken import sound
 from tests.shapes import SHAPES
 

@@ -31,7 +31,7 @@ from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.serving import FairLock, Served
 from lidarspec.transports.simulated_files import write_file
-from lidarspec.view.screen import Keyboard
+from lidarspec.view.terminal_screen import Keyboard
 from tests.broken import sound
 from tests.lines import TIMEOUT_S, free_port, read_until, until
 from tests.simulation.test_simulator import off

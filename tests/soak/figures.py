@@ -28,8 +28,8 @@ from lidarspec import Scan, Sensor
 from lidarspec.recording.format import DATAGRAM, HEADER, MAGIC, RECEIVED, Header, pack_record
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Serial
-from lidarspec.testing import subject as material
-from lidarspec.testing.subject import Subject
+from lidarspec.testing import sensor_under_test as material
+from lidarspec.testing.sensor_under_test import Subject
 from tests import made_captures as made
 from tests.engine.oracle import Oracle
 from tests.engine.streams import Books, clean, damaged, decoded, hostile_streams, worst

@@ -190,7 +190,7 @@ EVERY = (
             "tests/exports",
             "tests/engine/test_random_specs.py",
             "tests/engine/test_agreement.py",
-            "tests/framing/test_steady.py",
+            "tests/framing/test_regular_rows.py",
             "tests/points",
             "tests/scans/test_scan_columns.py",
             "tests/cli/test_new.py",

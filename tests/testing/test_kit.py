@@ -36,7 +36,7 @@ from construct import (
 from hypothesis import strategies as st
 
 from lidarspec import Sensor
-from lidarspec.framing.examples import random_frame
+from lidarspec.framing.example_frames import random_frame
 from lidarspec.framing.frame_engine import CompiledCodec
 from lidarspec.spec import (
     Checksummed,
@@ -56,7 +56,7 @@ from lidarspec.spec import (
 from lidarspec.testing import frames
 from lidarspec.testing.check import CheckTarget, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
-from lidarspec.testing.declared import check_declaration
+from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import Violation, left_over
 from lidarspec.testing.frames import (
     values_in_units_build_the_same_bytes,
@@ -64,7 +64,7 @@ from lidarspec.testing.frames import (
 )
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES, Property
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import (
     code_for_range,
@@ -140,7 +140,7 @@ def test_an_authors_tests_run_with_the_kits_fixtures(tmp_path: Path) -> None:
 def test_the_plugin_loads_nothing_of_the_engine(tmp_path: Path) -> None:
     (tmp_path / "test_other.py").write_text(
         "import sys\n\ndef test_light():\n"
-        "    assert 'lidarspec.testing.plugin' in sys.modules\n"
+        "    assert 'lidarspec.testing.pytest_plugin' in sys.modules\n"
         "    heavy = {'numpy', 'construct', 'hypothesis', 'lidarspec.spec.description',"
         " 'lidarspec.plugins'}\n"
         "    assert not heavy & sys.modules.keys()\n",

@@ -20,11 +20,11 @@ from lidarspec.spec import (
     Xor,
 )
 from lidarspec.testing.commands import the_simulated_sensor_answers
-from lidarspec.testing.declared import check_declaration
+from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import left_over
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES
-from lidarspec.testing.subject import Subject
+from lidarspec.testing.sensor_under_test import Subject
 from lidarspec.testing.vectors import every_checksum_is_checked
 from tests.broken import interpreted, sound
 

@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from lidarspec.points.look import STEPS
+from lidarspec.points.appearance import STEPS
 from lidarspec.view.canvas import (
     ALARM,
     BLANK,
@@ -22,7 +22,7 @@ from lidarspec.view.canvas import (
     sgr,
     style,
 )
-from lidarspec.view.screen import changes
+from lidarspec.view.terminal_screen import changes
 from tests.view.test_polar import DOTS
 
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidarspec.points.appearance import STEPS, look
 from lidarspec.points.colours import SCALES, Theme, colour, make_ramp, to_hex
-from lidarspec.points.look import STEPS, look
 from lidarspec.view.canvas import FIRST_STEP, INKS
 from lidarspec.view.svg import svg
 from tests.libraries import Library, needs
@@ -48,6 +48,6 @@ def test_terminal_and_svg_have_the_scale() -> None:
 
 @needs("matplotlib")
 def test_plot_has_the_scale() -> None:
-    colours = Library("lidarspec.view.figures").colour_map()
+    colours = Library("lidarspec.view.matplotlib_figures").colour_map()
     for share in (0.0, 0.5, 1.0):
         assert colours(share, bytes=True)[:3] == pytest.approx(colour(share, "light"), abs=2)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from lidarspec.view.canvas import STRONG, Canvas
-from lidarspec.view.screen import decode_keys
-from lidarspec.view.window import Choice
+from lidarspec.view.terminal_screen import decode_keys
+from lidarspec.view.terminal_window import Choice
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from lidarspec import PointCloud
 from lidarspec.errors import UnknownName
-from lidarspec.points.look import (
+from lidarspec.points.appearance import (
     STEPS,
     Look,
     bounds,

@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from lidarspec.points.look import fit, look
+from lidarspec.points.appearance import fit, look
 from lidarspec.view.svg import SIDE, svg
 from tests.view.test_polar import cloud
 

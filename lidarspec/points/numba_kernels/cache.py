@@ -24,7 +24,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from lidarspec.trust import describe_sharing
+from lidarspec.trusted_files import describe_sharing
 
 # mypy: disable-error-code="no-untyped-call"
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from lidarspec._version import __version__
 from lidarspec.errors import UsageError
 from lidarspec.frames.layout import Bytes2D, span
-from lidarspec.libraries import import_library
+from lidarspec.optional_libraries import import_library
 from lidarspec.points.numba_kernels.cache import Kept, is_kept
 from lidarspec.points.numba_kernels.source import KernelText, write_kernel
 from lidarspec.points.plan import Maker, Plan, PointsFunction, Values

@@ -31,6 +31,7 @@ from lidarspec.expressions.graph import (
 )
 from lidarspec.frames.layout import Leaf
 from lidarspec.points.conventions import returned_range
+from lidarspec.points.lookup_tables import every_value, is_number, possible, window
 from lidarspec.points.numba_kernels.writer import (
     TEMPLATES,
     KernelWriter,
@@ -40,7 +41,6 @@ from lidarspec.points.numba_kernels.writer import (
     line,
 )
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import every_value, is_number, possible, window
 from lidarspec.spec.vocabulary import LookUp, side_by_side
 
 #: points of which the scratch arrays stay in the fastest cache.

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import FACTORS, Node, key, last_axis, traverse
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
-from lidarspec.points.windows import CHEAP, every_value, raw_values, window
+from lidarspec.points.lookup_tables import CHEAP, every_value, raw_values, window
 from lidarspec.spec.bits import whole_bytes
 
 _SIGNS = {

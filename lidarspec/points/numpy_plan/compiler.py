@@ -1,9 +1,9 @@
 """Compile the expressions of a plan to the steps of a program.
 
 Each step is one NumPy call for a chunk of packets. An expression of one field of one or two bytes
-is a table by its raw value (`points.windows`). Values that are not full (one for a packet or block)
-are evaluated plainly for the whole batch and broadcast. Everything else is the NumPy function of
-the expression.
+is a table by its raw value (`points.lookup_tables`). Values that are not full (one for a packet or
+block) are evaluated plainly for the whole batch and broadcast. Everything else is the NumPy
+function of the expression.
 
 Columns that are not exact may be computed in another order: products, offsets, cosines and sines
 are float32, and the terms of a sum that are not full are added before they are broadcast.
@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import Node, Term, is_full, key, last_axis, only_field, terms
 from lidarspec.frames.arrays import deep
 from lidarspec.frames.layout import Leaf, elements
+from lidarspec.points.lookup_tables import CHEAP, FieldWindow, every_value, window
 from lidarspec.points.numpy_plan.program import TYPES, Program, Read, Run
 from lidarspec.points.plan import Plan
-from lidarspec.points.windows import CHEAP, FieldWindow, every_value, window
 from lidarspec.spec.vocabulary import row_numbers
 
 TURN_RAD = 2 * np.pi

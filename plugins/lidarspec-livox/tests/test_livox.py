@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.heard import Heard
 from lidarspec.detect.identification import verdict
+from lidarspec.detect.sample_bytes import Heard
 from tests.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"

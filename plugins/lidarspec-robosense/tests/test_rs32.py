@@ -13,8 +13,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.detect.heard import Heard
 from lidarspec.detect.identification import verdict
+from lidarspec.detect.sample_bytes import Heard
 from tests.evidence import assert_points, decoded, vector_bytes, vectors
 from tests.installed import sensor_ids
 

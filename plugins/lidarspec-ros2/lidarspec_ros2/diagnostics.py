@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from lidarspec.cli.read import FIGURES
 from lidarspec.device.device import Device
-from lidarspec.view.meter import MeterReading
+from lidarspec.view.rate_meter import MeterReading
 
 #: states of a device in which nothing comes.
 LOST = ("disconnected", "silent")

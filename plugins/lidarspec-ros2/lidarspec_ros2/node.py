@@ -32,8 +32,8 @@ from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
 from lidarspec.explaining.assignments import arguments
 from lidarspec.explaining.explanation import reply_text
-from lidarspec.view.feed import LOOK_S, Feed
-from lidarspec.view.meter import MeterReading
+from lidarspec.view.live_scans import LOOK_S, Feed
+from lidarspec.view.rate_meter import MeterReading
 from lidarspec_ros2.diagnostics import LOST, status
 from lidarspec_ros2.packets import PacketLog
 from lidarspec_ros2.parameters import NAMED, NODE_NAME, PARAMETERS, Parameter, Settings

@@ -18,8 +18,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import UInt8MultiArray
 
 from lidarspec.errors import SourceError
-from lidarspec.transports.bags import raw_chunk
 from lidarspec.transports.protocol import Chunk, LiveTransport
+from lidarspec.transports.robotics_logs import raw_chunk
 
 #: packets that wait for a reader: some seconds of the fastest sensors.
 WAITING = 5000

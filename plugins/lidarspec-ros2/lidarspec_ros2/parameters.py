@@ -19,9 +19,9 @@ from lidarspec.device.settings import find_device
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
-from lidarspec.recording.appending import TrafficLog
+from lidarspec.recording.background_writer import TrafficLog
+from lidarspec.scans.beams import Planes
 from lidarspec.scans.laserscan import LaserScan
-from lidarspec.scans.planes import Planes
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.protocol import Transport

@@ -30,9 +30,9 @@ from lidarspec.points.mount import Mount
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Sieve
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.bags import RAW
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.robotics_logs import RAW
 from lidarspec_ros2.clock import Stamps
 from lidarspec_ros2.parameters import Settings
 from lidarspec_ros2.shared_memory import format_megabytes

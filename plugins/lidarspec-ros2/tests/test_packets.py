@@ -16,7 +16,7 @@ from std_msgs.msg import UInt8MultiArray
 
 import lidarspec as ls
 from lidarspec.formats.messages import SCAN
-from lidarspec.transports.bags import RAW, raw_chunk
+from lidarspec.transports.robotics_logs import RAW, raw_chunk
 
 
 def test_a_node_decodes_what_another_one_publishes(run: Any, client: Client) -> None:

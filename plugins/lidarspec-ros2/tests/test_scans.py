@@ -24,9 +24,9 @@ from lidarspec import simulate
 from lidarspec.formats.messages import CLOUD, SCAN, Messages
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.recording.recorders import Recorder
-from lidarspec.scans.planes import Planes
-from lidarspec.transports.bags import RAW, raw_chunk
+from lidarspec.scans.beams import Planes
 from lidarspec.transports.protocol import Chunk
+from lidarspec.transports.robotics_logs import RAW, raw_chunk
 
 MESSAGES = Messages("ROS2_HUMBLE")
 WHOLE, STAMP = 6, 1_700_000_000_123_456_789

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.heard import Heard
 from lidarspec.detect.identification import verdict
+from lidarspec.detect.sample_bytes import Heard
 from lidarspec.errors import CommandError, UsageError
 from tests.evidence import capture, decoded, vector_bytes, vectors
 

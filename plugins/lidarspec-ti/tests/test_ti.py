@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.heard import Heard
 from lidarspec.detect.identification import verdict
+from lidarspec.detect.sample_bytes import Heard
 from tests.evidence import decoded
 
 RADAR = ls.sensor("ti-iwr6843")

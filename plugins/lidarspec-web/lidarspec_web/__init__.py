@@ -8,17 +8,17 @@ Modules in reading order:
 
 * `source_server`: a source, read and served; what `lidarspec view --web` runs.
 * `broadcast`: a source that is read once and shown to any number of pages; files are played.
-* `backlog`: the newest bytes of the source, frame by frame, and damaged bytes.
+* `recent_bytes`: the newest bytes of the source, frame by frame, and damaged bytes.
 * `scan_message`: one scan as the binary message that a page draws.
-* `answers`: all other messages to a page, as JSON.
+* `page_messages`: all other messages to a page, as JSON.
 * `command_forms`: the commands of the sensor, as forms of the page.
 * `open_page`: one page that is open: its socket, its requests and what is sent to it.
 * `page_requests`: limits on the requests of one page, and the threads that serve them.
 * `server`: the HTTP server of the page's files, its sockets and saved scans.
 * `access`: the token, host and origin that a request needs.
 * `connections`: limits on the connections to the server.
-* `saving`: scans that pages save as files.
-* `temporary`: the temporary folder of the server.
+* `scan_files`: scans that pages save as files.
+* `temporary_folder`: the temporary folder of the server.
 * `viewer`: a source in a cell of a notebook, drawn by the code of the page.
 
 The folder `page` has the page and the notebook widget as `make page` builds them from TypeScript.

@@ -19,10 +19,10 @@ from dataclasses import replace
 from typing import Any
 
 from lidarspec import Device, LidarSpecError, Scan, Selection, UsageError
-from lidarspec.recording.switch import RecordingSwitch
+from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.view.feed import DEFAULT_STEP_S, LOOK_S, Feed
-from lidarspec_web.backlog import Backlog
+from lidarspec.view.live_scans import DEFAULT_STEP_S, LOOK_S, Feed
+from lidarspec_web.recent_bytes import Backlog
 from lidarspec_web.scan_message import message
 
 #: Duration of the stored figures.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lidarspec import Sensor
-from lidarspec.explaining.wording import format_argument_type
+from lidarspec.explaining.formatting import format_argument_type
 from lidarspec.exports.reference import effect
 from lidarspec.frames.commands import argument_slot
 from lidarspec.spec.arguments import Range

@@ -23,9 +23,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from lidarspec import LidarSpecError, UsageError
 from lidarspec.errors import suggestion
-from lidarspec_web.answers import Answers
-from lidarspec_web.backlog import Backlog
 from lidarspec_web.broadcast import Shown
+from lidarspec_web.page_messages import Answers
 from lidarspec_web.page_requests import (
     MESSAGES_AT_ONCE,
     MESSAGES_PER_S,
@@ -34,6 +33,7 @@ from lidarspec_web.page_requests import (
     RateLimit,
     Workers,
 )
+from lidarspec_web.recent_bytes import Backlog
 
 #: Number of unsent replies above which no further request is read.
 MAX_REPLIES = 16

@@ -25,13 +25,13 @@ from starlette.websockets import WebSocket
 
 from lidarspec import SourceError
 from lidarspec_web.access import ANY_ADDRESS, Guard, add_token, make_token, write_opening_page
-from lidarspec_web.answers import Answers, saves
 from lidarspec_web.broadcast import Broadcast
 from lidarspec_web.connections import BACKLOG, Connections, ErrorReporter
 from lidarspec_web.open_page import SEND_TIMEOUT_S, OpenPage, describe_bug
+from lidarspec_web.page_messages import Answers, saves
 from lidarspec_web.page_requests import Workers
-from lidarspec_web.saving import Saves
-from lidarspec_web.temporary import TemporaryFolder, remove_stale_folders
+from lidarspec_web.scan_files import Saves
+from lidarspec_web.temporary_folder import TemporaryFolder, remove_stale_folders
 
 #: The built page.
 PAGE = Path(__file__).parent / "page"

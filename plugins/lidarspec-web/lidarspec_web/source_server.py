@@ -11,9 +11,9 @@ from types import TracebackType
 from typing import Self
 
 from lidarspec import Device, Selection, Sensor, open as open_device
-from lidarspec.recording.switch import RecordingSwitch
+from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.transports.open_url import is_live
-from lidarspec.view.feed import LOOK_S
+from lidarspec.view.live_scans import LOOK_S
 from lidarspec_web.broadcast import Broadcast
 from lidarspec_web.server import Site
 

@@ -17,9 +17,9 @@ from typing import Any, Self
 
 from lidarspec import LidarSpecError, Selection, Sensor, UsageError, open as open_device
 from lidarspec.errors import suggest, suggestion
-from lidarspec.view.feed import LOOK_S
-from lidarspec_web.answers import Answers
+from lidarspec.view.live_scans import LOOK_S
 from lidarspec_web.broadcast import Broadcast
+from lidarspec_web.page_messages import Answers
 
 #: The built widget.
 SCRIPT = Path(__file__).parent / "page" / "widget.js"

@@ -125,7 +125,7 @@ def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
 def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lidarspec_web.backlog.MAX_INPUT_BYTES", 1)
+    monkeypatch.setattr("lidarspec_web.recent_bytes.MAX_INPUT_BYTES", 1)
     with Station(f"sim:{SOLID}?{SLOWLY}", tmp_path) as station, station.page() as page:
         header, columns = page.scan()
         shown = station.broadcast.find_scan(header["scan"])

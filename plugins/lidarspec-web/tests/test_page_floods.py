@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from lidarspec_web import saving
-from lidarspec_web.backlog import Backlog
+from lidarspec_web import scan_files as saving
 from lidarspec_web.connections import Client, Connections
 from lidarspec_web.page_requests import MAX_WAITING, RateLimit
-from lidarspec_web.temporary import PREFIX
+from lidarspec_web.recent_bytes import Backlog
+from lidarspec_web.temporary_folder import PREFIX
 
 from .pages import DEADLINE, FLAT, Station
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec_web.temporary import PREFIX, TemporaryFolder, remove_stale_folders
+from lidarspec_web.temporary_folder import PREFIX, TemporaryFolder, remove_stale_folders
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="folders are locked on POSIX only")
 
 #: Makes a folder, and is killed.
 KILLED = """import os, signal
-from lidarspec_web.temporary import TemporaryFolder
+from lidarspec_web.temporary_folder import TemporaryFolder
 (TemporaryFolder().path / "scan.csv").write_text("x")
 os.kill(os.getpid(), signal.SIGKILL)"""
 

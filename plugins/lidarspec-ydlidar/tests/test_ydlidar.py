@@ -11,8 +11,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.detect.heard import Heard
 from lidarspec.detect.identification import contradiction, verdict
+from lidarspec.detect.sample_bytes import Heard
 from tests.evidence import capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"

@@ -1,0 +1,58 @@
+"""A sender in a process of its own, which keeps a rate whatever the receiver does.
+
+    python rate_sender.py FRAMES SIZE RATE SECONDS BURST TIMES (fd NUMBER | udp PORT)
+
+FRAMES is a file of frames of SIZE bytes each, TIMES a file for the time at which each was sent,
+int64 ns of the monotonic clock ("-" for none). Prints how many it sent.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import time
+from array import array
+from collections.abc import Callable
+from pathlib import Path
+
+
+def sender(kind: str, where: str) -> Callable[[bytes], object]:
+    """What sends one frame."""
+    if kind == "udp":
+        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        made.connect(("127.0.0.1", int(where)))
+        return made.send
+
+    def write(frame: bytes) -> None:
+        while frame:
+            frame = frame[os.write(int(where), frame) :]
+
+    return write
+
+
+def main(
+    path: str, size: str, rate: str, seconds: str, burst: str, times: str, kind: str, where: str
+) -> None:
+    """Send, print the number, and wait a moment before the line is closed."""
+    data, step, per_second = Path(path).read_bytes(), int(size), float(rate)
+    frames = [data[start : start + step] for start in range(0, len(data), step)]
+    number, together, send = int(per_second * float(seconds)), int(burst), sender(kind, where)
+    sent_at, began, sent = array("q"), time.monotonic(), 0
+    while sent < number:
+        due = min(
+            int((time.monotonic() - began) * per_second) // together * together + together, number
+        )
+        for index in range(sent, due):
+            send(frames[index % len(frames)])
+            sent_at.append(time.monotonic_ns())
+        sent = max(sent, due)
+        time.sleep(max(0.0002, began + sent / per_second - time.monotonic()))
+    if times != "-":
+        Path(times).write_bytes(sent_at.tobytes())
+    print(sent, flush=True)
+    time.sleep(0.2)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,157 @@
+"""Recognize bytes of sensors that are not installed, by the table of known sensors.
+
+A plugin that is not installed cannot parse anything, so the evidence is weaker than that of
+`detect`: the constant bytes that a data frame begins with and its size, then the UDP ports. Several
+sensors of a vendor, and of related vendors, often share them. The result is good enough to name the
+distributions to install.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from lidarspec.detect.sample_bytes import Heard
+from lidarspec.errors import WireError, suggest
+from lidarspec.framing.frame_engine import codec
+from lidarspec.known_sensors import KnownSensor, Signature, install_command, known_sensors
+from lidarspec.plugins import registry
+from lidarspec.sensor_operations import Sensor
+
+#: bytes at the beginning of a frame that a signature covers.
+MAX_SYNC_BYTES = 16
+MIN_SYNC_BYTES = 2
+#: share of the datagrams, or of the bytes of a stream, that must match.
+MIN_MATCHING_SHARE = 0.2
+#: frames in a stream that must follow one another.
+MIN_FRAMES_IN_A_ROW = 3
+#: how often the sync bytes of frames of variable size must occur in a stream, and how much more
+#: often than by chance.
+MIN_SYNC_COUNT = 8
+MIN_SYNC_COUNT_BY_CHANCE = 20
+#: sensors that a message lists.
+MAX_LISTED = 6
+
+
+def signatures(sensor: Sensor) -> tuple[Signature, ...]:
+    """Return the signatures of the data frames of a sensor that have enough constant bytes."""
+    found = []
+    for name in sensor.data_frames:
+        engine = codec(sensor.frames[name])
+        constant = {
+            offset: value
+            for offset, (mask, value) in engine.prefix.items()
+            if mask == 0xFF and offset < MAX_SYNC_BYTES
+        }
+        signature = Signature(_sync_text(constant), engine.size or 0)
+        if len(constant) >= MIN_SYNC_BYTES and signature not in found:
+            found.append(signature)
+    return tuple(found)
+
+
+def _sync_text(constant: dict[int, int]) -> str:
+    length = max(constant, default=-1) + 1
+    return " ".join(
+        f"{constant[offset]:02x}" if offset in constant else ".." for offset in range(length)
+    )
+
+
+def recognize(heard: Heard) -> list[KnownSensor]:
+    """Return the sensors of the table, not installed, that may have sent these bytes.
+
+    If no frame matches, these are the sensors with the destination port.
+    """
+    installed = set(registry().names())
+    missing = [row for row in known_sensors() if row.id not in installed]
+    shares = [_matching_share(row, heard) if heard.size else 0.0 for row in missing]
+    best = max(shares, default=0.0)
+    matching = []
+    if best >= MIN_MATCHING_SHARE:
+        matching = [row for row, share in zip(missing, shares, strict=True) if share == best]
+    at_port = [row for row in matching or missing if heard.ports & _udp_ports(row)]
+    return at_port or matching
+
+
+def _udp_ports(row: KnownSensor) -> set[int]:
+    return {port for link in row.links.values() if link.kind == "udp" for port in link.numbers}
+
+
+def _matching_share(row: KnownSensor, heard: Heard) -> float:
+    is_datagram = any(link.kind == "udp" for link in row.links.values())
+    if is_datagram != heard.datagrams:
+        return 0.0
+    if heard.datagrams:
+        share = _share_of_datagrams
+    else:
+        share = _share_of_stream
+    return max((share(signature, heard) for signature in row.signatures), default=0.0)
+
+
+def _pattern(sync: str) -> bytes:
+    return b"".join(
+        b"." if byte == ".." else re.escape(bytes.fromhex(byte)) for byte in sync.split()
+    )
+
+
+def _share_of_datagrams(signature: Signature, heard: Heard) -> float:
+    begins = re.compile(_pattern(signature.sync), re.DOTALL)
+    if signature.size:
+        sizes = {signature.size}
+    else:
+        sizes = {len(datagram) for datagram in heard.chunks}
+    count = sum(
+        begins.match(datagram) is not None for datagram in heard.chunks if len(datagram) in sizes
+    )
+    return count / len(heard.chunks)
+
+
+def _share_of_stream(signature: Signature, heard: Heard) -> float:
+    data = heard.data
+    offsets = [
+        match.start()
+        for match in re.finditer(b"(?=" + _pattern(signature.sync) + b")", data, re.DOTALL)
+    ]
+    if not signature.size:
+        constant_bytes = sum(byte != ".." for byte in signature.sync.split())
+        needed = max(MIN_SYNC_COUNT, MIN_SYNC_COUNT_BY_CHANCE * len(data) / 256**constant_bytes)
+        if len(offsets) >= needed:
+            return MIN_MATCHING_SHARE
+        return 0.0
+    starts = set(offsets)
+    followed = sum(offset + signature.size in starts for offset in offsets)
+    count = followed + 1 if offsets else 0
+    is_whole = count * signature.size == len(data)
+    if count < MIN_FRAMES_IN_A_ROW and not is_whole:
+        return 0.0
+    return min(1.0, count * signature.size / len(data))
+
+
+def describe(found: Sequence[KnownSensor]) -> str:
+    """Return the sentence that names the sensors and their distributions."""
+    ids = [row.id for row in found[:MAX_LISTED]]
+    more = len(found) - len(ids)
+    if more:
+        listed = f"{', '.join(ids)} and {more} more"
+    else:
+        listed = " or ".join(ids)
+    distributions = _distributions(found)
+    verb = "are" if len(distributions) > 1 else "is"
+    return f"this looks like data of {listed}; {' and '.join(distributions)} {verb} not installed"
+
+
+def suggest_installation(error: WireError, heard: Heard) -> WireError:
+    """Add the distributions to install to the error for unknown bytes, if known."""
+    missing = recognize(heard)
+    if missing:
+        error.add_note(describe(missing))
+        suggest(error, install_commands(missing))
+    return error
+
+
+def install_commands(found: Sequence[KnownSensor]) -> str:
+    """Return the command that installs the distributions of the sensors."""
+    return install_command(*_distributions(found))
+
+
+def _distributions(found: Sequence[KnownSensor]) -> list[str]:
+    return sorted({row.distribution for row in found})

@@ -1,0 +1,264 @@
+"""Split an input into pieces: valid frames, damaged frames, and the bytes between them.
+
+The decoder finds the valid frames, and `pieces` yields them as soon as it does. `explain_piece`
+searches the bytes between them for damaged frames. A damaged frame begins at constants that look
+like the start of a frame. It ends after the size of the frame, or one byte before or after that if
+another frame begins there, or at the start of the next frame.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+from lidarspec.errors import LidarSpecError, UnknownFrame, WireError
+from lidarspec.explaining.damage_search import changes
+from lidarspec.explaining.explanation import Explanation, explain
+from lidarspec.explaining.formatting import Row
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.parse import identify, layout_of
+from lidarspec.frames.wire_coder import frame_coder
+from lidarspec.framing.frame_engine import codec
+from lidarspec.spec import Sensor
+from lidarspec.spec.sensor import with_frames
+from lidarspec.transports.protocol import Chunk
+
+#: Minimum number of constant bytes at the start of a frame type that is searched for.
+MIN_SYNC_BYTES = 2
+#: Number of bytes without a frame that are collected before they are yielded as a piece.
+MAX_HELD_BYTES = 1 << 16
+#: Placeholder for the frame type of a whole input that may be one damaged frame.
+NEAREST = "?"
+
+
+@dataclass(frozen=True)
+class InputPiece:
+    """A frame of the input, or bytes that are in no frame.
+
+    Attributes:
+        offset: offset of the first byte in the input.
+        data: the bytes.
+        frame: the frame type, "" for bytes in no frame, or `NEAREST`.
+        datagram: True for bytes of a datagram that are in no frame.
+    """
+
+    offset: int
+    data: bytes
+    frame: str
+    datagram: bool = False
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether it is a valid frame."""
+        return self.frame not in ("", NEAREST)
+
+    @property
+    def end(self) -> int:
+        """The offset after its last byte."""
+        return self.offset + len(self.data)
+
+    def part(self, start: int, end: int, frame: str = "") -> InputPiece:
+        """Return the bytes from `start` to `end` as a piece of the input."""
+        return InputPiece(self.offset + start, self.data[start:end], frame)
+
+
+def pieces(
+    sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: str | None = None
+) -> Iterator[InputPiece]:
+    """Yield the frames of the input and the bytes between them, in order, as they are found.
+
+    A datagram that is not a frame is a piece of its own. An input that is not longer than a frame
+    and contains none is one piece of the type `NEAREST`.
+
+    Args:
+        datagrams: True if each chunk is a datagram, False for a stream.
+        frame: prefer this frame type if several types match the same bytes, and find it without
+            the frame that it must follow. Frames of other types are yielded too.
+
+    Raises:
+        UnknownFrame: if the sensor has no such frame type.
+    """
+    if frame is not None and frame not in sensor.frames:
+        raise UnknownFrame(frame, sensor.frames, place=sensor.id)
+    chunks = iter(chunks)
+    head = list[Chunk]()
+    longest = _find_max_length(sensor)
+    while (
+        sum(len(chunk.data) for chunk in head) <= longest
+        and (chunk := next(chunks, None)) is not None
+    ):
+        head.append(chunk)
+    whole = b"".join(chunk.data for chunk in head)
+    if len(whole) > longest:
+        yield from _split_input(
+            sensor if frame is None else _prefer_frame(sensor, frame),
+            itertools.chain(head, chunks),
+            datagrams=datagrams,
+        )
+        return
+    try:
+        yield InputPiece(0, whole, identify(sensor, whole, frame=frame))
+    except LidarSpecError:
+        found = list(
+            _split_input(
+                sensor if frame is None else _prefer_frame(sensor, frame), head, datagrams=datagrams
+            )
+        )
+        yield from found if any(piece.frame for piece in found) else [InputPiece(0, whole, NEAREST)]
+
+
+def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
+    """Return the sensor with one frame type as the first and incoming one, not after another."""
+    first = replace(sensor.frames[frame], direction="in", after=None)
+    return with_frames(
+        sensor,
+        {frame: first, **{name: other for name, other in sensor.frames.items() if name != frame}},
+    )
+
+
+def _split_input(
+    sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool
+) -> Iterator[InputPiece]:
+    decoder = sensor.decoder(stream=not datagrams)
+    held = bytearray()
+    start = 0
+    for chunk in itertools.chain(chunks, [None]):
+        if chunk is None or chunk.gap:
+            frames = decoder.finish()
+        else:
+            frames = []
+        if chunk is not None:
+            held += chunk.data
+            frames += decoder.feed(chunk.data)
+        if decoder.joins:  # a joined message has no contiguous bytes in the input
+            yield from (InputPiece(item.offset, item.data, item.frame) for item in frames)
+            continue
+        end = start
+        for item in frames:
+            if item.offset > end:
+                yield InputPiece(end, bytes(held[end - start : item.offset - start]), "", datagrams)
+            yield InputPiece(item.offset, item.data, item.frame)
+            end = item.offset + len(item.data)
+        left = len(held) - (end - start) - decoder.stats.pending
+        if left and (datagrams or chunk is None or left > MAX_HELD_BYTES):
+            yield InputPiece(end, bytes(held[end - start : end - start + left]), "", datagrams)
+            end += left
+        del held[: end - start]
+        start = end
+
+
+def explain_piece(
+    sensor: Sensor, piece: InputPiece, frame: str | None = None
+) -> Iterator[tuple[InputPiece, Explanation]]:
+    """Yield a piece with its explanation.
+
+    A piece without a frame is split into damaged frames and the bytes between them.
+
+    Args:
+        frame: the frame type for `NEAREST`; by default the closest.
+
+    Raises:
+        WireError: if the piece is `NEAREST` and does not even begin like a frame.
+    """
+    if piece.frame:
+        yield piece, explain(piece.data, sensor, piece.frame if piece.is_valid else frame)
+        return
+    end = 0
+    for part in _iter_damaged(sensor, piece):
+        if part.offset > piece.offset + end:
+            yield _explain_skipped(sensor, piece.part(end, part.offset - piece.offset))
+        yield part, explain(part.data, sensor, part.frame)
+        end = part.end - piece.offset
+    if end < len(piece.data):
+        yield _explain_skipped(sensor, piece.part(end, len(piece.data)))
+
+
+def _explain_skipped(sensor: Sensor, piece: InputPiece) -> tuple[InputPiece, Explanation]:
+    is_filler = not piece.data.translate(None, bytes(sensor.fillers))
+    remark = "filler" if is_filler else "in no frame"
+    return piece, Explanation(
+        sensor.id, "", piece.data, (Row(0, piece.data, "", (), (remark,), right=is_filler),)
+    )
+
+
+def _iter_damaged(sensor: Sensor, piece: InputPiece) -> Iterator[InputPiece]:
+    """Yield the damaged frames in the bytes of a piece, in order."""
+    data = piece.data
+    end = 0
+    starts = [start for start in likely_starts(sensor, data) if not piece.datagram or start == 0]
+    for start in [*starts, len(data)]:
+        if start > end and (name := _find_headless_type(sensor, data[end:start])):
+            yield piece.part(end, start, name)
+            end = start
+        if end <= start < len(data) and (name := _find_nearest_type(sensor, data[start:])):
+            if piece.datagram:
+                end = len(data)
+            else:
+                end = _find_end(sensor, data, start, name, [*starts, len(data)])
+            yield piece.part(start, end, name)
+
+
+def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
+    """Return the offsets at which a frame may begin, in ascending order.
+
+    There, the bytes match the first constants of an incoming frame type, and at least one more
+    byte follows. Types that begin with fewer than `MIN_SYNC_BYTES` constants are not searched for.
+    """
+    starts: set[int] = set()
+    for frame in sensor.incoming.values():
+        prefix = codec(frame).prefix
+        size = next(
+            (index for index in range(len(prefix) + 1) if prefix.get(index, (0, 0))[0] != 0xFF), 0
+        )
+        if size >= MIN_SYNC_BYTES:
+            magic = bytes(prefix[index][1] for index in range(size))
+            starts |= {
+                match.start() for match in re.finditer(re.escape(magic) + b"(?=.)", data, re.DOTALL)
+            }
+    return sorted(starts)
+
+
+def _find_nearest_type(sensor: Sensor, data: bytes) -> str:
+    """Return the frame type that the bytes begin like, "" if there is none."""
+    try:
+        return identify(sensor, data[: _find_max_length(sensor)])
+    except WireError as fault:
+        return fault.frame
+
+
+def _find_headless_type(sensor: Sensor, data: bytes) -> str:
+    """Return the type of a damaged frame that does not begin like a frame.
+
+    Returns "" if no single change makes the bytes a valid frame.
+    """
+    return next((name for name, frame in sensor.incoming.items() if changes(frame, data)), "")
+
+
+def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
+    """Return the offset at which a damaged frame ends.
+
+    This is the start of another frame at the expected end, or one byte before or after it.
+    Otherwise it is the expected end or the next start, whichever comes first.
+
+    Args:
+        ends: the offsets at which another frame may begin, and the end of the data.
+    """
+    following = [end for end in ends if end > start]
+    size = frame_coder(sensor.frames[name]).find_size(data[start:])
+    if size is not None:
+        return start + size
+    layout = layout_of(sensor, name, data[start : start + sensor.frames[name].max_length])
+    if not isinstance(layout, Layout):
+        return following[0]
+    whole = start + layout.size
+    if len(data) < whole:
+        cut_off = len(data)
+    else:
+        cut_off = min(following[0], whole)
+    return next((end for end in (whole, whole - 1, whole + 1) if end in following), cut_off)
+
+
+def _find_max_length(sensor: Sensor) -> int:
+    return max((frame.max_length for frame in sensor.frames.values()), default=0)

@@ -1,0 +1,174 @@
+"""Write point clouds: PCD of the Point Cloud Library, PLY, and the .bin of KITTI.
+
+The formats have no scans: the rows of several scans follow one another, with the number of the scan
+as a field. `time` counts from the stamp of the scan. Comments of the header have the stamp of the
+first scan, the sensor and the units.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError, suggest
+from lidarspec.formats.common import Spool
+from lidarspec.formats.point_rows import PointRows, room, write_rows
+from lidarspec.optional_libraries import import_library
+from lidarspec.scans.scan import Scan
+from lidarspec.transports.protocol import Format
+
+#: types that a format, or a common reader of it, does not support, and their replacements. Integers
+#: of 64 bits are exact up to 2**53.
+_PCD_TYPES = {"f2": "f4", "b1": "u1"}
+_PLY_TYPES = {
+    **_PCD_TYPES,
+    **dict.fromkeys(("i1", "i2", "u2"), "i4"),
+    **dict.fromkeys(("u4", "i8", "u8"), "f8"),
+}
+_PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
+#: maximum size in the header of compressed points.
+_MOST_COMPRESSED = (1 << 32) - 1
+
+
+def write_pcd(
+    path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
+) -> None:
+    """Write a binary PCD 0.7 file.
+
+    It has the columns of x y z intensity ring time that the sensor has, and its additional columns
+    in their types. WIDTH and HEIGHT are those of a single organized scan if every point is written,
+    with missing points as nan; otherwise HEIGHT is 1.
+    """
+    write_rows(path, _pcd_rows(scans, every_point=every_point), _pcd_header)
+
+
+def write_lzf_pcd(
+    path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False
+) -> None:
+    """Write the content of `write_pcd` as DATA binary_compressed, with LZF.
+
+    Raises:
+        UsageError: for 4 GiB of points or more, which the format does not support.
+    """
+    compress = import_library("lzf", "pcd").compress
+    rows = _pcd_rows(scans, every_point=every_point)
+    with contextlib.ExitStack() as files, path.open("wb") as target:
+        names = rows.dtype.names or ()
+        fields = {
+            name: files.enter_context(contextlib.closing(Spool(path.parent, np.uint8)))
+            for name in names
+        }
+        for block in rows:
+            _refuse_size(rows.length * rows.dtype.itemsize)
+            for name, field in fields.items():
+                field.add(
+                    _compress(block[name], compress)
+                )  # concatenated compressed blocks are a valid compressed field
+        start = target.write(_pcd_header(rows, "binary_compressed")) + 8
+        target.seek(start)
+        for field in fields.values():
+            field.copy_to(target)
+        sizes = [target.tell() - start, rows.length * rows.dtype.itemsize]
+        _refuse_size(max(sizes))
+        target.seek(start - 8)
+        target.write(np.array(sizes, "<u4").tobytes())
+
+
+def _compress(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
+    data = values.tobytes()
+    return np.frombuffer(
+        compress(data, len(data) + len(data) // 16 + 64) if data else b"", np.uint8
+    )  # the maximum size of compressed noise
+
+
+def _refuse_size(size: int) -> None:
+    if size > _MOST_COMPRESSED:
+        reason = "a compressed PCD file holds 4 GiB of points at the most"
+        raise suggest(
+            UsageError(reason), "the same to a .pcd file, or to one for each scan: %05d.lzf.pcd"
+        )
+
+
+def _pcd_rows(scans: Iterable[Scan], *, every_point: bool) -> PointRows:
+    return PointRows(
+        scans,
+        lambda types: _packed_dtype(types, _PCD_TYPES),
+        every_point=every_point,
+        is_picture=True,
+    )
+
+
+def _pcd_header(rows: PointRows, data: str = "binary") -> bytes:
+    width, height = rows.shape or (rows.length, 1)
+    types = [rows.dtype[name] for name in rows.dtype.names or ()]
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format" + room(width, rows.length),
+        *(f"# {fact}" for fact in rows.facts),
+        "VERSION 0.7",
+        f"FIELDS {' '.join(rows.dtype.names or ())}",
+        f"SIZE {' '.join(str(dtype.itemsize) for dtype in types)}",
+        f"TYPE {' '.join(dtype.kind.upper() for dtype in types)}",
+        f"COUNT {' '.join('1' for _ in types)}",
+        f"WIDTH {width}",
+        f"HEIGHT {height}",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {rows.length}",
+        f"DATA {data}",
+    ]
+    return "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
+
+
+def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write a binary little-endian PLY file.
+
+    It has the columns of x y z intensity ring time that the sensor has, and its additional columns.
+    Properties are float, double, uchar or int, because Open3D skips other types: int for `ring`,
+    double for larger integers.
+    """
+    write_rows(
+        path,
+        PointRows(scans, lambda types: _packed_dtype(types, _PLY_TYPES), every_point=every_point),
+        _ply_header,
+    )
+
+
+def _ply_header(rows: PointRows) -> bytes:
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {fact}" for fact in ["made by lidarspec" + room(rows.length), *rows.facts]),
+        f"element vertex {rows.length}",
+        *(
+            f"property {_PLY_NAMES[rows.dtype[name].str[1:]]} {name}"
+            for name in rows.dtype.names or ()
+        ),
+        "end_header",
+    ]
+    return "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
+
+
+def _packed_dtype(types: Mapping[str, Any], known: Mapping[str, str]) -> np.dtype[Any]:
+    """Return the type of a row without gaps, in types that a format supports."""
+    codes = {name: np.dtype(dtype).str[1:] for name, dtype in types.items()}
+    return np.dtype([(name, "<" + known.get(code, code)) for name, code in codes.items()])
+
+
+def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
+    """Write x y z intensity as little-endian float32, without a header.
+
+    The intensity is 0 if the sensor has none. A file of KITTI is one scan: ``out/%06d.bin``.
+    Intensities are raw values, not scaled to 1.
+    """
+    row = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+    write_rows(path, PointRows(scans, lambda types: row, every_point=every_point), lambda rows: b"")
+
+
+PCD = Format(".pcd", "a point cloud of PCL, binary", write_pcd, ("organized",))
+LZF_PCD = Format(".lzf.pcd", "a point cloud of PCL, compressed", write_lzf_pcd, ("organized",))
+PLY = Format(".ply", "a point cloud, binary", write_ply)
+KITTI = Format(".bin", "x y z intensity as KITTI has them, float32", write_kitti)

@@ -1,0 +1,348 @@
+"""Write whole records to a file in a thread, so that a disk delays no capture.
+
+A file that is overwritten is kept until the new one has its first record.
+
+Records wait in memory. The thread writes them every 0.2 s or 64 KiB, and calls fsync every second.
+Incomplete writes are continued. If the disk is full, a partly written record is removed again.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import errno
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Protocol, Self
+
+from lidarspec.errors import SourceError, SourceTimeout, UsageError, WriteError, failure_reason
+from lidarspec.transports.protocol import Chunk
+from lidarspec.unfinished_files import path_while_written, remove_abandoned
+
+#: limits after which records are written to the file, and after which fsync is called.
+FLUSH_BYTES = 1 << 16
+FLUSH_SECONDS = 0.2
+DISK_SECONDS = 1.0
+#: bytes that may wait for a slow disk; further records are dropped and counted.
+BACKLOG = 1 << 26
+#: seconds that `sync` and `close` wait for the disk.
+PATIENCE = 60.0
+
+#: (bytes, offset) -> the length of the record at this offset; 0 or less if there is none.
+Size = Callable[[bytes | bytearray, int], int]
+
+
+class RecordFile:
+    """A new file; a file that it replaces is kept until `settle`.
+
+    Args:
+        path: of the file.
+        size_at: returns the length of a record, because a partial write is cut after the last whole
+            record; None if it may be cut anywhere.
+        overwrite: whether the file may exist.
+
+    Raises:
+        UsageError: if it exists and must not be overwritten.
+        SourceError: if it cannot be made.
+    """
+
+    def __init__(self, path: str, size_at: Size | None, *, overwrite: bool) -> None:
+        self._place = Path(os.path.realpath(path))
+        self.replaces = (
+            overwrite and self._place.is_file() and os.name != "nt"
+        )  # systems that can rename open files
+        self._opened = self._place
+        if self.replaces:
+            remove_abandoned(self._place)
+            self._opened = path_while_written(self._place)
+        try:
+            self._file = open(self._opened, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115  closed by `close`
+        except FileExistsError:
+            raise UsageError(
+                f"{path} exists already; it is not overwritten unless asked for"
+            ) from None
+        except OSError as error:
+            raise SourceError(f"{path}: {failure_reason(path, error)}") from None
+        self.size = 0
+        self._size_at = size_at
+
+    def append(self, records: bytes | bytearray) -> None:
+        """Write whole records.
+
+        Raises:
+            OSError: if a record could not be written; the file then ends after the last whole one.
+        """
+        written = 0
+        try:
+            with memoryview(records) as left:
+                while written < len(records):
+                    more = self._file.write(left[written:])
+                    if not more:
+                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                    written += more
+        except OSError:
+            self.size += self._whole(records, written)
+            with contextlib.suppress(OSError):
+                self._file.truncate(self.size)
+            raise
+        self.size += written
+
+    def _whole(self, records: bytes | bytearray, limit: int) -> int:
+        """Return the total size of the records that end within a limit."""
+        end = limit if self._size_at is None else 0
+        while (
+            self._size_at is not None and 0 < (size := self._size_at(records, end)) <= limit - end
+        ):
+            end += size
+        return end
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the file has its final name."""
+        return self._opened == self._place
+
+    def settle(self) -> None:
+        """Replace the old file, if there is one and it still exists.
+
+        Raises:
+            OSError: if that fails.
+        """
+        if not self.is_settled:
+            os.replace(self._opened, self._place)
+            self._opened = self._place
+
+    def keep(self) -> None:
+        """Wait until all data is on the disk; does nothing for pipes and devices."""
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+                raise
+
+    def close(self) -> None:
+        """Close the file.
+
+        Without `settle`, the old file is kept and the new one is removed.
+        """
+        with contextlib.suppress(OSError):
+            self._file.close()
+            if not self.is_settled:
+                self._opened.unlink()
+
+
+class TrafficLog(Protocol):
+    """A recorder of all data that arrives and is sent: a file or a substitute.
+
+    Attributes:
+        error: the failure of the recording; None if there was none.
+    """
+
+    @property
+    def error(self) -> SourceError | None: ...
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Record received or sent data with its time."""
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Record an event of the line, such as "disconnect" or "reconnect".
+
+        Args:
+            at: the time, ns since 1970; by default now.
+        """
+
+    def close(self) -> None:
+        """End the recording.
+
+        Raises:
+            SourceError: if it could not be written.
+        """
+
+
+class Appender:
+    """Base of recorders: collects records from any thread for a file.
+
+    It is a context manager. Errors of the file are not raised while records are added, so that the
+    capture continues. The error is kept in `error`, and raised once, by the next `sync` or by
+    `close`. The file is then valid up to its last whole record.
+
+    Args:
+        path, size_at, overwrite: as in `RecordFile`.
+
+    Attributes:
+        records, bytes: the number of records so far, and of the data bytes in them.
+        dropped: the number of records dropped while the disk was too slow, or after it failed.
+        error: the failure of the file; None if there was none.
+    """
+
+    def __init__(self, path: str | Path, size_at: Size | None, *, overwrite: bool) -> None:
+        self.path = str(path)
+        self.records = 0
+        self.bytes = 0
+        self.dropped = 0
+        self.error: SourceError | None = None
+        self._changed = threading.Condition()
+        self._waiting = bytearray()
+        self._untold = 0
+        self._raised = False
+        self._closing = False
+        self._taken = 0
+        self._asked = 0
+        self._kept = 0  # counts of records added, requested to be on the disk, and on the disk
+        self._file = RecordFile(self.path, size_at, overwrite=overwrite)
+        self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
+        self._thread.start()
+        atexit.register(self._finish)
+
+    def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
+        """Record received or sent data with its time."""
+        raise NotImplementedError
+
+    def event(self, name: str, at: int | None = None, **details: Any) -> None:
+        """Record an event of the line, if the format supports events."""
+
+    def sync(self) -> None:
+        """Wait until everything recorded so far is on the disk.
+
+        Raises:
+            SourceError: if that is not possible.
+        """
+        with self._changed:
+            target = self._asked = self._taken
+            self._changed.notify_all()
+            if not self._changed.wait_for(
+                lambda: self._kept >= target or self.error or not self._thread.is_alive(), PATIENCE
+            ):
+                raise SourceTimeout(
+                    f"{self.path}: the disk has not taken the recording within {PATIENCE:.0f} s"
+                )
+        self._complain()
+
+    def keep_up(self) -> None:
+        """Wait until there is room for more records; for sources that can wait.
+
+        Raises:
+            SourceError: as `sync`.
+        """
+        if len(self._waiting) > BACKLOG // 4 or self.error:
+            self.sync()
+
+    def close(self) -> None:
+        """Write the waiting records and close the file; a second call does nothing.
+
+        Raises:
+            SourceError: if the file could not be written, unless `sync` has raised it already.
+        """
+        self._finish()
+        self._complain()
+
+    def discard(self) -> bool:
+        """Remove a closed file without records.
+
+        Returns:
+            False if a file that it would have replaced was kept.
+        """
+        if not self._file.replaces:
+            with contextlib.suppress(OSError):
+                os.unlink(self.path)
+        return not self._file.replaces
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._finish()
+        if error is None:
+            self._complain()
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self.path}: {self.records} records, {self.bytes}"
+            f" bytes{f'; {self.error}' if self.error else ''})"
+        )
+
+    def _put(self, record: bytes, size: int | None = None) -> None:
+        """Queue a record for the thread.
+
+        Args:
+            size: the number of data bytes in it; None if it is not counted as a record.
+        """
+        with self._changed:
+            if self.error or self._closing or len(self._waiting) + len(record) > BACKLOG:
+                self.dropped += 1
+                self._untold += 1
+                return
+            is_first = not self._waiting
+            if self._untold:
+                self._waiting += self._make_drop_record(self._untold)
+                self._untold = 0
+            self._waiting += record
+            self._taken += 1
+            if size is not None:
+                self.records += 1
+                self.bytes += size
+            if is_first or len(self._waiting) >= FLUSH_BYTES:
+                self._changed.notify_all()
+
+    def _make_drop_record(self, dropped: int) -> bytes:
+        """Return the record of an event of dropped records, if the format has one."""
+        return b""
+
+    def _complain(self) -> None:
+        if self.error and not self._raised:
+            self._raised = True
+            raise self.error
+
+    def _finish(self) -> None:
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(PATIENCE)
+        atexit.unregister(self._finish)
+
+    def _work(self) -> None:
+        """Write the waiting records until the end or a failure; runs in the thread."""
+        try:
+            due = time.monotonic() + DISK_SECONDS
+            while not (self._closing and not self._waiting and self._kept == self._taken):
+                with self._changed:
+                    self._changed.wait_for(
+                        lambda: self._waiting or self._kept < self._taken or self._closing
+                    )
+                    self._changed.wait_for(self._is_urgent, FLUSH_SECONDS)
+                    waiting = self._waiting
+                    self._waiting = bytearray()
+                    taken = self._taken
+                    asked = self._asked > self._kept or self._closing
+                    is_begun = self.records > 0
+                self._file.append(waiting)
+                if is_begun:
+                    self._file.settle()
+                if asked or time.monotonic() >= due:
+                    self._file.keep()
+                    due = time.monotonic() + DISK_SECONDS
+                    with self._changed:
+                        self._kept = taken
+                        self._changed.notify_all()
+        except Exception as error:
+            with self._changed:
+                reason = (error.strerror if isinstance(error, OSError) else None) or error
+                if self._file.is_settled:
+                    held = f"the recording is whole up to byte {self._file.size}"
+                else:
+                    held = "what was there before is kept"
+                self.error = WriteError(self.path, str(reason), held)
+                self._changed.notify_all()
+        finally:
+            self._file.close()
+
+    def _is_urgent(self) -> bool:
+        return len(self._waiting) >= FLUSH_BYTES or self._asked > self._kept or self._closing

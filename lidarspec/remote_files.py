@@ -1,0 +1,228 @@
+"""Files in stores, such as s3://bucket/drives/a.pcap.
+
+fsspec opens them by URL. Paths of local files are accepted too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import hashlib
+import io
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+from lidarspec.errors import LidarSpecError, SourceError, UsageError, suggest, system_errors
+from lidarspec.optional_libraries import import_library
+
+#: scheme -> the library that fsspec requires for it; "" if it needs none.
+DRIVERS = {
+    **dict.fromkeys(("file", "ftp", "memory"), ""),
+    **dict.fromkeys(("s3", "s3a"), "s3fs"),
+    **dict.fromkeys(("gs", "gcs"), "gcsfs"),
+    **dict.fromkeys(("az", "abfs", "abfss"), "adlfs"),
+    **dict.fromkeys(("http", "https"), "aiohttp"),
+    **dict.fromkeys(("ssh", "sftp"), "paramiko"),
+    "oci": "ocifs",
+    "oss": "ossfs",
+    "smb": "smbprotocol",
+    "hdfs": "pyarrow",
+}
+#: bytes at the beginning and at the end that tell a file from others of its size.
+ENDS = 1 << 16
+
+
+def is_stored(path: object) -> bool:
+    """bytes at the beginning and at the end that distinguish files of the same size."""
+    scheme, mark, _ = str(path).partition("://")
+    return bool(mark) and scheme in DRIVERS
+
+
+def system_of(url: str) -> Any:
+    """Return the file system of fsspec for a URL.
+
+    Raises:
+        UsageError: if fsspec, or its driver, is not installed.
+        SourceError: if the store cannot be reached.
+    """
+    fsspec = import_library("fsspec", "fsspec")
+    scheme = url.partition("://")[0]
+    with _failures(url):
+        try:
+            return fsspec.core.url_to_fs(url)[0]
+        except ImportError as error:
+            reason = f"{url}: {scheme}:// takes {DRIVERS[scheme]}, which is not installed"
+            raise suggest(UsageError(reason), f"pip install {DRIVERS[scheme]}") from error
+
+
+def file_of(path: str) -> BinaryIO:
+    """Open a path or URL for reading.
+
+    Raises:
+        UsageError: if the library of a store is not installed.
+        SourceError: if it cannot be opened.
+    """
+    if not is_stored(path):
+        with system_errors(path):
+            return open(path, "rb")
+    system = system_of(path)
+    with _failures(path):
+        file = system.open(path, "rb")
+        return (
+            io.BytesIO(file.getbuffer()) if isinstance(file, io.BytesIO) else file
+        )  # all readers of a BytesIO would share one offset
+
+
+def found(pattern: str) -> list[tuple[str, str]]:
+    """Return the files that match a path or URL with *, ? and **.
+
+    Returns:
+        (path, path below the fixed part of the pattern) of each file.
+
+    Raises:
+        SourceError: if there is none.
+    """
+    fixed = pattern
+    while glob.has_magic(fixed):
+        fixed = fixed.rpartition("/")[0]
+    if is_stored(pattern):
+        system = system_of(pattern)
+        with _failures(pattern):
+            paths = [system.unstrip_protocol(path) for path in system.glob(pattern)]
+    else:
+        paths = [path for path in glob.glob(pattern, recursive=True) if os.path.isfile(path)]
+    if not paths:
+        raise SourceError(f"{pattern}: there is no such file")
+    names = (
+        plain(path).removeprefix(plain(fixed)).lstrip("/")
+        if fixed != pattern
+        else path.rpartition("/")[2]
+        for path in paths
+    )
+    return sorted(zip(paths, names, strict=True))
+
+
+def files_in(folder: str) -> set[str]:
+    """Return the normalised paths of everything in a folder and below.
+
+    Empty if there is no folder.
+
+    Raises:
+        SourceError: if the store cannot be reached.
+    """
+    if not is_stored(folder):
+        return {
+            plain(Path(at, name))
+            for at, folders, files in os.walk(folder)
+            for name in (*folders, *files)
+        }
+    system = system_of(folder)
+    with _failures(folder):
+        if system.exists(folder):
+            return {plain(system.unstrip_protocol(path)) for path in system.find(folder)}
+        return set()
+
+
+def plain(path: object) -> str:
+    """Return a normalised path or URL for comparison.
+
+    memory:///a and memory://a are equal, as are ./a and a.
+    """
+    if is_stored(path):
+        return str(path).partition("://")[2].lstrip("/")
+    return Path(str(path)).as_posix().removeprefix("./")
+
+
+def stamp(path: str) -> dict[str, Any]:
+    """Return the `size` of a file and the time it was `modified`.
+
+    In a store, the time may be the store's tag instead.
+
+    Raises:
+        SourceError: if there is no such file.
+    """
+    if not is_stored(path):
+        with system_errors(path):
+            status = os.stat(path)
+        return {"size": status.st_size, "modified": str(status.st_mtime_ns)}
+    system = system_of(path)
+    with _failures(path):
+        info = system.info(path)
+    tag = next(
+        (
+            info[name]
+            for name in ("ETag", "etag", "LastModified", "mtime", "last_modified", "created")
+            if info.get(name)
+        ),
+        "",
+    )
+    return {"size": info["size"], "modified": str(tag)}
+
+
+def digest(path: str) -> str:
+    """Return a hash of the beginning and the end of a file."""
+    with contextlib.closing(file_of(path)) as file:
+        head = file.read(ENDS)
+        file.seek(max(file.seek(0, os.SEEK_END) - ENDS, 0))
+        return hashlib.blake2b(head + file.read(ENDS), digest_size=16).hexdigest()
+
+
+def put(local: Path, url: str) -> None:
+    """Copy a file or folder to a store; a file appears there as a whole.
+
+    Raises:
+        SourceError: if that fails.
+    """
+    system = system_of(url)
+    with _failures(url):
+        if local.is_dir():
+            system.put(str(local), url, recursive=True)
+            return
+        system.makedirs(url.rpartition("/")[0], exist_ok=True)
+        with system.transaction, local.open("rb") as file, system.open(url, "wb") as target:
+            shutil.copyfileobj(file, cast(Any, target), 1 << 22)
+
+
+def take_away(path: str | Path) -> None:
+    """Remove a file or folder, if there is one.
+
+    Raises:
+        SourceError: if that fails.
+    """
+    if is_stored(path):
+        system = system_of(str(path))
+        with _failures(str(path)):
+            system.rm(str(path), recursive=True)
+        return
+    with system_errors(path):
+        if os.path.isdir(path) and not os.path.islink(path):
+            shutil.rmtree(path)
+        else:
+            Path(path).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _failures(url: str) -> Iterator[None]:
+    """Convert all exceptions of a store to `SourceError`."""
+    try:
+        yield
+    except LidarSpecError:
+        raise
+    except Exception as error:
+        raise SourceError(f"{url}: {_failure_reason(url, error)}") from error
+
+
+def _failure_reason(url: str, error: Exception) -> str:
+    """Return the reason of a store's failure.
+
+    Many drivers report only the URL or path of a missing file.
+    """
+    text = str(error)
+    if plain(text) != plain(url) and text.lstrip("/") != plain(url) and text:
+        return text
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    return type(error).__name__

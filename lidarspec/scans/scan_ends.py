@@ -1,0 +1,287 @@
+"""Find the ends of scans by the sensor's declared rule.
+
+An end is before a point. Rules look at a column of the points, at a field of the packets or of the
+rows of an array in them, or at the time; `EndFinder` translates rows to points. Whether a scan ends
+there is decided by `cutter`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import SpecError, UnknownField
+from lidarspec.expressions.columns import Column
+from lidarspec.packets.masked_sector import FULL_TURNS, AngleReader, Sector
+from lidarspec.packets.packets import Packets
+from lidarspec.points.cloud import COLUMNS
+from lidarspec.points.column_sources import LazyColumns
+from lidarspec.points.reference_evaluator import Evaluated
+from lidarspec.scans.rotation import (
+    MIN_TURNS_AWAY,
+    Floats,
+    PassDetector,
+    WrapDetector,
+    previous_values,
+)
+from lidarspec.spec.sensor import SensorDescription
+from lidarspec.spec.timing import Every, OnChange, OnFlag, OnJump, OnRewind, OnWrap
+
+Indices = NDArray[np.intp]
+
+
+class End(NamedTuple):
+    """A place at which a scan ends by the rule.
+
+    Attributes:
+        point: the index of the point before which it ends.
+        packet: the row of the packet that shows it, which may be without points; None if a point
+            shows it.
+        is_leap: whether the angle leaps by more than `MIN_TURNS_AWAY`, and twice as far as at the
+            end before: something is missing there, or is no angle.
+    """
+
+    point: int
+    packet: int | None
+    is_leap: bool
+
+
+class EndFinder:
+    """Finds the ends of scans in one stream of points.
+
+    Args:
+        sensor: of the stream.
+    """
+
+    def __init__(self, sensor: SensorDescription) -> None:
+        self._rule = sensor.scan
+        self._reader = AngleReader(sensor)
+        self._wraps = WrapDetector()
+        self._passes: PassDetector | None = None  # if scans are cut at an angle that may be skipped
+        self._cut: float | None = None  # the angle that the user has configured, in turns
+        if "cut" in sensor.options:
+            self._cut = sensor.options["cut"] / 360 % 1
+            if isinstance(self._rule, OnChange):
+                self._passes = PassDetector(self._cut, direction=1)
+        self._value: float | None = None  # of the row before
+        self._start_ns: int | None = None  # the start of the first period
+        self._last_leap = 0.0  # turns by which the angle advanced at the end before
+
+    def use_sector(self, sector: Sector, angle: float | None) -> None:
+        """Cut scans in a masked sector from now on.
+
+        Args:
+            angle: of the last packet before, in turns; None if there is none.
+        """
+        at = sector.middle
+        if self._cut is not None:
+            at = self._cut
+        if self._passes is None:
+            self._passes = PassDetector(at, sector.direction)
+        self._passes.restart(at, sector.direction, angle)
+
+    def find(self, packets: Packets, points: Evaluated) -> list[End]:
+        """Return the ends in a batch, ascending."""
+        rule = self._rule
+        if self._passes is not None:
+            return self._find_passes(self._passes, packets, points)
+        if isinstance(rule, Every):
+            rows = self._find_periods(rule, packets, points)
+            return _make_ends(first_points(points)[rows], rows)
+        if isinstance(rule, OnWrap):
+            return self._find_wraps(rule, packets, points)
+        path = _own_path(packets, rule.name)
+        column = _read_field(points, path)
+        values, starts = _read_rows(column, points)
+        rows = self._find_changes(rule, values, _full_turn(packets, path))
+        if _is_per_packet(column):
+            return _make_ends(starts[rows], rows)
+        return _make_ends(starts[rows])
+
+    def _find_wraps(self, rule: OnWrap, packets: Packets, points: Evaluated) -> list[End]:
+        """Return the ends at which a column or a field passes an angle."""
+        rows: Indices | None = None
+        if rule.name in COLUMNS:
+            values = np.asarray(LazyColumns(points.source).read(rule.name), np.float64)
+            full = 2 * np.pi
+            ends, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
+        else:
+            path = _own_path(packets, rule.name)
+            column = _read_field(points, path)
+            values, starts = _read_rows(column, points)
+            full = _full_turn(packets, path) or 2 * np.pi
+            found, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
+            ends = starts[found]
+            if _is_per_packet(column):
+                rows = found
+        return _make_ends(ends, rows, map(self._is_leap, steps.tolist()))
+
+    def _cut_angle(self, rule: OnWrap, full: float) -> float:
+        """Return the angle at which scans are cut, in the unit in which a turn is `full`."""
+        if self._cut is None:
+            return rule.at
+        return self._cut * full
+
+    def _is_leap(self, step: float) -> bool:
+        last = self._last_leap
+        self._last_leap = step
+        return last > 0 and step > max(MIN_TURNS_AWAY, 2 * last)
+
+    def _find_passes(self, passes: PassDetector, packets: Packets, points: Evaluated) -> list[End]:
+        """Return the ends at which the angle of packets or rows passes an angle."""
+        if isinstance(self._rule, OnWrap):
+            path = _own_path(packets, self._rule.name)
+            column = _read_field(points, path)
+            values, starts = _read_rows(column, points)
+            rows = passes.push(values / (_full_turn(packets, path) or 2 * np.pi))
+            if _is_per_packet(column):
+                return _make_ends(starts[rows], rows)
+            return _make_ends(starts[rows])
+        angles = self._reader.angles(packets.table)
+        if angles is None:
+            return []
+        rows = passes.push(angles[: points.ready])
+        return _make_ends(first_points(points)[rows], rows)
+
+    def _find_changes(
+        self,
+        rule: OnFlag | OnChange | OnJump | OnRewind,
+        values: Floats,
+        full: float | None,
+    ) -> Indices:
+        """Return the rows that begin a scan by their value, or by the one before.
+
+        Args:
+            full: a whole turn, if the values are angles.
+        """
+        if isinstance(rule, OnFlag):
+            if rule.value is None:
+                return np.flatnonzero(values != 0)
+            return np.flatnonzero(values == rule.value)
+        if not len(values):
+            return np.empty(0, np.intp)
+        before = previous_values(values, self._value)
+        self._value = values.item(-1)
+        if isinstance(rule, OnRewind):
+            return np.flatnonzero(values < before)
+        if isinstance(rule, OnChange):
+            return np.flatnonzero(values != before)
+        steps = values - before
+        if full is not None:
+            steps = np.mod(steps + full / 2, full) - full / 2
+        return np.flatnonzero(np.abs(steps) > rule.by)
+
+    def _find_periods(self, rule: Every, packets: Packets, points: Evaluated) -> Indices:
+        """Return the packets with which a period begins."""
+        times = packets.time_ns[: points.ready]
+        if not len(times):
+            return np.empty(0, np.intp)
+        if self._start_ns is None:
+            self._start_ns = times.item(0)
+        periods = (times - self._start_ns) // int(rule.seconds * 1e9)
+        before = previous_values(periods.astype(np.float64), self._value)
+        self._value = float(periods[-1])
+        return np.flatnonzero(periods > before)
+
+
+def _make_ends(
+    points: Indices, packets: Indices | None = None, leaps: Iterable[bool] | None = None
+) -> list[End]:
+    rows: Iterable[int | None] = itertools.repeat(None)
+    if packets is not None:
+        rows = packets.tolist()
+    if leaps is None:
+        leaps = itertools.repeat(False)
+    return list(map(End, points.tolist(), rows, leaps))
+
+
+def _full_turn(packets: Packets, path: str) -> float | None:
+    """Return a whole turn in the unit of a field, None if it is no angle."""
+    if path.startswith("frame."):
+        table, _ = packets.frames
+    else:
+        table = packets.table
+    return FULL_TURNS.get(table.schema.fields[path.removeprefix("frame.")].unit)
+
+
+def _own_path(packets: Packets, path: str) -> str:
+    """Return the path of a field of the frame; packets that are parts have another one."""
+    _, _, parts = packets.frame.partition(".")
+    if not parts:
+        return path
+    if path.startswith(f"{parts}."):
+        return path.removeprefix(f"{parts}.")
+    return f"frame.{path}"
+
+
+def _read_field(points: Evaluated, path: str) -> Column:
+    column: Any = points.fields
+    for name in path.split("."):
+        try:
+            column = getattr(column, name)
+        except UnknownField as error:
+            raise SpecError(str(error), path="scan", rule="LS216") from None
+    if not isinstance(column, Column):
+        raise SpecError("scans are cut by a field, and this is a struct", path=path)
+    return column
+
+
+def _is_per_packet(column: Column) -> bool:
+    """Return whether a field has one value in each packet, and is not in an array."""
+    return all(name is None for name in column.axes)
+
+
+def _read_rows(column: Column, points: Evaluated) -> tuple[Floats, Indices]:
+    """Return the values of a field row by row, and the index of the first point of each row.
+
+    Rows are in stream order.
+    """
+    levels = 1 + max(
+        (index for index, name in enumerate(column.axes) if name is not None), default=-1
+    )
+    counts = points.counts
+    array = column.array[: points.ready]
+    if not levels and len(array) == len(counts):
+        return array.reshape(-1), first_points(points)
+    shape = np.broadcast_shapes(
+        (points.ready, *array.shape[1 : 1 + levels]), counts.shape[: 1 + levels]
+    )
+    sums = _sum_axes(np.broadcast_to(counts, (*shape, *counts.shape[1 + levels :])), 1 + levels)
+    values = np.broadcast_to(
+        array.reshape(len(array), *array.shape[1 : 1 + levels]), shape
+    ).reshape(-1)
+    if sums.size and not any(sums.strides) and sums.flat[0]:
+        return values, np.arange(len(values)) * int(sums.flat[0])
+    points_per_row = sums.reshape(-1)
+    starts = np.cumsum(points_per_row) - points_per_row
+    if levels:
+        has_points = points_per_row > 0
+        return values[has_points], starts[has_points]
+    return values, starts
+
+
+def first_points(points: Evaluated) -> Indices:
+    """Return the index of the first point of each packet, (ready,)."""
+    points_per_packet = _sum_axes(points.counts, 1)
+    return np.cumsum(points_per_packet) - points_per_packet
+
+
+def _sum_axes(counts: NDArray[Any], kept: int) -> Indices:
+    """Return the sums over all axes but the first `kept`.
+
+    Along axes that repeat one number, sums are computed as products.
+    """
+    times = 1
+    while counts.ndim > kept:
+        if counts.strides[-1] == 0 and counts.shape[-1] > 0:
+            times *= counts.shape[-1]
+            counts = counts[..., 0]
+        else:
+            counts = counts.sum(axis=-1)
+    if counts.size and not any(counts.strides):
+        return np.broadcast_to(counts.flat[0] * times, counts.shape)
+    return counts * times

@@ -1,0 +1,598 @@
+"""Checks of a declaration without any bytes of a sensor.
+
+They concern units, sources, lengths, sync bytes, coverage by checksums, and `plausible`.
+"""
+
+from __future__ import annotations
+
+import dis
+import inspect
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
+from lidarspec.expressions.columns import Batch, Fields
+from lidarspec.expressions.graph import Traced, UntraceableError
+from lidarspec.frames.layout import Layout
+from lidarspec.frames.schema import without_indices
+from lidarspec.framing.example_frames import draw_always, header, random_frame
+from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.points.conventions import TYPES
+from lidarspec.simulation.scenes import Room
+from lidarspec.simulation.simulator import simulation
+from lidarspec.spec import Clock, Frame, OnWrap, Sensor
+from lidarspec.spec.fields import factor, is_unit
+from lidarspec.spec.syntax import is_expression
+from lidarspec.spec.tree import Sealed, Struct, infos, nodes
+from lidarspec.testing.findings import Finding
+from lidarspec.testing.geometry import field_of, find_fields, trace_points
+from lidarspec.testing.sensor_under_test import Subject
+
+#: Names of fields that hold a measured value.
+MEASURES = frozenset(
+    [
+        "distance",
+        "range",
+        "radius",
+        "angle",
+        "azimuth",
+        "elevation",
+        "temperature",
+        "voltage",
+        "timestamp",
+    ]
+)
+#: Maximum share of payload offsets at which a sync pattern may match by chance.
+COMMON = 1 / 200
+#: Number of examples to measure before a frame is simulated for its length.
+FIRST_LENGTHS = 3
+#: Total number of examples to measure.
+LENGTHS = 12
+#: Default number of example payloads in which the sync pattern is counted.
+SYNC_EXAMPLES = 12
+#: Bits of constants and checksums up to which a frame is weak: random bytes match one every few
+#: megabytes.
+WEAK_BITS = 24
+#: The same for a frame without points, which does not damage a point cloud.
+WEAK_BITS_WITHOUT_POINTS = 16
+#: The same in datagrams, which have checksums of their own.
+WEAK_BITS_IN_DATAGRAMS = 8
+#: Maximum ratio of `max_length` to the length of the longest random frame.
+FAR = 8
+#: Seconds after which the wrap of a clock no longer matters.
+LONG = 7 * 86_400
+#: Column of points -> units of the fields that it comes from.
+UNITS = {"range": ("m",), "azimuth": ("deg", "rad"), **dict.fromkeys("xyz", ("m",))}
+#: Names of fields that hold the intensity of a return, and of fields that hold a code.
+INTENSITY = re.compile(
+    r"(\w+_)?(intensity|intensities|reflectivity|reflectance|rssi|amplitude|brightness|quality|signal)(_\w+)?"
+)
+CODE = re.compile(r"(\w+_)?(code|error|fault|status|errno)(_?\d+)?")
+PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IGNORECASE)
+
+Findings = Iterator[tuple[str, str, str]]
+
+
+def check_declaration(subject: Subject) -> list[Finding]:
+    """Return the findings of a declaration."""
+    sensor = subject.sensor
+    checks: list[Findings] = [
+        _sensor(sensor),
+        _check_required_fields(sensor),
+        _clock(sensor),
+        _options(sensor),
+    ]
+    checks += [_frame(subject, name, frame) for name, frame in subject.frames.items()]
+    checks += [_points(subject, name) for name in subject.sensor.data_frames]
+    checks += [_reach(subject)]
+    findings: list[Finding] = []
+    for check in checks:
+        try:
+            findings += [Finding(code, what, path, sensor.id) for code, what, path in check]
+        except Exception as error:  # raised by the plugin's own functions
+            findings.append(Finding("LS414", f"{type(error).__name__}: {error}", "", sensor.id))
+    return findings
+
+
+def _sensor(sensor: Sensor) -> Findings:
+    if PLACEHOLDER.fullmatch(sensor.source):
+        yield "LS202", f"source is {sensor.source!r}", ""
+    for name in ("vendor", "model"):
+        if not getattr(sensor, name).strip():
+            yield "LS211", f"{name} is empty", ""
+    if "data" not in sensor.links:
+        yield "LS211", "there is no link 'data'", "links"
+    if sensor.frames and not any(frame.data for frame in sensor.frames.values()):
+        yield "LS211", "no frame is the data", "frames"
+    low, high = sensor.range_limits
+    if not 0 <= low < high:
+        yield "LS210", f"range_limits are {low:g} .. {high:g}", "range_limits"
+
+
+def _check_required_fields(sensor: Sensor) -> Findings:
+    """Yield the missing fields of scans, clock and counter."""
+    known = {
+        path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.named
+    }
+    if isinstance(sensor.scan, OnWrap):
+        cut_by = known | set(TYPES)
+    else:
+        cut_by = known
+    if sensor.clock is not None:
+        clock = sensor.clock.source
+    else:
+        clock = ()
+    field_names = {
+        "scan": getattr(sensor.scan, "name", ""),
+        "sequence": sensor.sequence.field if sensor.sequence is not None else "",
+    }
+    given = [
+        *field_names.items(),
+        *(
+            ("clock", path)
+            for path in ((clock,) if isinstance(clock, str) else () if callable(clock) else clock)
+        ),
+    ]
+    for place, path in given:
+        there = cut_by if place == "scan" else known
+        if path and without_indices(path)[0] not in there:
+            yield "LS216", f"there is no field {path!r}{did_you_mean(path, there)}", place
+
+
+def _clock(sensor: Sensor) -> Findings:
+    """Yield a finding if a clock wraps within days and `wraps_at` is missing."""
+    clock = sensor.clock
+    if (
+        not isinstance(clock, Clock)
+        or callable(clock.source)
+        or clock.wraps_at is not None
+        or not sensor.frames
+    ):
+        return
+    named = codec(sensor.frames[sensor.data_frame]).schema.named
+    paths = (clock.source,) if isinstance(clock.source, str) else clock.source
+    infos = [named.get(without_indices(path)[0]) for path in paths]
+    spans = [
+        (
+            info.limits[1] * info.scale * float(factor(info.unit, "s") or 0)
+            if info and info.kind == "int"
+            else np.inf
+        )
+        for info in infos
+    ]
+    if 0 < sum(spans) < LONG:
+        what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"
+        yield "LS509", what, f"{sensor.data_frame}.{paths[0]}"
+
+
+def _options(sensor: Sensor) -> Findings:
+    """Yield the options that `configure` ignores.
+
+    An option is ignored if it is never read, or if all its choices give the same sensor.
+    """
+    function = sensor.configure.function
+    if isinstance(function, partial):
+        plain = function.func
+    else:
+        plain = function
+    if not inspect.isfunction(plain):
+        return
+    read = {
+        instruction.argval
+        for instruction in dis.get_instructions(plain)
+        if instruction.opname.startswith("LOAD_")
+    }
+    for name, option in sensor.configure.types.items():
+        if name not in read:
+            yield "LS217", f"configure never reads {name!r}", f"configure.{name}"
+        elif _changes_nothing(sensor, name, option.choices):
+            yield (
+                "LS217",
+                f"configure returns the same sensor whatever {name!r} is",
+                f"configure.{name}",
+            )
+
+
+def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
+    """Return whether `configure` accepts several values, and returns equal sensors."""
+    accepted = 0
+    for value in values:
+        try:
+            configured = sensor.configure(**{name: value})
+        except LidarSpecError:
+            continue
+        accepted += 1
+        same = replace(configured, options=sensor.options, configure=sensor.configure.function)
+        if any(
+            getattr(same, one.name) != getattr(sensor, one.name)
+            for one in fields(sensor)
+            if one.name != "configure"
+        ):
+            return False
+    return accepted > 1
+
+
+def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
+    engine = codec(frame)
+    if not isinstance(frame.tree, Struct | Sealed):
+        yield "LS114", f"it is a {type(frame.struct).__name__}", name
+    if not engine.is_compiled:
+        if not _is_reply(subject.sensor, name):  # a reply comes only once, on request
+            yield "LS116", getattr(engine, "reason", "its layout cannot be computed"), name
+    elif engine.size is not None and engine.size != frame.max_length:
+        yield (
+            "LS203",
+            f"every frame has {engine.size} bytes, and max_length is {frame.max_length}",
+            name,
+        )
+    else:
+        yield from _longest(subject, name, frame)
+    yield from _names(subject, name, frame)
+    if frame.plausible is not None:
+        yield from _plausible(subject, name, frame)
+    if isinstance(engine, CompiledCodec):
+        try:
+            candidates = [engine.tree.layout(subject.example(name, seed=seed)) for seed in range(3)]
+        except LidarSpecError:
+            return
+        layouts = [layout for layout in candidates if isinstance(layout, Layout)]
+        yield from _find_uncovered(name, layouts)
+        if frame.direction == "in":
+            yield from _sync(subject, name, frame, engine)
+            yield from _strength(subject, name, frame, layouts)
+
+
+def _is_reply(sensor: Sensor, name: str) -> bool:
+    """Return whether a frame type is the reply to a command."""
+    return any(name in command.replies for command in sensor.commands.values())
+
+
+def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
+    """Yield a finding if `max_length` is far above the lengths of random frames.
+
+    The decoder waits much longer than needed for a frame with a corrupt length.
+    """
+    sizes = list[int]()
+    try:
+        for size in _sizes(subject, name):
+            if FAR * size >= frame.max_length:
+                return
+            sizes.append(size)
+    except LidarSpecError:  # another check reports it
+        return
+    yield (
+        "LS203",
+        (
+            f"the longest of {len(sizes)} random frames has {max(sizes)} bytes, and max_length is"
+            f" {frame.max_length}"
+        ),
+        name,
+    )
+
+
+def _sizes(subject: Subject, name: str) -> Iterator[int]:
+    """Yield the lengths of examples and of a simulated frame.
+
+    The simulated frame comes late, because it takes long and is seldom needed.
+    """
+    yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS))
+    if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
+        yield len(simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0])
+    yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS, LENGTHS))
+    yield from _raised_sizes(subject, name)
+
+
+def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
+    """Yield the lengths of valid frames with one large value in a header field.
+
+    The value is the largest that `max_length` allows. Random headers seldom have large counts, and
+    a `sweep` may have the same count in all packets.
+    """
+    frame = subject.sensor.frames[name]
+    engine = codec(frame)
+    if not isinstance(engine, CompiledCodec) or engine.schema.parts:
+        return
+    source = subject.source(f"lengths of {name}")
+    for path in header(engine, source)[1]:
+        info = engine.schema.fields[path]
+        for shift in range(info.bits if info.const is None else 0):
+            raised = {path: partial(draw_always, info.limits[1] >> shift)}
+            try:
+                size = header(engine, source, raised)[0].size
+                if FAR * size < frame.max_length:
+                    break
+                yield len(
+                    random_frame(subject.sensor, name, source, {**subject.drawers(name), **raised})
+                )
+            except SpecError:  # too long, or not plausible
+                continue
+
+
+def _names(subject: Subject, name: str, frame: Frame) -> Findings:
+    """Yield fields without a unit with names of measured values.
+
+    `Scaled(..., "")` declares a pure number.
+    """
+    pure = _find_pure_numbers(frame) | (_find_multiplied(subject, name) if frame.data else set())
+    for path, info in codec(frame).schema.all_fields.items():
+        if (
+            info.name in MEASURES
+            and info.kind in ("int", "float")
+            and not info.unit
+            and not info.labels
+            and path not in pure
+        ):
+            yield (
+                "LS201",
+                f"{info.name!r} is a measure, and no Scaled says its unit",
+                f"{name}.{path}",
+            )
+
+
+def _find_multiplied(subject: Subject, name: str) -> set[str]:
+    """Return the fields that are multiplied with a field in metres to give ranges."""
+    try:
+        infos = [
+            field_of(subject, name, node)
+            for node in find_fields(getattr(trace_points(subject, name), "range", None))
+        ]
+    except Exception:  # another check reports it
+        return set()
+    has_metres = any(info is not None and factor(info.unit, "m") is not None for info in infos)
+    if has_metres:
+        return {info.path for info in infos if info is not None}
+    return set()
+
+
+def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
+    """Return the paths of fields that are declared as pure numbers.
+
+    They are Scaled with an empty unit.
+
+    Args:
+        with_scale: whether a factor may be declared too, as for the components of a direction.
+    """
+    return {
+        info.path
+        for node in nodes(frame.tree)
+        for info in infos(node)
+        if info.measured and not info.unit and (with_scale or not info.scaled)
+    }
+
+
+def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
+    try:
+        table = codec(frame).table([subject.example(name)])
+    except LidarSpecError:
+        table = codec(frame).table([])
+    try:
+        with np.errstate(all="ignore"):
+            answer = frame.plausible(Fields(Batch(table, np.zeros(len(table), np.bool_))))  # type: ignore[misc]
+    except Exception as error:
+        if isinstance(error, SpecError):
+            text = error.reason
+        else:
+            text = f"plausible: {type(error).__name__}: {error}"
+        yield getattr(error, "rule", "") or "LS414", text, f"{name}.plausible"
+        return
+    if is_expression(answer):
+        yield "LS207", f"it returns {answer!r}, an expression of construct", f"{name}.plausible"
+    elif isinstance(answer, bool | np.bool_ | str | type(None)):
+        yield "LS207", f"it returns {answer!r} whatever the frame is", f"{name}.plausible"
+
+
+def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
+    """Yield fields of a frame with checksums that none of its checksums covers.
+
+    Many checksums begin after the header: fields before all checksums are no findings.
+    """
+    reported: set[str] = set()
+    for layout in layouts:
+        if not layout.seals:
+            continue
+        under = {
+            byte for seal in layout.seals for start, end in seal.spans for byte in range(start, end)
+        }
+        sealing = {leaf.info.path for seal in layout.seals for leaf in seal.leaves}
+        for path, leaf in layout.leaves.items():
+            if (
+                path in sealing
+                or leaf.info.const is not None
+                or leaf.info.held
+                or path in reported
+                or 0 in leaf.shape
+            ):
+                continue
+            if leaf.wire is not None:
+                own = {leaf.offset}
+            else:
+                own = {leaf.offset + part.byte for part in leaf.elements[0].segments}
+            if not own <= under and max(own) > min(under):
+                reported.add(path)
+                yield (
+                    "LS205",
+                    f"byte {min(own - under)} is under no checksum of the frame",
+                    f"{name}.{path}",
+                )
+
+
+def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> Findings:
+    """Yield a finding if the constant bytes at the start are common in payloads."""
+    if subject.sensor.datagrams or frame.confirm > 1:
+        return
+    if not engine.prefix:
+        yield "LS204", "it has no constant bytes, and every byte is a candidate", name
+        return
+    seeds = range(subject.scale_rounds(SYNC_EXAMPLES, least=4))
+    data = np.frombuffer(
+        b"".join(subject.example(name, seed=seed)[max(engine.prefix) + 1 :] for seed in seeds),
+        np.uint8,
+    )
+    reach = max(engine.prefix) + 1
+    if len(data) < 4 * reach:
+        return
+    matching = np.ones(len(data) - reach + 1, np.bool_)
+    for offset, (mask, value) in engine.prefix.items():
+        matching &= (data[offset : offset + len(matching)] & mask) == value
+    expected = 2.0 ** -sum(mask.bit_count() for mask, _ in engine.prefix.values())
+    share = float(matching.mean())
+    # with few bytes, chance alone gives a larger share
+    chance = COMMON + 4 * (COMMON / len(matching)) ** 0.5
+    share = expected if expected > COMMON else share
+    if expected > COMMON or share > chance:
+        yield "LS204", f"its constants stand at {share:.1%} of the places in payloads", name
+
+
+def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) -> Findings:
+    """Yield a finding if constants and checksums are too few to reject random bytes."""
+    if frame.plausible is not None or frame.confirm > 1 or not layouts:
+        return
+    checked = [
+        sum(leaf.info.bits for seal in layout.seals for leaf in seal.leaves) for layout in layouts
+    ]
+    constant = [sum(mask.bit_count() for mask, _ in layout.known.values()) for layout in layouts]
+    weakest = min(map(sum, zip(checked, constant, strict=True)))
+    if weakest <= _weak_bits(subject.sensor, frame):
+        yield (
+            "LS206",
+            (
+                f"its constants and checksums have {weakest} bits, and it declares neither"
+                " plausible nor confirm"
+            ),
+            name,
+        )
+
+
+def _weak_bits(sensor: Sensor, frame: Frame) -> int:
+    """Return the bits of constants and checksums up to which a frame type is weak."""
+    if sensor.datagrams:
+        return WEAK_BITS_IN_DATAGRAMS
+    if frame.data:
+        return WEAK_BITS
+    return WEAK_BITS_WITHOUT_POINTS
+
+
+def _points(subject: Subject, name: str) -> Findings:
+    """Yield the findings of `points`: whether it can be traced, and its source fields."""
+    try:
+        result = trace_points(subject, name)
+    except UntraceableError as reason:
+        yield "LS208", str(reason), f"{name}.points"
+        return
+    except Exception:  # another property reports the failure
+        return
+    for column, units in UNITS.items():
+        if hasattr(result, column):
+            yield from _column(subject, name, getattr(result, column), column, units)
+    yield from _intensity(subject, name, result)
+
+
+def _intensity(subject: Subject, name: str, result: Any) -> Findings:
+    """Yield a finding if the intensity comes from a field with another name.
+
+    Applies if no column uses the field that is named intensity.
+    """
+    own = [
+        field_of(subject, name, node) for node in find_fields(getattr(result, "intensity", None))
+    ]
+    if not own or any(info is None or INTENSITY.search(info.path) for info in own):
+        return
+    columns = [getattr(result, one.name) for one in fields(result)]
+    taken = {
+        info.path
+        for value in columns
+        for node in find_fields(value)
+        if (info := field_of(subject, name, node)) is not None
+    }
+    ranges = [
+        info
+        for node in find_fields(getattr(result, "range", None))
+        if (info := field_of(subject, name, node)) is not None
+    ]
+    axes = {info.axes for info in ranges if info.axes}
+    for path, info in subject.fields(name).items():
+        if INTENSITY.fullmatch(info.name) and info.axes in axes and path not in taken:
+            others = ", ".join(info.path for info in own if info is not None)
+            yield (
+                "LS218",
+                f"it comes from {others}, and no column from this field",
+                f"{name}.{path}",
+            )
+            return
+
+
+def _reach(subject: Subject) -> Findings:
+    """Yield a finding if a range limit exceeds the largest value of the range field."""
+    reach: list[tuple[float, str]] = []
+    for name in subject.sensor.data_frames:
+        try:
+            result = trace_points(subject, name)
+        except Exception:  # another check reports it
+            return
+        value = getattr(result, "range", None)
+        if isinstance(value, Traced) and value.node.kind == "field":
+            info = field_of(subject, name, value.node)
+        else:
+            info = None
+        if info is not None and info.kind == "int":
+            metres = factor(info.unit, "m")
+        else:
+            metres = None
+        if info is None or metres is None:
+            return
+        declared = "{:g} .. {:g}".format(*subject.sensor.range_limits)
+        held = [info.physical(raw) * float(metres) for raw in (1, info.limits[1])]
+        subject.picture[f"{name}: range"] = (
+            f"{held[0]:.4g} .. {held[1]:.6g} m can be said, {declared} m is declared"
+        )
+        reach.append((held[1], f"{name}.{info.path}"))
+    furthest, path = max(reach, default=(np.inf, ""))
+    if subject.sensor.range_limits[1] > furthest * 1.001:
+        yield (
+            "LS210",
+            f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m",
+            path,
+        )
+
+
+def _column(
+    subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]
+) -> Findings:
+    """Yield a finding if no source field of a column has a unit of its kind."""
+    infos = [field_of(subject, name, node) for node in find_fields(value, looked_up=False)]
+    measured = [info for info in infos if info is not None and factor(info.unit, "m") is not None]
+    if column == "range" and measured and all(CODE.fullmatch(info.name) for info in measured):
+        yield (
+            "LS219",
+            "the range of points comes from it, and it is a code by its name",
+            f"{name}.{measured[0].path}",
+        )
+    free = [info for info in infos if info is not None and info.const is None and not info.labels]
+    if free and not any(
+        factor(info.unit, unit) is not None for info in infos if info is not None for unit in units
+    ):
+        bare = [info for info in free if not is_unit(info.unit)]
+        pure = _find_pure_numbers(subject.sensor.frames[name], with_scale=column == "azimuth")
+        if bare and not {info.path for info in bare} & pure:
+            order = list(subject.fields(name))
+            first = min(
+                bare,
+                key=lambda info: (
+                    -len(info.axes),
+                    order.index(info.path) if info.path in order else len(order),
+                ),
+            )
+            if first.unit:
+                problem = f"{first.unit!r} is no unit of it: {' or '.join(units)}"
+            else:
+                problem = f"it has no unit: {' or '.join(units)}"
+            yield (
+                "LS201",
+                f"the {column} of points comes from it, and {problem}",
+                f"{name}.{first.path}",
+            )

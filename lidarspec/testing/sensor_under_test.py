@@ -1,0 +1,371 @@
+"""A sensor under test, with its examples, their edits and truncated copies.
+
+A `Subject` has the sensor, its examples (drawn by the author's own strategies if there are any)
+and measured values. All random values are seeded, so that a failure can be repeated.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lidarspec.framing.example_frames import random_frame
+from lidarspec.framing.frame_engine import codec
+from lidarspec.spec import Frame, Sensor
+from lidarspec.spec.tree import FieldInfo, Sealed, nodes
+
+#: Maximum length in bytes of a frame that is cut at every byte.
+SHORT = 300
+#: Number of random offsets at which a longer frame is cut, besides both ends.
+SPOTS = 50
+
+
+def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
+    """Return frames as the data link delivers them: datagrams, or one run of bytes."""
+    parts = [data for _, data in frames]
+    if sensor.datagrams:
+        return parts
+    return b"".join(parts)
+
+
+def places(length: int, source: random.Random, spots: int = SPOTS) -> list[int]:
+    """Return offsets at which to cut: all of few, else both ends and random ones."""
+    if length <= SHORT * spots // SPOTS:
+        return list(range(length))
+    ends = {0, 1, 2, 3, length - 2, length - 1} & set(range(length))
+    return sorted({*ends, *source.sample(range(length), min(spots, length))})
+
+
+#: Sizes in bytes of the chunks that a stream is cut into, and their mean.
+CHUNKS = (0, 1, 1, 2, 3, 7, 20, 100, 1000)
+MEAN_CHUNK = sum(CHUNKS) / len(CHUNKS)
+
+
+def pieces(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes]:
+    """Yield the bytes in chunks of random sizes, including empty ones.
+
+    Args:
+        scale: factor of the sizes.
+    """
+    start = 0
+    while start < len(data):
+        size = source.choice(CHUNKS) * scale
+        yield data[start : start + size]
+        start += size
+
+
+def mutate(
+    data: bytes, source: random.Random, words: Sequence[bytes] = (), spots: Sequence[int] = ()
+) -> bytes:
+    """Return a copy of the bytes with a few random changes.
+
+    Bytes are changed, dropped, doubled, inserted, or overwritten.
+
+    Args:
+        words: byte strings that are inserted or written over as a whole, such as values at the edge
+            of a range, or pieces of other inputs.
+        spots: offsets for half of the changes, such as those of fields; by default all are random.
+    """
+    mutated = bytearray(data)
+    for _ in range(source.choice((1, 1, 2, 4))):
+        if spots and source.random() < 0.5:
+            offset = source.choice(spots)
+        else:
+            offset = source.randrange(len(mutated) + 1)
+        kind = source.randrange(6 if words else 5)
+        if kind == 0:
+            mutated[offset : offset + 1] = source.randbytes(1)
+        elif kind == 1:
+            del mutated[offset : offset + source.randint(1, 3)]
+        elif kind == 2:
+            mutated[offset:offset] = source.randbytes(source.randint(1, 3))
+        elif kind == 3:
+            mutated[offset : offset + 1] = source.choice((b"\x00", b"\xff", b"\x7f", b"\x80"))
+        elif kind == 4:
+            mutated[offset:offset] = mutated[max(offset - 4, 0) : offset]
+        else:
+            word = source.choice(words)
+            mutated[offset : offset + source.choice((0, len(word)))] = word
+    return bytes(mutated)
+
+
+def integers(
+    parsed: Any, path: str = "", kinds: tuple[type, ...] = (int,)
+) -> Iterator[tuple[Any, Any, str]]:
+    """Yield the integers of a parsed frame: (container, key in it, field path).
+
+    Args:
+        kinds: the types of the values.
+    """
+    entries: Iterable[tuple[Any, Any]] = (
+        parsed.items() if isinstance(parsed, dict) else enumerate(parsed)
+    )
+    for key, value in entries:
+        if isinstance(parsed, list):
+            below = path
+        elif path:
+            below = f"{path}.{key}"
+        else:
+            below = key
+        if isinstance(value, dict | list):
+            yield from integers(value, below, kinds)
+        elif type(value) in kinds:
+            yield parsed, key, below
+
+
+def physical(sensor: Sensor, name: str, data: bytes) -> Any:
+    """Return a parsed frame with its scaled numbers in units.
+
+    Returns None if a number is too wide to be exact as a float.
+    """
+    fields = codec(sensor.frames[name]).schema.all_fields
+    parsed = sensor.parse(data, frame=name)
+    for holder, key, path in list(integers(parsed, kinds=(int, float))):
+        info = fields.get(path)
+        if info is not None and info.scaled:
+            value = info.physical(holder[key])
+            if (
+                info.kind == "float"
+                and info.dtype is not None
+                and info.dtype.type(info.raw(value)) != holder[key]
+            ):
+                return None
+            if info.kind == "int" and info.bits > 48:
+                return None
+            holder[key] = value
+    return parsed
+
+
+def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
+    """Return the fields of a frame that hold a checksum, which callers do not set."""
+    engine = codec(sensor.frames[name])
+    layout = getattr(engine, "tree", None)
+    if layout is None or engine.schema.parts:
+        return {
+            path
+            for node in nodes(sensor.frames[name].tree)
+            if isinstance(node, Sealed)
+            for path in node.fields
+        }
+    layout_or_refusal = layout.layout(data)
+    return {
+        leaf.info.path for seal in getattr(layout_or_refusal, "seals", ()) for leaf in seal.leaves
+    }
+
+
+#: Default number of examples of each frame type for each property; numbers of rounds refer to it.
+USUAL_EXAMPLES = 40
+#: Default number of rounds of a conversation.
+USUAL_ROUNDS = 3
+#: Minimum number of rounds of a conversation.
+LEAST_ROUNDS = 2
+EXAMPLES = int(os.environ.get("LIDARSPEC_EXAMPLES", USUAL_EXAMPLES))
+#: Number of frame types above which fewer examples of each are used.
+MANY = 8
+#: Maximum total bytes of the examples of one frame type that a property uses.
+EXAMPLE_BYTES = 300_000
+#: Number of bytes after which no further round of a conversation begins.
+CONVERSATION_BYTES = 500_000
+#: Number of examples that measure the length of frames.
+MEASURED_SEEDS = 3
+#: Number of values that are drawn from a hypothesis strategy.
+POOL = 60
+
+
+@dataclass(eq=False)
+class Subject:
+    """A sensor under test.
+
+    Attributes:
+        sensor: the sensor.
+        examples: number of examples of each frame type for each property.
+        strategies: "frame.field" -> a hypothesis strategy of its raw value, or a function of
+            `random.Random`.
+        vectors: the file of golden vectors, None if there is none.
+        family: the ids of the sensors that share that file; empty if it belongs to this sensor
+            alone.
+        tested: related models that are tested too; frame types that they share are not tested
+            separately again.
+        measured: measured values of frames as text, by what they describe.
+        picture: measured values of points, likewise, to be compared with the manual.
+        traced: the result of `points` for traced columns of each data frame that could be traced.
+        placed: data frames with golden vectors that place points in two quadrants.
+        swept: packets along the `sweep` of each data frame, as far as a property needed them.
+    """
+
+    sensor: Sensor
+    examples: int = EXAMPLES
+    strategies: Mapping[str, Any] = field(default_factory=dict)
+    vectors: Path | None = None
+    family: tuple[str, ...] = ()
+    tested: Sequence[Sensor] = ()
+    measured: dict[str, str] = field(default_factory=dict)
+    picture: dict[str, str] = field(default_factory=dict)
+    traced: dict[str, Any] = field(default_factory=dict, repr=False)
+    placed: set[str] = field(default_factory=set, repr=False)
+    swept: dict[str, list[bytes]] = field(default_factory=dict, repr=False)
+    _known: dict[tuple[str, int], bytes] = field(default_factory=dict, repr=False)
+    _drawers: dict[str, dict[str, Callable[[random.Random], int]]] = field(
+        default_factory=dict, repr=False
+    )
+
+    @property
+    def frames(self) -> dict[str, Frame]:
+        """The frame types that are tested separately."""
+        tested = {id(frame) for sensor in self.tested for frame in sensor.frames.values()}
+        return {
+            name: frame for name, frame in self.sensor.frames.items() if id(frame) not in tested
+        }
+
+    @property
+    def commands(self) -> list[str]:
+        """The commands that are tested separately.
+
+        A command is left out if a related model that is tested too has the same one, with the same
+        frames, links and answers.
+        """
+        return [
+            name
+            for name in self.sensor.commands
+            if not any(_has_same_exchange(self.sensor, other, name) for other in self.tested)
+        ]
+
+    def fields(self, frame: str) -> Mapping[str, FieldInfo]:
+        """Return the fields of a frame type, by path."""
+        return codec(self.sensor.frames[frame]).schema.all_fields
+
+    def source(self, purpose: str = "") -> random.Random:
+        """Return a random generator for one purpose, the same in every run."""
+        return random.Random(f"{self.sensor.id} {purpose}")
+
+    def seeds(self, name: str, share: float = 1.0) -> range:
+        """Return the seeds of the examples of a frame type that are used.
+
+        There are fewer for long frames, since each field takes time, and if the sensor has many
+        frame types.
+        """
+        few = 8 if self.sensor.frames[name].max_length > SHORT else 1
+        few *= 2 if len(self.sensor.frames) > MANY else 1
+        return range(self.limit_to_bytes(name, max(int(self.examples * share) // few, 3)))
+
+    def limit_to_bytes(
+        self, name: str, number: int, total: int = EXAMPLE_BYTES, least: int = 1
+    ) -> int:
+        """Return how many of `number` frames of a type to use.
+
+        Args:
+            total: maximum number of their bytes.
+            least: minimum number of frames.
+        """
+        return min(number, max(total // self.length(name), least))
+
+    def length(self, name: str) -> int:
+        """Return the length in bytes of the longest of a few examples of a type."""
+        return max(1, *(len(self.example(name, seed=seed)) for seed in range(MEASURED_SEEDS)))
+
+    def scale_rounds(self, rounds: int, least: int = 1) -> int:
+        """Scale a number of rounds from the default number of examples to `examples`."""
+        return max(rounds * self.examples // USUAL_EXAMPLES, least)
+
+    def example(self, frame: str, *, seed: int = 0) -> bytes:
+        """Return the bytes of a valid frame with seeded content.
+
+        It is drawn by the author's strategies if there are any.
+        """
+        if (frame, seed) not in self._known:
+            drawn = self.drawers(frame)
+            source = random.Random(f"{self.sensor.id} {frame} {seed}")
+            if drawn:
+                example = random_frame(self.sensor, frame, source, drawn)
+            else:
+                example = self.sensor.example(frame, seed=seed)
+            self._known[frame, seed] = example
+        return self._known[frame, seed]
+
+    def drawers(self, frame: str) -> dict[str, Callable[[random.Random], int]]:
+        """Return the author's functions for raw values of fields of this frame, by path."""
+        if frame not in self._drawers:
+            own = {
+                path.removeprefix(f"{frame}."): how
+                for path, how in self.strategies.items()
+                if path.partition(".")[0] == frame
+            }
+            self._drawers[frame] = {
+                path: _make_pool(how) if hasattr(how, "example") else how
+                for path, how in own.items()
+            }
+        return self._drawers[frame]
+
+    def conversation(self, *, seed: int = 0, rounds: int | None = None) -> list[tuple[str, bytes]]:
+        """Return frames of all incoming types in a possible order, as (type, bytes).
+
+        Each has the frames before it that it needs to be accepted.
+        """
+        frames: list[tuple[str, bytes]] = []
+        size = 0
+        for turn in range(
+            self.scale_rounds(USUAL_ROUNDS, LEAST_ROUNDS) if rounds is None else rounds
+        ):
+            if size > CONVERSATION_BYTES:
+                break
+            for name in self.sensor.incoming:
+                frame = self.sensor.frames[name]
+                if frame.data or frame.confirm > 1:
+                    number = frame.confirm + 2
+                else:
+                    number = 1
+                first = (
+                    seed * 1000 + turn * number
+                )  # the lowest seeds, since other properties use their examples as well
+                if frame.after is not None:
+                    frames.append((frame.after, self.example(frame.after, seed=first)))
+                frames += [
+                    (name, self.example(name, seed=first + index)) for index in range(number)
+                ]
+            size = sum(len(data) for _, data in frames)
+        return frames
+
+    def stream(self, *, seed: int = 0, rounds: int | None = None) -> bytes:
+        """Return the bytes of a conversation."""
+        return b"".join(data for _, data in self.conversation(seed=seed, rounds=rounds))
+
+
+def _has_same_exchange(one: Sensor, other: Sensor, name: str) -> bool:
+    """Return whether a command and its reply are equal in two sensors."""
+    command = one.commands[name]
+    if other.commands.get(name) != command:
+        return False
+    types = [command.frame, *command.replies] if command.frame else command.replies
+    return (
+        all(one.frames[kind] is other.frames.get(kind) for kind in types)
+        and one.simulation.answers.get(name) == other.simulation.answers.get(name)
+        and one.links.get(command.link) == other.links.get(command.link)
+        and one.datagrams == other.datagrams
+    )
+
+
+def _make_pool(strategy: Any) -> Callable[[random.Random], int]:
+    """Return a function that chooses from values of a hypothesis strategy.
+
+    The values are the same in every run.
+    """
+    from hypothesis import HealthCheck, Phase, given, settings
+
+    pool: list[int] = []
+    quiet: dict[str, Any] = {
+        "database": None,
+        "deadline": None,
+        "suppress_health_check": list(HealthCheck),
+    }
+
+    @settings(max_examples=POOL, derandomize=True, phases=[Phase.generate], **quiet)
+    @given(strategy)
+    def collect(value: int) -> None:
+        pool.append(value)
+
+    collect()
+    return lambda source: source.choice(pool)

@@ -1,0 +1,63 @@
+"""Files that are written beside the ones whose place they take, and what killed processes left of
+them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import re
+import time
+from pathlib import Path
+
+from lidarspec.errors import SourceError
+from lidarspec.remote_files import take_away
+
+#: seconds without a write after which the file of a process that has ended is removed; another
+#: computer may be writing to it.
+ABANDONED_AFTER_S = 60.0
+
+
+def path_while_written(path: Path) -> Path:
+    """Return where this process writes a file or folder until it takes its place."""
+    return path.with_name(f".{os.getpid()}.{path.name}")
+
+
+def remove_abandoned(path: Path) -> None:
+    """Remove partial files and folders that killed processes of this computer left."""
+    for process, name in _list_unfinished(path.parent.absolute()):
+        left = path.with_name(f".{process}.{name}")
+        with contextlib.suppress(OSError, SourceError):
+            if (
+                name == path.name
+                and not is_running(process)
+                and time.time() - left.stat().st_mtime > ABANDONED_AFTER_S
+            ):
+                take_away(left)
+
+
+@functools.cache  # listed once: a folder can get many thousands of files
+def _list_unfinished(folder: Path) -> list[tuple[int, str]]:
+    """Return process and name of what is unfinished in a folder when this process writes there
+    first.
+    """
+    try:
+        names = os.listdir(folder)
+    except OSError:
+        return []
+    matches = (re.fullmatch(r"\.([1-9]\d*)\.(.+)", name, re.DOTALL) for name in names)
+    return [(int(match[1]), match[2]) for match in matches if match]
+
+
+def is_running(process: int) -> bool:
+    """Return whether a process exists; True if the system has no way to tell."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True

@@ -1,0 +1,355 @@
+"""Draw figures for reports with matplotlib.
+
+They show a scan to scale, its intensities, ranges over time, and rates of a source over time.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError
+from lidarspec.optional_libraries import import_library
+from lidarspec.points.appearance import Look, bounds
+from lidarspec.points.colours import make_ramp, to_hex
+from lidarspec.scans.scan import Scan
+from lidarspec.view.live_scans import Feed
+from lidarspec.view.rate_meter import totals
+
+#: supported suffixes of `save`.
+SUFFIXES = (".png", ".pdf", ".svg")
+#: in inches: the width of a figure, the height of a panel, and the limits of the side view; dots
+#: per inch.
+WIDTH = 7.0
+PANEL = 4.2
+LOWEST = 0.7
+HIGHEST = 3.0
+DPI = 160
+#: maximum bins of a histogram, of ranges, and of time; the smallest bin of time in seconds.
+BINS = 128
+NEAR = 200
+MOMENTS = 400
+NARROWEST = 0.1
+#: the percentile of the ranges that the axis shows.
+MOST = 99.8
+#: steps of the colour ramp.
+COLOURS = 256
+STYLE = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "svg.hashsalt": "lidarspec",  # identical figures have identical bytes
+}
+
+_Drawing = TypeVar("_Drawing", bound=Callable[..., Any])
+
+
+def _with_style(draw: _Drawing) -> _Drawing:
+    """Return a function that draws in the style of these figures."""
+
+    @functools.wraps(draw)
+    def drawn(*args: Any, **options: Any) -> Any:
+        with import_library("matplotlib", "plot").rc_context(STYLE):
+            return draw(*args, **options)
+
+    return drawn  # type: ignore[return-value]
+
+
+@_with_style
+def save(figure: Any, target: Any, suffix: str) -> None:
+    """Write a figure to a path or a binary file, in the format of a suffix."""
+    figure.savefig(
+        target,
+        format=suffix.removeprefix("."),
+        dpi=DPI,
+        metadata={"Date": None} if suffix == ".svg" else None,
+    )
+
+
+@_with_style
+def of_scan(scan: Scan, look: Look, title: str) -> Any:
+    """Draw a scan from above, forward up, to scale.
+
+    Unless it is flat, it is also drawn from its right side.
+    """
+    cloud = scan.points[scan.points.valid]
+    column: Any
+    if look.ramp == "range":
+        column = cloud.range
+    elif look.ramp == "intensity":
+        column = cloud.intensity
+    else:
+        column = cloud.extra[look.ramp]
+    unit = "m" if look.ramp == "range" else look.unit
+    lowest, highest = bounds(cloud)
+    low = min(float(lowest[2]), 0.0)
+    high = max(float(highest[2]), 0.0)
+    if look.flat:
+        tall = 0.0
+    else:
+        tall = float(np.clip((high - low) / (2 * look.reach) * WIDTH * 0.85, LOWEST, HIGHEST))
+    figure = _figure(title, WIDTH * 0.92 + tall)
+    rows = figure.subplots(
+        1 if look.flat else 2,
+        1,
+        squeeze=False,
+        height_ratios=[WIDTH * 0.75, *[tall] * (not look.flat)],
+    )[:, 0]
+    dots = {
+        "c": column,
+        "cmap": colour_map(),
+        "s": np.clip(20000 / max(len(cloud), 1), 0.4, 6),
+        "linewidths": 0,
+        "vmin": look.low,
+        "vmax": look.full,
+        "rasterized": True,
+    }
+    shown = rows[0].scatter(cloud.y, cloud.x, **dots)
+    forward, left = look.middle
+    seen = (forward - look.reach, forward + look.reach)
+    rows[0].set(xlim=(left + look.reach, left - look.reach), ylim=seen, aspect="equal")
+    rows[0].set(xlabel="y [m], left", ylabel="x [m], forward")
+    rows[0].plot(0, 0, "k^", markersize=6)
+    for side in rows[1:]:
+        side.scatter(cloud.x, cloud.z, **dots)
+        side.plot(0, 0, "k>", markersize=6)
+        side.set(xlim=seen, ylim=(low - 0.1, high + 0.1), aspect="equal")
+        side.set(xlabel="x [m], forward", ylabel="z [m], up")
+    figure.colorbar(
+        shown, ax=rows, label=f"{look.ramp} [{unit}]" if unit else look.ramp, shrink=0.6, pad=0.02
+    )
+    return figure
+
+
+@_with_style
+def of_intensities(scans: Iterable[Scan], title: str) -> Any:
+    """Draw the histogram of the intensities.
+
+    Raises:
+        UsageError: if the sensor has none.
+    """
+    counted = Counter[float]()
+    for scan in scans:
+        if scan.points.intensity is not None:
+            values, numbers = np.unique(
+                np.rint(scan.points.intensity[scan.points.valid]), return_counts=True
+            )
+            counted.update(dict(zip(values.tolist(), numbers.tolist(), strict=True)))
+    if not counted:
+        raise UsageError("there are no intensities to count")
+    strengths, counts = np.array(sorted(counted.items())).T
+    middle = strengths[np.searchsorted(np.cumsum(counts), counts.sum() / 2)]
+    figure = _figure(f"{title}: {int(counts.sum()):,} returns")
+    axes = figure.subplots()
+    low = min(float(strengths[0]), 0.0)
+    high = float(strengths[-1]) + 1
+    width = max(np.ceil((high - low) / BINS), 1.0)
+    axes.hist(strengths, bins=np.arange(low, high + width, width), weights=counts, color="C0")
+    axes.axvline(float(middle) + 0.5, color="C1", label=f"median {middle:g}")
+    axes.set(
+        xlabel="intensity, as the sensor gives it",
+        ylabel="returns",
+        yscale="log",
+        xlim=(low, high + width),
+        ylim=(0.5, None),
+    )
+    _legend(axes)
+    return figure
+
+
+@_with_style
+def of_ranges(scans: Iterable[Scan], title: str) -> Any:
+    """Draw the number of returns by range over time, and the median.
+
+    If there are many scans, an even selection is shown.
+
+    Args:
+        scans: at least one.
+    """
+    every = list[tuple[int, NDArray[np.float32], bool]]()
+    step = 1
+    number = 0
+    for number, scan in enumerate(scans, 1):
+        if (number - 1) % step == 0:
+            every.append((scan.stamp_ns, scan.points.range[scan.points.valid], scan.whole))
+        if len(every) == 2 * MOMENTS:  # limits memory for any duration
+            every = every[::2]
+            step = 2 * step
+    every = [one for one in every if one[2]] or every  # incomplete scans have fewer returns
+    if any(len(ranges) for _, ranges, _ in every):
+        farthest = np.percentile(np.concatenate([ranges for _, ranges, _ in every]), MOST)
+    else:
+        farthest = 1.0
+    edges = np.linspace(0, float(farthest) * 1.05, NEAR + 1)
+    times = np.array([(stamp - every[0][0]) * 1e-9 for stamp, *_ in every])
+    order = np.argsort(times, kind="stable")
+    if len(times) > 1:
+        last = float(np.median(np.diff(times[order])))
+    else:
+        last = NARROWEST
+    counts = np.stack([np.histogram(every[which][1], edges)[0] for which in order], axis=1)
+    figure = _figure(
+        f"{title}: {number:,} scans" + f", of which one in {step} is shown" * (step > 1)
+    )
+    axes = figure.subplots()
+    colours = import_library("matplotlib.colors", "plot").LogNorm(1, max(int(counts.max()), 2))
+    begins = np.append(times[order], times[order][-1] + last)
+    shown = axes.pcolormesh(
+        begins,
+        edges,
+        np.ma.masked_equal(counts, 0),
+        norm=colours,
+        cmap=colour_map(),
+        rasterized=True,
+    )
+    medians = [
+        float(np.median(every[which][1])) if len(every[which][1]) else np.nan for which in order
+    ]
+    axes.plot(times[order] + last / 2, medians, color="C3", linewidth=1, label="median")
+    axes.set(xlabel="time from the first scan [s]", ylabel="range [m]", ylim=(0, edges[-1]))
+    _legend(axes)
+    figure.colorbar(shown, label=f"returns in {edges[1]:.2g} m of a scan", pad=0.02)
+    return figure
+
+
+@_with_style
+def of_rates(rates: Rates, title: str) -> Any:
+    """Draw packets and scans per second, and the lost and invalid shares, over time.
+
+    Raises:
+        UsageError: if packets have no times.
+    """
+    seconds, (packets, lost, wrong) = rates.series()
+    figure = _figure(f"{title}: {int(rates.totals[0].sum()):,} packets", 2 * PANEL * 0.8)
+    panels = figure.subplots(4, 1, sharex=True)
+    for axes, values, label in (
+        (panels[0], packets / rates.width, "packets [1/s]"),
+        (panels[2], _share(lost, packets), "lost [%]"),
+        (panels[3], _share(wrong, packets), "wrong [%]"),
+    ):
+        axes.stairs(values, seconds, baseline=None, color="C0", linewidth=1.2, clip_on=False)
+        axes.set(ylabel=label, ylim=(0, max(float(np.nanmax(values, initial=0)) * 1.15, 1.0)))
+    panels[1].plot(
+        *zip(*rates.scans, strict=True) if rates.scans else ([], []), ".", markersize=3, color="C0"
+    )
+    panels[1].set(
+        ylabel="scans [1/s]",
+        ylim=(0, max([rate for _, rate in rates.scans if np.isfinite(rate)], default=1) * 1.3),
+    )
+    panels[3].set(
+        xlabel=f"time from the first packet [s], in steps of {rates.width:g} s",
+        xlim=(0, seconds[-1]),
+    )
+    figure.align_ylabels(panels)
+    return figure
+
+
+class Rates:
+    """Counts of packets, losses and invalid frames in even steps of time.
+
+    The time is that of arrival, else that of the sensor's clock.
+
+    Args:
+        feed: is read to its end, or until a time.
+        until: a time of `time.monotonic`.
+
+    Attributes:
+        width: of a step, seconds.
+        totals: (3, n): packets, lost packets and invalid frames in each step. Losses and invalid
+            frames are counted per batch of packets, and spread over it.
+        scans: seconds from the first packet, and rate, of each whole scan.
+    """
+
+    def __init__(self, feed: Feed, until: float) -> None:
+        self._feed = feed
+        self._first = 0
+        self._before = totals(feed.device.stats)
+        self.width = NARROWEST
+        self.totals = np.zeros((3, 1))
+        self._last = 0.0
+        self.scans = list[tuple[float, float]]()
+        while not feed.ended and time.monotonic() < until:
+            feed.pump(0.0)
+            self._take()
+            self.scans += [
+                (self._seconds(scan.host_ns or scan.stamp_ns), scan.rate_hz)
+                for scan in feed.scans
+                if scan.whole
+            ]
+
+    def _seconds(self, at: int) -> float:
+        """Return a time as seconds from the first packet."""
+        return (at - self._first) * 1e-9
+
+    def _take(self) -> None:
+        """Count the last batch of the feed."""
+        packets = self._feed.packets
+        if packets is None or not len(packets):
+            return
+        if packets.host_ns.any():
+            times = packets.host_ns
+        else:
+            times = packets.time_ns
+        self._first = self._first or int(times[0])
+        after = totals(self._feed.device.stats)
+        lost, wrong = (after[name] - self._before[name] for name in ("lost", "rejected"))
+        self._before = after
+        steps = np.maximum((times - self._first) * (1e-9 / self.width), 0).astype(np.intp)
+        self._last = max(self._last, self._seconds(int(times.max())))
+        counted = np.bincount(steps, minlength=self.totals.shape[1]).astype(np.float64)
+        grown = np.zeros((3, len(counted)))
+        grown[:, : self.totals.shape[1]] = self.totals
+        self.totals = grown + np.outer((1, lost / len(packets), wrong / len(packets)), counted)
+
+    def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the edges of the steps, (n + 1,) seconds, and their counts, (3, n).
+
+        The last step is left out, because it is incomplete.
+        """
+        if self._last < self.width:
+            raise UsageError(
+                f"{self._feed.device.source}: its packets bear no times, or all the same"
+            )
+        full = max(int(self._last / self.width), 1)
+        joined = -(-full // MOMENTS)
+        counts = self.totals[:, : max(full // joined, 1) * joined]
+        counts = np.add.reduceat(counts, np.arange(0, counts.shape[1], joined), axis=1)
+        self.width = round(self.width * joined, 6)
+        return np.arange(counts.shape[1] + 1) * self.width, counts
+
+
+def colour_map() -> Any:
+    """Return the colours of values on white paper, for matplotlib."""
+    colours = import_library("matplotlib.colors", "plot")
+    return colours.ListedColormap([to_hex(rgb) for rgb in make_ramp("light", COLOURS)], "lidarspec")
+
+
+def _legend(axes: Any) -> None:
+    """Draw the legend above the axes, outside of the data."""
+    axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 0.99), borderpad=0.2)
+
+
+def _share(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return percentages."""
+    every = some + others
+    return np.asarray(np.divide(100 * some, every, out=np.full(len(some), np.nan), where=every > 0))
+
+
+def _figure(title: str, height: float = PANEL) -> Any:
+    figure = import_library("matplotlib.figure", "plot").Figure(
+        figsize=(WIDTH, height), layout="constrained"
+    )
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+    return figure

@@ -1,0 +1,350 @@
+"""The terminal window of a running sensor, drawn at most twelve times a second.
+
+`Window.run` waits for keys and data in turn. `Choice` is the state that the keys change, and
+`Window.cells` draws the window anew from it, the newest scan and the figures; `Screen` writes the
+cells that changed.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from lidarspec.points.appearance import Look, look, ramps
+from lidarspec.recording.recorder_switch import RecordingSwitch
+from lidarspec.scans.scan import Scan
+from lidarspec.view.canvas import ALARM, GOOD, PLAIN, STRONG, Cells
+from lidarspec.view.live_scans import Feed
+from lidarspec.view.polar import picture
+from lidarspec.view.rate_meter import NOTHING, MeterReading, format_figure
+from lidarspec.view.terminal_screen import Screen
+from lidarspec.view.terminal_window_parts import (
+    Figure,
+    draw_keys,
+    draw_message,
+    write_last_line,
+    write_side,
+    write_title,
+)
+
+#: minimum seconds between two pictures.
+FRAME_PERIOD_S = 0.08
+#: seconds between two readings of the figures.
+FIGURES_PERIOD_S = 1.0
+#: zoom factor of one key press, and its limits.
+ZOOM_FACTOR = 1.25
+MAX_ZOOM = 1e3
+MIN_ZOOM = 1e-2
+#: movement of one key press, as a share of the reach of the picture.
+MOVE_SHARE = 0.2
+#: axis and sign by key: forward is the first axis, left the second.
+MOVES = {"up": (1, 0), "down": (-1, 0), "left": (0, 1), "right": (0, -1)}
+#: a picture is drawn larger when its points need less than this share of its reach.
+MIN_USED_SHARE = 0.7
+#: width of the figures beside the picture, in columns.
+SIDE_COLUMNS = 25
+#: a window with less room for picture or lines has the figures in its last line.
+MIN_PICTURE_COLUMNS = 36
+MIN_SIDE_LINES = 14
+#: error or loss rate above which a figure is an alarm.
+ALARM_RATE = 0.01
+DEFAULT_RAMPS = ("range", "intensity")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The choices that keys have made.
+
+    Attributes:
+        ramp: the column that colours show.
+        zoom: magnification; 1.0 shows all points.
+        middle: of the picture, metres forward and left of the sensor.
+        paused: whether the picture stands still.
+        helped: whether the keys are listed.
+        done: whether the window closes.
+    """
+
+    ramp: str = "range"
+    zoom: float = 1.0
+    middle: tuple[float, float] = (0.0, 0.0)
+    paused: bool = False
+    helped: bool = False
+    done: bool = False
+
+    def after(self, key: str, reach: float, ramps: Sequence[str] = DEFAULT_RAMPS) -> Choice:
+        """Return the choice after a key press.
+
+        Args:
+            key: its name.
+            reach: of the picture, metres from its middle to its edge.
+            ramps: the columns that colours can show.
+        """
+        if key in ("q", "Q"):
+            return replace(self, done=True)
+        if key == " ":
+            return replace(self, paused=not self.paused)
+        if key in ("c", "C"):
+            return replace(self, ramp=self._next_ramp(ramps))
+        if key in ("+", "="):
+            return replace(self, zoom=min(self.zoom * ZOOM_FACTOR, MAX_ZOOM))
+        if key in ("-", "_"):
+            return replace(self, zoom=max(self.zoom / ZOOM_FACTOR, MIN_ZOOM))
+        if key == "0":
+            return replace(self, zoom=1.0, middle=(0.0, 0.0))
+        if key in MOVES:
+            step = MOVE_SHARE * reach
+            forward, left = MOVES[key]
+            middle = (self.middle[0] + forward * step, self.middle[1] + left * step)
+            return replace(self, middle=middle)
+        if key in ("?", "h"):
+            return replace(self, helped=not self.helped)
+        if key == "escape":
+            return replace(self, helped=False)
+        return self
+
+    def _next_ramp(self, ramps: Sequence[str]) -> str:
+        if self.ramp not in ramps:
+            return ramps[0]
+        return ramps[(ramps.index(self.ramp) + 1) % len(ramps)]
+
+
+class Window:
+    """Shows the scans of a feed with its figures.
+
+    Args:
+        feed: of the open device.
+        source: as the user typed it.
+        ramp: the column that colours show at first.
+        record: records the source, if it is live.
+        duration: seconds after which the window closes; None leaves that to the keys.
+    """
+
+    def __init__(
+        self,
+        feed: Feed,
+        source: str,
+        *,
+        ramp: str = "range",
+        record: RecordingSwitch | None = None,
+        duration: float | None = None,
+    ) -> None:
+        self._feed = feed
+        self._device = feed.device
+        self._source = source
+        self._record = record
+        self.choice = Choice(ramp)
+        self._scan: Scan | None = None
+        self._look: Look | None = None
+        self._reading: MeterReading | None = None
+        self._read_at = time.monotonic()
+        if duration is None:
+            self._end = math.inf
+        else:
+            self._end = self._read_at + duration
+
+    def run(self, screen: Screen) -> None:
+        """Draw until the user quits or the duration is over.
+
+        Raises:
+            LidarSpecError: if the source fails.
+        """
+        drawn_at = 0.0
+        drawn_number = -1
+        drawn_size = (0, 0)
+        while not self.choice.done and time.monotonic() < self._end:
+            keys = self._wait(screen)
+            for key in keys:
+                self._press(key)
+            now = time.monotonic()
+            has_scan = self._feed.number != drawn_number and not self.choice.paused
+            is_old = now - drawn_at >= FIGURES_PERIOD_S / 2
+            size = screen.size()
+            if keys or has_scan or is_old or size != drawn_size:
+                screen.show(self.cells(*size))
+                drawn_at = now
+                drawn_number = self._feed.number
+                drawn_size = size
+
+    def _wait(self, screen: Screen) -> list[str]:
+        """Read data until the next picture is due, and return the keys that were pressed."""
+        if self._feed.ended or (self.choice.paused and not self._device.is_live):
+            self._feed.rest()
+            return screen.keys.read(FRAME_PERIOD_S)
+        self._feed.pump(time.monotonic() + FRAME_PERIOD_S)
+        return screen.keys.read(0)
+
+    def cells(self, columns: int, lines: int) -> Cells:
+        """Return the window as it is now.
+
+        The figures are beside the picture, or in the last line if the window is narrow.
+        """
+        self._update_reading()
+        self._update_scan()
+        is_wide = columns > MIN_PICTURE_COLUMNS + SIDE_COLUMNS and lines >= MIN_SIDE_LINES
+        width = columns - SIDE_COLUMNS - 1 if is_wide else columns
+        height = max(lines - (1 if is_wide else 2), 1)
+        current_look = self._current_look()
+        window = Cells.blank(columns, lines)
+        window.paste(1, 0, self._picture(width, height, current_look))
+        write_title(window, self._device.sensor.id, self._source, *self._state())
+        if is_wide:
+            write_side(window, width, self._figures(), current_look)
+        else:
+            write_last_line(window, self._figures())
+        if self.choice.helped:
+            _paste_in_middle(window, draw_keys(columns, lines))
+        return window
+
+    def _picture(self, width: int, height: int, current_look: Look) -> Cells:
+        """Return the picture of the scan, with what is wrong in its middle."""
+        if self._scan is None:
+            drawn = Cells.blank(width, height)
+        else:
+            drawn = picture(self._scan.points, width=width, height=height, look=current_look)
+        warning = self._warning()
+        if warning:
+            _paste_in_middle(drawn, draw_message(width, warning))
+        return drawn
+
+    def _press(self, key: str) -> None:
+        known = DEFAULT_RAMPS if self._scan is None else ramps(self._scan.points)
+        self.choice = self.choice.after(key, self._current_look().reach, known)
+        if key in ("r", "R") and self._record is not None:
+            self._record.toggle()
+
+    def _update_reading(self) -> None:
+        """Read the figures once a second."""
+        now = time.monotonic()
+        duration = now - self._read_at
+        if duration < FIGURES_PERIOD_S:
+            return
+        seconds = duration if self._device.is_live else None
+        self._reading = self._feed.meter.reading(self._device.stats, seconds)
+        self._read_at = now
+
+    def _update_scan(self) -> None:
+        """Take the newest scan, on the scale of the one before if it fits."""
+        newest = self._feed.scan
+        if newest is None or newest is self._scan:
+            return
+        if self.choice.paused and self._scan is not None:
+            return
+        self._scan = newest
+        new = look(newest.points, ramp=self.choice.ramp)
+        old = self._look
+        if old is not None and _fits(new.reach, old.reach):
+            new = replace(new, reach=old.reach)
+        if old is not None and old.ramp == new.ramp and _fits(new.full, old.full):
+            new = replace(new, full=old.full, low=min(old.low, new.low))
+        self._look = new
+
+    def _current_look(self) -> Look:
+        """Return the scale of the picture, as the keys have changed it."""
+        if self._look is None:
+            return Look("range", 1.0, 1.0)
+        if self._scan is not None and self._look.ramp != self.choice.ramp:
+            new = look(self._scan.points, ramp=self.choice.ramp)
+            self._look = replace(new, reach=self._look.reach)
+            self.choice = replace(self.choice, ramp=new.ramp)
+        reach = self._look.reach / self.choice.zoom
+        return replace(self._look, reach=reach, middle=self.choice.middle)
+
+    def _state(self) -> tuple[str, int]:
+        """Return the state in a word, and its ink."""
+        if self._record is None:
+            recording = None
+        else:
+            recording = self._record.recording
+        if recording is not None:
+            return f"● {recording[0]}", ALARM
+        if self.choice.paused:
+            return "‖ paused", STRONG
+        if self._device.is_live:
+            state = self._device.state
+            if state == "streaming":
+                return ("● live", GOOD)
+            return (state, ALARM)
+        if self._feed.ended:
+            return ("end", STRONG)
+        return ("▶ playing", GOOD)
+
+    def _figures(self) -> list[Figure]:
+        """Return the figures of the last second and of the scan that is shown."""
+        reading = self._reading or NOTHING
+        figures = [
+            Figure("speed", format_figure(reading.speed_hz, "{:.1f} Hz"), STRONG),
+            Figure("packets", format_figure(reading.packet_rate_hz, "{:.0f} /s")),
+            Figure("input", format_figure(reading.bytes_per_s, "{:.1f} kB/s", 1e-3)),
+            *self._scan_figures(),
+            _rate_figure("errors", reading.error_rate if self._reading else None),
+            _rate_figure("skipped", reading.skipped_rate if self._reading else None),
+            self._lost_figure(reading),
+            Figure("jitter", format_figure(reading.jitter_s, "{:.2f} ms", 1e3)),
+        ]
+        if self._device.queued is not None:
+            figures.append(Figure("queue", str(self._device.queued)))
+        return figures
+
+    def _scan_figures(self) -> list[Figure]:
+        """Return the figures of the scan that is shown."""
+        if self._scan is None:
+            return [Figure("points", "0"), Figure("valid", "-"), Figure("nearest", "-")]
+        points = self._scan.points
+        ranges = points.range[points.valid]
+        if len(points):
+            valid_share = len(ranges) / len(points)
+        else:
+            valid_share = None
+        nearest = float(ranges.min()) if len(ranges) else None
+        figures = [
+            Figure("points", str(len(points))),
+            Figure("valid", format_figure(valid_share, "{:.1f} %", 100)),
+            Figure("nearest", format_figure(nearest, "{:.2f} m")),
+        ]
+        if points.nominal:
+            figures.insert(0, Figure("calibration", "nominal", ALARM))
+        return figures
+
+    def _lost_figure(self, reading: MeterReading) -> Figure:
+        lost = self._device.stats.lost
+        if lost:
+            return Figure("lost", str(lost), ALARM)
+        return Figure("lost", "-" if reading.loss_rate is None else "0")
+
+    def _warning(self) -> str:
+        """Return the message for the middle of the picture, "" if nothing is wrong."""
+        device = self._device
+        if self._record is not None and self._record.trouble:
+            return self._record.trouble
+        failure = device.stats.failure(device.sensor.id)
+        if failure is not None:
+            return str(failure)
+        warnings = device.warnings
+        if self._feed.ended:
+            if self._scan is not None:
+                return ""
+            if warnings:
+                return warnings[-1]
+            return "the input ended without a scan"
+        is_disturbed = device.is_live and device.state not in ("streaming", "waiting")
+        if is_disturbed and warnings:
+            return warnings[-1]
+        return ""
+
+
+def _rate_figure(name: str, rate: float | None) -> Figure:
+    is_alarm = rate is not None and rate >= ALARM_RATE
+    return Figure(name, format_figure(rate, "{:.2f} %", 100), ALARM if is_alarm else PLAIN)
+
+
+def _paste_in_middle(target: Cells, box: Cells) -> None:
+    row = (target.size[1] - box.size[1]) // 2
+    column = (target.size[0] - box.size[0]) // 2
+    target.paste(max(row, 0), max(column, 0), box)
+
+
+def _fits(needed: float, kept: float) -> bool:
+    """Return whether a scale can stay, so that the picture does not change with every scan."""
+    return MIN_USED_SHARE * kept <= needed <= kept

@@ -1,0 +1,126 @@
+"""The parts of the terminal window around the picture: title, figures, colours, keys, messages."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from lidarspec.points.appearance import STEPS, Look
+from lidarspec.view.canvas import ALARM, FAINT, FIRST_STEP, LABEL, PLAIN, STRONG, Cells
+
+KEYS = (
+    ("space", "pause and go on"),
+    ("c", "what colours show"),
+    ("+ -", "zoom in and out"),
+    ("arrows", "move what is in the middle"),
+    ("0", "all of it again"),
+    ("r", "record to a file, and stop; not of files"),
+    ("q", "quit"),
+    ("?", "this page"),
+)
+HINTS = (("space pause", "c colour"), ("+ - zoom", "0 all"), ("? help", "q quit"))
+HINT_COLUMNS = 13
+#: columns of the margins, and of the longest key with its margin, on the page of keys.
+KEY_COLUMNS = 14
+#: minimum room for the name of the source in the title.
+MIN_SOURCE_COLUMNS = 8
+
+
+class Figure(NamedTuple):
+    """A figure of the window: its name, its value as text, and the ink of the value."""
+
+    name: str
+    value: str
+    ink: int = PLAIN
+
+
+def write_title(window: Cells, sensor: str, source: str, state: str, ink: int) -> None:
+    """Write sensor, source and state into the first line."""
+    columns = window.size[0]
+    room = columns - len(sensor) - len(state) - 6
+    window.write(0, 1, sensor, STRONG)
+    window.write(0, len(sensor) + 3, shorten_source(source, room), LABEL)
+    window.write(0, columns - len(state) - 1, state, ink)
+
+
+def shorten_source(source: str, room: int) -> str:
+    """Return the source, or its end if it is longer than the room, "" if there is hardly any."""
+    if len(source) <= room:
+        return source
+    if room <= MIN_SOURCE_COLUMNS:
+        return ""
+    return "..." + source[len(source) - room + 3 :]
+
+
+def write_side(window: Cells, left: int, figures: Sequence[Figure], look: Look) -> None:
+    """Write figures, colours and keys beside the picture, as far as there is room.
+
+    Args:
+        window: has the picture in its first columns.
+        left: the first column beside it.
+        figures: one a line.
+        look: the colours of the picture.
+    """
+    columns, lines = window.size
+    for row in range(1, lines):
+        window.write(row, left, "│", FAINT)
+    for row, figure in enumerate(figures[: lines - 1], start=1):
+        window.write(row, left + 2, figure.name, LABEL)
+        window.write(row, columns - 1 - len(figure.value), figure.value, figure.ink)
+    ramp_row = len(figures) + 2
+    hints_row = lines - len(HINTS)
+    if ramp_row + 2 <= hints_row:
+        _write_ramp(window, ramp_row, left + 2, look)
+    if ramp_row + 2 < hints_row:
+        for row, (first, second) in enumerate(HINTS, start=hints_row):
+            window.write(row, left + 2, f"{first:<{HINT_COLUMNS}}{second}", FAINT)
+
+
+def write_last_line(window: Cells, figures: Sequence[Figure]) -> None:
+    """Write the figures that are known into the last line, as far as there is room."""
+    columns, lines = window.size
+    row = lines - 1
+    column = 1
+    for figure in figures:
+        if figure.value == "-":
+            continue
+        width = len(figure.name) + 1 + len(figure.value)
+        if column + width >= columns:
+            break
+        window.write(row, column, figure.name, LABEL)
+        window.write(row, column + len(figure.name) + 1, figure.value, figure.ink)
+        column += width + 2
+
+
+def _write_ramp(window: Cells, row: int, column: int, look: Look) -> None:
+    """Write a bar of the colours, and below it the values at its ends."""
+    for step in range(STEPS):
+        window.write(row, column + step, "━", FIRST_STEP + step)
+    low, high = look.ends
+    window.write(row + 1, column, low, LABEL)
+    window.write(row + 1, column + (STEPS - len(look.ramp)) // 2, look.ramp, LABEL)
+    window.write(row + 1, column + STEPS - len(high), high, LABEL)
+
+
+def draw_keys(columns: int, lines: int) -> Cells:
+    """Return the page of keys, which fits into a window of this size."""
+    width = min(max(len(text) for _, text in KEYS) + KEY_COLUMNS, columns)
+    page = Cells.blank(width, min(len(KEYS) + 4, lines))
+    page.write(0, 0, "─" * width, FAINT)
+    page.write(0, 2, " keys ", LABEL)
+    for row, (key, text) in enumerate(KEYS, start=2):
+        page.write(row, 3, key, STRONG)
+        page.write(row, 11, text)
+    page.write(page.size[1] - 1, 0, "─" * width, FAINT)
+    return page
+
+
+def draw_message(columns: int, text: str) -> Cells:
+    """Return a message for the middle of a picture."""
+    lines = textwrap.wrap(text, max(columns - 4, 1))
+    width = min(max(map(len, lines)) + 4, columns)
+    box = Cells.blank(width, len(lines) + 2)
+    for row, line in enumerate(lines, start=1):
+        box.write(row, 2, line, ALARM)
+    return box

@@ -1,0 +1,270 @@
+"""The messages to a page, as dicts for JSON; `is` names the kind of each.
+
+Scans are binary messages (`scan_message`). `page/src/protocol.ts` declares the same messages for
+the page.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import Any
+
+from lidarspec import LidarSpecError, UsageError, __version__, explain
+from lidarspec.explaining.assignments import arguments
+from lidarspec.explaining.explanation import Explanation, reply_text
+from lidarspec.explaining.file_contents import duration
+from lidarspec.points.appearance import is_flat
+from lidarspec.scans.provenance import PointOrigin
+from lidarspec_web.broadcast import Broadcast, Shown
+from lidarspec_web.command_forms import find_restart, make_form
+from lidarspec_web.recent_bytes import MAX_DAMAGED, Backlog, Damaged, Taken
+
+#: Number of cached explanations of frames.
+KEPT_EXPLANATIONS = 16
+#: Maximum number of damaged pieces in one message.
+MAX_DAMAGED_LISTED = 20
+
+
+class Answers:
+    """Makes the messages to the pages of a broadcast.
+
+    Args:
+        broadcast: the broadcast that the pages show.
+        control: whether commands may be sent to a real sensor.
+
+    Attributes:
+        duration: duration of a file, in seconds; None if it is unknown.
+        why_no_control: the reason why no commands are sent; "" if they are.
+    """
+
+    def __init__(self, broadcast: Broadcast, *, control: bool) -> None:
+        self.broadcast = broadcast
+        self.duration = _duration(broadcast)
+        self.why_no_control = _why_no_control(broadcast, control=control)
+        # Several pages show the same frame, and each lists the same damaged pieces.
+        self._explain = functools.lru_cache(maxsize=KEPT_EXPLANATIONS)(self._make_explanation)
+        self._verdict = functools.lru_cache(maxsize=MAX_DAMAGED)(self._make_verdict)
+
+    def hello(self) -> dict[str, Any]:
+        """Return the first message to a page: source, sensor, and available actions."""
+        broadcast = self.broadcast
+        sensor = broadcast.device.sensor
+        return {
+            "is": "hello",
+            "sensor": sensor.id,
+            "title": f"{sensor.vendor} {sensor.model}",
+            "source": broadcast.source,
+            "live": broadcast.is_live,
+            "planar": _is_planar(broadcast.shown),
+            "duration": self.duration,
+            "control": not self.why_no_control,
+            "why_no_control": self.why_no_control,
+            "commands": [make_form(sensor, name) for name in sensor.commands],
+            "restart": find_restart(sensor),
+            "saves": saves(),
+            "records": broadcast.switch is not None,
+            "history": list(broadcast.history),
+            "version": __version__,
+        }
+
+    def state(self, *, frozen: bool, since: int, at: Shown | None = None) -> dict[str, Any]:
+        """Return the state of the source.
+
+        Args:
+            frozen: whether the page has paused a live source.
+            since: the number of damaged pieces that the page knows.
+            at: the scan that the page is paused at; by default the newest.
+        """
+        broadcast = self.broadcast
+        switch = broadcast.switch
+        shown = at or broadcast.shown
+        warnings = list(broadcast.warnings)
+        recording = None
+        if switch is not None:
+            current = switch.recording
+            if current is not None:
+                recording = {"name": current[0], "bytes": current[1]}
+            if switch.trouble:
+                warnings.append(switch.trouble)
+        return {
+            "is": "state",
+            "at": broadcast.now(),
+            "position": 0.0 if shown is None else shown.position,
+            "state": "paused" if frozen else broadcast.state,
+            "paused": frozen or broadcast.paused,
+            "speed": broadcast.speed,
+            "figures": broadcast.history[-1] if broadcast.history else None,
+            "warnings": warnings,
+            "info": broadcast.info,
+            "recording": recording,
+            "damaged": {"total": broadcast.backlog.damaged, "newest": self._list_damaged(since)},
+        }
+
+    def frame(self, taken: Taken, why: str, place: PointOrigin | None = None) -> dict[str, Any]:
+        """Return a frame with every byte explained.
+
+        Args:
+            taken: the frame.
+            why: the reason why it is shown: "last", "number" or "point".
+            place: origin of the point that the page asked for.
+        """
+        explanation = self._explain(taken.frame, taken.data)
+        value = None
+        if place is not None:
+            value = explanation.path_of(place.number, place.part)
+        return {
+            "is": "frame",
+            "number": taken.number,
+            "position": self._position(taken.at),
+            "hex": taken.data.hex(),
+            "why": why,
+            "value": value,
+            "explanation": explanation.to_dict(),
+        }
+
+    def find_frame(self, number: int, backlog: Backlog) -> dict[str, Any]:
+        """Return a frame by its number."""
+        taken = backlog.frame(number)
+        if taken is None:
+            return _gone(f"frame {number}")
+        return self.frame(taken, "number")
+
+    def origin(
+        self, shown: Shown | None, number: int, index: int, backlog: Backlog
+    ) -> dict[str, Any]:
+        """Return the frame that a point of a scan came from, with the path of its field."""
+        if shown is None or index >= len(shown.scan):
+            return _gone(f"point {index} of scan {number}")
+        place = shown.scan.provenance(index)
+        taken = backlog.at(place)
+        if taken is None:
+            return _gone(f"the frame of point {index}")
+        return self.frame(taken, "point", place)
+
+    def find_damaged(self, number: int, backlog: Backlog) -> dict[str, Any]:
+        """Return a damaged piece with the changes that would explain the damage."""
+        piece = backlog.find_damaged(number)
+        if piece is None:
+            return _gone(f"damaged piece {number}")
+        return {
+            "is": "frame",
+            "number": number,
+            "position": self._position(piece.at),
+            "hex": piece.data.hex(),
+            "why": "damaged",
+            "value": None,
+            "explanation": backlog.explain_damaged(piece),
+        }
+
+    def compose_command(self, name: str, texts: Mapping[str, str]) -> dict[str, Any]:
+        """Return the bytes of a command, explained.
+
+        Args:
+            name: name of the command.
+            texts: its arguments as typed, by name.
+
+        Raises:
+            UsageError: if an argument is missing or invalid.
+        """
+        sensor = self.broadcast.device.sensor
+        data = sensor.command(name, **arguments(sensor, name, _assignments(texts)))
+        explanation = None
+        if data:
+            explanation = explain(data, sensor, sensor.commands[name].frame).to_dict()
+        return {"is": "composed", "command": name, "hex": data.hex(), "explanation": explanation}
+
+    def sent(self, name: str, texts: Mapping[str, str]) -> dict[str, Any]:
+        """Send a command, and return the reply in words.
+
+        Raises:
+            UsageError: if commands are not sent, or an argument is missing or invalid.
+            CommandError: if the sensor refuses it or does not reply.
+        """
+        if self.why_no_control:
+            raise UsageError(self.why_no_control)
+        device = self.broadcast.device
+        values = arguments(device.sensor, name, _assignments(texts))
+        reply = device.send(name, **values)
+        return {
+            "is": "replied",
+            "command": name,
+            "text": reply_text(device.sensor, reply),
+            "hex": reply.data.hex(),
+        }
+
+    def _make_explanation(self, frame: str, data: bytes) -> Explanation:
+        return explain(data, self.broadcast.device.sensor, frame)
+
+    def _make_verdict(self, piece: Damaged) -> str:
+        return piece.verdict(self.broadcast.device.sensor)
+
+    def _position(self, at: int) -> float | None:
+        """Return the seconds from the first scan to an arrival (ns since 1970)."""
+        began_ns = self.broadcast.began_ns
+        if at <= 0 or not began_ns:
+            return None
+        return (at - began_ns) * 1e-9
+
+    def _list_damaged(self, since: int) -> list[dict[str, Any]]:
+        """Return the newest damaged pieces, from a number on."""
+        backlog = self.broadcast.backlog
+        return [
+            {
+                "number": piece.number,
+                "position": self._position(piece.at),
+                "offset": piece.offset,
+                "size": piece.size,
+                "verdict": self._verdict(piece),
+            }
+            for piece in backlog.since(max(since, backlog.damaged - MAX_DAMAGED_LISTED))
+        ]
+
+
+def saves() -> list[str]:
+    """Return the suffixes of the files that a scan can be saved as."""
+    suffixes = ["pcd", "ply", "csv"]
+    if find_spec("laspy") is not None:
+        suffixes.append("las")
+    suffixes.append("svg")
+    return suffixes
+
+
+def _gone(what: str) -> dict[str, Any]:
+    """Return the reply for data that is no longer kept."""
+    return {"is": "gone", "what": what}
+
+
+def _assignments(texts: Mapping[str, str]) -> list[str]:
+    return [f"{name}={text}" for name, text in texts.items()]
+
+
+def _is_planar(shown: Shown | None) -> bool:
+    """Return whether the points of a scan lie in one plane."""
+    if shown is None:
+        return False
+    points = shown.scan.points
+    return is_flat(points[points.valid])
+
+
+def _duration(broadcast: Broadcast) -> float | None:
+    """Return the duration of a file in seconds, None if finding it would take long."""
+    if not broadcast.can_seek:
+        return None
+    try:
+        return duration(broadcast.source)
+    except LidarSpecError:
+        return None
+
+
+def _why_no_control(broadcast: Broadcast, *, control: bool) -> str:
+    """Return the reason why no commands are sent, "" if they are."""
+    sensor = broadcast.device.sensor
+    if not sensor.commands:
+        return f"{sensor.id} takes no commands"
+    if not broadcast.is_live:
+        return f"{broadcast.source} is a file: nothing can be sent to it"
+    if not control and not broadcast.source.startswith("sim:"):
+        return "commands are sent to a sensor only where the page was opened with --control"
+    return ""

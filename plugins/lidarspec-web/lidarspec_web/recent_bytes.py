@@ -1,0 +1,312 @@
+"""The newest bytes of a source: frames by number and offset, and damaged bytes.
+
+A decoder passes the backlog its input and the frames that it found (`Witness`). Both are stored
+unchanged, up to a limit, so that reading is not slowed down; a frame is cut out on request. Bytes
+that the decoder skipped are cut out at once, because their input is dropped soon: they are
+explained when a page asks for them.
+"""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec import Decoder, Sensor, WireError
+from lidarspec.explaining.explanation import Explanation
+from lidarspec.explaining.input_segments import InputPiece, explain_piece
+from lidarspec.framing.results import Frames, Numbers, array_of
+from lidarspec.scans.provenance import PointOrigin
+
+#: Maximum bytes of stored input.
+MAX_INPUT_BYTES = 1 << 23
+#: Maximum number of stored results of the decoder.
+MAX_RESULTS = 1024
+#: Maximum number of stored damaged pieces.
+MAX_DAMAGED = 500
+#: Maximum number of stored bytes of one damaged piece.
+MAX_DAMAGED_BYTES = 1 << 13
+
+
+@dataclass(frozen=True)
+class Damaged:
+    """Bytes in no frame: a damaged frame, or other bytes.
+
+    Attributes:
+        number: number of the damaged piece, from 0.
+        offset: offset in the input.
+        size: in bytes.
+        at: arrival of the frame after them, ns since 1970; -1 if it is unknown.
+        data: the bytes, or the first of them.
+        datagram: whether they are one whole datagram.
+    """
+
+    number: int
+    offset: int
+    size: int
+    at: int
+    data: bytes
+    datagram: bool
+
+    def verdict(self, sensor: Sensor) -> str:
+        """Return the fault of the bytes in one sentence."""
+        if not self.data:
+            return "a message of which datagrams are missing"
+        try:
+            sensor.parse(self.data)
+        except WireError as error:
+            return error.reason
+        return "its values are not plausible"
+
+
+@dataclass(frozen=True)
+class Taken:
+    """One frame of the backlog.
+
+    Attributes:
+        number: number of the frame, from 0; None if only its scan holds the frame.
+        frame: its type.
+        at: arrival, ns since 1970; -1 if it is unknown.
+        data: its bytes.
+    """
+
+    number: int | None
+    frame: str
+    at: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class _DecoderInput:
+    """One input of the decoder.
+
+    Attributes:
+        offset: offset of its first byte in the whole input.
+        buffer: contains its bytes, and maybe others.
+        starts: offset of each part in the buffer: one for a stream, one for each datagram.
+        sizes: sizes of the parts, in bytes.
+    """
+
+    offset: int
+    buffer: NDArray[np.uint8]
+    starts: Numbers
+    sizes: NDArray[np.intp]
+
+    @property
+    def size(self) -> int:
+        return int(self.sizes.sum())
+
+
+@dataclass(frozen=True)
+class _Result:
+    """Frames from one input of the decoder, and the number of the first."""
+
+    first_number: int
+    frames: Frames
+
+    @property
+    def offset(self) -> int:
+        return int(self.frames.places[0])
+
+    @property
+    def last_offset(self) -> int:
+        return int(self.frames.places[-1])
+
+    def take(self, index: int) -> Taken:
+        frames = self.frames
+        kind = int(frames.kinds[index])
+        return Taken(
+            self.first_number + index,
+            frames.names[kind],
+            int(frames.at[index]),
+            frames.data(index),
+        )
+
+
+class Backlog:
+    """Stores the newest input of a decoder and the frames in it: a `Witness`.
+
+    One thread adds to it; any thread may read it.
+
+    Attributes:
+        sensor: the sensor that sends the bytes.
+        damaged: number of damaged pieces so far.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self.damaged = 0
+        self._lock = threading.Lock()
+        self._is_stream = True
+        self._joins_datagrams = False
+        self._inputs = deque[_DecoderInput]()
+        self._input_size = 0
+        self._results = deque[_Result]()
+        self._frame_count = 0
+        self._end = 0  # end of the last frame, an offset in the input
+        self._damaged = deque[Damaged](maxlen=MAX_DAMAGED)
+
+    def observe_input(
+        self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
+    ) -> None:
+        """Store the input of the decoder."""
+        with self._lock:
+            self._is_stream = decoder.stream
+            self._joins_datagrams = decoder.joins
+            added = _DecoderInput(decoder.stats.bytes_in, buffer, starts, sizes)
+            self._inputs.append(added)
+            self._input_size += added.size
+            self._drop_old()
+
+    def found(self, frames: Frames) -> None:
+        """Store frames of the input, in its order."""
+        if not len(frames):
+            return
+        with self._lock:
+            if frames.gaps.any():
+                self._keep_skipped(frames)
+            self._results.append(_Result(self._frame_count, frames))
+            self._frame_count += len(frames)
+            self._end = int(frames.places[-1]) + int(frames.sizes[-1])
+
+    def forget(self) -> None:
+        """Discard the bytes, because the input begins anew; frame numbers continue."""
+        with self._lock:
+            self._inputs.clear()
+            self._results.clear()
+            self._input_size = 0
+            self._end = 0
+
+    def freeze(self) -> Backlog:
+        """Return a copy of the current frames and damaged pieces, which does not change."""
+        copy = Backlog(self.sensor)
+        with self._lock:
+            copy._results = deque(self._results)
+            copy._damaged = deque(self._damaged)
+            copy._frame_count = self._frame_count
+            copy.damaged = self.damaged
+        return copy
+
+    @property
+    def newest(self) -> int:
+        """The number of the newest frame; -1 if there is none yet."""
+        return self._frame_count - 1
+
+    def frame(self, number: int) -> Taken | None:
+        """Return a frame by its number, None if it is no longer stored."""
+        with self._lock:
+            following = bisect_right(self._results, number, key=lambda one: one.first_number)
+            result = self._results[following - 1] if following else None
+        if result is None or number - result.first_number >= len(result.frames):
+            return None
+        return result.take(number - result.first_number)
+
+    def at(self, place: PointOrigin) -> Taken | None:
+        """Return the frame that a point came from.
+
+        Returns None if it is no longer stored and the scan does not have its original bytes.
+        """
+        with self._lock:
+            following = bisect_right(self._results, place.offset, key=lambda one: one.offset)
+            result = self._results[following - 1] if following else None
+        if result is not None:
+            offsets = result.frames.offsets
+            index = int(offsets.searchsorted(place.offset))
+            if index < len(offsets) and offsets[index] == place.offset:
+                return result.take(index)
+        if self.sensor.frames[place.frame].wire is not None:
+            return None
+        return Taken(None, place.frame, place.host_ns or -1, place.data)
+
+    def find_damaged(self, number: int) -> Damaged | None:
+        """Return a damaged piece by its number, None if it is no longer stored."""
+        return next((piece for piece in self.since(number) if piece.number == number), None)
+
+    def since(self, number: int) -> list[Damaged]:
+        """Return the stored damaged pieces from a number on."""
+        with self._lock:
+            return [piece for piece in self._damaged if piece.number >= number]
+
+    def explain_damaged(self, piece: Damaged) -> dict[str, Any]:
+        """Return one explanation of a damaged piece, as `Explanation.to_dict`.
+
+        It has the rows of each damaged frame in it, with the change that would explain the damage,
+        and of the bytes between them.
+        """
+        parts = list(
+            explain_piece(self.sensor, InputPiece(piece.offset, piece.data, "", piece.datagram))
+        )
+        frames = [explanation for _, explanation in parts if explanation.frame]
+        rows = []
+        for part, explanation in parts:
+            shift = part.offset - piece.offset
+            rows += [row.to_dict() | {"offset": row.offset + shift} for row in explanation.rows]
+        notes = [note for explanation in frames for note in explanation.notes]
+        if frames:
+            first = frames[0]
+        else:
+            first = Explanation(self.sensor.id, "", piece.data, ())
+        return first.to_dict() | {"size": len(piece.data), "notes": notes, "rows": rows}
+
+    def _drop_old(self) -> None:
+        """Drop the oldest inputs and results beyond the limits."""
+        inputs = self._inputs
+        results = self._results
+        while self._input_size > MAX_INPUT_BYTES and len(inputs) > 1:
+            self._input_size -= inputs.popleft().size
+        oldest = inputs[0].offset
+        while len(results) > 1 and (len(results) > MAX_RESULTS or results[0].last_offset < oldest):
+            results.popleft()
+        # Inputs without frames give no results.
+        while len(inputs) > 2 * MAX_RESULTS:
+            self._input_size -= inputs.popleft().size
+
+    def _keep_skipped(self, frames: Frames) -> None:
+        """Store the bytes that were skipped before some of these frames."""
+        ends = frames.offsets + frames.sizes
+        previous_ends = np.concatenate([[self._end], ends[:-1]])
+        for index in np.flatnonzero(frames.gaps).tolist()[-MAX_DAMAGED:]:
+            at = int(frames.at[index])
+            begin = int(previous_ends[index])
+            end = int(frames.offsets[index])
+            if self._joins_datagrams:
+                size = int(frames.gaps[index])
+                self._keep_damaged(end, size, at, b"", is_datagram=False)
+            elif self._is_stream:
+                data = self._stream_bytes(begin, end)
+                self._keep_damaged(begin, end - begin, at, data, is_datagram=False)
+            else:
+                for offset, data in self._datagrams(begin, end):
+                    self._keep_damaged(offset, len(data), at, data, is_datagram=True)
+
+    def _keep_damaged(
+        self, offset: int, size: int, at: int, data: bytes, *, is_datagram: bool
+    ) -> None:
+        data = data[:MAX_DAMAGED_BYTES]
+        self._damaged.append(Damaged(self.damaged, offset, size, at, data, is_datagram))
+        self.damaged += 1
+
+    def _stream_bytes(self, begin: int, end: int) -> bytes:
+        """Return the stored bytes of a stream from one offset to another."""
+        parts = [
+            bytes(one.buffer[max(begin - one.offset, 0) : end - one.offset])
+            for one in self._inputs
+            if one.offset < end
+        ]
+        return b"".join(parts)
+
+    def _datagrams(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
+        """Yield offset and bytes of each datagram that begins in a range of offsets."""
+        for one in self._inputs:
+            offsets = one.offset + np.cumsum(one.sizes) - one.sizes
+            starts = array_of(one.starts)
+            for index in np.flatnonzero((offsets >= begin) & (offsets < end)).tolist():
+                start = int(starts[index])
+                data = one.buffer[start : start + int(one.sizes[index])]
+                yield int(offsets[index]), data.tobytes()

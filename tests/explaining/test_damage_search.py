@@ -1,0 +1,96 @@
+"""What became of a damaged frame: the flipped bit, the lost or inserted byte."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+import lidarspec as ls
+from lidarspec import explain
+from lidarspec.explaining.damage_search import Change, changes
+from tests.cli.running import EXAMPLE
+from tests.shapes import SHAPES
+
+STL = ls.sensor("ldrobot-stl27l")
+STL_FRAME = STL.frames["data"]
+#: Shapes with short frames: every byte of a frame is tried in every place.
+SHORT_SHAPES = [
+    name
+    for name, sensor in SHAPES.items()
+    if "data" in sensor.frames and sensor.frames["data"].max_length <= 60
+]
+
+
+def flipped(offset: int, bit: int) -> Change:
+    return Change("flipped bit", offset, bit)
+
+
+def test_the_flipped_bit_of_a_damaged_frame_is_found() -> None:
+    data = STL.example("data", seed=4)
+    for flip in (flipped(0, 3), flipped(7, 6), flipped(20, 0), flipped(46, 1)):
+        damaged = flip.repair(data)
+        assert flip in changes(STL_FRAME, damaged)
+        for change in changes(STL_FRAME, damaged):
+            STL.parse(change.repair(damaged))
+
+
+@pytest.mark.parametrize("offset", [0, 1, 7, 20, 46])
+def test_a_lost_and_an_inserted_byte_are_found(offset: int) -> None:
+    data = STL.example("data", seed=4)
+    lost, more = data[:offset] + data[offset + 1 :], data[:offset] + b"\x9b" + data[offset:]
+    for damaged in (lost, more):
+        found = changes(STL_FRAME, damaged)
+        assert data in {change.repair(damaged) for change in found}
+        for change in found:
+            STL.parse(change.repair(damaged))
+    assert {change.kind for change in changes(STL_FRAME, lost)} == {"lost byte"}
+    assert {change.kind for change in changes(STL_FRAME, more)} == {"inserted byte"}
+
+
+def test_a_lost_and_an_inserted_byte_are_told() -> None:
+    assert explain(EXAMPLE[1:], STL, "data").notes == (
+        "one lost byte would explain it: 0x54 before byte 0, in header",
+    )
+    (note,) = explain(EXAMPLE[:20] + EXAMPLE[21:], STL).notes
+    assert re.fullmatch(
+        r"one lost byte would explain it, but in any of \d+ places, so that nothing can be said of"
+        r" where",
+        note,
+    )
+    assert "byte 20, 0x9b" in " ".join(explain(EXAMPLE[:20] + b"\x9b" + EXAMPLE[20:], STL).notes)
+    assert explain(EXAMPLE[:20] + EXAMPLE[23:], STL).notes == ()
+    assert explain(EXAMPLE + b"abc", STL).notes == ()
+
+
+@pytest.mark.parametrize("name", SHORT_SHAPES)
+def test_what_is_said_to_mend_a_frame_mends_it(name: str) -> None:
+    sensor = SHAPES[name]
+    data = sensor.example("data")
+    middle = len(data) // 2
+    without = data[:middle] + data[middle + 1 :]
+    inserted = data[:middle] + b"\x9b" + data[middle:]
+    for damaged in (flipped(middle, 2).repair(data), without, inserted):
+        for change in changes(sensor.frames["data"], damaged):
+            sensor.parse(change.repair(damaged), "data")
+
+
+def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
+    notes = explain(flipped(46, 0).repair(EXAMPLE), STL).notes
+    assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
+    assert (
+        "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m"
+        in notes
+    )
+    assert explain(EXAMPLE[:20], STL).notes == ()
+
+
+def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
+    sensor = ls.sensor("cspc-m1c1-mini")
+    data = max((sensor.example("data", seed=seed) for seed in range(9)), key=len)
+    (note,) = explain(flipped(20, 2).repair(data), sensor, "data").notes
+    assert re.fullmatch(
+        r"one flipped bit would explain it, but in any of \d+ places, so that nothing can be said"
+        r" of where",
+        note,
+    )
