@@ -27,9 +27,6 @@ PAGES = sorted(
     for page in (path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
     if not page.startswith(GENERATED)
 )
-MANUAL = bytes.fromhex(
-    "542c6808ab7ee000e4dc00e2d900e5d500e3d300e4d000e9cd00e4ca00e2c700e9c500e5c200e5c000e5be823a1a50"
-)  # STL-27L development manual, section 3.3
 
 
 def headings(page: str) -> set[str]:
@@ -76,32 +73,6 @@ def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
     pages.assert_printed(block("text", "a ... d\ne\n", pages.OUTPUT), "a b c d  \ne\n")
     with pytest.raises(AssertionError, match="the page says"):
         pages.assert_printed(block("text", "a\n", pages.OUTPUT), "a\nb\n")
-
-
-def test_the_plugin_of_the_tutorial_decodes_the_manuals_frame(tmp_path: Path) -> None:
-    (plugin,) = [
-        block for block in pages.blocks("tutorial/first-sensor.md") if block.title == "stl27l.py"
-    ]
-    (tmp_path / plugin.title).write_text(plugin.text, encoding="utf-8")
-    packets = ls.sensor(tmp_path / plugin.title).decode(MANUAL)
-    assert packets["start_angle"].tolist() == [pytest.approx(324.27)]
-    assert packets.raw["points"]["distance"][0].tolist() == [
-        224,
-        220,
-        217,
-        213,
-        211,
-        208,
-        205,
-        202,
-        199,
-        197,
-        194,
-        192,
-    ]
-    cloud = packets.points()
-    assert cloud.x[0] == pytest.approx(0.224 * 0.81186, abs=1e-4)  # cos 324.27 deg
-    assert cloud.y[0] == pytest.approx(0.224 * 0.58384, abs=1e-4)  # 35.73 deg to the left
 
 
 def test_the_python_of_the_readme_prints_what_it_says(tmp_path: Path) -> None:
