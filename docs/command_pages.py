@@ -4,7 +4,7 @@
     python docs/command_pages.py --man    # the manual pages only
 
 `make reference` runs the first, `make wheels` the second. The manual pages go to docs/man, which
-git ignores. In docs/reference/command-line.md (usage and options of each verb) and
+git ignores. In docs/reference/command-line.md (shared options; usage and options of each verb) and
 docs/reference/ros2.md (parameters of the node) the text between the marks is generated and the rest
 is written by hand; tests/docs/test_reference_pages.py fails if a generated part is out of date.
 """
@@ -15,6 +15,7 @@ import inspect
 import json
 import re
 import sys
+from collections import Counter
 from pathlib import Path
 
 import click
@@ -24,7 +25,9 @@ from lidarspec.cli.root import SPOKEN, VERBS, main as root
 
 DOCS = Path(__file__).parent
 PAGE, NODE = "reference/command-line.md", "reference/ros2.md"
-BEGIN, END = "<!-- made by make reference -->", "<!-- until here -->"
+BEGIN, END = "<!-- generated -->", "<!-- end -->"
+SHARED = "Shared options"
+MIN_SHARING_VERBS = 3
 
 
 def context(verb: str) -> click.Context:
@@ -59,28 +62,47 @@ def options(verb: str) -> list[tuple[str, str]]:
     return [(typed, " ".join(text.split())) for typed, text in filter(None, records)]
 
 
+def shared_options() -> list[tuple[str, str]]:
+    """Return the options that at least `MIN_SHARING_VERBS` verbs have, with the same text."""
+    verbs = Counter(option for verb in VERBS for option in options(verb))
+    return [option for option, count in verbs.items() if count >= MIN_SHARING_VERBS]
+
+
+def option_table(rows: list[tuple[str, str]]) -> list[str]:
+    """Return the lines of a table of options; none without options."""
+    if not rows:
+        return []
+    escaped = [(typed.replace("|", "\\|"), text.replace("|", "\\|")) for typed, text in rows]
+    return ["| option | |", "|---|---|", *(f"| `{typed}` | {text} |" for typed, text in escaped)]
+
+
 def section(verb: str) -> str:
-    """What is made of a verb's section."""
-    rows = [
-        f"| `{typed}` | {text} |"
-        for typed, text in (
-            (t.replace("|", "\\|"), x.replace("|", "\\|")) for t, x in options(verb)
-        )
-    ]
-    table = ["", "| option | |", "|---|---|", *rows] if rows else []
-    return "\n".join(
-        [BEGIN, "", f"`{usage(verb)}`", "", "\n\n".join(paragraphs(verb)), *table, "", END]
-    )
+    """Return the generated part of a verb's section.
+
+    Shared options are named only, and of the help the first paragraph is printed.
+    """
+    shared = shared_options()
+    lines = ["", f"`{usage(verb).replace(' [OPTIONS]', '')}`", "", paragraphs(verb)[0]]
+    names = [re.split("[ ,]", option[0])[0] for option in options(verb) if option in shared]
+    if names:
+        lines += ["", f"[Shared](#shared-options): {', '.join(f'`{name}`' for name in names)}"]
+    table = option_table([option for option in options(verb) if option not in shared])
+    if table:
+        lines += ["", *table]
+    return "\n".join([BEGIN, *lines, "", END])
 
 
 def page(text: str) -> str:
-    """command-line.md with every made part as it is now; a verb without one gets it below its
-    heading.
+    """Return command-line.md with every generated part renewed.
+
+    A verb without a generated part gets one below its heading.
     """
-    for verb in VERBS:
-        before, heading, after = text.partition(f"## {verb}\n\n")
+    generated = {verb: section(verb) for verb in VERBS}
+    generated[SHARED] = "\n".join([BEGIN, "", *option_table(shared_options()), "", END])
+    for title, part in generated.items():
+        before, heading, after = text.partition(f"## {title}\n\n")
         rest = re.sub(rf"\A{re.escape(BEGIN)}.*?{re.escape(END)}\n\n?", "", after, flags=re.DOTALL)
-        text = f"{before}{heading}{section(verb)}\n\n{rest}" if heading else text
+        text = f"{before}{heading}{part}\n\n{rest}" if heading else text
     return text
 
 
