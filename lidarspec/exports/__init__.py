@@ -6,6 +6,7 @@ cannot express the spec. Modules in reading order:
 
 * `json`, `stubs`: the spec as data, and as types for an editor.
 * `reference`, `diagram`: a page in Markdown, and packet diagrams in SVG.
+* `quick_start`: the start of this page: commands to copy, and notes of the plugin.
 * `ksy`, `wireshark`: a Kaitai Struct format, and a dissector in Lua.
 * `c`, `c_fields`: a header in C, and its functions that read fields.
 """

@@ -1,7 +1,8 @@
 """A sensor's reference page in Markdown.
 
-It has links, commands, the wire table of every frame, checksums, clock and geometry. Each section
-is a table or a few sentences from the spec alone. Only geometry uses bytes: the points of an
+It has commands to copy, notes, links, commands, the wire table of every frame, checksums, clock and
+geometry. Each section is a table or a few sentences from the spec alone, except the notes, which
+the plugin ships. Only geometry uses bytes: the points of an
 example frame give the columns and the directions of the channels.
 """
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError
 from lidarspec.explaining.formatting import describe_losses, format_argument_type
+from lidarspec.exports.quick_start import list_commands, read_notes, write_python
 from lidarspec.frames.wire_table import frame_size, wire_table
 from lidarspec.framing.results import Counters, Found, pack_found
 from lidarspec.packets.stream import PacketStream
@@ -47,11 +49,14 @@ def page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
     Args:
         pictures: frame type -> address of its packet diagram.
     """
-    parts = [f"# {escape(f'{sensor.vendor} {sensor.model}')}", "\n".join(_facts(sensor))]
+    parts = [f"# {escape(f'{sensor.vendor} {sensor.model}')}", _quick_start(sensor)]
+    for name, picture in (pictures or {}).items():
+        parts.append(f"![{name}: packet diagram]({picture})")
+    parts += [read_notes(sensor.id), "## Facts", "\n".join(_facts(sensor))]
     if sensor.commands:
         parts += ["## Commands", "\n".join(_commands(sensor))]
     for name, frame in sensor.frames.items():
-        parts += [*_frame(name, frame, (pictures or {}).get(name, ""))]
+        parts += [*_frame(name, frame)]
     parts += ["## Geometry", "\n".join(_geometry(sensor))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -165,7 +170,15 @@ def effect(sensor: Sensor, name: str) -> str:
     return "; ".join(text for text, holds in effects.items() if holds)
 
 
-def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
+def _quick_start(sensor: Sensor) -> str:
+    """Return the commands to copy, with aligned comments, and a program in Python."""
+    commands = list_commands(sensor)
+    width = max(len(command) for command, _ in commands)
+    lines = [f"$ {command.ljust(width)}    # {purpose}" for command, purpose in commands]
+    return "\n".join(["```console", *lines, "```", "", "```python", write_python(sensor), "```"])
+
+
+def _frame(name: str, frame: Frame) -> Iterator[str]:
     if frame.direction == "out":
         kind = "to the sensor"
     elif frame.data:
@@ -181,8 +194,6 @@ def _frame(name: str, frame: Frame, picture: str) -> Iterator[str]:
         frame.plausible is not None
     )
     yield "; ".join(remarks) + "."
-    if picture:
-        yield f"![{name}: packet diagram]({picture})"
     rows = [
         (row.offset, row.size, row.type, f"`{row.field}`", row.unit, row.meaning)
         for row in wire_table(frame)

@@ -1,0 +1,69 @@
+"""The start of a sensor's reference page: commands to copy, a program, and installation notes.
+
+The commands follow from the links of the sensor. Notes are Markdown files that a plugin ships as
+`notes/ID.md` beside its modules: wiring, connectors, addresses and settings from the manual.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+from lidarspec.entry_points import SENSORS, entry_points
+from lidarspec.spec import Sensor
+from lidarspec.spec.links import Serial, Tcp, Udp
+
+
+def list_commands(sensor: Sensor, source: str = "") -> list[tuple[str, str]]:
+    """Return (command, purpose) for a shell: the first things to do with a sensor.
+
+    Args:
+        source: the SOURCE in the commands; by default a typical one for the links of the sensor.
+    """
+    source = source or typical_source(sensor)
+    sensor_option = f"-s {sensor.id}"
+    return [
+        (f"lidarspec detect {source}", "identify the sensor"),
+        (f"lidarspec view {source} {sensor_option}", "draw its scans; --web: in the browser"),
+        (f"lidarspec record {source} {sensor_option} -t 10s -o a.lsr", "record ten seconds"),
+        ("lidarspec convert a.lsr a.foxglove.mcap", "open the result in Foxglove"),
+        (f"lidarspec ros2 {source} {sensor_option}", "publish it in ROS 2"),
+    ]
+
+
+def write_python(sensor: Sensor, source: str = "") -> str:
+    """Return a Python program that prints the points of one scan."""
+    return f"""\
+import lidarspec as ls
+
+with ls.open("{source or typical_source(sensor)}", "{sensor.id}") as device:
+    scan = next(device.scans())
+print(scan.points.xyz)    # float32, shape (N, 3), in metres"""
+
+
+def typical_source(sensor: Sensor) -> str:
+    """Return a SOURCE for the data link of a sensor, with an address to be replaced."""
+    link = sensor.links["data"]
+    if isinstance(link, Serial):
+        return "/dev/ttyUSB0"
+    if isinstance(link, Tcp):
+        return f"tcp://192.168.0.10:{link.port}"
+    is_found_by_broadcast = any(
+        isinstance(other, Udp) and other.broadcast for other in sensor.links.values()
+    )
+    if sensor.on_open and not is_found_by_broadcast:
+        return "udp://?src=192.168.0.10"
+    return "udp://"
+
+
+def read_notes(sensor_id: str) -> str:
+    """Return the notes that the plugin of an installed sensor ships, "" if there are none."""
+    for entry in entry_points(SENSORS):
+        if entry.name != sensor_id:
+            continue
+        package = importlib.util.find_spec(entry.module.partition(".")[0])
+        for folder in (package and package.submodule_search_locations) or ():
+            path = Path(folder, "notes", f"{sensor_id}.md")
+            if path.is_file():
+                return path.read_text(encoding="utf-8").strip()
+    return ""

@@ -1,0 +1,65 @@
+"""Tests of the commands and notes at the start of a sensor's page."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lidarspec as ls
+from lidarspec.exports.quick_start import list_commands, read_notes, typical_source, write_python
+from tests.libraries import needs
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(arguments: list[str], folder: Path) -> str:
+    result = subprocess.run(
+        [sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=True
+    )
+    return result.stdout
+
+
+@needs("mcap", "google.protobuf")
+def test_the_commands_work_as_they_are_printed(tmp_path: Path) -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    source = f"sim:{sensor.id}?rate=max"
+    commands = [shlex.split(command) for command, _ in list_commands(sensor, source)]
+    outputs = {
+        command[1]: run(["-m", *(part.replace("10s", "1s") for part in command)], tmp_path)
+        for command in commands
+        if command[1] in ("detect", "record", "convert")
+    }
+    assert sensor.id in outputs["detect"]
+    assert (tmp_path / "a.foxglove.mcap").stat().st_size > 0
+    assert "[" in run(["-c", write_python(sensor, source)], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "source"),
+    [
+        ("ldrobot-stl27l", "/dev/ttyUSB0"),
+        ("velodyne-vlp16", "udp://"),
+        ("livox-mid360", "udp://"),  # found by broadcast
+        ("ouster-os1", "udp://?src=192.168.0.10"),
+        ("sick-tim571", "tcp://192.168.0.10:2112"),
+    ],
+)
+def test_the_source_fits_the_links(sensor: str, source: str) -> None:
+    assert typical_source(ls.sensor(sensor)) == source
+
+
+def test_notes_are_read_from_the_plugin() -> None:
+    assert "ZH1.5T-4P" in read_notes("ldrobot-stl27l")
+    assert read_notes("acme-x1") == ""
+
+
+def test_each_notes_file_belongs_to_a_sensor() -> None:
+    files = list(ROOT.glob("plugins/*/lidarspec_*/notes/*.md"))
+    assert files
+    for file in files:
+        assert read_notes(file.stem) == file.read_text(encoding="utf-8").strip()
+        assert not file.read_text(encoding="utf-8").startswith("# ")
