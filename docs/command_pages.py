@@ -111,16 +111,13 @@ def node(text: str) -> str:
     sys.path.insert(0, str(DOCS.parent / "plugins" / "lidarspec-ros2"))
     from lidarspec_ros2.parameters import PARAMETERS
 
-    rows = [
-        f"| `{one.name}` | {one.kind} | `{json.dumps(one.default)}` | {one.text} |"
-        f" {'yes' if one.live else ''} |"
-        for one in PARAMETERS
-    ]
-    table = "\n".join(
-        ["| parameter | type | default | | at run time |", "|---|---|---|---|---|", *rows]
-    )
+    table = ["| parameter | default | |", "|---|---|---|"]
+    for parameter in PARAMETERS:
+        name = f"`{parameter.name}`*" if parameter.live else f"`{parameter.name}`"
+        default = json.dumps(parameter.default)
+        table.append(f"| {name} | `{default}` | {parameter.text} |")
     before, after = text.partition(BEGIN)[0], text.partition(END)[2]
-    return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
+    return "\n".join([f"{before}{BEGIN}", "", *table, "", f"{END}{after}"])
 
 
 def manual(verb: str) -> str:

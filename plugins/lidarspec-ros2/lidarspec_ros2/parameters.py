@@ -57,55 +57,55 @@ class Parameter:
 #: what the fields of `Mount` are.
 _MOUNT = {
     **{
-        axis: f"The sensor's origin, metres {way} of the carrier's."
-        for axis, way in (("x", "forward"), ("y", "left"), ("z", "up"))
+        axis: f"Position of the sensor, metres {way} the carrier."
+        for axis, way in (("x", "in front of"), ("y", "left of"), ("z", "above"))
     },
     **{
-        f"{turn}_deg": f"How it is turned about {axis}, degrees."
+        f"{turn}_deg": f"Rotation about {axis}, degrees."
         for turn, axis in (("roll", "x"), ("pitch", "y"), ("yaw", "z"))
     },
-    "inverted": "Whether it hangs upside down.",
+    "inverted": "The sensor is mounted upside down.",
 }
 _SIDE, _FAR, _TURN = 1e4, 1e6, 360.0
 PARAMETERS = (
     Parameter(
         "source",
         "",
-        "A port, an address, a file, a simulated sensor, or a name of lidarspec.toml: SOURCE of the"
-        " command line.",
+        "Port, address, file, simulated sensor, or name in lidarspec.toml: SOURCE of the command"
+        " line.",
     ),
     Parameter(
         "sensor",
         "",
-        "The sensor: an id, an alias, or a file; found out where it is left out. As -s.",
+        "Id, alias or file of the sensor; default: detected. As -s.",
     ),
-    Parameter("options", [""], "What the sensor is configured with: NAME=VALUE each. As -O."),
-    Parameter("calibration", "", "The unit's own calibration, a file. As --calibration."),
+    Parameter("options", [""], "Options of the sensor, each NAME=VALUE. As -O."),
+    Parameter("calibration", "", "Calibration file of this unit. As --calibration."),
     Parameter(
         "autostart",
         True,
-        "Whether the node configures and activates itself; else a manager of lifecycles does.",
+        "Configure and activate the node when it starts; false: a lifecycle manager does.",
     ),
     *(
         Parameter(
             f"mount.{field.name}",
             getattr(Mount(), field.name),
-            f"{_MOUNT[field.name]} Points are turned so, unless publish_tf is set.",
+            _MOUNT[field.name],
         )
         for field in fields(Mount)
     ),
-    Parameter("frame_id", "laser", "The frame of the points.", live=True),
+    Parameter("frame_id", "laser", "frame_id of the messages.", live=True),
     Parameter(
         "publish_tf",
         False,
-        "Whether the mount is published on /tf_static, from parent_frame to frame_id; points stay"
-        " as measured.",
+        "Publish the mount on /tf_static, from parent_frame to frame_id, and do not transform"
+        " points.",
     ),
-    Parameter("parent_frame", "base_link", "The frame of the carrier, for publish_tf."),
+    Parameter("parent_frame", "base_link", "Frame of the carrier, for publish_tf."),
     Parameter(
         "beams",
         0,
-        "Ranges of a LaserScan: always so many. 0: as many as the sensor has.",
+        "Number of ranges in each LaserScan. 0: that of the sensor.",
         0,
         1 << 20,
         live=True,
@@ -113,7 +113,7 @@ PARAMETERS = (
     Parameter(
         "angle_min",
         0.0,
-        "Where the first beam of scan looks, radians. The same as angle_max: all that is seen.",
+        "First angle of scan, radians. If equal to angle_max: all angles.",
         -10,
         10,
         live=True,
@@ -121,16 +121,16 @@ PARAMETERS = (
     Parameter(
         "angle_max",
         0.0,
-        "Where the last beam of scan looks, radians; below angle_min it is a turn on.",
+        "Last angle of scan, radians; if below angle_min, one turn is added.",
         -10,
         10,
         live=True,
     ),
-    Parameter("range_min", 0.0, "Metres; nearer returns are none.", 0, _FAR, live=True),
+    Parameter("range_min", 0.0, "Drop nearer returns, metres.", 0, _FAR, live=True),
     Parameter(
         "range_max",
         0.0,
-        "Metres; farther returns are none. 0: no limit but the sensor's.",
+        "Drop farther returns, metres. 0: the limit of the sensor.",
         0,
         _FAR,
         live=True,
@@ -138,7 +138,7 @@ PARAMETERS = (
     Parameter(
         "scan_ring",
         -1,
-        "Of a sensor of several rings the one that scan has. -1: none.",
+        "The ring in scan, for a sensor with several rings. -1: not used.",
         -1,
         1 << 16,
         live=True,
@@ -146,7 +146,7 @@ PARAMETERS = (
     Parameter(
         "scan_z_min",
         0.0,
-        "Of a sensor of several rings scan has the points from this z on, metres.",
+        "Lowest z of points in scan, metres, for a sensor with several rings.",
         -_SIDE,
         _SIDE,
         live=True,
@@ -154,7 +154,7 @@ PARAMETERS = (
     Parameter(
         "scan_z_max",
         0.0,
-        "And up to this one. The same as scan_z_min: none.",
+        "Highest z of points in scan, metres. If equal to scan_z_min: not used.",
         -_SIDE,
         _SIDE,
         live=True,
@@ -162,40 +162,41 @@ PARAMETERS = (
     Parameter(
         "organized",
         True,
-        "Whether clouds keep the sensor's rows and columns, with nan for what is missing.",
+        "Publish organised clouds: rows and columns, with nan for missing points.",
         live=True,
     ),
     Parameter(
         "use_device_time",
         True,
-        "Whether stamps are by the sensor's clock, in the host's time; else by the arrival.",
+        "Stamp by the sensor's clock, converted to the host's time; false: by arrival time.",
         live=True,
     ),
     Parameter(
         "device_time_is_ros_time",
         False,
-        "Whether the sensor's clock is right, by PTP or GPS: stamps are what it says.",
+        "Stamp with the sensor's time, which PTP or GPS sets.",
         live=True,
     ),
     Parameter(
         "time_offset",
         0.0,
-        "Seconds added to every stamp: below 0 for a delay that is always there.",
+        "Seconds added to every stamp; negative for a constant delay.",
         -_SIDE,
         _SIDE,
         live=True,
     ),
-    Parameter("publish_packets", False, "Whether packets has what the sensor sends, as it comes."),
+    Parameter(
+        "publish_packets", False, "Publish the packets of the sensor as received, on packets."
+    ),
     Parameter(
         "qos",
         "best_effort",
-        "Of the topics with data: best_effort, as for sensor data, or reliable.",
+        "Reliability of the data topics: best_effort or reliable.",
     ),
     Parameter(
         "replay_speed",
         1.0,
-        "How many times faster than it was recorded a file is played. 0: as fast as it can be"
-        " read.",
+        "Speed of a file relative to the recording. 0: as fast as possible.",
         0,
         1000,
     ),
