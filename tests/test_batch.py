@@ -256,7 +256,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path
         in ran("convert", drives / "long.bin", drives / "bad.bin", out, code=2).stderr
     )
     assert (
-        "leave out --jobs"
+        "omit --jobs"
         in ran(
             "convert",
             source,
@@ -271,7 +271,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path
         ).stderr
     )
     assert (
-        "size from 1MB on"
+        "size of at least 1MB"
         in ran("convert", source, out, "--to", "csv", "--piece", "5", code=2).stderr
     )
     assert "without --to" in ran("convert", source, out, "--to", "csv", "-n", "5", code=2).stderr

@@ -45,10 +45,10 @@ MOST = 1 << 22
 @click.option(
     "--distribution",
     metavar="NAME",
-    help="Name of the distribution, such as lidarspec-acme; an existing one gets this sensor too.",
+    help="Name of the distribution, such as lidarspec-acme; if it exists, the sensor is added.",
 )
-@click.option("--vendor", metavar="NAME", help="As the vendor writes it; default: from the id.")
-@click.option("--model", metavar="NAME", help="As the vendor writes it; default: from the id.")
+@click.option("--vendor", metavar="NAME", help="Name of the vendor; default: from the id.")
+@click.option("--model", metavar="NAME", help="Name of the model; default: from the id.")
 @click.option(
     "--link",
     type=click.Choice(["serial", "udp"]),
@@ -71,11 +71,11 @@ def new(
 ) -> None:
     """Create a distribution for your own sensor; it works before you change anything.
 
-    It holds an invented sensor with frames, checksum, points, commands and simulation, its tests,
-    and the entry point that makes it known once it is installed. --distribution adds a module and
-    its tests to a distribution that exists. --from-capture drafts the frames from the bytes of a
-    capture: sync bytes, length, checksum, counters and angles, each with its evidence; all other
-    bytes are marked as unknown.
+    It contains an invented sensor with frames, checksum, points, commands and simulation, its
+    tests, and an entry point, so that lidarspec finds it after installation. --distribution adds a
+    module and its tests to an existing distribution. --from-capture drafts the frames from the
+    bytes of a capture: sync bytes, length, checksum, counters and angles, each with its evidence;
+    all other bytes are marked as unknown.
     """
     names = Names(sensor_id, distribution or "", vendor or "", model or "")
     if sensor_id in sensors():
@@ -157,7 +157,7 @@ def _draft_files(names: Names, link: str | None, capture: str) -> dict[str, str]
     "-v",
     "--verbose",
     is_flag=True,
-    help="Also print skipped checks with the reason, and measured values.",
+    help="Also print measured values, and skipped checks with the reason.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @output_option
@@ -225,7 +225,7 @@ def _format_report(report: Report, *, verbose: bool) -> list[str]:
     "-f",
     "--frame",
     metavar="NAME",
-    help="Export this frame type only; default: all, or the one with the points.",
+    help="Export this frame type only; default: all types, or the data frame.",
 )
 def export(kind: str, sensor_id: str, output: str | None, frame: str | None) -> None:
     """Export a sensor's spec: wireshark, c, ksy (Kaitai), md, svg, json, pyi.

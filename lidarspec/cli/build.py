@@ -43,9 +43,10 @@ def build(
 ) -> None:
     """Build one frame from field=value; a value with a unit is physical.
 
-    A bare number is the raw integer. points[*].distance=1m sets every element,
-    points[3].intensity=7 one; later ones win. Constants, counts and checksums are filled in. -o
-    writes the bytes, or hexadecimal text if FILE ends in .hex.
+    A number without a unit is the raw integer. points[*].distance=1m sets every element,
+    points[3].intensity=7 a single one; a later assignment overrides an earlier one. Constants,
+    counts and checksums are filled in. -o writes the bytes, or hexadecimal text if FILE ends in
+    .hex.
     """
     sensor = named_sensor(sensor_id)
     if "=" in frame:
@@ -92,7 +93,7 @@ def build(
     "--timeout",
     type=DURATION,
     metavar="TIME",
-    help="Reply timeout; default: the sensor's own.",
+    help="Reply timeout; default: declared by the sensor.",
 )
 @output_options
 def send(
@@ -107,12 +108,12 @@ def send(
 ) -> None:
     """Send a command to a sensor, and print its reply.
 
-    Nothing else is sent: a sensor that is started keeps running when the verb ends. Values are in
-    the unit that `show` prints, or have a unit of their own: rate=600rpm. A sensor that sends
-    nothing until it is started has to be named with -s.
+    Only this command is sent: a started sensor keeps running after the verb ends. Values are in the
+    unit that `show` prints, or have their own unit: rate=600rpm. If a sensor sends nothing until it
+    is started, name it with -s.
     """
     if (command is None) == (digits is None):
-        raise UsageError("send takes either the name of a command, or bytes: --hex 'a5 50'")
+        raise UsageError("send requires either the name of a command, or bytes: --hex 'a5 50'")
     data = b"" if digits is None else _bytes(digits)
     answer = _Answer()
     record = (lambda _: answer) if digits is not None and is_live(source) else None
@@ -138,7 +139,7 @@ def _bytes(digits: str) -> bytes:
     try:
         return parse_hex(digits)
     except ValueError as error:
-        raise UsageError(f"--hex takes bytes in hexadecimal: {error}") from None
+        raise UsageError(f"--hex requires bytes in hexadecimal: {error}") from None
 
 
 class _Answer:
@@ -200,7 +201,7 @@ def _write(
     if len(rest) < len(
         found
     ):  # data frames continue: the incomplete pieces at both ends belong to them
-        note(f"{len(found) - len(rest)} data frames came meanwhile")
+        note(f"{len(found) - len(rest)} data frames received meanwhile")
         rest = [piece for piece in rest if piece.is_valid or piece not in (found[0], found[-1])]
     parts = [
         (piece, part)
@@ -214,7 +215,7 @@ def _write(
     elif parts:
         emit_lines(listing(sensor, parts), output)
     if not parts:
-        note("nothing came back")
+        note("no reply received")
 
 
 def _sent(
@@ -232,9 +233,7 @@ def _sent(
 
 def _refuse_file(device: Device, source: str) -> None:
     if not device.is_live:
-        raise suggest(
-            UsageError(f"{source} is a file: nothing can be sent to it"), "lidarspec ports"
-        )
+        raise suggest(UsageError(f"cannot send to {source}: it is a file"), "lidarspec ports")
 
 
 def _reply_to_dict(sensor: Sensor, reply: Reply) -> dict[str, Any]:

@@ -89,7 +89,7 @@ class _Counts:
     "--packets",
     "with_packets",
     is_flag=True,
-    help="Also write the packets of IN, for a ROS log that lidarspec can read again.",
+    help="Also write the packets of IN, so that lidarspec can read the ROS log.",
 )
 @click.option("--imu", "is_imu", is_flag=True, help="Write the IMU samples instead of the points.")
 @click.option(
@@ -137,23 +137,23 @@ def convert(
 ) -> None:
     """Write the points of a recording or capture to a file of another format.
 
-    The suffix of OUT decides the format. .csv and .npz hold x y z range azimuth elevation intensity
-    time ring return_index column, as far as the sensor has them, its further columns, and the
-    number of the scan, in metres, radians, and seconds since the scan's stamp. .npy, .ply, .pcd and
-    the compressed .lzf.pcd hold x y z intensity ring time, further columns and, for several scans,
+    The suffix of OUT selects the format. .csv and .npz hold x y z range azimuth elevation intensity
+    time ring return_index column, if the sensor has them, its further columns, and the number of
+    the scan, in metres, radians, and seconds since the scan's stamp. .npy, .ply, .pcd and the
+    compressed .lzf.pcd hold x y z intensity ring time, further columns and, for several scans,
     their number; .bin, as in KITTI, x y z intensity; .xyz x y z. To write one file for each scan,
-    put a number into the name: scans/%05d.pcd. With %F, %H, %M or %S in the name, all
-    scans of one date, hour, minute or second share a file.
+    put a number into the name: scans/%05d.pcd. With %F, %H, %M or %S in the name, all scans of one
+    date, hour, minute or second share a file.
 
     .lsr, .pcap and .pcapng hold the packets as they were received.
 
-    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, logs of ROS (.mcap,
-    .bag, .rosbag2, .db3), of Foxglove (.foxglove.mcap) and of Rerun (.rrd) need libraries that are
-    not installed by default: lidarspec[arrow,las,e57,zarr,ros,foxglove,rerun].
+    Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, and logs of ROS (.mcap,
+    .bag, .rosbag2, .db3), Foxglove (.foxglove.mcap) and Rerun (.rrd) require optional libraries:
+    lidarspec[arrow,las,e57,zarr,ros,foxglove,rerun].
 
-    With --to each IN is a file, a pattern in quotes, 'drives/**/*.pcap', or a URL,
-    s3://bucket/a.pcap, and OUT is a folder. Its manifest.jsonl lists the finished pieces: the same
-    command again does only the missing ones. If a file fails, the others are still converted.
+    With --to, each IN is a file, a quoted pattern ('drives/**/*.pcap') or a URL
+    (s3://bucket/a.pcap), and OUT is a folder. Its manifest.jsonl lists the finished pieces; repeat
+    the command to convert only the missing ones. If a file fails, the others are still converted.
     """
     properties = {
         "beams": selection.beams,
@@ -165,12 +165,12 @@ def convert(
         if is_requested:
             check_holds(target if suffix is None else f"{target}.{suffix.removeprefix('.')}", name)
     if not sources:
-        raise UsageError(f"Missing argument 'OUT': where the points of {target} are to go")
+        raise UsageError(f"Missing argument 'OUT': the output file for the points of {target}")
     if suffix is not None:
         if count or is_imu or organized or with_packets:
-            raise UsageError("-n, --imu, --organized and --packets are for one file, without --to")
+            raise UsageError("-n, --imu, --organized and --packets cannot be combined with --to")
         if jobs and scheduler:
-            raise UsageError("--dask has its own workers: leave out --jobs")
+            raise UsageError("--dask uses its own workers: omit --jobs")
         records = batch.convert(
             sources,
             target,
@@ -187,14 +187,12 @@ def convert(
         _follow_batch(records, target, file_count, as_json=as_json)
         return
     if len(sources) > 1 or jobs or scheduler or piece_size:
-        error = UsageError(
-            "several files, and --jobs, --dask and --piece, go into a folder in one format"
-        )
-        raise suggest(error, "the same with --to parquet")
+        error = UsageError("several input files, --jobs, --dask and --piece require --to FORMAT")
+        raise suggest(error, "repeat with --to parquet")
     source = sources[0]
     if Path(target).suffix.lower() in _PACKET_SUFFIXES:
         if count or is_imu or replace(selection, times=(None, None), time="device") != EVERYTHING:
-            raise UsageError(f"{target} holds packets, which are selected by --slice alone")
+            raise UsageError(f"packets in {target} can be selected by --slice only")
         refuse_overwriting([target], source, sensor_id, force=force)
         _write_packets(source, target, sensor_id, selection.times, as_json=as_json)
         return
@@ -230,7 +228,7 @@ def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]
     if not len(samples):
         raise _no_data_error(device, target)
     write_imu(target, samples)
-    note(f"{target}: {len(samples)} samples of the IMU of {device.sensor.id}; {device.stats}")
+    note(f"{target}: {len(samples)} IMU samples of {device.sensor.id}; {device.stats}")
     return {"samples": len(samples)}
 
 
@@ -240,7 +238,7 @@ def _write_packets(
     """Write packets as they were received."""
     if is_live(source):
         raise suggest(
-            UsageError(f"{source} is no file"),
+            UsageError(f"{source} is not a file"),
             f"lidarspec record {quote(source)} -o {quote(target)}",
         )
     with (
@@ -310,11 +308,11 @@ def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | No
         return
     if is_live(source) or source == "-":
         raise UsageError(
-            f"--packets reads IN twice, and {source} can be read only once: record it first"
+            f"--packets reads IN twice, but {source} can be read only once: record it first"
         )
     with contextlib.closing(transport(source)) as opened:
         if not opened.datagrams:
-            raise UsageError(f"{source} is a stream of bytes: packets are those of datagrams")
+            raise UsageError(f"--packets requires datagrams, but {source} is a byte stream")
         yield opened.chunks()
 
 
@@ -360,7 +358,7 @@ def _describe_batch(totals: Counter[str], done_before: int, failed_count: int) -
     names = [name for name in totals if name != "pieces" or totals[name] > totals["files"]]
     parts = [", ".join(f"{totals[name]} {name}" for name in names) or "nothing"]
     if done_before:
-        parts.append(f"{done_before} pieces were done before")
+        parts.append(f"{done_before} pieces were finished before")
     if failed_count:
         parts.append(f"{failed_count} failed")
     return "; ".join(parts)

@@ -53,7 +53,7 @@ def report(error: Exception, verb: str) -> int:
         note("".join(traceback.format_exception(error)))
     if not command:
         note(f"a bug in lidarspec: {type(error).__name__}: {error}")
-        note("  next: the same with LIDARSPEC_DEBUG=1, and report it with what that prints")
+        note("  next: repeat with LIDARSPEC_DEBUG=1, and report the output")
         return code
     message = _message(error)
     note(message)

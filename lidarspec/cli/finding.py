@@ -74,9 +74,9 @@ def ports(as_json: bool, output: str | None) -> None:
         [f"udp://:{port}", ", ".join(_senders(port)), _udp_state(users), ""]
         for port, users in udp.items()
     ]
-    emit(table(["port", "what it is", "state", "lasting name"], rows, output), output)
+    emit(table(["port", "description", "state", "stable name"], rows, output), output)
     if not serial:
-        note("there is no serial port; one that should be here: is it plugged in?")
+        note("no serial port found: check that the device is plugged in")
     note(
         f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}"
         if sensors()
@@ -132,8 +132,8 @@ def crc(
 
     Frames are arguments of hexadecimal digits, one frame each; a text file with one frame on each
     line (.hex, .txt); or a capture. In raw bytes the frames are found by their structure, or by
-    their length in --period. More frames give a surer result: a dozen is plenty. Only the beginning
-    of a long file is read.
+    their length with --period. More frames give a more certain result; a dozen is enough. Only the
+    beginning of a long file is read.
     """
     frames = _frames(words, period, offset)
     matches = search(frames)
@@ -146,12 +146,13 @@ def crc(
         emit("\n\n".join(_text(match, len(frames[0])) for match in shown), output)
     if not matches:
         note(
-            f"no checksum of {len(frames)} frame{'s' * (len(frames) != 1)} was found: are they"
-            " whole, and do they begin where they should?"
+            f"no checksum found in {len(frames)} frame{'s' * (len(frames) != 1)}: check that each"
+            " is"
+            " complete and begins at its first byte"
         )
         raise click.exceptions.Exit(FINDINGS)
     if matches[0].doubt < WEAK:
-        note("this may be chance: give more frames")
+        note("the match may be chance: give more frames")
 
 
 def _frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
@@ -186,7 +187,7 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
     found = structure(chunks, datagrams=datagrams)
     if found is None:
         raise suggest(
-            UsageError(f"{path}: where its frames begin cannot be seen"),
+            UsageError(f"{path}: cannot find where its frames begin"),
             f"lidarspec crc {quote(path)} --period BYTES --offset BYTES",
         )
     if found.period:
@@ -219,12 +220,12 @@ def _text(match: Match, length: int) -> str:
         order = ""
     name = f" ({match.name})" if match.name else ""
     if match.doubt >= WEAK:
-        chance = f"one wrong guess in {match.odds} would be"
+        chance = f"1 in {match.odds} by chance"
     else:
-        chance = "which may be chance"
+        chance = "may be chance"
     lines = [
         (
-            f"{match.algorithm.describe()}{name}: right in {match.right} of {match.total} frames;"
+            f"{match.algorithm.describe()}{name}: correct in {match.right} of {match.total} frames;"
             f" {chance}"
         ),
         f"  field: {match.place}{order}",
@@ -260,10 +261,10 @@ def detect(
     """Identify the installed sensor that sends, its port and its baud rate.
 
     SOURCE is a port, a file or a capture; by default every serial port at every baud rate that
-    installed sensors declare, and every UDP port. A sensor matches by the share of the bytes in
-    frames with valid checksum and plausible values. Sensors with the same frames are distinguished
-    by their clocks, names in their frames and baud rates, as far as possible; -v also lists the
-    sensors that were ruled out.
+    installed sensors declare, and every UDP port. Sensors are ranked by the share of the bytes that
+    are in frames with valid checksum and plausible values. Sensors with the same frames are
+    distinguished by their clocks, names in their frames and baud rates, if possible; -v also lists
+    the sensors that were ruled out.
     """
     if source == "-":
         raise suggest(
@@ -389,7 +390,9 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
             [_place(one.heard), f"{name}, not installed", verdict_of, "", "", why]
             for name, why in one.others.items()
         ]
-    return table(["source", "sensor", "is it", "in frames", "data frames", "told by"], rows, output)
+    return table(
+        ["source", "sensor", "match", "in frames", "data frames", "evidence"], rows, output
+    )
 
 
 def _place(heard: Heard) -> str:
@@ -413,18 +416,16 @@ def _conclusions(
             yield f"next: lidarspec {_verb(one)} {_again(one)} {format_sensor_options(one.sensor)}"
         elif one.alike:
             yield (
-                f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, and nothing in"
-                " these tells them apart: choose one"
+                f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, which do not"
+                " identify"
+                " the model: choose one"
             )
             if files := [
                 name
                 for name in one.alike[0].sensor.configure.files
                 if one.alike[0].sensor.recognise is not None
             ]:
-                yield (
-                    "which unit it is, and where its beams point, no packet says: -O"
-                    f" {files[0]}=FILE does"
-                )
+                yield (f"the packets do not contain beam angles: pass -O {files[0]}=FILE")
             options = format_sensor_options(one.alike[0].sensor)
             yield f"next: lidarspec {_verb(one)} {_again(one)} {options}"
         elif one.others:
@@ -455,21 +456,21 @@ def _conclusions(
         if unknown:
             structure_note = ""
         else:
-            structure_note = "; nor can frames of one kind be seen in them"
-        yield f"{size} bytes{kind}, and no frame of an installed sensor{structure_note}"
+            structure_note = "; no repeated structure found"
+        yield f"{size} bytes{kind} without a frame of an installed sensor{structure_note}"
         yield f"next: {_following(source, unknown)}"
         return
     if source is not None and live_address(source) is None:
         yield from [no_bytes(source, ())] * (not any(one.heard.warnings for one in found))
         yield "next: lidarspec sensors"
         return
-    yield from [] if any(one.heard.warnings for one in found) else ["nothing came"]
+    yield from [] if any(one.heard.warnings for one in found) else ["no data received"]
     is_serial = source is None or (
         (address := live_address(source)) is not None and address.scheme == "serial"
     )
     if is_serial and not start and started_first():
         yield (
-            f"{', '.join(sensor.id for sensor in started_first())} send nothing before they are"
+            f"{', '.join(sensor.id for sensor in started_first())} send nothing until they are"
             " started"
         )
         yield f"next: lidarspec detect {source or ''}".rstrip() + " --start"
@@ -566,8 +567,8 @@ def _structure_text(found: Structure) -> str:
         length = f"of {found.length} bytes"
     lines = [
         "unknown frames:",
-        f"  sync      {found.sync.hex(' ') or 'not known'}",
-        f"  length    {length}: {len(found.frames)} of them, {found.share:.0%} of the bytes",
+        f"  sync      {found.sync.hex(' ') or 'unknown'}",
+        f"  length    {length}: {len(found.frames)} frames, {found.share:.0%} of the bytes",
     ]
     for match in found.checksums[:TOLD]:
         if "\n" not in match.paste:
@@ -575,10 +576,10 @@ def _structure_text(found: Structure) -> str:
         else:
             checksum = match.algorithm.describe()
         lines.append(
-            f"  checksum  {checksum} in {match.place}: right in {match.right} of {match.total}"
+            f"  checksum  {checksum} in {match.place}: correct in {match.right} of {match.total}"
         )
     return "\n".join(
-        lines if found.checksums else [*lines, "  checksum  none was found at the usual places"]
+        lines if found.checksums else [*lines, "  checksum  not found at the usual places"]
     )
 
 
@@ -625,7 +626,7 @@ def doctor(
             + (f"\n       next: {one.mend}" if one.mend else "")
             for one in diagnoses
         ]
-        emit("\n".join(lines) or "nothing is wrong with the ports of this computer", output)
+        emit("\n".join(lines) or "no problem found with the ports of this computer", output)
     if sensor is None and not sensors():
         note(no_sensors())
     if any(not finding.ok for finding in diagnoses):

@@ -44,8 +44,7 @@ def parse(
 ) -> None:
     """Print the fields of each frame in some bytes.
 
-    With --slice, which selects by the times of arrival, offsets count from the beginning of the
-    slice.
+    --slice selects by arrival time; offsets then count from the beginning of the slice.
     """
     with open_input(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id)
@@ -65,7 +64,7 @@ def parse(
         else:
             emit_parts(_tables(sensor, frames, output), output)
         if wanted.unframed:
-            note(f"{wanted.unframed} bytes are in no frame; lidarspec explain names them")
+            note(f"{wanted.unframed} bytes outside frames; lidarspec explain shows them")
 
 
 def _fields(sensor: Sensor, piece: InputPiece) -> dict[str, Any]:
@@ -141,7 +140,9 @@ def explain(
     with --slice, which selects by the times of arrival, from the beginning of the slice.
     """
     if at is not None and stretch is not None:
-        raise UsageError("--at is for one byte, and --bytes for several: leave out one of them")
+        raise UsageError(
+            "--at and --bytes cannot be combined: use --at for a byte, --bytes for a range"
+        )
     with open_input(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id, damaged=True)
         if not given.data:
@@ -297,15 +298,15 @@ class FrameSelection:
             Exit: if `bad` is set and there is damage.
         """
         if self._ended and not self._shown and self._end <= self._from:
-            raise UsageError(f"{given.source} has {self._end} bytes: there is no byte {self._from}")
+            raise UsageError(f"{given.source} has {self._end} bytes: no byte {self._from}")
         if not self.valid and (self._ended or not self._bad):
             if self._fault is None and self._frame is not None:
                 if self.others:
-                    others = f", and {self.others} of other types"
+                    others = f", but {self.others} of other types"
                 else:
                     others = ""
                 raise WireError(
-                    f"{given.source} has no {self._frame} frame{others}", sensor=self._sensor.id
+                    f"no {self._frame} frame in {given.source}{others}", sensor=self._sensor.id
                 )
             raise (
                 no_frame(self._sensor, given)
@@ -320,9 +321,9 @@ class FrameSelection:
     def _counts(self) -> Iterator[str]:
         yield f"{self.valid} frame{'s' * (self.valid != 1)}"
         yield f"{self.damaged} damaged"
-        yield f"{self.unframed} byte{'s' * (self.unframed != 1)} in no frame"
+        yield f"{self.unframed} byte{'s' * (self.unframed != 1)} outside frames"
         if self.others:
-            yield f"{self.others} of other types left out"
+            yield f"{self.others} of other types omitted"
 
 
 def _stretch(text: str | None) -> tuple[float, float]:
@@ -335,7 +336,7 @@ def _stretch(text: str | None) -> tuple[float, float]:
         start = 0
         end = 0
     if not colon or not 0 <= start < end:
-        raise UsageError(f"{text!r} is no FROM:TO, such as 940:1034, 0x3ac: or :47")
+        raise UsageError(f"{text!r} is not a byte range FROM:TO, such as 940:1034, 0x3ac: or :47")
     return start, end
 
 
@@ -406,14 +407,14 @@ def _sensor(
     if sensors:
         fits = [sensor.id for sensor in sensors]
         note(
-            f"these bytes fit {fits[0]}"
-            + (f"; so do {', '.join(fits[1:])}: choose with -s" if fits[1:] else "")
+            f"these bytes match {fits[0]}"
+            + (f", and also {', '.join(fits[1:])}: choose with -s" if fits[1:] else "")
         )
         return sensors[0], fits
     fault = nearest_fault(given)
     if not damaged or not fault.sensor:
         raise fault
-    note(f"these bytes fit no sensor; they come nearest to {fault.sensor}")
+    note(f"these bytes match no sensor; the closest is {fault.sensor}")
     return named_sensor(fault.sensor), []
 
 

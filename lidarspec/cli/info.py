@@ -19,8 +19,8 @@ from lidarspec.explaining.file_contents import contents, shown
 def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
     """Describe the contents of files: kind, times, senders, sensor, rates, loss.
 
-    FILE is any readable file: a recording, a capture, a robotics log, raw bytes. Of a long file
-    only the beginning is read, and the time of its end. Several files are printed one after
+    FILE is any readable file: a recording, a capture, a robotics log, raw bytes. If a file is long,
+    only its beginning and the time of its end are read. Several files are printed one after
     another.
     """
     unknown_files = []

@@ -83,7 +83,7 @@ def open_input(
     else:
         try:
             if not (data := parse_hex(text)):
-                raise ValueError("there are no digits")
+                raise ValueError("no digits found")
             reading = _beginning(
                 text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False
             )
@@ -176,12 +176,12 @@ def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
     text = " ".join(words)
     if len(words) == 1 and live_address(text) is not None:
         return suggest(
-            UsageError(f"{text} is live: this takes bytes or a file"),
+            UsageError(f"{text} is a live source: expected bytes or a file"),
             f"lidarspec read {quote(text)} --packets",
         )
     if len(words) == 1 and re.search(r"[/\\.]", text):
         return SourceError(f"{text}: no such file")
-    return UsageError(f"{text[:QUOTED]!r} is no file, and not hexadecimal: {error}")
+    return UsageError(f"{text[:QUOTED]!r} is neither a file nor hexadecimal: {error}")
 
 
 def refuse_overwriting(
@@ -214,13 +214,13 @@ def refuse_overwriting(
             if path == 0:
                 name = "standard input"
             elif path != same:
-                name = f"read as {path}"
+                name = f"the same file as the input {path}"
             else:
-                name = "read"
+                name = "the input"
             raise UsageError(f"{same} is {name}: it would be overwritten")
     if existing and not force:
-        error = UsageError(f"{existing[0]} exists already; it is not overwritten unless asked for")
-        raise suggest(error, "the same with --force, or with another file")
+        error = UsageError(f"{existing[0]} exists already, and is not overwritten without --force")
+        raise suggest(error, "repeat with --force, or with another file")
 
 
 def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
@@ -288,11 +288,11 @@ def nearest_fault(given: Heard) -> WireError:
     best = nearest(given.data)
     if best is None:
         if sensors():
-            text = f"no frame of any of the {len(sensors())} installed sensors"
+            text = f"no frame of the {len(sensors())} installed sensors"
         else:
             text = "no frame of an installed sensor"
         if given.is_text:
-            text = f"{given.source}: this is text, and {text} is in it"
+            text = f"{given.source} is text: {text}"
         error = suggest_installation(WireError(text, data=given.data[:QUOTED]), given)
         return suggest(error, "lidarspec sensors")
     return suggest(best, f"lidarspec explain {quote(given.source)} -s {best.sensor}")
@@ -326,13 +326,13 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     if not device.is_live:
         if stats.bytes_in and (instead := fits_instead(sensor, source)):
             return suggest(
-                WireError(f"{source} {instead[0]}", sensor=sensor.id), f"the same with {instead[1]}"
+                WireError(f"{source} {instead[0]}", sensor=sensor.id), f"repeat with {instead[1]}"
             )
         given = None if stats.frames else again(source)
         if given is not None and (fault := _never_right(given)) is not None:
             return fault
         if given is not None and given.is_text:
-            error = WireError(f"{source} is text, and has no data frame: {stats}", sensor=sensor.id)
+            error = WireError(f"{source} is text without a data frame: {stats}", sensor=sensor.id)
             return suggest(error, f"lidarspec detect {quote(source)}")
         if stats.bytes_in:
             reason = "; ".join([f"{source} has no data frame: {stats}", *device.warnings])
@@ -411,7 +411,7 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
     if own:
         assignments = " and ".join(f"{name}={value}" for name, value in own.items())
         return (
-            f"does not say which data frames it holds: they are found with {assignments}",
+            f"does not contain the sensor's settings; data frames are found with {assignments}",
             format_sensor_options(sensor.configure(**own)),
         )
     others = [score.sensor for score in scores if score.sensor.id != sensor.id]
@@ -419,7 +419,7 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
         return None
     return (
         (
-            "has no data frame of it; its frames are those of"
+            "has no data frame of this sensor, but frames of"
             f" {', '.join(other.id for other in others)}"
         ),
         format_sensor_options(others[0]),

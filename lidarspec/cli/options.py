@@ -54,7 +54,7 @@ def sensor_words(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _add_sensor_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    help_text = "The sensor: an id, an alias, or a file ./mysensor.py."
+    help_text = "Sensor: an id, an alias, or a file ./mysensor.py."
     return click.option("-s", "--sensor", "sensor_id", metavar="ID", help=help_text)(function)
 
 
@@ -64,9 +64,7 @@ def _optional(function: Callable[..., Any]) -> Callable[..., Any]:
         metavar="FILE",
         help="Calibration file of this unit; short for -O calibration=FILE.",
     )(function)
-    help_text = (
-        "An option of the sensor, such as calibration=FILE or answer=FRAME; may be given again."
-    )
+    help_text = "Option of the sensor, such as calibration=FILE or answer=FRAME; repeatable."
     return click.option(
         "-O", "--option", "options", metavar="NAME=VALUE", multiple=True, help=help_text
     )(unit)
@@ -89,12 +87,10 @@ def configure_sensor(
     if not options:
         return sensor_id
     if sensor_id is None:
-        raise UsageError(
-            f"{options[0].partition('=')[0]} is an option of a sensor: name the sensor with -s"
-        )
+        raise UsageError(f"-O {options[0].partition('=')[0]} requires a sensor: name it with -s")
     given = dict(option.partition("=")[::2] for option in options)
     if unset := [option for option in options if "=" not in option]:
-        raise UsageError(f"-O {unset[0]}: an option has a value: NAME=VALUE")
+        raise UsageError(f"-O {unset[0]}: expected NAME=VALUE")
     named: Sensor = sensor(sensor_id)
     configured: Sensor = named.configure(
         **{name: _value(named, name, text) for name, text in given.items()}
@@ -130,7 +126,7 @@ def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
 
 def colour_option(function: Function) -> Function:
     """Add ``--colour`` for pictures, in both spellings."""
-    help_text = "What colours show: range, intensity, or a further column of the points."
+    help_text = "Value that sets the colour: range, intensity, or a further column of the points."
     return click.option(
         "--colour",
         "--color",
@@ -163,7 +159,7 @@ class NumberType(click.ParamType):  # type: ignore[type-arg]  # older versions o
         try:
             return self._parse(value)
         except (ValueError, UsageError):
-            self.fail(f"{value!r} is no {self._form}", param, ctx)
+            self.fail(f"{value!r} is not {self._form}", param, ctx)
 
 
 def _duration(text: str) -> float:
@@ -251,25 +247,27 @@ def _distances(text: str) -> tuple[float, float]:
 
 
 #: Seconds, from "10s", "500ms", "2min", "1h" or a bare number.
-DURATION = NumberType("duration", _duration, "duration above 0, such as 10s, 500ms, 2min or 1h")
+DURATION = NumberType("duration", _duration, "a duration above 0, such as 10s, 500ms, 2min or 1h")
 #: A number from 0 to 1, from "1%" or "0.01".
-SHARE = NumberType("share", _share, "share, such as 1% or 0.01")
+SHARE = NumberType("share", _share, "a share, such as 1% or 0.01")
 #: An offset in bytes, from "940" or "0x3ac".
-OFFSET = NumberType("offset", _offset, "offset of a byte, such as 940 or 0x3ac")
+OFFSET = NumberType("offset", _offset, "the offset of a byte, such as 940 or 0x3ac")
 #: A number of bytes, from "256MB" or "1GB".
-BYTES = NumberType("size", _bytes, "size from 1MB on, such as 256MB or 1GB")
+BYTES = NumberType("size", _bytes, "a size of at least 1MB, such as 256MB or 1GB")
 #: A factor above 0; 0 for "max".
-SPEED = NumberType("speed", _speed, "speed: a factor such as 1, 0.5 or 10, or max")
+SPEED = NumberType("speed", _speed, "a speed, such as 1, 0.5, 10 or max")
 #: A begin and an end, seconds or dates, from "10s:20s", ":1min" or "2026-11-23T05:02:00Z:".
 SLICE = NumberType(
     "slice",
     lambda text: _between(text, _moment),
-    "slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:",
+    "a slice of time, such as 10s:20s, 10s:, :1min or 2026-11-23T05:02:00Z:",
 )
 #: A first and a last index, from "5:10".
-INDICES = NumberType("indices", _indices, "slice of whole numbers, such as 5:10, 5: or :10")
+INDICES = NumberType("indices", _indices, "a slice of whole numbers, such as 5:10, 5: or :10")
 #: A minimum and a maximum range in metres, from "0.5m:30m".
-DISTANCES = NumberType("distances", _distances, "span of distances, such as 0.5m:30m, 50cm: or :30")
+DISTANCES = NumberType(
+    "distances", _distances, "a span of distances, such as 0.5m:30m, 50cm: or :30"
+)
 
 #: Argument of `Selection` -> its option.
 SELECTING: dict[str, Callable[[Any], Any]] = {
@@ -343,5 +341,5 @@ def selecting(*names: str) -> Callable[[Function], Function]:
 
 def points_option(function: Function) -> Function:
     """Add ``--all`` and ``--valid``."""
-    help_text = "Points without a valid return as well, or not.  [default: --valid]"
+    help_text = "All points, or only those with a valid return.  [default: --valid]"
     return click.option("--all/--valid", "every_point", default=False, help=help_text)(function)

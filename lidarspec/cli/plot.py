@@ -82,17 +82,15 @@ def plot(
 
     A scan is drawn to scale from above, and also from the side if the points are not in one plane.
     --kind intensity draws a histogram of the intensities, ranges the number of returns at each
-    range over time, and rates the packets and scans per second, with losses and errors. All but the
-    SVG of a scan needs matplotlib: lidarspec[plot].
+    range over time, and rates the packets and scans per second, with losses and errors. Everything
+    except the SVG of a scan requires matplotlib: lidarspec[plot].
     """
     if output == "-":
         suffix = ".svg"
     else:
         suffix = Path(output).suffix.lower()
     if suffix not in matplotlib_figures.SUFFIXES:
-        raise UsageError(
-            f"{output}: pictures are written as {', '.join(matplotlib_figures.SUFFIXES)}"
-        )
+        raise UsageError(f"{output}: expected a suffix of {', '.join(matplotlib_figures.SUFFIXES)}")
     refuse_overwriting(output, source, sensor_id)
     with open_device(source, sensor_id) as device:
         if kind == "scan":
@@ -140,8 +138,8 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
     if whole_count < number:
         plural = "" if whole_count == 1 else "s"
         note(
-            f"{source} has {whole_count} whole scan{plural}; drawn is the last piece of it that"
-            " could be"
+            f"{source} has {whole_count} whole scan{plural}: drawing the last part that can be"
+            " drawn"
         )
     return chosen
 

@@ -93,7 +93,7 @@ def read(
     Points are printed when their scan is complete, with the columns of a PointCloud and the number
     of the scan, in metres, radians, and seconds since the scan's stamp. Packets are printed with
     their offset in the input, their time, and the values of their fields in units; arrays only with
-    --json. Of the options that select, packets accept --slice and --time.
+    --json. Packets can be selected by --slice and --time only.
     """
     with open_device(source, sensor_id) as device:
         if frame is not None and frame not in device.sensor.frames:
@@ -150,7 +150,7 @@ def _packets(
 ) -> Iterator[tuple[Units, Row]]:
     """Yield each packet with the fields of its header in units; arrays stay arrays."""
     if replace(selection, times=(None, None), time="device") != Selection():
-        raise UsageError("packets are selected by --slice and --time alone")
+        raise UsageError("packets can be selected by --slice and --time only")
     wanted = Slice(selection.times)
     number = 0
     for batch in device.packets(frame, wait=LOOK_S):
@@ -338,7 +338,7 @@ def stats(
 
     One line for each interval, and a summary at the end. Errors are frames with a wrong checksum,
     length or value; loss counts missing packets by the sensor's own counter or clock. A file is
-    read as fast as possible, in batches, and by the time of its packets, so that an interval can be
+    read as fast as possible, in batches; its intervals are measured by packet time and can be
     longer than requested. Several sources are read one after another.
     """
     lasting = min(duration or math.inf, interval * count if count else math.inf)
@@ -356,7 +356,7 @@ def stats(
             )
             worst = max(reading.error_rate, reading.loss_rate or 0.0)
             if max_errors is not None and worst > max_errors:
-                note(f"{worst:.3%} of the frames are wrong or lost, more than {max_errors:.3%}")
+                note(f"{worst:.3%} of the frames are invalid or lost, more than {max_errors:.3%}")
                 has_findings = True
             try:
                 conclude(device)

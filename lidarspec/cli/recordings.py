@@ -56,7 +56,7 @@ from lidarspec.transports.replays import LATE_NS, Replay
     type=DURATION,
     help="Stop after this time, such as 10s; default: at Ctrl-C.",
 )
-@count_option("packets or more: data packets of the sensor, or datagrams")
+@count_option("packets or more: data packets, or datagrams if no sensor is named")
 @click.option("--no-start", is_flag=True, help="Send no commands to the sensor.")
 @click.option("--force", is_flag=True, help="Overwrite FILE.")
 @click.option(
@@ -78,8 +78,8 @@ def record(
 ) -> None:
     """Record a source with arrival times, in one file that survives a crash.
 
-    A sensor that is named, with -s or by the source (sim:ID), is started, and its description is
-    stored in the file. Without a sensor, raw bytes are recorded.
+    With -s ID or a source sim:ID, the sensor is started and its description is stored in the file.
+    Without a sensor, raw bytes are recorded.
     """
     check_suffix(target)
     if times is not None:
@@ -112,7 +112,7 @@ def record(
         interrupted = True
     except UsageError as error:
         if task.recorder is None and os.path.exists(target) and not force:
-            suggest(error, "the same with --force, or with another file")
+            suggest(error, "repeat with --force, or with another file")
         raise
     except SourceError as error:
         if task.recorder is not None and task.recorder.error is error:
@@ -133,14 +133,14 @@ def _slice_error(source: str, target: str, times: str) -> UsageError:
     """Return the error for --slice, with the command that cuts a recording."""
     if is_live(source):
         return suggest(
-            UsageError("--slice cuts recordings; of a live source, -t takes the first seconds"),
+            UsageError("--slice is for recordings; for a live source, use -t"),
             "lidarspec record --help",
         )
     command = (
         f"lidarspec replay {shlex.quote(source)} --to {shlex.quote(target)} --slice"
         f" {shlex.quote(times)}"
     )
-    return suggest(UsageError("record copies a whole file; replay cuts a part out of it"), command)
+    return suggest(UsageError("record copies whole files; replay copies a part"), command)
 
 
 def _print_recording(task: SourceRecording) -> None:
@@ -164,16 +164,14 @@ def _sum_up_recording(
     device = task.device
     if not kept.records:
         if not kept.discard():
-            note(f"{kept.path} is left as it was")
+            note(f"{kept.path} was not changed")
         if device is not None:
             raise nothing_came(device, source, task.elapsed)
         if live_address(source) is not None:
             raise suggest(
                 CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}"
             )
-        raise suggest(
-            WireError(f"{source} holds nothing that was received"), "lidarspec record --help"
-        )
+        raise suggest(WireError(f"{source} contains no received data"), "lidarspec record --help")
     stats = device.stats if device is not None else None
     summary = f"{kept.path}: {_describe_recording(task, kept)}"
     if stats is not None and (damage := _describe_damage(stats)):
@@ -255,14 +253,14 @@ def replay(
     """
     if is_live(file):
         raise suggest(
-            UsageError(f"{file} is live: only what was recorded can be replayed"),
+            UsageError(f"{file} is a live source: only a file can be replayed"),
             f"lidarspec record {shlex.quote(file)} -o recording.lsr",
         )
     is_file = place.endswith(SUFFIXES) and "://" not in place
     if is_file and loop:
-        raise UsageError("a file cannot take a replay that never ends: leave out --loop")
+        raise UsageError("--loop requires a port or socket, not a file")
     if file == "-" and loop:
-        raise UsageError("standard input can be read only once: leave out --loop")
+        raise UsageError("standard input can be read only once: omit --loop")
     if is_file:
         refuse_overwriting(place, file, sensor_id)
     with contextlib.ExitStack() as undo:
@@ -330,7 +328,7 @@ def _make_file(
         return recorder_like(source, file, place, sensor, overwrite=force)
     except UsageError as error:
         if os.path.exists(place) and not force:
-            raise suggest(error, "the same with --force, or with another file") from None
+            raise suggest(error, "repeat with --force, or with another file") from None
         raise
 
 
@@ -339,14 +337,14 @@ def _announce(file: str, place: str, sensor: Sensor | None, *, as_json: bool) ->
     if not as_json:
         say(place)
     if not place.startswith("udp:"):
-        note(f"playing {file} to {place}, as soon as it is opened")
+        note(f"replaying {file} to {place} when a reader opens it")
         note(f"next: lidarspec {_view_words(sensor, place)}")
         return
     source = place
     has_port = ":" in place.removeprefix("udp://")
     if not has_port:
         source = "udp://" if sensor else "udp://:PORT"
-    note(f"playing {file} to {place}")
+    note(f"replaying {file} to {place}")
     note(f"next: lidarspec {_view_words(sensor, source)}")
 
 
@@ -372,18 +370,16 @@ def _print_summary(
 ) -> None:
     note(f"{file} to {place}: {_describe_progress(played)}")
     if not played.is_timed:
-        note(
-            f"{file} does not say when its bytes arrived: they went out as fast as they were taken"
-        )
+        note(f"{file} has no arrival times: its bytes were sent as fast as possible")
     if played.late:
         note(
-            f"{played.late} chunks went out more than {LATE_NS // 1_000_000} ms late, up to"
+            f"{played.late} chunks were sent more than {LATE_NS // 1_000_000} ms late, up to"
             f" {played.latest / 1e6:.0f} ms"
         )
     if len(played.senders) > 1 and not is_file:
         note(
-            f"{len(played.senders)} senders were recorded, and all went out from one address;"
-            f" choose one with '{file}?src=ADDRESS'"
+            f"the datagrams of {len(played.senders)} senders were sent from one address; choose one"
+            f" sender with '{file}?src=ADDRESS'"
         )
     if is_file:
         note(f"next: lidarspec {_view_words(sensor, place)}")

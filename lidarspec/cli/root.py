@@ -39,15 +39,15 @@ GROUPS = {
         "doctor": ("finding", "Diagnose why no data arrives from a sensor, and suggest a fix."),
         "plugins": (
             "sensors",
-            "List the plugins that were found, and errors of those that do not load.",
+            "List the installed plugins, and the errors of those that fail to load.",
         ),
         "trust": (
             "sensors",
-            "Trust a folder: its lidarspec.toml may name Python files, and files elsewhere.",
+            "Trust a folder: its lidarspec.toml may name Python files and files elsewhere.",
         ),
         "demo": (
             "sim",
-            "Simulate a sensor on a port, read it over a bad line, record it and draw it.",
+            "Simulate a sensor on a port, read it over a noisy line, record it and draw it.",
         ),
         "help": ("root", "Print the help of a verb, or the list of all verbs."),
     },
@@ -122,13 +122,13 @@ SPOKEN = (
         -1,
         "-q",
         "--quiet",
-        help="Print no remarks and no progress; errors are still printed.",
+        help="Print errors only, no remarks and no progress.",
     ),
     _make_verbosity_option(
         1,
         "-v",
         "--verbose",
-        help=("Also print time and memory used, and the place in the code of an error."),
+        help="Also print time and memory used, and the code location of an error.",
     ),
 )
 
@@ -173,7 +173,7 @@ class Verbs(click.Group):
         if args[0] not in VERBS and args[0] not in find_added_verbs() and not ctx.resilient_parsing:
             if args[0] in ELSEWHERE:
                 error = click.UsageError(
-                    f"the verb {args[0]!r} comes with a plugin that is not installed", ctx
+                    f"the verb {args[0]!r} is part of a plugin that is not installed", ctx
                 )
                 raise suggest(error, install_command(ELSEWHERE[args[0]], extra=args[0]))
             raise click.UsageError(
@@ -218,7 +218,7 @@ class Verbs(click.Group):
 
 
 def _from(entry: EntryPoint) -> str:
-    return f"Of the plugin {entry.distribution} {entry.version}."
+    return f"From the plugin {entry.distribution} {entry.version}."
 
 
 def _run(group: click.Group, words: list[str]) -> int:

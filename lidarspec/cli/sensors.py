@@ -62,7 +62,7 @@ def guide() -> str:
         f"serial ports: {', '.join(ports) or 'none'}",
     ]
     if named:
-        lines.append(f"devices of {FILE}: {', '.join(named)}")
+        lines.append(f"devices in {FILE}: {', '.join(named)}")
     commands = {
         "demo": "simulate a sensor, and draw it",
         "sensors": "list the installed sensors",
@@ -70,13 +70,13 @@ def guide() -> str:
         f"view {source}": "draw its points",
         f"record {source} -o a.lsr -t 10s": "record it for 10 s",
         "convert a.lsr points.csv": "write the points to a file",
-        "explain a.lsr -n 1": "name every byte of a frame",
-        "doctor": "find out why no data arrives",
+        "explain a.lsr -n 1": "explain every byte of a frame",
+        "doctor": "diagnose why no data arrives",
     }
     width = max(len(command) for command in commands)
     lines.append("")
     lines += [f"  lidarspec {command:<{width}}  {text}" for command, text in commands.items()]
-    lines += ["", "lidarspec help: every verb; lidarspec help VERB: its options"]
+    lines += ["", "lidarspec help lists all verbs, lidarspec help VERB its options"]
     return "\n".join(lines)
 
 
@@ -119,7 +119,7 @@ def sensors(as_json: bool, output: str | None) -> None:
     "--plan",
     "as_plan",
     is_flag=True,
-    help="Show how points are computed, and what uses plain evaluation.",
+    help="Show how points are computed, and which parts use plain evaluation.",
 )
 @output_options
 def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> None:
@@ -153,7 +153,7 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
     units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
     parts += (
         [
-            "  says    "
+            "  reports "
             f"{', '.join(f'{role} ({path}{units[role]})' for role, path in sensor.info.items())}"
         ]
         if sensor.info
@@ -211,7 +211,7 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
     sent = pack_found([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
     if not isinstance(packets.table, Rows) or not packets.table.groups:
-        return ["plain evaluation: an example has no points"]
+        return ["plain evaluation: the example has no points"]
     largest = max(packets.table.groups, key=lambda group: group.layout.size)
     plan = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)
     if isinstance(plan, Plan):
@@ -223,11 +223,10 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
 @output_options
 @click.pass_context
 def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
-    """List the plugins that were found, and errors of those that do not load.
+    """List the installed plugins, and the errors of those that fail to load.
 
-    They are loaded in another process first and, if anything is wrong, each in a process of its
-    own, so that a plugin that hangs or ends the program is named. The exit code is 1 if something
-    is wrong.
+    They are loaded in a separate process. If that fails, each is loaded in its own process, to find
+    the plugin that hangs or ends the program. The exit code is 1 if a plugin fails.
     """
     from lidarspec.plugins import try_plugins
 
@@ -258,14 +257,13 @@ def _describe_plugin(plugin: Plugin) -> str:
 @click.command()
 @click.argument("folder", default=".")
 def trust(folder: str) -> None:
-    """Trust a folder: its lidarspec.toml may name Python files, and files elsewhere.
+    """Trust a folder: its lidarspec.toml may name Python files and files elsewhere.
 
-    Use it only for your own folders with files that you know. It is stored permanently, and holds
-    for this folder alone. LIDARSPEC_TRUST trusts a folder for a single run.
+    Trust only your own folders, with files that you know. The decision is stored, for this folder
+    only. LIDARSPEC_TRUST trusts a folder for a single run.
     """
     say(
-        f"{trusted(folder)}: what its {FILE} names is believed from now on;"
-        f" a line in {user_folder() / TRUSTED} says so"
+        f"{trusted(folder)}: its {FILE} is trusted from now on; stored in {user_folder() / TRUSTED}"
     )
 
 
@@ -322,8 +320,8 @@ def _command_text(sensor: Sensor, name: str) -> str:
     )
     if command["reply"]:
         answer = (
-            f", answered by {command['reply']}"
-            f"{' while it is stopped' if command['only_stopped'] else ''}"
+            f", reply {command['reply']}"
+            f"{' (only while stopped)' if command['only_stopped'] else ''}"
         )
     else:
         answer = ""

@@ -144,7 +144,7 @@ def sim(
     """Simulate a sensor on a serial port, UDP, TCP or in a file.
 
     It behaves as its spec describes: it runs in real time, replies to commands, starts and stops.
-    Its place is printed on standard output, all else on standard error.
+    Its address is printed on standard output, everything else on standard error.
     """
     sensor = named_sensor(sensor_id)
     faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
@@ -153,10 +153,10 @@ def sim(
     place = to or ("udp://" if sensor.datagrams else "pty")
     if place != "pty" and "://" not in place:
         if link is not None:
-            raise UsageError("a link leads to a pseudo-terminal: it goes with --to pty")
+            raise UsageError("--link requires --to pty")
         if Path(place).suffix.lower() not in SUFFIXES:
             raise UsageError(
-                f"{place!r} is no place: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
+                f"--to {place}: expected pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
                 f" ({', '.join(SUFFIXES)})"
             )
         written = write_file(device, place, duration or IN_A_FILE, overwrite=force)
@@ -178,7 +178,7 @@ def sim(
     finally:
         opened.close()
         if opened.unsent_bytes:
-            lost = f"; nobody was there for {size(opened.unsent_bytes)}"
+            lost = f"; {size(opened.unsent_bytes)} had no reader"
         else:
             lost = ""
         note(f"{_sent(device)}{lost}")
@@ -202,7 +202,9 @@ def _tell(
         )
         return
     say(where)
-    control_lines = "".join(f"\n  asked over {name}: {place}" for name, place in controls.items())
+    control_lines = "".join(
+        f"\n  commands over {name}: {place}" for name, place in controls.items()
+    )
     note(f"{sensor.id}, simulated{control_lines}\n  next: {following}")
 
 
@@ -216,7 +218,7 @@ def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Ca
         nonlocal heard, present
         events = device.heard[heard:]
         if device.present != present:
-            events += [f"plugged in again, {opened.place}" if device.present else "unplugged"]
+            events += [f"plugged in again at {opened.place}" if device.present else "unplugged"]
         for event in events:
             progress.note(f"{time.monotonic() - began:.1f} s: {event}")
         heard = len(device.heard)
@@ -243,7 +245,7 @@ def _sent(device: SimulatedDevice) -> str:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: bool) -> None:
-    """Simulate a sensor on a port, read it over a bad line, record it and draw it."""
+    """Simulate a sensor on a port, read it over a noisy line, record it and draw it."""
     simulated = (
         one
         for one in registry().sensors().values()
@@ -279,10 +281,10 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
         harm = "of the bytes damaged"
     lacks_pty = data_link(result.sensor, Serial) and not has_terminals()
     if lacks_pty:
-        where = f"{result.place}, since this system has no pseudo-terminals"
+        where = f"{result.place} (no pseudo-terminals on this system)"
     else:
         where = result.place
-    passed = f"{errors:.1%} {harm}, {result.intact} came through unharmed"
+    passed = f"{errors:.1%} {harm}, {result.intact} arrived undamaged"
     lines = [
         f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
         *(str(reply) for reply in result.replies if reply.confirmed),
@@ -298,12 +300,13 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
         rate = ""
     lines.append(
         f"{len(whole)} whole scan{'s' * (len(whole) != 1)}{rate}, {facts['points']} points; the"
-        f" last one: {whole[-1]}"
+        " last scan:"
+        f" {whole[-1]}"
     )
     if result.digest == result.again:
         same = "the same points"
     else:
-        same = "OTHER points"
+        same = "DIFFERENT points"
     lines.append(
         f"recorded ({size(result.recorded)}) and read again: {same}, SHA-256 {result.again[:16]}..."
     )

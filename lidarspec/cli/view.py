@@ -93,19 +93,19 @@ def view(
     """Draw a live sensor in the terminal, or with --web in the browser.
 
     It is drawn from above, and also from the side if the points are not in one plane. A file is
-    played at its own speed. If standard output is no terminal, one picture is printed.
+    played at its own speed. If standard output is not a terminal, one picture is printed.
 
     Keys: space pauses, r records, c switches colours, + - zoom, arrows move, 0 shows all again, ?
     helps, q quits.
 
-    --rerun needs lidarspec[rerun]; it reads a file as fast as possible, and the viewer plays it.
+    --rerun requires lidarspec[rerun]; it reads a file as fast as possible, and the viewer plays it.
     """
     if once + web + in_rerun > 1:
-        raise UsageError("--once, --web and --rerun are three ways to look at it: choose one")
+        raise UsageError("--once, --web and --rerun cannot be combined")
     if (opens or address is not None or control) and not web:
-        raise UsageError("--open, --address and --control are for the page: add --web")
+        raise UsageError("--open, --address and --control require --web")
     if output is not None and not in_rerun:
-        raise UsageError("-o is for --rerun; a picture is drawn into a file by lidarspec plot")
+        raise UsageError("-o requires --rerun; lidarspec plot writes a picture to a file")
     if web:
         _serve(
             source, sensor_id, duration, selection, opens=opens, address=address, control=control
@@ -176,7 +176,7 @@ def _serve(
         with ended_by_terminate(), server:
             say(server.link)
             if opens and not _open_in_browser(server):
-                note("no browser was found: open the link yourself")
+                note("no browser found: open the link yourself")
             server.run(duration)
             conclude(server.device)
     finally:
@@ -200,7 +200,7 @@ def parse_address(address: str | None) -> tuple[str, int]:
     try:
         origin = Origin.parse(address or "127.0.0.1")
     except UsageError:
-        raise UsageError(f"--address is HOST or HOST:PORT, not {address}") from None
+        raise UsageError(f"--address {address}: expected HOST or HOST:PORT") from None
     return origin.host, origin.port or 0
 
 
@@ -221,9 +221,7 @@ def _in_rerun(
 
     if target and not target.startswith(SCHEMES):
         if not target.lower().endswith(RERUN.suffix):
-            raise UsageError(
-                f"{target}: a recording for Rerun's viewer has the suffix {RERUN.suffix}"
-            )
+            raise UsageError(f"{target}: a recording for Rerun requires the suffix {RERUN.suffix}")
         refuse_overwriting([target], source, sensor_id)
     with open_device(source, sensor_id, period=LOOK_S) as device:
         feed = Feed(device, select=selection)

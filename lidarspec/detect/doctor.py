@@ -69,7 +69,7 @@ def computer() -> Iterator[Diagnosis]:
     if not serial_ports:
         yield Diagnosis(
             True,
-            "there is no serial port: where one should be, its cable or driver is missing",
+            "no serial port found: check the cable and the driver",
             "sudo dmesg | tail",
         )
     for port in serial_ports:
@@ -88,7 +88,7 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
     if not os.path.exists(name):
         yield Diagnosis(False, f"{path}: no such file or port", "lidarspec ports")
     elif not os.access(name, os.R_OK):
-        yield Diagnosis(False, f"{path}: this user may not read it", f"sudo chmod a+r {path}")
+        yield Diagnosis(False, f"{path}: no permission to read it", f"sudo chmod a+r {path}")
     elif os.path.getsize(name) == 0:
         yield Diagnosis(False, f"{path} is empty")
     else:
@@ -108,12 +108,12 @@ def _serial(
     if os.name == "posix" and not os.path.exists(port):
         yield Diagnosis(
             False,
-            f"{port}: no such port; it is not plugged in, or its driver is missing",
+            f"{port}: no such port; check that it is plugged in, and its driver",
             "lidarspec ports",
         )
         return
     problems = [finding for finding in (*_permission(port), *_in_use(port)) if not finding.ok]
-    yield from problems or [Diagnosis(True, f"{port} is there, and may be opened")]
+    yield from problems or [Diagnosis(True, f"{port} exists and can be opened")]
     if not problems:
         yield from _examine_bytes(source, sensor, seconds)
 
@@ -121,13 +121,13 @@ def _serial(
 def _permission(port: str) -> Iterator[Diagnosis]:
     if not ports.is_allowed(port):
         group = ports.group(port)
-        text = f"{port}: this user may not open it"
+        text = f"{port}: no permission to open it"
         by_group = Diagnosis(
             False,
-            f"{text}; the group {group} may, from the next login on",
+            f"{text}; members of the group {group} have it, from their next login",
             f"sudo usermod -aG {group} $USER",
         )
-        yield by_group if group else Diagnosis(False, f"{text}; nobody but root may", _rule(port))
+        yield by_group if group else Diagnosis(False, f"{text}; only root has it", _rule(port))
 
 
 def _rule(port: str) -> str:
@@ -156,7 +156,7 @@ def _udp(
     began = time.monotonic()
     found = list(_examine_bytes(source, sensor, seconds))
     yield from found
-    if any("nothing came" in finding.text for finding in found):
+    if any("no data received" in finding.text for finding in found):
         rates = {
             name: (count - before.get(name, count)) / (time.monotonic() - began)
             for name, count in ports.count_received().items()
@@ -207,18 +207,18 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
     if host:
-        text = f"only packets to {host} are listened to; a sensor may send to another address"
+        text = f"this receives only packets to {host}; the sensor may send to another address"
         yield Diagnosis(True, text, f"lidarspec doctor udp://:{numbers[0]}")
     for name, rate in active.items():
         text = (
-            f"{name} receives {rate:.0f} packets/s, none of them on port {listed}: another port,"
-            " another address, or a firewall"
+            f"{name} receives {rate:.0f} packets/s, but no packet on port {listed}: check the"
+            " sensor's destination port and address, and the firewall"
         )
         yield Diagnosis(False, text, f"sudo tcpdump -ni {name} udp")
         if ports.filters_senders(name):
             text = (
-                f"{name} drops senders whose addresses it does not reach, as a sensor with its"
-                " factory address is (rp_filter)"
+                f"{name} drops packets of senders in other networks, such as a sensor with its"
+                " factory address (rp_filter)"
             )
             yield Diagnosis(
                 False,
@@ -227,8 +227,8 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
             )
     if rates and not active:
         text = (
-            "no network interface receives anything: cable, power of the sensor, or an interface"
-            " that is down"
+            "no network interface receives data: check the cable, the power of the sensor, and"
+            " that the interface is up"
         )
         yield Diagnosis(False, text, "ip -br address")
 
@@ -289,7 +289,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
             at = ""
         return Diagnosis(
             False,
-            f"{heard.size} bytes came, and no frame of an installed sensor{at}",
+            f"{heard.size} bytes received, but no frame of an installed sensor{at}",
             f"lidarspec detect {quoted}",
         )
     if heard.baud is not None:
@@ -299,7 +299,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
     if sensor is not None and sensor.id not in ids:
         return Diagnosis(
             False,
-            f"it sends frames of {ids[0]}{at}, not of {sensor.id}",
+            f"received frames of {ids[0]}{at}, not of {sensor.id}",
             f"lidarspec view {quoted} -s {ids[0]}",
         )
     name = sensor.id if sensor is not None else ids[0]
@@ -309,14 +309,14 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
             command = f"lidarspec view {quoted} -s {other}"
         else:
             command = f"lidarspec detect {quoted}"
-        return Diagnosis(False, f"it sends frames of {other} ({why}){at}, not of {name}", command)
+        return Diagnosis(False, f"received frames of {other} ({why}){at}, not of {name}", command)
     score = next(score for score in found.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)
     if heard.baud is not None and link and heard.baud not in link.bauds:
         again = quote(with_option(source, "baud", heard.baud))
         return Diagnosis(
             False,
-            f"{name} sends{at}, and {link.baud} is declared",
+            f"{name} sends{at}, but {link.baud} is declared",
             f"lidarspec view {again} -s {name}",
         )
     cut_off = (
@@ -325,8 +325,8 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
     if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
         return Diagnosis(
             False,
-            f"{name} sends{at}, and {1 - score.share:.0%} of the bytes are in no frame: cable,"
-            " ground or baud rate",
+            f"{name} sends{at}, but {1 - score.share:.0%} of the bytes are outside frames: check"
+            " cable, ground and baud rate",
         )
     device = "".join(
         f", {role} {text}" for role, text in read_info(score.sensor, score.found).items()
@@ -343,13 +343,13 @@ def _nothing(source: str, sensor: Sensor | None) -> Diagnosis:
     quoted = quote(source)
     if sensor is not None and sensor in started_first():
         start = next(name for name in sensor.on_open if sensor.commands[name].starts)
-        text = f"nothing came; {sensor.id} sends nothing before it is started"
+        text = f"no data received; {sensor.id} sends nothing until it is started"
         return Diagnosis(False, text, f"lidarspec send {quoted} {start} -s {sensor.id}")
     address = live_address(source)
     if sensor is None and address is not None and address.scheme == "serial":
         text = (
-            "nothing came: a sensor that has to be started first, no power, or its transmit line is"
-            " not on our receive line"
+            "no data received: start the sensor, or check its power, and that its transmit line is"
+            " connected to our receive line"
         )
         return Diagnosis(False, text, f"lidarspec detect {quoted} --start")
-    return Diagnosis(False, "nothing came within the time of listening")
+    return Diagnosis(False, "no data received within the listening time")

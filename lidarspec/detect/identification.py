@@ -137,7 +137,7 @@ def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
     )
     if fits or not names:
         return ""
-    return f"{sensor.info['model']} says {names[0]}"
+    return f"{sensor.info['model']} is {names[0]}"
 
 
 def _excluding_relatives(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
@@ -227,7 +227,7 @@ def _match_clock(sensor: Sensor, found: Sequence[Found]) -> str:
         grain = min(float(np.ptp(steps)), expected) / (2 * len(steps) ** 0.5)
     if abs(step - expected) > PACE_TOLERANCE * expected + grain:
         return ""
-    return f"its clock advances by {step / 1e6:.3g} ms a packet"
+    return f"its clock advances by {step / 1e6:.3g} ms per packet"
 
 
 @functools.lru_cache(maxsize=256)
@@ -256,7 +256,7 @@ def _match_name(sensor: Sensor, found: Sequence[Found]) -> str:
     """Return a reason if the frames name the model of this sensor, else ""."""
     return next(
         (
-            f"{sensor.info['model']} says {text}"
+            f"{sensor.info['model']} is {text}"
             for text in _models(sensor, found)
             if _plain(text) == _plain(sensor.model)
         ),
@@ -430,16 +430,17 @@ def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     frames = [item.data for item in found[0].found if item.frame == most]
     ids = " or ".join(score.sensor.id for score in found)
     text = (
-        f"{len(frames)} {most} frames of {ids} by their constants, lengths and rhythm, and their"
-        " checksums are never right"
+        f"{len(frames)} {most} frames match {ids} in constants, lengths and rhythm, but all their"
+        " checksums are wrong"
     )
     match = next(iter(search(frames, quick=True)), None)
     if match is None:
-        return f"{text}; no other checksum was found at the usual places"
+        return f"{text}; no other checksum found at the usual places"
     length = len(frames[0])
     covered = sum(last - first for first, last in match.span.ranges(match.place, length))
     where = (
-        f"{match.algorithm.describe()} in {match.place} is right in {match.right} of {match.total}"
+        f"{match.algorithm.describe()} in {match.place} is correct in {match.right} of"
+        f" {match.total}"
     )
     return (
         f"{text}: {where}, over {covered} of the {length - match.place.size} other bytes"
@@ -604,12 +605,12 @@ def detect(source: str | Path) -> Sensor:
     if len({one.sensor.id for one in fitting if one.sensor}) > 1:
         listed = ", ".join(f"{one.sensor.id} ({one.heard.sender})" for one in fitting if one.sensor)
         raise UsageError(
-            f"{source}: several sensors send, {listed}; choose one with ?src=ADDRESS and -s"
+            f"{source}: several sensors send: {listed}; choose one with ?src=ADDRESS and -s"
         )
     if fitting[0].sensor is None:
         example = format_sensor_options(fitting[0].alike[0].sensor)
         raise UsageError(
-            f"{source}: {', '.join(names(fitting[0]))} send the same frames; name one, as with"
+            f"{source}: {', '.join(names(fitting[0]))} send the same frames; name one, such as"
             f" {example}"
         )
     return fitting[0].sensor
@@ -637,7 +638,7 @@ def others_named(found: Verdict) -> str:
     """Return a message for frames of models that are known but not installed."""
     return (
         " or ".join(f"these are frames of {name} ({why})" for name, why in found.others.items())
-        + ", which no installed plugin reads"
+        + ", which no installed plugin supports"
     )
 
 
@@ -685,9 +686,9 @@ def _no_sensor_error(source: str, found: Sequence[Verdict]) -> Exception:
     if fault := next((one.fault for one in found if one.fault), ""):
         return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {quote(str(source))}")
     if heard.size:
-        kind = "this is text, and " if heard.is_text else ""
+        kind = " in this text" if heard.is_text else ""
         error = WireError(
-            f"{source}: {kind}no installed sensor's frames are in it", data=heard.chunks[0][:SHOWN]
+            f"{source}: no frame of an installed sensor{kind}", data=heard.chunks[0][:SHOWN]
         )
         return suggest_installation(error, heard)
     if live_address(source) is None:
@@ -695,7 +696,7 @@ def _no_sensor_error(source: str, found: Sequence[Verdict]) -> Exception:
     if heard.warnings:
         why = heard.warnings[0]
     else:
-        why = f"{source}: nothing comes; a sensor that has to be started first is named with -s"
+        why = f"{source}: no data received; if the sensor must be started first, name it with -s"
     return suggest(CommandError(why), f"lidarspec doctor {quote(source)}")
 
 

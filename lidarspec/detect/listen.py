@@ -150,7 +150,9 @@ def _strangers(opened: LiveTransport) -> tuple[str, ...]:
     """Return a warning if only other senders sent datagrams."""
     if opened.stranger is None:
         return ()
-    others = f"{opened.foreign} datagrams came from others, such as {endpoint(opened.stranger)}"
+    others = (
+        f"{opened.foreign} datagrams came from other senders, such as {endpoint(opened.stranger)}"
+    )
     return (f"{opened.label}: no data from the requested sender; {others}",)
 
 

@@ -35,8 +35,7 @@ SCREENED = 16
 #: Minimum share of frames with a valid checksum, if it has a constant of its own.
 CERTAIN = 0.95
 ANYWHERE = (
-    "an XOR of a whole frame fits at other places of it as well:"
-    " of those that do, this is where bytes vary most"
+    "an XOR of a whole frame fits at several offsets: this is the one with the most varying bytes"
 )
 #: Heads and groups of words that are tried.
 HEADS = (0, 2, 4, 6, 8, 10, 12)
@@ -232,7 +231,7 @@ def _fitting(
                 proven = right >= CERTAIN * len(samples)
             if proven and doubtful > 0 and not (few.alone and fitted):
                 remarks: tuple[str, ...] = (
-                    ("a constant is in it: fields left out of what it covers, or a start value",)
+                    ("it contains a constant: fields outside the covered bytes, or a start value",)
                     if fitted
                     else ()
                 )

@@ -414,8 +414,8 @@ def _registers(
             1,
             (
                 (
-                    "with frames of one length alone, init and xorout cannot be told apart: other"
-                    " pairs do the same"
+                    "frames of a single length do not determine init and xorout: other pairs"
+                    " give the same results"
                 ),
             ),
         )

@@ -189,7 +189,7 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     found = structure(chunks, datagrams=datagrams)
     if found is None:
         raise WireError(
-            "no frames of one kind can be seen in these bytes", data=b"".join(chunks[:1])[:16]
+            "no repeated frame structure found in these bytes", data=b"".join(chunks[:1])[:16]
         )
     parts = chunks if datagrams else [b"".join(chunks)]
     size = sum(map(len, chunks))
@@ -564,9 +564,9 @@ def _known_fields(draft: Draft) -> list[Field]:
     fields = list(_header(draft))
     if (length := draft.length) is not None:
         sizes = sorted({len(frame) for _, frame in draft.frames})
-        of_one = f"whole frames of {sizes[0]} bytes, and the beginning of another"
+        of_one = f"complete frames of {sizes[0]} bytes, and a part of another"
         why = (
-            f"frames are as long as {length} says: "
+            f"length of the frame, {length}: "
             f"{of_one if len(sizes) == 1 else f'frames of {sizes[0]} to {sizes[-1]} bytes'}"
         )
         fields.append(
@@ -605,7 +605,7 @@ def _header(draft: Draft) -> Iterator[Field]:
     edges = [0, *(cut for cut in _span_cuts(draft) if 0 < cut < end), end]
     for a, b in itertools.pairwise(edges):
         if b > a:
-            why = (f"{len(draft.frames)} frames begin so",) if a == 0 else ()
+            why = (f"{len(draft.frames)} frames begin with it",) if a == 0 else ()
             yield Field(
                 a, b - a, f"header_{a}" if a else "header", f"Const({_bytes(draft.sync[a:b])})", why
             )
@@ -746,11 +746,11 @@ def _counter_name(draft: Draft) -> str:
 
 def _check(draft: Draft, seal: Match, start: int) -> Field:
     if seal.doubt < WEAK:
-        chance = "which may be chance: hold more frames against it"
+        chance = "may be chance: compare with more frames"
     else:
-        chance = f"a wrong one would be so once in {seal.odds}"
+        chance = f"1 in {seal.odds} by chance"
     why = (
-        f"right in {seal.right} of {seal.total} frames, {chance}",
+        f"correct in {seal.right} of {seal.total} frames, {chance}",
         *(one for one in seal.remarks if "constant" not in one),
     )
     size = min(len(frame) for _, frame in draft.frames)
@@ -826,7 +826,7 @@ def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator
     yield (
         f'scan=OnWrap("{angles[0]}"),{_or(angles[1:])}'
         if angles
-        else "scan=Every(0.1),  # seconds: no angle is known that a turn could be told by"
+        else "scan=Every(0.1),  # seconds: no angle found that marks a revolution"
     )
     if counters:
         one = counters[0]
@@ -836,7 +836,7 @@ def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator
             limits = ""
         yield (
             f'sequence=Sequence("{one.name}"{limits}),'
-            f"  # a jump in it is a loss{_or([other.name for other in counters[1:]], '')}"
+            f"  # a jump is a loss{_or([other.name for other in counters[1:]], '')}"
         )
 
 
@@ -924,8 +924,8 @@ class Names:
     def __post_init__(self) -> None:
         if not _ID.fullmatch(self.id):
             raise UsageError(
-                f"{self.id!r} is no id: it is vendor-model in lower case with hyphens,"
-                " such as acme-x1"
+                f"{self.id!r} is not a valid id: expected vendor-model in lower case, such as"
+                " acme-x1"
             )
         vendor, _, model = self.id.partition("-")
         defaults = {
@@ -937,11 +937,11 @@ class Names:
             object.__setattr__(self, name, getattr(self, name) or default)
         if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", self.distribution):
             raise UsageError(
-                f"{self.distribution!r} is no name of a distribution: lower case with hyphens,"
-                " such as lidarspec-acme"
+                f"{self.distribution!r} is not a valid name of a distribution: expected lower case"
+                " with hyphens, such as lidarspec-acme"
             )
         if unfit := re.search(r'["\\\n]', self.vendor + self.model):
-            raise UsageError(f"vendor and model cannot have {unfit[0]!r} in them")
+            raise UsageError(f"vendor and model must not contain {unfit[0]!r}")
 
     @property
     def constant(self) -> str:
@@ -966,7 +966,7 @@ class Names:
 
 def make_example_files(names: Names, link: Link) -> dict[str, str]:
     """Return the files of a distribution with an example sensor: path -> text."""
-    values = {**names.values(), "speed_remark": ", with code 3; else 0" if link == "serial" else ""}
+    values = {**names.values(), "speed_remark": ", if code is 3" if link == "serial" else ""}
     return _files(
         names,
         link,
@@ -985,11 +985,11 @@ def make_draft_files(
         origin: a description of the capture.
         port: the UDP port that the datagrams were sent to; None if unknown.
     """
-    serial = "Serial(115_200)},  # the baud rate: a capture does not tell it"
+    serial = "Serial(115_200)},  # baud rate: a capture does not contain it"
     if port:
-        udp = f"Udp({port})}},  # where the capture's datagrams went"
+        udp = f"Udp({port})}},  # destination of the captured datagrams"
     else:
-        udp = "Udp(2368)},  # the port: this capture does not tell it"
+        udp = "Udp(2368)},  # port: this capture does not contain it"
     values = {
         **names.values(),
         **make_template_values(draft, origin=origin, link=serial if link == "serial" else udp),
@@ -1071,8 +1071,8 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
             vectors = "[]"
     if f'name = "{names.distribution}"\n' not in project or _LISTED not in project:
         raise UsageError(
-            f"{folder / 'pyproject.toml'} is not that of {names.distribution},"
-            " or lists no lidarspec.sensors"
+            f"{folder / 'pyproject.toml'} does not belong to {names.distribution},"
+            " or has no entry points lidarspec.sensors"
         )
     part = names.id.partition("-")[2].replace("-", "_")
     part = part if part.isidentifier() else f"model_{part}"

@@ -34,7 +34,7 @@ CIRCLES = {
     5_760: (1 / 16, "sixteenths of a degree"),
     23_040: (1 / 64, "1/64 of a degree"),
     36_000: (0.01, "hundredths of a degree"),
-    46_080: (1 / 128, "1/128 of a degree, or 1/64 above a bit of its own"),
+    46_080: (1 / 128, "1/128 of a degree, or 1/64 with a flag in the lowest bit"),
     360_000: (0.001, "thousandths of a degree"),
     3_600_000: (0.0001, "1/10 000 of a degree"),
 }
@@ -132,10 +132,10 @@ class Candidate:
         if self.kind == "angle":
             return f"{text}, wraps at {self.circle}: {CIRCLES[self.circle][1]}?"
         if not self.wraps:
-            return f"{text}; not seen to start again"
+            return f"{text}; no wrap found"
         if self.kind == "counter":
-            return f"{text}, from {self.circle - 1} back to {self.first}"
-        return f"{text}, starts again at about {self.circle}"
+            return f"{text}, wraps from {self.circle - 1} to {self.first}"
+        return f"{text}, wraps at about {self.circle}"
 
 
 def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:

@@ -88,10 +88,10 @@ class Span:
         if self.part == "before":
             return f"bytes {self.head} up to the checksum"
         if self.part == "behind":
-            return f"all bytes from {self.head} behind the checksum" + (
-                f" but the last {self.tail}" if self.tail else ""
+            return f"all bytes from {self.head} after the checksum" + (
+                f" except the last {self.tail}" if self.tail else ""
             )
-        return f"all other bytes but the first {self.head}" + (
+        return f"all other bytes except the first {self.head}" + (
             f" and the last {self.tail}" if self.tail else ""
         )
 

@@ -54,8 +54,8 @@ def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
     given = sum(map(is_index, names))
     if given != arrays:
         raise UsageError(
-            f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, and {path!r} has {given}"
-            " indices"
+            f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, but {path!r} has {given}"
+            f" ind{'ex' if given == 1 else 'ices'}"
         )
     return names, _raw(info, value.strip(), path, place)
 
@@ -87,7 +87,7 @@ def _octets(text: str, place: str) -> bytes:
     try:
         return parse_hex(text)
     except ValueError:
-        raise UsageError(f"{place} takes bytes in hexadecimal, not {text!r}") from None
+        raise UsageError(f"{place}: expected bytes in hexadecimal, got {text!r}") from None
 
 
 def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, str]:
@@ -98,16 +98,14 @@ def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, st
     else:
         per_unit = Fraction(1)
     if per_unit is None:
-        raise UsageError(
-            f"{place} is in {unit or 'no unit'}, and {given!r} cannot be turned into that"
-        )
+        raise UsageError(f"{place}: expected {unit or 'no unit'}, cannot convert from {given!r}")
     try:
         if digits[:2].lower() in ("0x", "0b", "0o"):
             number = Fraction(int(digits, 0))
         else:
             number = Fraction(digits)
     except ValueError:
-        raise UsageError(f"{place} takes {wanted}, not {text!r}") from None
+        raise UsageError(f"{place}: expected {wanted}, got {text!r}") from None
     return number * per_unit, given
 
 
@@ -143,7 +141,7 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
         if isinstance(target, list) and target:
             return 0
         raise UsageError(
-            f"{place}: how many elements {path}[*] has is not known: give the count field, or"
+            f"{place}: the number of elements of {path}[*] is not known: give the count field, or"
             f" {path}[0]=..."
         ) from None
 
@@ -158,7 +156,7 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
         UsageError: for an unknown command or argument, or an invalid value.
     """
     if name not in sensor.commands:
-        hint = "" if sensor.commands else "; it takes no commands"
+        hint = "" if sensor.commands else "; it has no commands"
         raise UnknownCommand(name, sensor.commands, place=sensor.id, hint=hint)
     command = sensor.commands[name]
     given: dict[str, Any] = {}

@@ -180,10 +180,7 @@ def describe_damage(
     """
     matching = changes(frame, data)
     if len(matching) > TOLD:
-        yield (
-            f"one {matching[0].kind} would explain it, but in any of {len(matching)} places, so"
-            " that nothing can be said of where"
-        )
+        yield (f"one {matching[0].kind} would explain it, at any of {len(matching)} places")
         return
     before = values(data) if matching else {}
     for change in matching:

@@ -188,13 +188,13 @@ def describe_reply(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, s
     Each field is (path, value, meaning).
     """
     if not reply.confirmed or reply.frame is None:
-        return "sent; no answer is documented, so whether it took is not known", []
+        return "sent; no reply is documented, so the result is unknown", []
     values = explain(reply.data, sensor, reply.frame).fields.values()
     rows = [
         (value.path, value.raw.hex(" ") if isinstance(value.raw, bytes) else str(value), value.docs)
         for value in values
     ]
-    return f"answered with {reply.frame}", rows
+    return f"replied with {reply.frame}", rows
 
 
 def reply_text(sensor: Sensor, reply: Reply) -> str:
@@ -218,9 +218,7 @@ def _add_points(
     """Return the rows with their points, and notes on the frame."""
     frame = sensor.frames[name]
     survey = codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
-    notes = ["not plausible: a decoder passes over this frame"] * bool(
-        survey.status[0] == IMPLAUSIBLE
-    )
+    notes = ["not plausible: decoders skip this frame"] * bool(survey.status[0] == IMPLAUSIBLE)
     if not (frame.data or frame.points):
         return rows, tuple(notes)
     try:
@@ -234,7 +232,7 @@ def _add_points(
         evaluated = evaluate_plainly(packets)
     except LidarSpecError as error:
         return rows, (*notes, f"no points: {error}")
-    notes += ["defaults stand in for what a frame of another type would say"] * bool(
+    notes += ["default values are used in place of those from a frame of another type"] * bool(
         evaluated.cloud.nominal
     )
     points = [Point.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]

@@ -200,11 +200,11 @@ def contents(path: str | Path) -> Contents:
     """
     if str(path) == "-" or is_live(path):
         raise suggest(
-            UsageError(f"{path} is no file"),
+            UsageError(f"{path} is not a file"),
             f"lidarspec detect {quote(str(path))}" if str(path) != "-" else "lidarspec info FILE",
         )
     with contextlib.closing(transport(path)) as opened:
-        kind = KINDS.get(type(opened), "bytes as a sensor sent them")
+        kind = KINDS.get(type(opened), "raw bytes")
         if not os.path.exists(path):
             file = str(path).partition("?")[0]
         else:
@@ -329,7 +329,7 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
             until = ""
         lines.append(("time", f"{format_date(found.first_ns)}{until}"))
     else:
-        lines.append(("time", "it does not say when its bytes arrived"))
+        lines.append(("time", "no arrival times"))
     seconds = found.seen_seconds or 0.0
     if seconds:
         rate = f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s"
@@ -357,8 +357,8 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
         lines.append(
             (
                 "part",
-                "the file is long: what is counted is of its beginning"
-                + ", its end is not known" * (found.last_ns is None),
+                "the file is long: only its beginning is counted"
+                + ", and its end is unknown" * (found.last_ns is None),
             )
         )
     for content in found.contents:
@@ -368,10 +368,10 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
 
 def _describe_content(content: Content) -> Iterator[tuple[str, str]]:
     if not content.sensors:
-        yield "sensor", f"none that is installed sends such bytes ({content.source})"
+        yield "sensor", f"not identified among the installed ones ({content.source})"
         return
     if content.share is None:
-        sure = "as the file says"
+        sure = "named in the file"
     else:
         sure = f"{content.share:.1%} of the bytes are in its frames"
     yield "sensor", f"{' or '.join(content.sensors)}: {sure}"
@@ -388,6 +388,6 @@ def _describe_content(content: Content) -> Iterator[tuple[str, str]]:
             lost = ""
         else:
             lost = f", lost {reading.loss_rate:.3%}"
-        rest = f", bytes in none of them {reading.skipped_rate:.3%}" * (content.share is None)
-        yield "frames", f"wrong {reading.error_rate:.3%}{lost}{rest}"
+        rest = f", bytes outside frames {reading.skipped_rate:.3%}" * (content.share is None)
+        yield "frames", f"invalid {reading.error_rate:.3%}{lost}{rest}"
     yield "next", content.command

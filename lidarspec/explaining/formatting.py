@@ -62,7 +62,7 @@ class Point(NamedTuple):
 
     def __str__(self) -> str:
         if math.isnan(self.azimuth_deg + self.elevation_deg):
-            return "direction not known from this frame alone"
+            return "direction unknown without other frames"
         level = round(self.elevation_deg, 2) == 0
         direction = f"at {format_fixed(self.azimuth_deg, 2)} deg" + (
             "" if level else f", {format_fixed(self.elevation_deg, 2)} deg up"

@@ -107,7 +107,7 @@ class FrameRows:
         elif fault is not None and self._has_form and not left:
             yield Row(self.after, left, "(end)", (), (fault.reason,), right=False)
         elif left:
-            yield Row(self.after, left, "", (), ("after the frame's end",), right=False)
+            yield Row(self.after, left, "", (), ("after the end of the frame",), right=False)
 
     def _row_path(self, path: str) -> str:
         """Return the innermost array element that contains a field, or the field itself."""

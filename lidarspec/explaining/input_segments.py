@@ -177,7 +177,7 @@ def explain_piece(
 
 def _explain_skipped(sensor: Sensor, piece: InputPiece) -> tuple[InputPiece, Explanation]:
     is_filler = not piece.data.translate(None, bytes(sensor.fillers))
-    remark = "filler" if is_filler else "in no frame"
+    remark = "filler" if is_filler else "outside frames"
     return piece, Explanation(
         sensor.id, "", piece.data, (Row(0, piece.data, "", (), (remark,), right=is_filler),)
     )

@@ -199,7 +199,7 @@ def list_differences(differences: list[Difference], sizes: tuple[int, int]) -> I
     differing = (
         f"{bits} bit{'s' * (bits != 1)} in {fields} field{'s' * (fields != 1)} of {length} differ"
     )
-    yield (TextSpan(differing if fields else f"{length}, all alike", "note"),)
+    yield (TextSpan(differing if fields else f"{length}, all identical", "note"),)
 
 
 def _lines(difference: Difference) -> Iterator[Line]:
@@ -243,7 +243,7 @@ def _missing(group: list[Difference], which: str) -> Line:
         names = paths[0]
     else:
         names = f"{paths[0]} to {paths[-1]}"
-    return (TextSpan(f"{'':6}{names}  ", "name"), TextSpan(f"in the {which} frame alone"))
+    return (TextSpan(f"{'':6}{names}  ", "name"), TextSpan(f"only in the {which} frame"))
 
 
 def _format_value(value: FieldValue) -> str:

@@ -91,7 +91,7 @@ def test_the_command_alone_is_a_guide_to_what_is_here(folder: Path) -> None:
     assert len(lines) <= 16
     assert all(len(line) <= 80 for line in lines if not line.startswith("serial ports"))
     assert lines[1].startswith(f"{len(ls.sensors())} sensors of ")
-    assert "devices of lidarspec.toml: front" in lines
+    assert "devices in lidarspec.toml: front" in lines
     commands = guide_commands(lines)
     assert {command.split()[0] for command in commands} <= set(VERBS)
     assert "view front" in commands

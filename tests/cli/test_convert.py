@@ -144,7 +144,9 @@ def test_points_of_a_sensor_that_the_frames_contradict_come_with_a_word(tmp_path
     told = ran(
         "convert", tmp_path / "vlp16.bin", tmp_path / "out.csv", "-s", "velodyne-hdl32e"
     ).stderr
-    assert "the frames are those of velodyne-vlp16 (its clock advances by 1.33 ms a packet)" in told
+    assert (
+        "the frames are those of velodyne-vlp16 (its clock advances by 1.33 ms per packet)" in told
+    )
 
 
 def test_every_verb_that_shows_points_says_where_their_angles_are_nominal(tmp_path: Path) -> None:
@@ -165,11 +167,11 @@ def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_pat
     sensor, log, out = ls.sensor("slamtec-rplidar-a1"), tmp_path / "nodes.bin", tmp_path / "out.csv"
     log.write_bytes(b"".join(simulate(sensor, 900)))
     assert (
-        "name one, as with -s slamtec-rplidar-a1 -O answer=node"
+        "name one, such as -s slamtec-rplidar-a1 -O answer=node"
         in ran("convert", log, out, code=2).stderr
     )
     told = ran("convert", log, out, "-s", "slamtec-rplidar-s2", code=4).stderr
-    assert "they are found with answer=node" in told
+    assert "data frames are found with answer=node" in told
     following = next(line for line in told.splitlines() if "next: " in line).split(
         "next: lidarspec "
     )[1]
@@ -181,8 +183,8 @@ def test_a_log_without_its_descriptor_is_led_to_the_option_that_reads_it(tmp_pat
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["-O", "answer=node"], "name the sensor with -s"),
-        (["-s", "slamtec-rplidar-a1", "-O", "answer"], "an option has a value: NAME=VALUE"),
+        (["-O", "answer=node"], "requires a sensor: name it with -s"),
+        (["-s", "slamtec-rplidar-a1", "-O", "answer"], "expected NAME=VALUE"),
         (["-s", "slamtec-rplidar-a1", "-O", "answr=node"], "answr"),
         (
             ["-s", "slamtec-rplidar-a1", "-O", "mode=7000"],
@@ -293,7 +295,7 @@ def test_files_for_each_scan_are_overwritten_when_it_is_asked_for_alone(tmp_path
     source.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 300)))
     before = source.read_bytes()
     assert (
-        f"{source} is read: it would be overwritten"
+        f"{source} is the input: it would be overwritten"
         in ran("convert", "--force", source, target, "-s", "ldrobot-stl27l", code=2).stderr
     )
     assert source.read_bytes() == before
@@ -370,7 +372,7 @@ def test_files_of_packets_are_of_packets_alone_and_of_files(tmp_path: Path) -> N
     ran("sim", "ldrobot-stl27l", "--to", tmp_path / "drive.lsr", "-t", "100ms")
     out = tmp_path / "out.pcapng"
     assert (
-        "selected by --slice alone"
+        "selected by --slice only"
         in ran("convert", tmp_path / "drive.lsr", out, "--scans", "1:2", code=2).stderr
     )
     assert (
@@ -435,7 +437,7 @@ def test_what_an_imu_felt_is_written_in_place_of_the_points(tmp_path: Path) -> N
     sensor = SHAPES["shape-inertia"]
     bytes_.write_bytes(b"".join(simulate(sensor, 40)))
     told = ran("convert", bytes_, tmp_path / "imu.csv", "-s", plugin, "--imu").stderr
-    assert "120 samples of the IMU of shape-inertia" in told
+    assert "120 IMU samples of shape-inertia" in told
     rows = read(tmp_path / "imu.csv")
     assert next(iter(rows)) == "time_ns"
     np.testing.assert_allclose(rows["linear_acceleration_z"], 9.80665)

@@ -30,7 +30,10 @@ def test_words() -> None:
 
 
 def test_one_frame_with_spaces_is_one_frame() -> None:
-    assert "1 frame was found" in ran("crc", *(f"{byte:02x}" for byte in EXAMPLE), code=1).stderr
+    assert (
+        "no checksum found in 1 frame:"
+        in ran("crc", *(f"{byte:02x}" for byte in EXAMPLE), code=1).stderr
+    )
 
 
 @pytest.mark.slow
@@ -68,7 +71,7 @@ def test_a_checksum_without_a_name_comes_as_a_class() -> None:
 @pytest.mark.slow
 def test_few_frames_are_weak() -> None:
     assert (
-        "this may be chance: give more frames"
+        "the match may be chance: give more frames"
         in ran("crc", *(frame.hex() for frame in FRAMES[:2])).stderr
     )
 
@@ -77,7 +80,7 @@ def test_few_frames_are_weak() -> None:
 def test_none_is_found_and_nothing_is_no_input(tmp_path: Path) -> None:
     source = random.Random(2)
     assert (
-        "no checksum of 9 frames was found"
+        "no checksum found in 9 frames"
         in ran("crc", *(source.randbytes(14).hex() for _ in range(9)), code=1).stderr
     )
     ran("crc", code=2)
@@ -91,4 +94,4 @@ def test_none_is_found_and_nothing_is_no_input(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_many_frames_prove_more_than_a_float_can_hold() -> None:
     frames = simulate(ls.sensor("ldrobot-stl27l"), 250)
-    assert "one wrong guess in 1e+" in ran("crc", *(frame.hex() for frame in frames)).stdout
+    assert "1 in 1e+" in ran("crc", *(frame.hex() for frame in frames)).stdout

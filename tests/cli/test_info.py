@@ -74,7 +74,7 @@ def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) 
     assert told["recorded"]["source"] == "/dev/ttyUSB0"
     assert told["contents"][0]["sensors"] == ["ldrobot-stl27l"]
     text = ran("info", path).stdout
-    assert "as the file says" in text
+    assert "named in the file" in text
     assert "what is counted is of its beginning" in text
 
 
@@ -93,10 +93,10 @@ def test_a_file_without_times_and_one_of_nobody(tmp_path: Path) -> None:
     empty.write_bytes(b"")
     told = printed("info", raw)
     assert (told["kind"], told["first_ns"], told["flows"][0]["sender"]) == (
-        "bytes as a sensor sent them",
+        "raw bytes",
         None,
         None,
     )
-    assert "it does not say when its bytes arrived" in ran("info", raw).stdout
-    assert "none that is installed sends such bytes" in ran("info", noise, code=4).stdout
+    assert "no arrival times" in ran("info", raw).stdout
+    assert "not identified among the installed ones" in ran("info", noise, code=4).stdout
     ran("info", empty, code=4)

@@ -121,7 +121,7 @@ def test_stats_of_a_file(capture: Path) -> None:
 @pytest.mark.parametrize(("limit", "code"), [("1%", 1), ("0.019", 1), ("2.5 %", 0), ("0.5", 0)])
 def test_too_many_errors_are_a_finding(capture: Path, limit: str, code: int) -> None:
     result = ran("stats", capture, *SENSOR, "--max-errors", limit, code=code)
-    assert ("2.000% of the frames are wrong or lost" in result.stderr) == bool(code)
+    assert ("2.000% of the frames are invalid or lost" in result.stderr) == bool(code)
 
 
 @pytest.mark.slow
@@ -204,7 +204,7 @@ def test_plot_writes_a_picture(capture: Path, tmp_path: Path) -> None:
     assert "10.0 Hz, " in "".join(text.text or "" for text in root.findall(".//{*}text"))
     assert ran("plot", capture, *SENSOR, "-o", "-").stdout.startswith("<svg")
     assert (
-        "pictures are written as"
+        "expected a suffix of"
         in ran("plot", capture, *SENSOR, "-o", tmp_path / "scan.gif", code=2).stderr
     )
 

@@ -82,7 +82,7 @@ def test_show_tells_commands_and_their_bytes() -> None:
         "only_stopped": False,
     }
     assert found["frames"]["data"]["size"] == "10 + 3*lsn"
-    assert "command start: aa 55 f0 0f, answered by ack" in ran("show", "cspc-m1c1-mini").stdout
+    assert "command start: aa 55 f0 0f, reply ack" in ran("show", "cspc-m1c1-mini").stdout
 
 
 @pytest.mark.parametrize("sensor", REPRESENTATIVES)
@@ -208,9 +208,7 @@ def test_on_a_terminal_of_80_columns_ids_and_fields_stay_whole() -> None:
 
 
 def test_the_limits_of_a_command_are_printed_with_every_digit() -> None:
-    assert (
-        "command get_config key=0..4294967295, answered" in ran("show", "slamtec-rplidar-a1").stdout
-    )
+    assert "command get_config key=0..4294967295, reply" in ran("show", "slamtec-rplidar-a1").stdout
 
 
 @pytest.mark.parametrize(

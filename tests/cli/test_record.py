@@ -281,7 +281,7 @@ def test_an_old_recording_stays_where_the_source_is_silent(tmp_path: Path) -> No
     target = tmp_path / "it.lsr"
     target.write_bytes(b"precious")
     said = ran("record", source, "-o", target, "--force", "-t", "0.2s", code=5).stderr
-    assert f"{target} is left as it was\n{source} sent nothing" in said
+    assert f"{target} was not changed\n{source} sent nothing" in said
     assert (target.read_bytes(), list(tmp_path.iterdir())) == (b"precious", [target])
 
 
@@ -329,7 +329,7 @@ def test_what_cannot_be_recorded_says_why(stream: Path, datagrams: Path, tmp_pat
     assert not (tmp_path / "it.lsr").exists()
     (tmp_path / "empty.bin").touch()
     assert (
-        "holds nothing"
+        "no received data"
         in ran("record", tmp_path / "empty.bin", "-o", tmp_path / "it.lsr", code=4).stderr
     )
     assert not (tmp_path / "it.lsr").exists()
@@ -378,10 +378,11 @@ def test_replays_say_what_they_cannot_do(stream: Path, datagrams: Path, tmp_path
         "a byte stream was recorded"
         in ran("replay", stream, "--to", "udp://127.0.0.1:9", code=2).stderr
     )
-    assert "is live" in ran("replay", "udp://:2368", code=2).stderr
-    assert "no speed" in ran("replay", stream, "--speed", "0", code=2).stderr
+    assert "is a live source" in ran("replay", "udp://:2368", code=2).stderr
+    assert "not a speed" in ran("replay", stream, "--speed", "0", code=2).stderr
     assert (
-        "never ends" in ran("replay", stream, "--to", tmp_path / "it.lsr", "--loop", code=2).stderr
+        "requires a port or socket"
+        in ran("replay", stream, "--to", tmp_path / "it.lsr", "--loop", code=2).stderr
     )
     raw = tmp_path / "it.bin"
     raw.write_bytes(received(stream))

@@ -129,7 +129,7 @@ def test_the_plug_is_pulled_and_said_to_be(tmp_path: Path) -> None:
         :2
     ] == [
         "unplugged",
-        "plugged in again, udp://127.0.0.1:2998",
+        "plugged in again at udp://127.0.0.1:2998",
     ]
 
 

@@ -117,7 +117,7 @@ def test_captures_of_others_are_nobodys(name: str, monkeypatch: pytest.MonkeyPat
     theirs = {sensor.vendor for sensor in map(ls.sensor, ALIKE[name])}
     rest = {other: sensor for other, sensor in ls.sensors().items() if sensor.vendor not in theirs}
     monkeypatch.setattr("lidarspec.detect.identification.sensors", lambda: rest)
-    with pytest.raises(WireError, match="no installed sensor's frames"):
+    with pytest.raises(WireError, match="no frame of an installed sensor"):
         detect(capture(name))
 
 
@@ -213,7 +213,7 @@ def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None
     assert (found.alike, [*found.others]) == ((), [name])
     (tmp_path / "one.bin").write_bytes(data[0])
     with pytest.raises(
-        WireError, match=f"these are frames of {name} .*, which no installed plugin reads"
+        WireError, match=f"these are frames of {name} .*, which no installed plugin supports"
     ):
         detect(tmp_path / "one.bin")
 
@@ -253,7 +253,7 @@ def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
     found = verdict(Heard("", (named, *data), baud=1_000_000))
     assert (found.sensor and found.sensor.id, found.alike[0].why) == (
         "slamtec-rplidar-s3",
-        "info.model says RPLIDAR S3",
+        "info.model is RPLIDAR S3",
     )
 
 
@@ -309,7 +309,7 @@ def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path:
         in found.fault
     )
     path.write_bytes(data)
-    with pytest.raises(WireError, match="their checksums are never right") as error:
+    with pytest.raises(WireError, match="all their checksums are wrong") as error:
         detect(path)
     assert error.value.__notes__ == [f"next: lidarspec crc {path}"]
     noise = random.Random(2)
@@ -368,7 +368,7 @@ def test_a_sensor_that_has_to_be_started_first() -> None:
         found = verdict(heard)
         assert (found.sensor and found.sensor.id, found.alike[0].why) == (
             "cspc-m1c1-mini",
-            "info.model says M1C1_Mini",
+            "info.model is M1C1_Mini",
         )
         until(lambda: made.device.heard[-1] == "stop")
 
@@ -409,7 +409,7 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
 def test_bytes_at_the_wrong_rate_fit_nobody(tmp_path: Path) -> None:
     source = random.Random(6)
     with port(tmp_path) as made, working(lambda stop: _noise(made, source, stop)) as stop:
-        with pytest.raises(WireError, match="no installed sensor"):
+        with pytest.raises(WireError, match="no frame of an installed sensor"):
             detect(made.name)
         stop.set()
         made.discard()

@@ -45,6 +45,6 @@ def test_a_device_and_doctor_tell_what_was_said_last(tmp_path: Path) -> None:
 
 def test_show_says_where_it_stands_and_in_which_unit() -> None:
     assert (
-        "says    temperature (position.top_board_temperature, degC)"
+        "reports temperature (position.top_board_temperature, degC)"
         in ran("show", "velodyne-vlp16").stdout
     )

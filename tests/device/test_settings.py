@@ -89,10 +89,12 @@ def test_every_verb_takes_a_name(folder: Path, words: tuple[str, ...]) -> None:
 
 def test_a_live_device_by_name_is_live(folder: Path) -> None:
     assert (
-        "rear is live: only what was recorded can be replayed"
-        in ran("replay", "rear", code=2).stderr
+        "rear is a live source: only a file can be replayed" in ran("replay", "rear", code=2).stderr
     )
-    assert "udp://:6699 is live: this takes bytes or a file" in ran("parse", "rear", code=2).stderr
+    assert (
+        "udp://:6699 is a live source: expected bytes or a file"
+        in ran("parse", "rear", code=2).stderr
+    )
 
 
 def test_hexadecimal_digits_are_no_name(folder: Path) -> None:
@@ -139,7 +141,7 @@ def test_a_file_with_a_mistake_takes_away_its_own_devices_alone(folder: Path, te
         assert ls.open("desk").sensor.id == SENSOR
     assert ran("stats", "desk").stderr.count(f"{broken}: not TOML") == 1
     assert ran("stats", "front", code=2).stderr.startswith(f"{broken}: not TOML")
-    assert "devices of lidarspec.toml: desk" in ran().stdout
+    assert "devices in lidarspec.toml: desk" in ran().stdout
 
 
 @pytest.mark.parametrize("whose", ["another's", "everybody's", "everybody's folder"])

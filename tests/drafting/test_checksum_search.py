@@ -148,7 +148,7 @@ def test_what_the_checksum_leaves_out_in_front() -> None:
     assert (match.name, match.span.head, match.span.describe(match.place, 34)) == (
         "CRC-16/MODBUS",
         2,
-        "all other bytes but the first 2",
+        "all other bytes except the first 2",
     )
 
 

@@ -190,7 +190,7 @@ def test_the_evidence_stands_beside_each_field(tmp_path: Path) -> None:
         "# lies between this frame's angle_4 and the next one's: the angle of the last sample?\n"
         in text
     )
-    assert "# right in 256 of 256 frames, a wrong one would be so once in " in text
+    assert "# correct in 256 of 256 frames, 1 in " in text
     assert "algorithm=Crc(width=8, poly=0x4D),\n" in text
     assert 'scan=OnWrap("angle_4"),' in text
     assert len(list(sensor.scans((tmp_path / "some.bin").read_bytes()))) == 3
@@ -395,11 +395,11 @@ def test_noise_has_no_candidates() -> None:
     ids=["noise", "zeros", "a byte"],
 )
 def test_bytes_without_frames_are_refused(tmp_path: Path, data: bytes) -> None:
-    with pytest.raises(WireError, match="no frames of one kind"):
+    with pytest.raises(WireError, match="no repeated frame structure"):
         draft([data], datagrams=False)
     (tmp_path / "some.bin").write_bytes(data)
     assert (
-        "no frames of one kind"
+        "no repeated frame structure"
         in ran(
             "new", "acme-x9", "--into", tmp_path, "--from-capture", tmp_path / "some.bin", code=4
         ).stderr
@@ -466,8 +466,8 @@ def test_the_counter_that_never_jumps_is_taken_and_the_others_are_offered() -> N
 def test_other_checksums_that_fit_and_other_angles_are_offered() -> None:
     text = written(simulate(ls.sensor("ldrobot-ld06"), 300))
     assert (
-        "# or Crc(width=8, poly=0x4D, xorout=0x18) at byte 46 over all other bytes but the first 1"
-        in text["struct"]
+        "# or Crc(width=8, poly=0x4D, xorout=0x18) at byte 46"
+        " over all other bytes except the first 1" in text["struct"]
     )
     assert 'scan=OnWrap("angle_4"),  # or angle_42' in text["arguments"]
 

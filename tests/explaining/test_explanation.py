@@ -234,7 +234,7 @@ def test_a_wrong_constant_is_told() -> None:
 
 def test_what_follows_the_frame_is_told_and_the_frame_still_gives_points() -> None:
     found = explain(EXAMPLE + b"abc", ls.sensor("ldrobot-stl27l"))
-    assert (found.rows[-1].data, found.rows[-1].meaning) == (b"abc", "after the frame's end")
+    assert (found.rows[-1].data, found.rows[-1].meaning) == (b"abc", "after the end of the frame")
     assert sum(len(row.points) for row in found.rows) == 12
 
 
@@ -390,11 +390,11 @@ def test_a_checksum_within_a_frame_is_judged_over_its_own_bytes() -> None:
 
 def test_look_ahead_and_implausible_frames_are_told() -> None:
     ahead = explain(SHAPES["shape-ahead"].example("data"), SHAPES["shape-ahead"])
-    assert any("direction not known from this frame alone" in row.meaning for row in ahead.rows)
+    assert any("direction unknown without other frames" in row.meaning for row in ahead.rows)
     values = ls.sensor("ldrobot-stl27l").parse(EXAMPLE)
     values.start_angle = 36001
     found = explain(ls.sensor("ldrobot-stl27l").build("data", values), ls.sensor("ldrobot-stl27l"))
-    assert found.notes == ("not plausible: a decoder passes over this frame",)
+    assert found.notes == ("not plausible: decoders skip this frame",)
 
 
 def test_bytes_that_begin_like_no_frame_are_refused() -> None:

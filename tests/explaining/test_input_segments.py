@@ -53,7 +53,7 @@ def test_a_flipped_bit_a_lost_and_an_inserted_byte_and_a_truncated_frame_are_tol
     for damaged, size, verdict in (
         (flipped, 47, "flipped bit would explain it"),
         (headless, 47, "one flipped bit would explain it: byte 0 bit 0, header"),
-        (data[:SPOT] + data[SPOT + 1 :], 46, "one lost byte would explain it, but in any of"),
+        (data[:SPOT] + data[SPOT + 1 :], 46, "one lost byte would explain it, at any of"),
         (data[1:], 46, "one lost byte would explain it: 0x54 before byte 0, in header"),
         (data[:SPOT] + b"\x77" + data[SPOT:], 48, "byte 20, 0x77"),
         (data[:11], 11, "frame ends at byte 11 of 47: points[1].intensity needs 1 byte, 0 left"),

@@ -65,7 +65,7 @@ def test_differences_are_told_field_by_field_and_to_the_bit() -> None:
     ]
     assert (
         text(list(list_differences(first.differences(first), (47, 47)))[-1])
-        == "47 bytes, all alike"
+        == "47 bytes, all identical"
     )
 
 
@@ -82,7 +82,7 @@ def test_fields_that_one_frame_alone_has_are_told_together() -> None:
             parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data))
         )
     ]
-    assert "      samples[1].distance to samples[2].exposure  in the second frame alone" in shown
+    assert "      samples[1].distance to samples[2].exposure  only in the second frame" in shown
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def ran(site: Path, *words: str) -> subprocess.CompletedProcess[str]:
 def test_a_verb_is_listed_without_being_loaded_and_runs(site: Path) -> None:
     listed = ran(site, "--help")
     assert "loaded" not in listed.stderr
-    assert "survey  Of the plugin acme-survey 1.2." in listed.stdout
+    assert "survey  From the plugin acme-survey 1.2." in listed.stdout
     done = ran(site, "survey", "hills")
     assert (done.returncode, done.stdout) == (0, "hills\n")
     assert "Says a word." in ran(site, "help", "survey").stdout

@@ -265,7 +265,7 @@ def test_commands_are_services_with_arguments_as_parameters(run: Any, client: Cl
     assert not client.trigger("set_speed").success
     assert client.set("set_speed.speed", 1440) == ""
     sent = client.trigger("set_speed")
-    assert (sent.success, "no answer is documented" in sent.message) == (True, True)
+    assert (sent.success, "no reply is documented" in sent.message) == (True, True)
     assert client.trigger("stop").success
 
 
@@ -275,7 +275,7 @@ def test_a_reply_stands_in_the_message(run: Any, client: Client) -> None:
     assert client.trigger("stop").success
     found = client.trigger("get_health")
     assert found.success
-    assert "answered with health" in found.message
+    assert "replied with health" in found.message
     assert "status" in found.message
 
 

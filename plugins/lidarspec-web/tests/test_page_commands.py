@@ -82,7 +82,7 @@ def test_a_reply_is_told_in_words_while_the_picture_goes_on(tmp_path: Path) -> N
         replied = page.asked("send", command="get_version", arguments={})
         assert (replied["is"], replied["command"]) == ("replied", "get_version")
         assert bytes.fromhex(replied["hex"])
-        assert replied["text"].startswith("answered with ")
+        assert replied["text"].startswith("replied with ")
         assert page.scan()[0]["scan"] > first["scan"]
 
 

@@ -157,7 +157,7 @@ def test_a_tmini_is_told_from_other_makes_and_models_by_what_its_packets_say_of_
         "info", model=150, firmware={"minor": 0, "major": 1}, hardware=2, serial=bytes(16)
     )
     found = verdict(Heard("", (information + heard.chunks[0],)))
-    assert (found.sensor, found.alike[0].why) == (TMINI, "info.model says T-mini Pro")
+    assert (found.sensor, found.alike[0].why) == (TMINI, "info.model is T-mini Pro")
     others = verdict(Heard("", tuple(simulate(ls.sensor("ydlidar-g2"), 60))))
     assert {"cspc-coin-d4", "ydlidar-g2", "ydlidar-s4b"} <= {
         score.sensor.id for score in others.alike
@@ -182,4 +182,4 @@ def test_a_relative_whose_other_frames_differ_contradicts_nothing() -> None:
     assert started[0].frame == "info"
     assert contradiction(coin, started) == ""
     said = contradiction(TMINI, TMINI.split(vector_bytes(FILE, "yd_devinfo_tmini_plus")))
-    assert said == "the frames are those of ydlidar-tmini-plus (info.model says T-mini Plus)"
+    assert said == "the frames are those of ydlidar-tmini-plus (info.model is T-mini Plus)"
