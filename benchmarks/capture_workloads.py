@@ -32,7 +32,7 @@ from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Serial
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 RATE = 6300  # packets per second of an RS-LiDAR-M1
 TOGETHER = 63  # of them in 10 ms
@@ -214,7 +214,7 @@ def hostile(inputs: Inputs) -> Work:
     tasks: dict[str, tuple[ls.Sensor, list[bytes]]] = {}
     length = HOSTILE // QUICKER if inputs.is_quick else HOSTILE
     for sensor in families.values():
-        for name, parts in streams(Subject(sensor), length=length).items():
+        for name, parts in streams(SensorUnderTest(sensor), length=length).items():
             tasks[f"{name} of {sensor.id}"] = sensor, parts
 
     def finding(sensor: ls.Sensor, parts: list[bytes]) -> Callable[[], Any]:

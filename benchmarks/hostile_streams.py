@@ -17,7 +17,7 @@ from collections.abc import Callable
 from lidarspec.errors import SpecError
 from lidarspec.framing.example_frames import random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Examples of each frame type that streams are made of.
 EXAMPLES = 6
@@ -31,7 +31,7 @@ MAX_NOISE_BYTES = 3
 ANNOUNCED_INTERVAL = 40
 
 
-def streams(subject: Subject, length: int) -> dict[str, list[bytes]]:
+def streams(subject: SensorUnderTest, length: int) -> dict[str, list[bytes]]:
     """Return streams of at least `length` bytes by their kind, as pieces: frames and fragments."""
     sensor = subject.sensor
     source = subject.source("hostile 0")
@@ -58,7 +58,7 @@ def _of_length(length: int, make: Callable[[], bytes]) -> list[bytes]:
     return parts
 
 
-def _makers(subject: Subject) -> dict[str, Callable[[random.Random], bytes]]:
+def _makers(subject: SensorUnderTest) -> dict[str, Callable[[random.Random], bytes]]:
     """Return a function for each kind of stream that makes a piece of it."""
     incoming = subject.sensor.incoming
     names = list(incoming)
@@ -131,7 +131,7 @@ def _makers(subject: Subject) -> dict[str, Callable[[random.Random], bytes]]:
     return makers
 
 
-def _of_random_header(subject: Subject, name: str, seed: int) -> bytes:
+def _of_random_header(subject: SensorUnderTest, name: str, seed: int) -> bytes:
     """Return a frame with a random header.
 
     Returns no bytes if the type has one layout, or if no such frame can be generated.

@@ -17,7 +17,7 @@ import lidarspec as ls
 from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
-from lidarspec.simulation.simulator import opening, simulate
+from lidarspec.simulation.simulator import make_opening_frame, simulate
 
 #: sensor, frames of a full run, what it is configured for.
 SENSORS: dict[str, tuple[str, int, dict[str, Any]]] = {
@@ -89,7 +89,7 @@ class Inputs:
 
     def stream(self, key: str) -> bytes:
         """All frames in a row, after what the sensor sends before them."""
-        return opening(self.sensor(key)) + b"".join(self.frames(key))
+        return make_opening_frame(self.sensor(key)) + b"".join(self.frames(key))
 
     def noisy(self, key: str) -> Noisy:
         """The frames with one byte of every fiftieth damaged, and as many runs of noise of a

@@ -23,7 +23,7 @@ from remote_contender import prepare_in
 import lidarspec as ls
 from lidarspec.packets.packets import Packets
 from lidarspec.points.reference_evaluator import evaluate_plainly
-from lidarspec.simulation.simulator import opening
+from lidarspec.simulation.simulator import make_opening_frame
 from lidarspec_ouster import nominal
 
 Others = dict[str, Callable[[], Timed]]
@@ -319,7 +319,7 @@ def m1c1_stream(inputs: Inputs) -> Work:
 
 def rplidar_stream(inputs: Inputs) -> Work:
     some = inputs.frames("rplidar")[: 10 * FEW]
-    first = len(opening(inputs.sensor("rplidar")))
+    first = len(make_opening_frame(inputs.sensor("rplidar")))
     more: Others = {"rplidar": lambda: libraries.rplidar_nodes(some)}
     by_us: Callable[[bytes], Any] = lambda data: handwritten_serial.rplidar_stream(data, first)  # noqa: E731
     return in_stream(

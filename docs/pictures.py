@@ -27,9 +27,9 @@ from screens import svg as drawn
 import lidarspec as ls
 from lidarspec.exports import select_frame
 from lidarspec.exports.diagram import svg as diagram
-from lidarspec.points.appearance import fit, look
+from lidarspec.points.appearance import choose_appearance, fit_to_points
 from lidarspec.simulation.simulator import simulate
-from lidarspec.view.live_scans import Feed
+from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.svg import svg
 from lidarspec.view.terminal_window import FIGURES_PERIOD_S, Window
 
@@ -54,9 +54,9 @@ def terminal(folder: Path) -> str:
     with ls.open(
         simulated("ldrobot-stl27l", folder / "room.pcap", "5s"), "ldrobot-stl27l"
     ) as device:
-        feed = Feed(device)
+        feed = LiveScans(device)
         window = Window(feed, "/dev/ttyUSB0")
-        feed.pump(0.0)
+        feed.read(0.0)
         time.sleep(
             FIGURES_PERIOD_S
         )  # after which the window reads its figures, which are by the packets' own times
@@ -69,7 +69,7 @@ def cloud() -> str:
     scan = next(scan for scan in sensor.scans(simulate(sensor, 600)) if scan.complete)
     return svg(
         scan.points,
-        fit(scan.points, look(scan.points)),
+        fit_to_points(scan.points, choose_appearance(scan.points)),
         f"{sensor.id}: {len(scan):,} points",
         side=520,
         most=9000,

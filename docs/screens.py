@@ -22,8 +22,8 @@ import lidarspec as ls
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
-from lidarspec.view.canvas import BLANK, INKS, Cells
-from lidarspec.view.live_scans import Feed
+from lidarspec.view.canvas import BLANK, INKS, CellGrid
+from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.terminal_window import Window
 
 HERE = Path(__file__).parent / "how-to" / "screens"
@@ -43,19 +43,19 @@ def screen(
     seconds: float,
     ramp: str = "range",
     called: str = "",
-) -> Cells:
+) -> CellGrid:
     """The window of `view` after some seconds."""
     with ls.open(source, sensor) as device:
-        feed = Feed(device, played=True)
+        feed = LiveScans(device, played=True)
         window = Window(feed, called or source, ramp=ramp)
         end = time.monotonic() + seconds
         while time.monotonic() < end and not feed.ended:
-            feed.pump(time.monotonic() + 0.1)
+            feed.read(time.monotonic() + 0.1)
             shown = window.cells(columns, lines)
         return shown
 
 
-def svg(cells: Cells) -> str:
+def svg(cells: CellGrid) -> str:
     """A screen as an SVG document; braille is drawn dot by dot, since few fonts have it as wide as
     letters.
     """
@@ -80,7 +80,7 @@ def svg(cells: Cells) -> str:
     )
 
 
-def _dots(cells: Cells) -> Iterator[str]:
+def _dots(cells: CellGrid) -> Iterator[str]:
     bits = np.where(_braille(cells), cells.codes - BLANK, 0)
     places = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (0, 3), (1, 3))
     for ink in np.unique(cells.inks[bits > 0]).tolist():
@@ -97,11 +97,11 @@ def _dots(cells: Cells) -> Iterator[str]:
         )
 
 
-def _braille(cells: Cells) -> NDArray[np.bool_]:
+def _braille(cells: CellGrid) -> NDArray[np.bool_]:
     return (cells.codes > BLANK) & (cells.codes < BLANK + 256)
 
 
-def _texts(cells: Cells) -> Iterator[str]:
+def _texts(cells: CellGrid) -> Iterator[str]:
     inks = np.where(_braille(cells) | (cells.codes == ord(" ")), -1, cells.inks).tolist()
     for row, line in enumerate(cells.lines()):
         start = 0

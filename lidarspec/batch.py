@@ -50,22 +50,22 @@ from lidarspec.errors import (
     system_errors,
 )
 from lidarspec.formats import format_of, write
-from lidarspec.formats.arrow_tables import tables
+from lidarspec.formats.arrow_tables import iter_tables
 from lidarspec.optional_libraries import import_library
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.remote_files import (
     digest,
-    file_of,
     files_in,
-    found,
+    find_files,
     is_stored,
-    plain,
-    put,
-    stamp,
-    take_away,
+    normalise_path,
+    open_stored,
+    read_stamp,
+    remove,
+    upload,
 )
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
+from lidarspec.scans.selection import EVERYTHING, ScanSelector, Selection
 from lidarspec.sensor_operations import Sensor
 
 #: Bytes of a piece that is written to a file, and of a piece that is a partition in memory.
@@ -167,9 +167,9 @@ class FilePiece:
 
     def iter_numbered(self, scans: FileScans) -> Iterator[Scan]:
         """Yield the selected scans of the piece, with their numbers in the file."""
-        sieve = Sieve(self.select, self.source)
+        sieve = ScanSelector(self.select, self.source)
         for number, scan in enumerate(itertools.islice(scans, self.count), self.first):
-            if (wanted := sieve.take(scan)) is not None:
+            if (wanted := sieve.select(scan)) is not None:
                 yield replace(wanted, number=number)
             if sieve.ended:
                 break
@@ -201,7 +201,7 @@ def convert_piece(piece: FilePiece) -> Record:
     """Write the points of a piece, and return its record for the manifest."""
     counts: Record = {"first_scan": piece.first, "scans": 0, "points": 0}
     try:
-        about = {**stamp(piece.source), "digest": digest(piece.source)}
+        about = {**read_stamp(piece.source), "digest": digest(piece.source)}
         with piece.open_scans() as scans:
             counted = _count_scans(piece, piece.iter_numbered(scans), counts)
             first = next(counted, None)
@@ -236,10 +236,10 @@ def _write(piece: FilePiece, scans: Iterable[Scan]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         local = Path(folder) / piece.output.rpartition("/")[2]
         write(local, scans, every_point=piece.every_point)
-        put(local, piece.output)
+        upload(local, piece.output)
 
 
-def pieces(
+def make_pieces(
     sources: Sequence[str],
     sensor: str | Sensor | None,
     *,
@@ -262,7 +262,7 @@ def pieces(
         name = sensor or ""
         options = {}
     made: dict[str, FilePiece] = {}
-    for source, below in (pair for pattern in sources for pair in found(str(pattern))):
+    for source, below in (pair for pattern in sources for pair in find_files(str(pattern))):
         if to:
             target = f"{folder.rstrip('/')}/{below.rpartition('.')[0] or below}.{to}"
         else:
@@ -333,7 +333,7 @@ class Manifest:
     def _read_lines(self) -> list[str]:
         """Return the lines of an existing manifest, none if there is no manifest."""
         try:
-            with contextlib.closing(file_of(self.path)) as file:
+            with contextlib.closing(open_stored(self.path)) as file:
                 return file.read().decode(errors="replace").splitlines()
         except SourceError:
             return []
@@ -359,7 +359,7 @@ class Manifest:
 
     def has(self, path: str) -> bool:
         """Return whether a file was in the folder at the beginning."""
-        return plain(path) in self._outputs
+        return normalise_path(path) in self._outputs
 
     def done(self, piece: FilePiece) -> Record | None:
         """Return the record of a piece that need not be made again, else None."""
@@ -377,7 +377,7 @@ class Manifest:
 
     def _is_same(self, source: str, record: Record) -> bool:
         """Return whether a file is the one of a record."""
-        now = stamp(source)
+        now = read_stamp(source)
         return bool(
             now["size"] == record["size"]
             and (now["modified"] == record["modified"] or digest(source) == record["digest"])
@@ -399,7 +399,7 @@ class Manifest:
         for number, record in self._records.get((piece.source, piece.target), {}).items():
             output = record.get("output")
             if output and self.has(output) and self.done(replace(piece, number=number)) is None:
-                take_away(output)
+                remove(output)
 
     def add(self, record: Record) -> None:
         """Write the record of a piece."""
@@ -424,10 +424,10 @@ class Manifest:
         with tempfile.TemporaryDirectory() as folder:
             local = Path(folder) / MANIFEST
             local.write_text("".join(f"{line}\n" for line in self._lines), encoding="utf-8")
-            put(local, self.path)
+            upload(local, self.path)
 
 
-class _Here(Executor):
+class _InProcessExecutor(Executor):
     """Runs each task in this process when it is submitted."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -440,7 +440,7 @@ class _Here(Executor):
         return future
 
 
-def _begin() -> None:
+def _exit_with_parent() -> None:
     """Make a worker process end together with its parent, without a traceback."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     parent = multiprocessing.parent_process()
@@ -472,13 +472,13 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
         with client, client.get_executor(pure=False) as executor:
             yield executor
     elif jobs == 1:
-        yield _Here()
+        yield _InProcessExecutor()
     else:
         context = multiprocessing.get_context(
             "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
         )
         context.set_forkserver_preload([__name__])
-        with ProcessPoolExecutor(jobs, context, initializer=_begin) as executor:
+        with ProcessPoolExecutor(jobs, context, initializer=_exit_with_parent) as executor:
             try:
                 yield executor
             except BaseException:
@@ -524,11 +524,11 @@ def convert(
         UsageError: for an unknown format, or if a library is missing.
     """
     format_of(f"x.{to}")
-    todo = pieces(
+    todo = make_pieces(
         sources, sensor, folder=folder, to=to, every_point=every_point, size=size, select=select
     )
     with contextlib.closing(Manifest(folder)) as manifest:
-        _try(to)
+        _check_format(to)
         if taken := [
             piece.target
             for piece in todo
@@ -545,8 +545,8 @@ def convert(
             todo = [piece for piece in todo if not finished[piece.source]]
         for piece in todo:
             manifest.clear(piece)
-        with _swept(folder, to), _executor(jobs, scheduler) as executor:
-            for record, is_old in _run(
+        with _without_partial_files(folder, to), _executor(jobs, scheduler) as executor:
+            for record, is_old in _iter_results(
                 executor, todo, (lambda _: None) if force else manifest.done
             ):
                 if not is_old:
@@ -554,7 +554,7 @@ def convert(
                 yield record, is_old
 
 
-def _run(
+def _iter_results(
     executor: Executor, todo: Iterable[FilePiece], done: Callable[[FilePiece], Record | None]
 ) -> Iterator[tuple[Record, bool]]:
     """Yield the record of each finished piece, and whether it is an old one.
@@ -564,7 +564,7 @@ def _run(
     ended = queue.SimpleQueue[tuple[FilePiece, Future[Any]]]()
     tasks = deque((survey if _is_large(piece) else convert_piece, piece) for piece in todo)
     running = 0
-    ahead = 1 if isinstance(executor, _Here) else AHEAD
+    ahead = 1 if isinstance(executor, _InProcessExecutor) else AHEAD
 
     def hand_over(function: Callable[[FilePiece], Any], piece: FilePiece) -> None:
         executor.submit(function, piece).add_done_callback(
@@ -602,11 +602,11 @@ def _is_large(piece: FilePiece) -> bool:
     if piece.select.is_counted:
         return False
     with contextlib.suppress(LidarSpecError):
-        return bool(stamp(piece.source)["size"] > piece.size)
+        return bool(read_stamp(piece.source)["size"] > piece.size)
     return False
 
 
-def _try(to: str) -> None:
+def _check_format(to: str) -> None:
     """Write an empty file in a format, to check that its library is installed.
 
     This happens before any input is read.
@@ -616,13 +616,13 @@ def _try(to: str) -> None:
 
 
 @contextlib.contextmanager
-def _swept(folder: str, to: str) -> Iterator[None]:
+def _without_partial_files(folder: str, to: str) -> Iterator[None]:
     """Remove partial files of killed processes from a folder, before and after."""
 
     def sweep() -> None:
         for path in () if is_stored(folder) else Path(folder).rglob(f".*.{to}"):
             if re.match(r"\.\d+\.", path.name):
-                take_away(path)
+                remove(path)
 
     sweep()
     try:
@@ -658,19 +658,19 @@ def read(
     dask = import_library("dask", "dask")
     frames = import_library("dask.dataframe", "dask")
     import_library("pyarrow", "arrow")
-    todo = pieces(
+    todo = make_pieces(
         [urls] if isinstance(urls, str) else urls,
         sensor,
         every_point=every_point,
         size=size,
         select=select,
     )
-    found = dask.compute(*(dask.delayed(_cut)(piece) for piece in todo))
+    found = dask.compute(*(dask.delayed(_cut_into_pieces)(piece) for piece in todo))
     cut = [piece for pieces in found for piece in pieces if piece.count != 0 or not piece.number]
     return frames.from_map(_partition, cut, meta=_partition(replace(cut[0], count=1)).iloc[:0])
 
 
-def _cut(piece: FilePiece) -> list[FilePiece]:
+def _cut_into_pieces(piece: FilePiece) -> list[FilePiece]:
     """Return all pieces of a file."""
     if not _is_large(piece):
         return [piece]
@@ -685,7 +685,7 @@ def _cut(piece: FilePiece) -> list[FilePiece]:
 def _partition(piece: FilePiece) -> Any:
     """Return the points of a piece as a pandas dataframe."""
     with piece.open_scans() as scans:
-        made = tables(piece.iter_numbered(scans), every_point=piece.every_point)
+        made = iter_tables(piece.iter_numbered(scans), every_point=piece.every_point)
         table = import_library("pyarrow", "arrow").concat_tables(made)
         if not table.num_rows and piece.is_last and not piece.first:
             raise WireError(f"no scan in {piece.source}: {scans.stats}")

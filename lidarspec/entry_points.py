@@ -29,7 +29,7 @@ PAGE = "lidarspec.page"
 _FOLDERS = (".dist-info", ".egg-info")
 
 
-class _NotOnlyFolders(Exception):
+class _NonFolderPathError(Exception):
     """Something that only importlib.metadata knows how to search."""
 
 
@@ -68,8 +68,8 @@ def entry_points(group: str) -> list[EntryPoint]:
     """
     try:
         found = [entry for folder in _distributions() for entry in _iter_declared(folder, group)]
-    except _NotOnlyFolders:
-        found = _by_metadata(group)
+    except _NonFolderPathError:
+        found = _read_by_metadata(group)
     return sorted(found, key=lambda entry: (entry.name, entry.value))
 
 
@@ -79,30 +79,30 @@ def _distributions() -> Iterator[str]:
         hasattr(finder, "find_distributions") and finder is not PathFinder
         for finder in sys.meta_path
     ):
-        raise _NotOnlyFolders
+        raise _NonFolderPathError
     seen = set()
     for place in sys.path:
         for name in _list_names(place or os.curdir):
             stem, kind = os.path.splitext(name)
             if kind.lower() in _FOLDERS:
-                distribution = normal(stem.partition("-")[0])
+                distribution = normalise_name(stem.partition("-")[0])
                 if distribution not in seen:
                     seen.add(distribution)
                     yield os.path.join(place, name)
 
 
-def normal(distribution: str) -> str:
+def normalise_name(distribution: str) -> str:
     """The name of a distribution, in the one way of the several that people write it in."""
     return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
 def _list_names(place: str) -> list[str]:
     if place.lower().rstrip("/\\").endswith(".egg"):
-        raise _NotOnlyFolders
+        raise _NonFolderPathError
     try:
         return os.listdir(place)
     except NotADirectoryError:
-        raise _NotOnlyFolders from None
+        raise _NonFolderPathError from None
     except OSError:
         return []
 
@@ -141,7 +141,7 @@ def _text(folder: str, name: str) -> str:
         return ""
 
 
-def _by_metadata(group: str) -> list[EntryPoint]:
+def _read_by_metadata(group: str) -> list[EntryPoint]:
     import importlib.metadata
 
     found: dict[str, list[EntryPoint]] = {}
@@ -164,5 +164,5 @@ def _by_metadata(group: str) -> list[EntryPoint]:
             FileNotFoundError
         ):  # so the finder of the library importlib_metadata says that there is no metadata
             continue
-        found.setdefault(normal(name), entries)
+        found.setdefault(normalise_name(name), entries)
     return [entry for entries in found.values() for entry in entries]

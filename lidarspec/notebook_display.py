@@ -14,7 +14,7 @@ from typing import Any
 DRAWING = "lidarspec.view.notebook"
 
 
-def drawn(kind: str) -> Callable[[Any], str | None]:
+def make_display_method(kind: str) -> Callable[[Any], str | None]:
     """Return a method that displays a value with the function of this name.
 
     The method returns None if the value is displayed as text.

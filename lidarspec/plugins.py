@@ -35,7 +35,15 @@ from zlib import crc32
 
 import pluggy
 
-from lidarspec.entry_points import GROUP, PAGE, SENSORS, VERBS, EntryPoint, entry_points, normal
+from lidarspec.entry_points import (
+    GROUP,
+    PAGE,
+    SENSORS,
+    VERBS,
+    EntryPoint,
+    entry_points,
+    normalise_name,
+)
 from lidarspec.errors import (
     LidarSpecError,
     SourceError,
@@ -51,7 +59,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Http, Link, Serial, Tcp, Udp
 from lidarspec.spec.results import Points
 from lidarspec.spec.syntax import prepare, seals
-from lidarspec.trusted_files import document, own_settings
+from lidarspec.trusted_files import own_settings, read_document
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -254,7 +262,7 @@ class Registry:
     def plugins(self) -> list[Plugin]:
         """All installed plugins, with the errors of those that failed or lost a name."""
         self._load_all()
-        offered = [self._together(entries) for entries in self._offered.values()]
+        offered = [self._load_module(entries) for entries in self._offered.values()]
         return [self._judge(plugin) for plugin in (*self._modules, *offered)]
 
     def _judge(self, plugin: Plugin) -> Plugin:
@@ -296,7 +304,7 @@ class Registry:
                 raise SpecError(" ".join(str(error).split()), path=name) from None
             raise
         distribution, _, module = name.partition(":")
-        self._keep((distribution, module), sensors, claimed=True)
+        self._store_sensors((distribution, module), sensors, claimed=True)
         self._ready.clear()
         return [sensor.id for sensor in sensors]
 
@@ -328,10 +336,10 @@ class Registry:
                 sensor=sensor.id,
             )
         aliases = sorted(names.union(sensor.aliases) - {sensor.id})
-        self._keep(home, [replace(sensor, aliases=aliases)])
+        self._store_sensors(home, [replace(sensor, aliases=aliases)])
         return [sensor.id]
 
-    def _together(self, entries: list[EntryPoint]) -> Plugin:
+    def _load_module(self, entries: list[EntryPoint]) -> Plugin:
         """Return the result of loading all sensors of a module."""
         tried = [self._tried[entry] for entry in entries]
         failed = next((plugin for plugin in tried if plugin.error), tried[0])
@@ -347,7 +355,7 @@ class Registry:
             self._check(sensor, sensors)
         return sensors
 
-    def _keep(self, home: Home, sensors: list[Sensor], *, claimed: bool = False) -> None:
+    def _store_sensors(self, home: Home, sensors: list[Sensor], *, claimed: bool = False) -> None:
         for sensor in sensors:
             self._sensors.setdefault(home, {})[sensor.id] = sensor
             for name in (sensor.id, *sensor.aliases):
@@ -357,16 +365,16 @@ class Registry:
         """Return the plugin that owns a name, None if there is no claim or no owner."""
         claims = self._claims.get(name, {})
         homes = [home for home, claimed in claims.items() if claimed] or list(claims)
-        first = {normal(home[0]): home for home in reversed(homes)}
+        first = {normalise_name(home[0]): home for home in reversed(homes)}
         if len(first) < 2:
             return next(iter(first.values()), None)
-        alike = {home: self._alike(home, name) for home in first.values()}
+        alike = {home: self._find_same_names(home, name) for home in first.values()}
         named = self._named_owners()
         wanted = {
-            home: {normal(named[one]) for one in names if one in named}
+            home: {normalise_name(named[one]) for one in names if one in named}
             for home, names in alike.items()
         }
-        chosen = [home for home in alike if normal(home[0]) in wanted[home]]
+        chosen = [home for home in alike if normalise_name(home[0]) in wanted[home]]
         owners = chosen or [
             home for home, names in alike.items() if not wanted[home] and _is_vendor(home[0], names)
         ]
@@ -374,7 +382,7 @@ class Registry:
             return owners[0]
         return None
 
-    def _alike(self, home: Home, name: str) -> set[str]:
+    def _find_same_names(self, home: Home, name: str) -> set[str]:
         """Return all names of a plugin's sensor with this name.
 
         Before it is loaded, these are the names of its entry points.
@@ -452,7 +460,7 @@ class Registry:
     def failures(self) -> list[Plugin]:
         """The plugins loaded so far that failed, or lost a name to another."""
         offered = [
-            self._together([entry for entry in entries if entry in self._tried])
+            self._load_module([entry for entry in entries if entry in self._tried])
             for entries in self._offered.values()
             if any(entry in self._tried for entry in entries)
         ]
@@ -634,7 +642,7 @@ def _summarize_link(link: Link) -> KnownLink:
 
 def _is_vendor(distribution: str, names: Iterable[str]) -> bool:
     """Return whether a distribution is `lidarspec-VENDOR` for the vendor of a name."""
-    prefix, _, vendor = normal(distribution).partition("-")
+    prefix, _, vendor = normalise_name(distribution).partition("-")
     return (
         prefix == NAMESPACE
         and bool(vendor)
@@ -650,7 +658,7 @@ def named_owners() -> dict[str, str]:
     file = own_settings()
     try:
         if file.is_file():
-            named = document(file).get("owners", {})
+            named = read_document(file).get("owners", {})
         else:
             named = {}
         if not isinstance(named, dict) or not all(
@@ -925,7 +933,7 @@ def verb(entry: EntryPoint) -> click.Command:
 
 
 @contextlib.contextmanager
-def standing_in(other: Registry) -> Iterator[Registry]:
+def use_registry(other: Registry) -> Iterator[Registry]:
     """Use `other` as the registry of this environment within the context."""
     registry()
     _registries.append(other)
@@ -1030,14 +1038,14 @@ def _faults_of(file: Path) -> Iterator[None]:
         raise SpecError(f"{type(error).__name__}: {error}", path=str(file)) from error
 
 
-def rebuilt(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
+def rebuild_sensor(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
     """Return an installed sensor with options; used to unpickle one."""
     known = sensor(sensor_id)
     return known.configure(**options) if options else known
 
 
 def _reduce(value: Sensor) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:
-    return rebuilt, (value.id, dict(value.options))
+    return rebuild_sensor, (value.id, dict(value.options))
 
 
 copyreg.pickle(Sensor, _reduce)

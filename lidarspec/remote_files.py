@@ -41,7 +41,7 @@ def is_stored(path: object) -> bool:
     return bool(mark) and scheme in DRIVERS
 
 
-def system_of(url: str) -> Any:
+def find_file_system(url: str) -> Any:
     """Return the file system of fsspec for a URL.
 
     Raises:
@@ -58,7 +58,7 @@ def system_of(url: str) -> Any:
             raise suggest(UsageError(reason), f"pip install {DRIVERS[scheme]}") from error
 
 
-def file_of(path: str) -> BinaryIO:
+def open_stored(path: str) -> BinaryIO:
     """Open a path or URL for reading.
 
     Raises:
@@ -68,7 +68,7 @@ def file_of(path: str) -> BinaryIO:
     if not is_stored(path):
         with system_errors(path):
             return open(path, "rb")
-    system = system_of(path)
+    system = find_file_system(path)
     with _failures(path):
         file = system.open(path, "rb")
         return (
@@ -76,7 +76,7 @@ def file_of(path: str) -> BinaryIO:
         )  # all readers of a BytesIO would share one offset
 
 
-def found(pattern: str) -> list[tuple[str, str]]:
+def find_files(pattern: str) -> list[tuple[str, str]]:
     """Return the files that match a path or URL with *, ? and **.
 
     Returns:
@@ -89,7 +89,7 @@ def found(pattern: str) -> list[tuple[str, str]]:
     while glob.has_magic(fixed):
         fixed = fixed.rpartition("/")[0]
     if is_stored(pattern):
-        system = system_of(pattern)
+        system = find_file_system(pattern)
         with _failures(pattern):
             paths = [system.unstrip_protocol(path) for path in system.glob(pattern)]
     else:
@@ -97,7 +97,7 @@ def found(pattern: str) -> list[tuple[str, str]]:
     if not paths:
         raise SourceError(f"{pattern}: there is no such file")
     names = (
-        plain(path).removeprefix(plain(fixed)).lstrip("/")
+        normalise_path(path).removeprefix(normalise_path(fixed)).lstrip("/")
         if fixed != pattern
         else path.rpartition("/")[2]
         for path in paths
@@ -115,18 +115,18 @@ def files_in(folder: str) -> set[str]:
     """
     if not is_stored(folder):
         return {
-            plain(Path(at, name))
+            normalise_path(Path(at, name))
             for at, folders, files in os.walk(folder)
             for name in (*folders, *files)
         }
-    system = system_of(folder)
+    system = find_file_system(folder)
     with _failures(folder):
         if system.exists(folder):
-            return {plain(system.unstrip_protocol(path)) for path in system.find(folder)}
+            return {normalise_path(system.unstrip_protocol(path)) for path in system.find(folder)}
         return set()
 
 
-def plain(path: object) -> str:
+def normalise_path(path: object) -> str:
     """Return a normalised path or URL for comparison.
 
     memory:///a and memory://a are equal, as are ./a and a.
@@ -136,7 +136,7 @@ def plain(path: object) -> str:
     return Path(str(path)).as_posix().removeprefix("./")
 
 
-def stamp(path: str) -> dict[str, Any]:
+def read_stamp(path: str) -> dict[str, Any]:
     """Return the `size` of a file and the time it was `modified`.
 
     In a store, the time may be the store's tag instead.
@@ -148,7 +148,7 @@ def stamp(path: str) -> dict[str, Any]:
         with system_errors(path):
             status = os.stat(path)
         return {"size": status.st_size, "modified": str(status.st_mtime_ns)}
-    system = system_of(path)
+    system = find_file_system(path)
     with _failures(path):
         info = system.info(path)
     tag = next(
@@ -164,19 +164,19 @@ def stamp(path: str) -> dict[str, Any]:
 
 def digest(path: str) -> str:
     """Return a hash of the beginning and the end of a file."""
-    with contextlib.closing(file_of(path)) as file:
+    with contextlib.closing(open_stored(path)) as file:
         head = file.read(ENDS)
         file.seek(max(file.seek(0, os.SEEK_END) - ENDS, 0))
         return hashlib.blake2b(head + file.read(ENDS), digest_size=16).hexdigest()
 
 
-def put(local: Path, url: str) -> None:
+def upload(local: Path, url: str) -> None:
     """Copy a file or folder to a store; a file appears there as a whole.
 
     Raises:
         SourceError: if that fails.
     """
-    system = system_of(url)
+    system = find_file_system(url)
     with _failures(url):
         if local.is_dir():
             system.put(str(local), url, recursive=True)
@@ -186,14 +186,14 @@ def put(local: Path, url: str) -> None:
             shutil.copyfileobj(file, cast(Any, target), 1 << 22)
 
 
-def take_away(path: str | Path) -> None:
+def remove(path: str | Path) -> None:
     """Remove a file or folder, if there is one.
 
     Raises:
         SourceError: if that fails.
     """
     if is_stored(path):
-        system = system_of(str(path))
+        system = find_file_system(str(path))
         with _failures(str(path)):
             system.rm(str(path), recursive=True)
         return
@@ -221,7 +221,11 @@ def _failure_reason(url: str, error: Exception) -> str:
     Many drivers report only the URL or path of a missing file.
     """
     text = str(error)
-    if plain(text) != plain(url) and text.lstrip("/") != plain(url) and text:
+    if (
+        normalise_path(text) != normalise_path(url)
+        and text.lstrip("/") != normalise_path(url)
+        and text
+    ):
         return text
     if isinstance(error, FileNotFoundError):
         return "no such file"

@@ -12,13 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from lidarspec.notebook_display import drawn
+from lidarspec.notebook_display import make_display_method
 from lidarspec.spec.sensor import SensorDescription
 
 if TYPE_CHECKING:
     from lidarspec.framing.decoder import Decoder
     from lidarspec.framing.results import Found
-    from lidarspec.packets.imu import Waiting
+    from lidarspec.packets.imu import WaitingSamples
     from lidarspec.packets.packets import Packets
     from lidarspec.scans.scan import Scan
     from lidarspec.scans.selection import Selection
@@ -72,7 +72,7 @@ class Sensor(SensorDescription):
         SpecError: for an invalid id or status, or if a part refers to one that does not exist.
     """
 
-    _repr_html_ = drawn("sensor")
+    _repr_html_ = make_display_method("sensor")
 
     def parse(
         self, data: bytes, frame: str | None = None, *, verify: bool = True, units: bool = False
@@ -145,7 +145,7 @@ class Sensor(SensorDescription):
             UsageError: for an unknown back end, or a sensor that has no frames before it is
                 configured.
         """
-        from lidarspec.framing.decoder import Decoder, backend as checked_backend
+        from lidarspec.framing.decoder import Decoder, select_backend as checked_backend
 
         chosen = checked_backend(backend)
         sums = None
@@ -196,7 +196,9 @@ class Sensor(SensorDescription):
         packets, _ = self._decode(data, frame, backend)
         return packets
 
-    def _decode(self, data: Any, frame: str | None, backend: str) -> tuple[Packets, Waiting | None]:
+    def _decode(
+        self, data: Any, frame: str | None, backend: str
+    ) -> tuple[Packets, WaitingSamples | None]:
         """Return the packets of a frame type, and the IMU samples if no type is named."""
         from lidarspec.framing.decoder import frames_of, is_stream
         from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
@@ -230,8 +232,8 @@ class Sensor(SensorDescription):
             UsageError: for a text or a path, an unknown back end, a sensor that has no frames
                 before it is configured, or if no scan is selected.
         """
-        from lidarspec.scans.selection import Sieve
-        from lidarspec.scans.stream import scans_of
+        from lidarspec.scans.selection import ScanSelector
+        from lidarspec.scans.stream import iter_scans
 
         packets, imu = self._decode(data, None, backend)
         if packets.stats.bytes_in and not len(packets):
@@ -240,10 +242,10 @@ class Sensor(SensorDescription):
                 " another sensor?",
                 stacklevel=2,
             )
-        scans = scans_of(self, [packets], imu)
+        scans = iter_scans(self, [packets], imu)
         if select is None:
             return self._warn_after(scans, packets)
-        return self._warn_after(Sieve(select, "the data").of(scans), packets)
+        return self._warn_after(ScanSelector(select, "the data").iter_selected(scans), packets)
 
     def _warn_after(self, scans: Iterator[Any], packets: Packets) -> Iterator[Scan]:
         """Yield the scans, then warn about errors of the plugin and scans without an end."""

@@ -45,7 +45,7 @@ def own_settings() -> Path:
     return user_folder() / FILE
 
 
-def foreign(path: Path) -> str:
+def find_distrust(path: Path) -> str:
     """Return the reason why a file is not the user's own, "" if it is.
 
     An example is "/tmp belongs to user 0". The file and its folder have to belong to the user, and
@@ -110,7 +110,7 @@ def trust(folder: str | Path) -> Path:
     allowed = Path(folder).resolve()
     if not allowed.is_dir() or len(str(allowed).splitlines()) > 1:
         raise UsageError(f"{folder} is no folder")
-    if reason := foreign(allowed / "."):
+    if reason := find_distrust(allowed / "."):
         raise UsageError(f"{reason}; whoever writes there could run programs as you")
     file = user_folder() / TRUSTED
     if not is_trusted(allowed):
@@ -121,7 +121,7 @@ def trust(folder: str | Path) -> Path:
     return allowed
 
 
-def beside(folder: Path, value: object) -> Path:
+def resolve_beside(folder: Path, value: object) -> Path:
     """Return the file that a file in `folder` names: one in it or below it.
 
     Raises:
@@ -136,7 +136,7 @@ def beside(folder: Path, value: object) -> Path:
     return found
 
 
-def document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
+def read_document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
     """Return the content of a TOML or JSON file.
 
     Raises:

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from lidarspec.errors import SourceError
-from lidarspec.remote_files import take_away
+from lidarspec.remote_files import remove
 
 #: seconds without a write after which the file of a process that has ended is removed; another
 #: computer may be writing to it.
@@ -34,7 +34,7 @@ def remove_abandoned(path: Path) -> None:
                 and not is_running(process)
                 and time.time() - left.stat().st_mtime > ABANDONED_AFTER_S
             ):
-                take_away(left)
+                remove(left)
 
 
 @functools.cache  # listed once: a folder can get many thousands of files

@@ -26,6 +26,6 @@ def test_failure_of_a_store_has_a_reason(
             raise failure
 
     url = "http://10.0.0.1/drive.pcap"
-    monkeypatch.setattr(remote_files, "system_of", lambda url: System())
+    monkeypatch.setattr(remote_files, "find_file_system", lambda url: System())
     with pytest.raises(SourceError, match=f"^{re.escape(f'{url}: {reason}')}$"):
-        remote_files.file_of(url)
+        remote_files.open_stored(url)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lidarspec.detect.uninstalled_sensors import signatures
+from lidarspec.detect.uninstalled_sensors import make_signatures
 from lidarspec.plugins import registry, summarize
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,7 +29,7 @@ def table() -> str:
             row = summarize(sensor, homes[name].distribution, homes[name].version)
             rows.append(
                 json.dumps(
-                    row._replace(signatures=signatures(sensor)).to_dict(), ensure_ascii=False
+                    row._replace(signatures=make_signatures(sensor)).to_dict(), ensure_ascii=False
                 )
             )
     return "[\n" + ",\n".join(rows) + "\n]\n"

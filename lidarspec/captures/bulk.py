@@ -2,8 +2,8 @@
 
 Consecutive datagrams of a device differ in their payloads, their times and little else. So
 `CaptureBatches` parses one record as `CaptureReader` does. The result is valid for every record of
-the same length with the same header bytes, apart from the bytes that may vary (see `Pattern` and
-`Headers`). `find_records` returns the offsets of the records in a buffer, and a `RecordKind`
+the same length with the same header bytes, apart from the bytes that may vary (see `RecordLayout`
+and `Headers`). `find_records` returns the offsets of the records in a buffer, and a `RecordKind`
 selects all records of its kind at once. All other records are read one by one, so that datagrams,
 their order and the statistics are those of `CaptureReader` for any file.
 """
@@ -22,11 +22,11 @@ from lidarspec.captures.records import (
     LARGEST_BLOCK,
     DamagedRecordError,
     Form,
-    Passed,
-    Times,
-    records,
+    NoPacketReason,
+    TimeEncoding,
+    make_record_reader,
 )
-from lidarspec.captures.source import Source, Truncated
+from lidarspec.captures.source import BufferedInput, TruncatedError
 from lidarspec.frames.layout import rows_at
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
@@ -65,7 +65,7 @@ class RecordKind:
     start: int
     size: int
     source: Sender
-    times: Times
+    times: TimeEncoding
     value: NDArray[np.uint64]
     mask: NDArray[np.uint64]
     trailer: str | None
@@ -126,7 +126,7 @@ def make_record_kind(record: bytes, datagram: Datagram, form: Form) -> RecordKin
         form: the reader of its file.
     """
     headers = datagram.headers
-    pattern = form.pattern(record)
+    pattern = form.find_layout(record)
     if headers is None or pattern is None:
         return None
     head = pattern.head
@@ -171,7 +171,7 @@ def find_records(
     view = storage.data
     if stop - at < _HEAD:
         return np.array([at], np.intp), False
-    while stop - at >= _HEAD and (length := form.length(view, at)) and at + length <= stop:
+    while stop - at >= _HEAD and (length := form.find_length(view, at)) and at + length <= stop:
         if length == before and not singles_left and stop - at >= _RUN * length:
             run = _count_equal_lengths(storage, at, (stop - at) // length, length, form)
             pieces += [np.array(single, np.intp), np.arange(at, at + run * length, length)]
@@ -190,7 +190,7 @@ def _count_equal_lengths(
     storage: NDArray[np.uint8], at: int, count: int, length: int, form: Form
 ) -> int:
     """Return the number of consecutive records of one length, at most `count`."""
-    place, kind, claim = form.claim(length)
+    place, kind, claim = form.length_field(length)
     claims: NDArray[Any] = np.ndarray((count,), kind, storage, at + place, (length,))
     others = claims != claim
     if others.any():
@@ -308,22 +308,22 @@ class CaptureBatches(CaptureReader):
         """Yield the datagrams of the file, one batch for each buffer that was read."""
         known: list[RecordKind] = []
         with self._count_end():
-            form = self._form = self._form or records(self._source)
+            form = self._form = self._form or make_record_reader(self._source)
             while self._source.begin_record():
                 starts, stuck = find_records(
                     self._source.storage, self._source.at, self._source.stop, form
                 )
-                if len(starts) < 2 and not stuck and self._source.more():
+                if len(starts) < 2 and not stuck and self._source.read_more():
                     continue
                 if len(starts) <= 1:
                     starts = np.array([self._source.at])
                 found = _RecordBlock(self, self._source, form, starts, known)
                 ended = found.read()
-                place = self._source.place
+                place = self._source.offset
                 if len(batch := found.batch()):
                     self.stats.datagrams += len(batch)
                     yield batch
-                if self._source.place != place:
+                if self._source.offset != place:
                     continue  # the consumer of the batch called `skip`
                 if isinstance(ended, DamagedRecordError):
                     self._skip_damage(form)
@@ -342,7 +342,7 @@ class _RecordBlock:
     def __init__(
         self,
         reader: CaptureReader,
-        source: Source,
+        source: BufferedInput,
         form: Form,
         starts: Indices,
         known: list[RecordKind],
@@ -367,7 +367,7 @@ class _RecordBlock:
         self._section = form.sections
         self._storage = source.storage
         # Taken now: the source may switch to another buffer when it reads ahead.
-        self._buffer = source.lent()
+        self._buffer = source.view()
 
     def read(self) -> Exception | None:
         """Read the records; return the exception if one of them cannot be read."""
@@ -378,7 +378,7 @@ class _RecordBlock:
                 self._source.at = int(self._starts[index])
                 try:
                     self._read_single(index)
-                except (DamagedRecordError, Truncated) as ended:
+                except (DamagedRecordError, TruncatedError) as ended:
                     self._kinds = self._kinds[:index]
                     return ended
                 if self._form.sections != self._section:
@@ -477,7 +477,7 @@ class _RecordBlock:
         self._source.begin_record()
         packet = self._form.read()
         datagram = self._reader.to_datagram(packet)
-        if datagram is None or isinstance(packet, Passed):
+        if datagram is None or isinstance(packet, NoPacketReason):
             return
         self._singles[index] = datagram
         if self._kinds_added == MOST_KNOWN or not self._are_whole:

@@ -2,8 +2,8 @@
 
 Files without raw sensor data are refused with a message that names their kind.
 
-Nothing is decompressed as a whole: `Unpacking` is a file that decompresses as it is read. If the
-compressed bytes are truncated or damaged, it ends there, and `damage` has the reason. All data
+Nothing is decompressed as a whole: `UnpackedFile` is a file that decompresses as it is read. If the
+compressed bytes are truncated or damaged, it ends there, and `find_damage` has the reason. All data
 before the damage is read, except for at most `STEP` bytes, or a block of bzip2. The table of a zip
 archive is at its end, so archives can be read from files but not from pipes.
 """
@@ -24,7 +24,7 @@ from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownName, UsageError, suggest, system_errors
 from lidarspec.optional_libraries import import_library
 from lidarspec.recording.format import MAGIC
-from lidarspec.remote_files import file_of
+from lidarspec.remote_files import open_stored
 
 #: bytes at the start that determine the kind of a file.
 HEAD = 512
@@ -110,7 +110,7 @@ class Damage(NamedTuple):
     unread: int
 
 
-class Unpacking(io.RawIOBase):
+class UnpackedFile(io.RawIOBase):
     """The content of a compressed file, decompressed as it is read; never seekable.
 
     Args:
@@ -175,10 +175,10 @@ class Unpacking(io.RawIOBase):
         return f": the {self._count} bytes that could be unpacked were read"
 
 
-def damage(file: BinaryIO) -> Damage | None:
+def find_damage(file: BinaryIO) -> Damage | None:
     """Return the reason why a decompressed file ended early, None if it did not."""
     raw = getattr(file, "raw", None)
-    if isinstance(raw, Unpacking):
+    if isinstance(raw, UnpackedFile):
         return raw.damage
     return None
 
@@ -190,7 +190,7 @@ def open_capture(path: str | os.PathLike[str], member: str = "") -> BinaryIO:
         SourceError, UsageError: as `unpack`, and if it cannot be opened.
     """
     with system_errors(os.fspath(path)), ExitStack() as undo:
-        file = undo.enter_context(closing(file_of(os.fspath(path))))
+        file = undo.enter_context(closing(open_stored(os.fspath(path))))
         content = unpack(os.fspath(path), file, member)
         undo.pop_all()
     return content
@@ -210,7 +210,7 @@ def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
         UsageError: for an archive with several captures, or if a library is missing.
     """
     for _ in range(DEEPEST):
-        packing = _packing(head(file))
+        packing = _packing(peek_head(file))
         if packing is None:
             break
         if packing is ZIP:
@@ -218,7 +218,7 @@ def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
             member = ""
         else:
             content = import_library(packing.module, "zstd").open(file)
-        file = cast(BinaryIO, io.BufferedReader(Unpacking(name, file, content), FILLED))
+        file = cast(BinaryIO, io.BufferedReader(UnpackedFile(name, file, content), FILLED))
     if member:
         raise UsageError(f"{name} is no zip archive: there is no {member} in it")
     return file
@@ -312,7 +312,7 @@ def refuse_container(path: str, start: bytes) -> None:
             )
 
 
-def head(file: BinaryIO) -> bytes:
+def peek_head(file: BinaryIO) -> bytes:
     """Return the first bytes of a file or pipe, without consuming them."""
     if isinstance(file, io.BufferedReader):
         return file.peek(HEAD)[:HEAD]

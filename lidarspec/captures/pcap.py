@@ -1,7 +1,7 @@
 """Read the UDP datagrams of a pcap or pcapng file, and make the records of new files.
 
-`records` iterates over the records of the file and `ip` parses the captured frames. This module
-joins the two and counts every packet that gives no datagram in `CaptureStats`. Captures are
+`make_record_reader` iterates over the records of the file and `ip` parses the captured frames. This
+module joins the two and counts every packet that gives no datagram in `CaptureStats`. Captures are
 untrusted input: after the first four bytes no content raises, and memory use follows the bytes
 that are present, not the lengths that they claim.
 """
@@ -33,16 +33,16 @@ from lidarspec.captures.records import (
     CapturedPacket,
     DamagedRecordError,
     Form,
-    Passed,
+    NoPacketReason,
     is_capture,
+    make_record_reader,
     packet_record,
-    records,
-    resume,
     seek_time,
+    skip_damage,
 )
-from lidarspec.captures.source import SMALLEST, Source, Truncated
+from lidarspec.captures.source import SMALLEST, BufferedInput, TruncatedError
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.transports.protocol import Closing
+from lidarspec.transports.protocol import ClosingContext
 
 #: Link types for private use. Captures of byte streams are written with the first one.
 USER_LINKS = range(147, 163)
@@ -128,7 +128,7 @@ def _count_name(counts: Counter[str], name: str) -> None:
     counts[name] += 1
 
 
-class CaptureReader(Closing):
+class CaptureReader(ClosingContext):
     """The UDP datagrams of a capture in file order, each of them once.
 
     A second iterator continues where the first one stopped.
@@ -154,7 +154,7 @@ class CaptureReader(Closing):
         if isinstance(file, str | os.PathLike):
             self._owned = open_capture(file)
             file = self._owned
-        self._source = Source(file, largest=self.largest)
+        self._source = BufferedInput(file, largest=self.largest)
         self._fragments = Reassembly()
         self._form: Form | None = None
         self._datagrams: Iterator[Datagram] | None = None
@@ -173,9 +173,9 @@ class CaptureReader(Closing):
             raise
 
     @property
-    def place(self) -> int:
+    def offset(self) -> int:
         """The file offset of the next record."""
-        return self._source.place
+        return self._source.offset
 
     def __iter__(self) -> Iterator[Datagram]:
         # Not in __init__: the generator refers to the reader, and such a cycle keeps an unused
@@ -204,7 +204,7 @@ class CaptureReader(Closing):
 
     def _iter_datagrams(self) -> Iterator[Datagram]:
         with self._count_end():
-            form = records(self._source)
+            form = make_record_reader(self._source)
             self._form = form
             while self._source.begin_record():
                 try:
@@ -219,10 +219,10 @@ class CaptureReader(Closing):
     def _skip_damage(self, form: Form) -> None:
         """Continue at the next readable record or at the end, and count the lost bytes."""
         damage_start = self._source.record
-        has_more = resume(self._source, form)
+        has_more = skip_damage(self._source, form)
         self.stats.malformed += 1
         self.stats.damaged += 1
-        self.stats.lost += self._source.place - damage_start
+        self.stats.lost += self._source.offset - damage_start
         self.stats.stopped_at = None if has_more else damage_start
 
     @contextmanager
@@ -230,7 +230,7 @@ class CaptureReader(Closing):
         """Close the file after the records were read, and count how it ended."""
         try:
             yield
-        except Truncated:
+        except TruncatedError:
             self.stats.truncated_tail = True
             self.stats.stopped_at = self._source.record
         finally:
@@ -238,10 +238,10 @@ class CaptureReader(Closing):
         self._fragments.finish()
         self.stats.incomplete_fragments = self._fragments.dropped
 
-    def to_datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
+    def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
         """Return the datagram that this packet contains or completes, and count the packet."""
-        if isinstance(packet, Passed):
-            if packet is Passed.MALFORMED:
+        if isinstance(packet, NoPacketReason):
+            if packet is NoPacketReason.MALFORMED:
                 self.stats.malformed += 1
             return None
         self.stats.packets += 1
@@ -284,9 +284,9 @@ class StreamReader(CaptureReader):
     Their sender and receiver are `UNKNOWN_ENDPOINT`.
     """
 
-    def to_datagram(self, packet: CapturedPacket | Passed) -> Datagram | None:
+    def to_datagram(self, packet: CapturedPacket | NoPacketReason) -> Datagram | None:
         """Return the content of the packet; count a packet of another link type."""
-        if isinstance(packet, Passed):
+        if isinstance(packet, NoPacketReason):
             return None
         self.stats.packets += 1
         if packet.link not in USER_LINKS:

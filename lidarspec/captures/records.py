@@ -1,14 +1,14 @@
 """Read and write the records of pcap and pcapng files.
 
 `PcapRecords` and `PcapngBlocks` read one record at a time. They also describe a record as a
-`Pattern`, from which `bulk` recognizes similar records without reading each. `seek_time` searches a
-file by capture time.
+`RecordLayout`, from which `bulk` recognizes similar records without reading each. `seek_time`
+searches a file by capture time.
 
 Hostile input: `source` reads in bounded steps, and each iteration of a loop either advances or ends
 the reading.
 
 Damaged input: an implausible length is accepted unless other records begin within the range that it
-covers. After a record that cannot be read, `resume` continues at the next offset at which one
+covers. After a record that cannot be read, `skip_damage` continues at the next offset at which one
 record follows another.
 
 Source: the IETF drafts "PCAP Capture File Format" (draft-ietf-opsawg-pcap) and "PCAP Now Generic
@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.captures.source import Source, Truncated
+from lidarspec.captures.source import BufferedInput, TruncatedError
 from lidarspec.errors import UsageError
 
 LARGEST_PACKET = 1 << 18  # the limit of libpcap and Wireshark for the supported link types
@@ -71,8 +71,8 @@ _DAY = 86_400
 _YEAR = 31_536_000
 _MOST_INTERFACES = 1024
 _SECOND = 1_000_000_000
-#: Latest time that `Times.ns` converts, in seconds. Records with later times are read one by one,
-#: so that no int64 overflows.
+#: Latest time that `TimeEncoding.ns` converts, in seconds. Records with later times are read one by
+#: one, so that no int64 overflows.
 _FURTHEST = 4_000_000_000
 
 
@@ -96,7 +96,7 @@ class CapturedPacket(NamedTuple):
     original: int
 
 
-class Passed(Enum):
+class NoPacketReason(Enum):
     """The reason why a record yields no packet."""
 
     NO_PACKET = 0
@@ -109,7 +109,7 @@ def is_capture(head: bytes) -> bool:
 
 
 @dataclass(frozen=True)
-class Times:
+class TimeEncoding:
     """The encoding of a capture time in two words of a record.
 
     Attributes:
@@ -152,7 +152,7 @@ class Times:
         return seconds * _SECOND + fraction * _SECOND // self.ticks + self.offset, right
 
 
-class Pattern(NamedTuple):
+class RecordLayout(NamedTuple):
     """The layout of a packet record, as defined by the file format.
 
     Attributes:
@@ -167,7 +167,7 @@ class Pattern(NamedTuple):
     head: int
     free: tuple[int, ...]
     uncut: tuple[int, ...]
-    times: Times
+    times: TimeEncoding
     trailer: str | None
 
 
@@ -182,7 +182,7 @@ class PcapRecords:
 
     sections = 0
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: BufferedInput) -> None:
         self._source = source
         self.order, self._unit = _PCAP[source.take(4)]
         *_, self._snap_length, link = struct.unpack(self.order + "HHiIII", source.take(20))
@@ -191,13 +191,13 @@ class PcapRecords:
         self._lengths = struct.Struct(self.order + "II")
         self._began: int | None = None
 
-    def over(self, source: Source) -> PcapRecords:
+    def reopen(self, source: BufferedInput) -> PcapRecords:
         """Return a reader of the same format for another position in the file."""
         other = copy.copy(self)
         other._source = source
         return other
 
-    def length(self, data: memoryview | bytes, at: int) -> int:
+    def find_length(self, data: memoryview | bytes, at: int) -> int:
         """Return the length of the record at an offset; 0 if it is implausible or invalid.
 
         Args:
@@ -206,15 +206,15 @@ class PcapRecords:
         captured, original = self._lengths.unpack_from(data, at + 8)
         return self._head.size + captured if self._is_sure(captured, original) else 0
 
-    def claim(self, length: int) -> tuple[int, str, int]:
+    def length_field(self, length: int) -> tuple[int, str, int]:
         """Return the offset, type and value of both length fields of an uncut record."""
         captured: int = length - self._head.size
         return 8, f"{self.order}u8", captured << 32 | captured
 
-    def pattern(self, record: bytes) -> Pattern:
+    def find_layout(self, record: bytes) -> RecordLayout:
         """Return the layout of a record."""
-        times = Times(f"{self.order}u4", 0, 1, _SECOND // self._unit, True)
-        return Pattern(self._head.size, tuple(range(8)), tuple(range(12, 16)), times, None)
+        times = TimeEncoding(f"{self.order}u4", 0, 1, _SECOND // self._unit, True)
+        return RecordLayout(self._head.size, tuple(range(8)), tuple(range(12, 16)), times, None)
 
     def read(self) -> CapturedPacket:
         """Read the next record and return its packet.
@@ -224,7 +224,7 @@ class PcapRecords:
         """
         head = self._source.peek(self._head.size)
         if len(head) < self._head.size:
-            raise Truncated
+            raise TruncatedError
         seconds, fraction, captured, original = self._head.unpack(head)
         if captured > LARGEST_PACKET or not any(head):  # a hole in a file reads as zeros
             raise DamagedRecordError
@@ -239,7 +239,7 @@ class PcapRecords:
             original,
         )
 
-    def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
+    def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
         """Return the first offset below `stop` at which a record may begin; None if there is none.
 
         The record has to be followed by another one, or by the end of the input.
@@ -290,9 +290,9 @@ class PcapRecords:
         within = max(captured, min(original, LARGEST_PACKET) + 1)
         data = self._source.peek(self._head.size + within + _REACH)
         is_end = len(data) < self._head.size + within + _REACH
-        if len(data) == size or self.first_place(data[size:], 1, is_end=is_end) is not None:
+        if len(data) == size or self.find_next_record(data[size:], 1, is_end=is_end) is not None:
             return False
-        return self.first_place(data[self._head.size :], within, is_end=is_end) is not None
+        return self.find_next_record(data[self._head.size :], within, is_end=is_end) is not None
 
 
 class Interface(NamedTuple):
@@ -312,20 +312,20 @@ class PcapngBlocks:
         order: the byte order of the section, as in `struct`.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: BufferedInput) -> None:
         self._source = source
         self.sections = 0
         self.order = "<"
         self._interfaces: list[Interface] = []
         self._knows_all = True  # no interface of the section was lost to damage
 
-    def over(self, source: Source) -> PcapngBlocks:
+    def reopen(self, source: BufferedInput) -> PcapngBlocks:
         """Return a reader with the same interfaces for another position in the file."""
         other = copy.copy(self)
         other._source, other._interfaces = source, list(self._interfaces)
         return other
 
-    def length(self, data: memoryview | bytes, at: int) -> int:
+    def find_length(self, data: memoryview | bytes, at: int) -> int:
         """Return the length of the block at an offset; 0 if `read` has to handle the block.
 
         This applies to the start of a section, an invalid length and a block longer than
@@ -336,21 +336,21 @@ class PcapngBlocks:
             0 if kind == _SECTION_KIND or length > LARGEST_BLOCK or not _can_be(length) else length
         )
 
-    def claim(self, length: int) -> tuple[int, str, int]:
+    def length_field(self, length: int) -> tuple[int, str, int]:
         """Return the offset, type and value of the length field of a block."""
         return 4, f"{self.order}u4", length
 
-    def pattern(self, record: bytes) -> Pattern | None:
+    def find_layout(self, record: bytes) -> RecordLayout | None:
         """Return the layout of a block; None if such blocks are read one by one."""
         kind, _, number = struct.unpack_from(self.order + "III", record)
         if kind != ENHANCED_PACKET:
             return None
         interface = self._interfaces[number]
         word = f"{self.order}u4"
-        times = Times(word, 3, 4, interface.ticks, False, interface.offset)
-        return Pattern(28, tuple(range(12, 20)), tuple(range(24, 28)), times, word)
+        times = TimeEncoding(word, 3, 4, interface.ticks, False, interface.offset)
+        return RecordLayout(28, tuple(range(12, 20)), tuple(range(24, 28)), times, word)
 
-    def read(self) -> CapturedPacket | Passed:
+    def read(self) -> CapturedPacket | NoPacketReason:
         """Read the next block and return its packet.
 
         Raises:
@@ -358,7 +358,7 @@ class PcapngBlocks:
         """
         head = bytes(self._source.peek(12))
         if len(head) < 12:
-            raise Truncated
+            raise TruncatedError
         if head[:4] == _SECTION:
             if head[8:] not in _ORDERS:
                 raise DamagedRecordError
@@ -372,7 +372,7 @@ class PcapngBlocks:
             raise DamagedRecordError
         if length > LARGEST_BLOCK:
             self._source.skip(length)
-            return Passed.NO_PACKET
+            return NoPacketReason.NO_PACKET
         body = self._source.take(length)[8:-4]
         if kind == _INTERFACE:
             if len(body) < 8 or len(self._interfaces) == _MOST_INTERFACES:
@@ -380,10 +380,12 @@ class PcapngBlocks:
                 raise DamagedRecordError
             self._interfaces.append(_interface(self.order, body))
         if kind in _PACKETS:
-            return _block_packet(self.order, kind, body, self._interfaces) or Passed.MALFORMED
-        return Passed.NO_PACKET
+            return (
+                _block_packet(self.order, kind, body, self._interfaces) or NoPacketReason.MALFORMED
+            )
+        return NoPacketReason.NO_PACKET
 
-    def first_place(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
+    def find_next_record(self, data: memoryview, stop: int, *, is_end: bool) -> int | None:
         """Return the first offset below `stop` at which a block may begin; None if there is none.
 
         If an interface block was lost, only the start of a section counts. Packets refer to
@@ -419,14 +421,14 @@ class PcapngBlocks:
         data = self._source.peek(size)
         if len(data) == length:
             return data[-4:] != data[4:8]
-        return self.first_place(data[4:], size, is_end=True) is not None
+        return self.find_next_record(data[4:], size, is_end=True) is not None
 
 
 #: The reader of either format.
 Form = PcapRecords | PcapngBlocks
 
 
-def records(source: Source) -> Form:
+def make_record_reader(source: BufferedInput) -> Form:
     """Return the reader for a file that `is_capture` accepts.
 
     Raises:
@@ -437,7 +439,7 @@ def records(source: Source) -> Form:
     return PcapRecords(source)
 
 
-def resume(source: Source, form: Form) -> bool:
+def skip_damage(source: BufferedInput, form: Form) -> bool:
     """Advance to the next record after a damaged one.
 
     Returns:
@@ -445,14 +447,14 @@ def resume(source: Source, form: Form) -> bool:
     """
     source.skip(len(source.peek(1)))
     while data := source.peek(_STEP + _REACH):
-        found = form.first_place(data, _STEP, is_end=len(data) < _STEP + _REACH)
+        found = form.find_next_record(data, _STEP, is_end=len(data) < _STEP + _REACH)
         source.skip(min(_STEP, len(data)) if found is None else found)
         if found is not None:
             return True
     return False
 
 
-def seek_time(source: Source, form: Form, at: int) -> bool:
+def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
     """Skip to at most `NEAR` bytes before the first packet captured at a time or later.
 
     The search assumes that packets are in the order of their times, and that all sections of a
@@ -466,7 +468,7 @@ def seek_time(source: Source, form: Form, at: int) -> bool:
         False if nothing was skipped: the packet is not ahead, or the file is a pipe or compressed.
         The position is then unchanged.
     """
-    here = low = source.place
+    here = low = source.offset
     high = source.size
     if high is None:
         return False
@@ -478,22 +480,22 @@ def seek_time(source: Source, form: Form, at: int) -> bool:
             high = middle
         else:
             low = found[1]
-    source.go(low)
+    source.seek(low)
     return low > here
 
 
-def _find_timed_packet(source: Source, form: Form, stop: int) -> tuple[int, int] | None:
+def _find_timed_packet(source: BufferedInput, form: Form, stop: int) -> tuple[int, int] | None:
     """Return the time and offset of the next packet with a time; None if none begins before `stop`.
 
     The search ends at the start of another section.
     """
-    form, section = form.over(source), form.sections
-    while resume(source, form) and source.begin_record() and source.record < stop:
+    form, section = form.reopen(source), form.sections
+    while skip_damage(source, form) and source.begin_record() and source.record < stop:
         try:
             packet = form.read()
         except DamagedRecordError:
             continue
-        except Truncated:
+        except TruncatedError:
             break
         if form.sections != section:
             break
@@ -601,7 +603,7 @@ def record_size(data: bytes | bytearray, at: int) -> int:
     return _RECORD.size + int.from_bytes(data[at + 8 : at + 12], "little")
 
 
-class Writing(NamedTuple):
+class CaptureFormat(NamedTuple):
     """Functions that write captures of one format.
 
     Attributes:
@@ -639,8 +641,8 @@ def _block(kind: int, body: bytes) -> bytes:
 
 #: Functions that write captures, by file suffix.
 WRITINGS = {
-    ".pcap": Writing(capture_head, packet_record, record_size),
-    ".pcapng": Writing(
+    ".pcap": CaptureFormat(capture_head, packet_record, record_size),
+    ".pcapng": CaptureFormat(
         _pcapng_head,
         _pcapng_record,
         lambda data, at: int.from_bytes(data[at + 4 : at + 8], "little"),

@@ -3,8 +3,8 @@
 Reads are done in bounded steps. The buffer grows with the bytes that have been read, never with a
 length field of the file, so a corrupt length cannot cause a large allocation.
 
-Callers can use the buffer without a copy. `Source.lent` returns it as a read-only array, and
-`Source` does not write to that buffer again while the array, or a view of it, is alive.
+Callers can use the buffer without a copy. `BufferedInput.view` returns it as a read-only array, and
+`BufferedInput` does not write to that buffer again while the array, or a view of it, is alive.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ SLACK = 256
 MOST_KEPT = 2
 
 
-class Truncated(Exception):
+class TruncatedError(Exception):
     """The input ended within a record."""
 
 
-class Source:
+class BufferedInput:
     """A buffered reader of a file or pipe.
 
     Args:
@@ -46,23 +46,23 @@ class Source:
         storage: the current buffer; its last `SLACK` bytes are never filled.
         at: offset of the next byte in `storage`.
         record: file offset of the current record, set by `begin_record`.
-        place: file offset of the next byte.
+        offset: file offset of the next byte.
     """
 
     def __init__(self, file: BinaryIO, *, largest: int = SMALLEST) -> None:
         self._file = file
         self._read_into = _read_into(file)
         self._largest = largest
-        self._kept: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
-        self._lent: weakref.ref[Any] | None = None
+        self._viewed_buffers: list[tuple[NDArray[np.uint8], weakref.ref[Any]]] = []
+        self._last_view: weakref.ref[Any] | None = None
         self._data = memoryview(b"")
-        self._passed = 0  # bytes of the file before `storage`
+        self._bytes_dropped = 0  # bytes of the file before `storage`
         self.record = self.at = 0
         self._adopt(np.empty(_first_size(file, largest) + SLACK, np.uint8), 0)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return the state for pickling: the copy continues at the same offset."""
-        return _source_at, (self._file, self._largest, self.place)
+        return _source_at, (self._file, self._largest, self.offset)
 
     @property
     def stop(self) -> int:
@@ -70,22 +70,22 @@ class Source:
         return len(self._data)
 
     @property
-    def place(self) -> int:
-        return self._passed + self.at
+    def offset(self) -> int:
+        return self._bytes_dropped + self.at
 
-    def open_at(self, place: int) -> Source:
+    def open_at(self, place: int) -> BufferedInput:
         """Return a second source of the same file that starts at a file offset.
 
-        Both sources share the file position: call `go` on this one before it is used again.
+        Both sources share the file position: call `seek` on this one before it is used again.
         """
         return _source_at(self._file, SMALLEST, place)
 
-    def go(self, place: int) -> None:
+    def seek(self, place: int) -> None:
         """Continue at an offset of a seekable file."""
         self._file.seek(place)
-        self._lent = None  # the new buffer has not been lent
+        self._last_view = None  # the new buffer has not been lent
         self._adopt(np.empty_like(self.storage), 0)
-        self.record = self._passed = place
+        self.record = self._bytes_dropped = place
 
     @property
     def size(self) -> int | None:
@@ -104,7 +104,7 @@ class Source:
 
     def begin_record(self) -> bool:
         """Mark the start of a record; return False at the end of the input."""
-        self.record = self.place
+        self.record = self.offset
         return self._has(1)
 
     def take(self, size: int) -> bytes:
@@ -114,7 +114,7 @@ class Source:
             Truncated: if fewer are left.
         """
         if not self._has(size):
-            raise Truncated
+            raise TruncatedError
         self.at += size
         return bytes(self._data[self.at - size : self.at])
 
@@ -127,25 +127,25 @@ class Source:
         while size:
             step = min(size, SMALLEST)
             if not self._has(step):
-                raise Truncated
+                raise TruncatedError
             self.at += step
             size -= step
 
-    def more(self) -> bool:
+    def read_more(self) -> bool:
         """Read at least one more byte into the buffer; return False at the end of the input.
 
         This can replace `storage` and reset `at`.
         """
         return self._has(len(self._data) - self.at + 1)
 
-    def lent(self) -> NDArray[np.uint8]:
+    def view(self) -> NDArray[np.uint8]:
         """Return the bytes in the buffer, (n,), uint8, read-only.
 
         The buffer is not reused while this array, or a view of it, is alive.
         """
         array = np.frombuffer(self._view[: len(self._data)], np.uint8)
         array.flags.writeable = False
-        self._lent = weakref.ref(array)
+        self._last_view = weakref.ref(array)
         return array
 
     def _has(self, size: int) -> bool:
@@ -179,20 +179,23 @@ class Source:
                 size = 2 * size
             else:
                 size = max(size, min(2 * size, self._largest))
-        if self._lent is not None:
-            self._kept = [*self._kept[1 - MOST_KEPT :], (self.storage, self._lent)]
+        if self._last_view is not None:
+            self._viewed_buffers = [
+                *self._viewed_buffers[1 - MOST_KEPT :],
+                (self.storage, self._last_view),
+            ]
         spare = self._spare(size)
         spare[:have] = tail
-        self._passed += at
+        self._bytes_dropped += at
         self._adopt(spare, have)
 
     def _spare(self, size: int) -> NDArray[np.uint8]:
-        if self._lent is None and len(self.storage) - SLACK == size:
+        if self._last_view is None and len(self.storage) - SLACK == size:
             return self.storage
-        self._lent = None
-        for index, (storage, lent) in enumerate(self._kept):
+        self._last_view = None
+        for index, (storage, lent) in enumerate(self._viewed_buffers):
             if lent() is None and len(storage) - SLACK == size:
-                del self._kept[index]
+                del self._viewed_buffers[index]
                 return storage
         return np.empty(size + SLACK, np.uint8)
 
@@ -203,11 +206,11 @@ class Source:
         self.at = 0
 
 
-def _source_at(file: BinaryIO, largest: int, place: int) -> Source:
+def _source_at(file: BinaryIO, largest: int, place: int) -> BufferedInput:
     """Return a source of a seekable file that starts at an offset."""
     file.seek(place)
-    source = Source(file, largest=largest)
-    source.record = source._passed = place
+    source = BufferedInput(file, largest=largest)
+    source.record = source._bytes_dropped = place
     return source
 
 

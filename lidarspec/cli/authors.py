@@ -11,15 +11,15 @@ import click
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, output_option
 from lidarspec.cli.terminal import note, say
-from lidarspec.detect.sample_bytes import beginning
+from lidarspec.detect.sample_bytes import read_beginning
 from lidarspec.drafting.draft import (
+    DistributionNames,
     Link,
-    Names,
+    add_to_distribution,
     draft,
-    joining,
     make_draft_files,
     make_example_files,
-    write,
+    write_files,
 )
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, ExportError, export as exported, select_frame
@@ -77,7 +77,7 @@ def new(
     bytes of a capture: sync bytes, length, checksum, counters and angles, each with its evidence;
     all other bytes are marked as unknown.
     """
-    names = Names(sensor_id, distribution or "", vendor or "", model or "")
+    names = DistributionNames(sensor_id, distribution or "", vendor or "", model or "")
     if sensor_id in sensors():
         raise suggest(
             UsageError(f"{sensor_id} is installed already: choose another id"),
@@ -94,8 +94,8 @@ def new(
     else:
         texts = _draft_files(names, link, capture)
     if folder.exists():
-        texts = joining(folder, names, texts)
-    write(folder, texts)
+        texts = add_to_distribution(folder, names, texts)
+    write_files(folder, texts)
     for name in texts:
         say(str(folder / name))
     if capture is None:
@@ -108,14 +108,14 @@ def new(
     )
 
 
-def _draft_files(names: Names, link: str | None, capture: str) -> dict[str, str]:
+def _draft_files(names: DistributionNames, link: str | None, capture: str) -> dict[str, str]:
     """Return the files with a draft of the frames of a capture.
 
     If several senders or ports occur, the group with the most bytes is used.
     """
     groups: dict[object, list[Chunk]] = {}
     with contextlib.closing(transport(capture)) as opened:
-        for chunk in beginning(opened, MOST):
+        for chunk in read_beginning(opened, MOST):
             groups.setdefault((chunk.sender, chunk.receiver and chunk.receiver[1]), []).append(
                 chunk
             )

@@ -20,7 +20,7 @@ from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageError, suggest
 from lidarspec.explaining.assignments import arguments, values
 from lidarspec.explaining.explanation import describe_reply, explain
-from lidarspec.explaining.input_segments import explain_piece, pieces
+from lidarspec.explaining.input_segments import explain_piece, iter_pieces
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.sensor_operations import Sensor
@@ -115,14 +115,14 @@ def send(
     if (command is None) == (digits is None):
         raise UsageError("send requires either the name of a command, or bytes: --hex 'a5 50'")
     data = b"" if digits is None else _bytes(digits)
-    answer = _Answer()
+    answer = _AnswerLog()
     record = (lambda _: answer) if digits is not None and is_live(source) else None
     with open_device(source, sensor_id, start=False, record=record) as device:
         device.leave_on()
         if command is None:
             _write(device, source, data, answer, timeout, as_json=as_json, output=output)
             return
-        reply = _sent(device, source, command, assignments, timeout)
+        reply = _send(device, source, command, assignments, timeout)
         sensor = device.sensor
     if as_json:
         emit_json(_reply_to_dict(sensor, reply), output)
@@ -142,7 +142,7 @@ def _bytes(digits: str) -> bytes:
         raise UsageError(f"--hex requires bytes in hexadecimal: {error}") from None
 
 
-class _Answer:
+class _AnswerLog:
     """A recorder that keeps the received chunks in memory."""
 
     error = None
@@ -180,7 +180,7 @@ def _write(
     device: Device,
     source: str,
     data: bytes,
-    answer: _Answer,
+    answer: _AnswerLog,
     timeout: float | None,
     *,
     as_json: bool,
@@ -194,7 +194,7 @@ def _write(
     note(f"sent {len(data)} byte{'s' * (len(data) != 1)}: {data.hex(' ')}")
     heard = answer.after(before, ANSWERED if timeout is None else timeout)
     if heard:
-        found = list(pieces(sensor, heard, datagrams=sensor.datagrams))
+        found = list(iter_pieces(sensor, heard, datagrams=sensor.datagrams))
     else:
         found = []
     rest = [piece for piece in found if piece.frame not in sensor.data_frames]
@@ -218,7 +218,7 @@ def _write(
         note("no reply received")
 
 
-def _sent(
+def _send(
     device: Device, source: str, command: str, assignments: Sequence[str], timeout: float | None
 ) -> Reply:
     sensor = device.sensor

@@ -29,7 +29,7 @@ from lidarspec.frames.schema import schema
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.transports.ports import serial_ports
+from lidarspec.transports.ports import list_serial_ports
 
 #: The environment variable that holds the request of the shell.
 VARIABLE = "_LIDARSPEC_COMPLETE"
@@ -38,7 +38,7 @@ BREAKS = ":="
 
 
 @add_completion_class
-class Bash(BashComplete):
+class BashCompletion(BashComplete):
     """click's completion for bash, with support for words that contain ``:`` or ``=``.
 
     No blank is added after ``field=`` and ``sim:``.
@@ -111,7 +111,13 @@ def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
         simulated = [f"sim:{name}" for name in registry().names()]
     else:
         simulated = ["sim:"]
-    sources = [*devices(), *(port.path for port in serial_ports()), "udp://", "tcp://", *simulated]
+    sources = [
+        *devices(),
+        *(port.path for port in list_serial_ports()),
+        "udp://",
+        "tcp://",
+        *simulated,
+    ]
     if not any(source.startswith(incomplete) for source in sources):
         return []
     return [

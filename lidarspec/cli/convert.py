@@ -16,13 +16,13 @@ import click
 from lidarspec import batch
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.inputs import (
-    again,
     conclude,
-    fits_instead,
-    nearest_fault,
-    no_frame,
+    identify_file,
+    iter_device_scans,
+    nearest_fault_error,
+    no_frame_error,
     refuse_overwriting,
-    scans_of,
+    reread,
 )
 from lidarspec.cli.options import BYTES, count_option, points_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit_json, size
@@ -31,12 +31,12 @@ from lidarspec.detect.identification import detect
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import recorder_like
 from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
-from lidarspec.formats import check_holds, format_of, targets, write, write_imu
-from lidarspec.formats.common import replacing
+from lidarspec.formats import check_holds, find_existing, format_of, write, write_imu
+from lidarspec.formats.common import replace_file
 from lidarspec.packets.imu import join_samples
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
-from lidarspec.remote_files import found
+from lidarspec.remote_files import find_files
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Times, iter_received
 from lidarspec.sensor_operations import Sensor
@@ -183,7 +183,7 @@ def convert(
             select=selection,
             force=force,
         )
-        file_count = len({path for pattern in sources for path, _ in found(pattern)})
+        file_count = len({path for pattern in sources for path, _ in find_files(pattern)})
         _follow_batch(records, target, file_count, as_json=as_json)
         return
     if len(sources) > 1 or jobs or scheduler or piece_size:
@@ -197,7 +197,7 @@ def convert(
         _write_packets(source, target, sensor_id, selection.times, as_json=as_json)
         return
     format_of(target)
-    refuse_overwriting(targets(target), source, sensor_id, force=force)
+    refuse_overwriting(find_existing(target), source, sensor_id, force=force)
     if sensor_id is None:
         sensor = _detect_sensor(source, target)
     else:
@@ -209,7 +209,7 @@ def convert(
             summary = _write_points(
                 device,
                 target,
-                itertools.islice(scans_of(device, source, selection), count),
+                itertools.islice(iter_device_scans(device, source, selection), count),
                 every_point=every_point,
                 organized=organized,
                 with_packets=with_packets,
@@ -244,7 +244,7 @@ def _write_packets(
     with (
         contextlib.closing(transport(source)) as opened,
         Progress(size) as progress,
-        replacing(Path(target)) as part,
+        replace_file(Path(target)) as part,
     ):
         sensor: Sensor | None = None
         if sensor_id is not None:
@@ -255,7 +255,7 @@ def _write_packets(
         try:
             with recorder_like(opened, source, str(part), sensor, overwrite=True) as file:
                 for chunk in iter_received(opened, times, source):
-                    file.keep_up()
+                    file.wait_for_room()
                     file.write(chunk)
                     progress(lambda: f"{target}: {file.records} packets", opened.place)
         except WriteError as error:  # its text names the temporary file
@@ -370,8 +370,8 @@ def _detect_sensor(source: str, target: str) -> Sensor:
     except UsageError as error:
         raise suggest(error, f"lidarspec convert {quote(source)} {quote(target)} -s ID") from None
     except WireError as error:
-        given = None if suggestion(error) else again(source)
-        raise error if given is None else nearest_fault(given) from None
+        given = None if suggestion(error) else reread(source)
+        raise error if given is None else nearest_fault_error(given) from None
 
 
 def _no_data_error(device: Device, target: str) -> Exception:
@@ -390,13 +390,13 @@ def _no_data_error(device: Device, target: str) -> Exception:
     failure = stats.failure(sensor.id)
     if failure is not None:
         return failure
-    instead = fits_instead(sensor, source)
+    instead = identify_file(sensor, source)
     if instead is not None:
         error = WireError(f"{source} {instead[0]}", sensor=sensor.id)
         return suggest(error, f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}")
-    given = again(source) if not stats.frames else None
+    given = reread(source) if not stats.frames else None
     if given is not None:
-        return no_frame(sensor, given)
+        return no_frame_error(sensor, given)
     return suggest(
         WireError(f"no data frame in {source}: {stats}", sensor=sensor.id),
         f"lidarspec explain {quote(source)} -s {sensor.id}",

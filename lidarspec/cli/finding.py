@@ -17,22 +17,29 @@ from lidarspec.cli.inputs import read
 from lidarspec.cli.options import DURATION, sensor_option
 from lidarspec.cli.output import Progress, emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, voice
-from lidarspec.detect.doctor import computer, examine
+from lidarspec.detect.doctor import examine, examine_computer
 from lidarspec.detect.identification import (
     Verdict,
-    best,
+    describe_unsupported_models,
     format_sensor_options,
-    names,
-    others_named,
-    verdict,
-    verdicts,
+    identify_sample,
+    identify_senders,
+    list_candidates,
+    select_best,
 )
-from lidarspec.detect.listen import LISTEN, hear, ignore, probe, started_first, udp_ports
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.listen import (
+    LISTEN,
+    ignore_progress,
+    list_start_required,
+    list_udp_ports,
+    probe,
+    read_samples,
+)
+from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.detect.uninstalled_sensors import describe, install_commands, recognize
 from lidarspec.drafting.checksum_search import search
-from lidarspec.drafting.periods import Structure, cut, structure
-from lidarspec.drafting.samples import Match
+from lidarspec.drafting.periods import FrameStructure, find_structure, split_frames
+from lidarspec.drafting.samples import ChecksumMatch
 from lidarspec.errors import SourceError, UsageError, WireError, suggest
 from lidarspec.known_sensors import KnownSensor, find_known_sensor, install_command, no_sensors
 from lidarspec.plugins import sensor as named_sensor, sensors
@@ -41,7 +48,7 @@ from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, resolve
-from lidarspec.transports.ports import SerialPort, User, serial_ports, udp_users
+from lidarspec.transports.ports import PortUser, SerialPort, find_udp_users, list_serial_ports
 from lidarspec.transports.protocol import no_bytes
 
 #: Bits of evidence below which a match may be chance.
@@ -58,8 +65,8 @@ TOLD = 2
 @output_options
 def ports(as_json: bool, output: str | None) -> None:
     """List the serial ports of this computer, and the UDP ports of installed sensors."""
-    serial = serial_ports()
-    udp = {port: udp_users(port) for port in udp_ports()}
+    serial = list_serial_ports()
+    udp = {port: find_udp_users(port) for port in list_udp_ports()}
     if as_json:
         listed = [{**vars(port), "users": [vars(user) for user in port.users]} for port in serial]
         emit_json(
@@ -101,13 +108,13 @@ def _state(port: SerialPort) -> str:
     return "free"
 
 
-def _udp_state(users: tuple[User, ...] | None) -> str:
+def _udp_state(users: tuple[PortUser, ...] | None) -> str:
     if users is None:
         return "free"
     return f"in use by {', '.join(map(str, users)) or 'another user'}"
 
 
-def _udp(port: int, users: tuple[User, ...] | None) -> dict[str, Any]:
+def _udp(port: int, users: tuple[PortUser, ...] | None) -> dict[str, Any]:
     return {
         "port": port,
         "sensors": _senders(port),
@@ -139,7 +146,7 @@ def crc(
     matches = search(frames)
     if as_json:
         emit_json(
-            {"frames": len(frames), "matches": [checksum_told(match) for match in matches]}, output
+            {"frames": len(frames), "matches": [match_to_dict(match) for match in matches]}, output
         )
     elif matches:
         shown = [match for match in matches if match.open == matches[0].open][:PRINTED]
@@ -157,19 +164,19 @@ def crc(
 
 def _frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes]:
     if len(words) == 1 and (words[0] == "-" or os.path.exists(words[0])):
-        return _of_file(words[0], period, offset)
+        return _read_frames(words[0], period, offset)
     whole = read(words).data
     if period is not None:
-        return cut(whole, period, offset)
+        return split_frames(whole, period, offset)
     each = [read([word]).data for word in words]
     if min(map(len, each)) > 2:
         return each
     return [whole]
 
 
-def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
+def _read_frames(path: str, period: int | None, offset: int) -> list[bytes]:
     if path != "-" and not path.endswith(HEX):
-        heard = max(hear(path), key=lambda one: one.size)
+        heard = max(read_samples(path), key=lambda one: one.size)
         if not heard.size:
             raise suggest(WireError(no_bytes(path, heard.warnings)), "lidarspec sensors")
         for warning in heard.warnings:
@@ -181,10 +188,10 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
         chunks = tuple(chunk for chunk in given.chunks if chunk)
         datagrams = path.endswith(HEX) and len(chunks) > 1 and max(map(len, chunks)) < LONGEST
     if period is not None:
-        return cut(b"".join(chunks), period, offset)
+        return split_frames(b"".join(chunks), period, offset)
     if datagrams and path.endswith(HEX):
         return list(chunks)
-    found = structure(chunks, datagrams=datagrams)
+    found = find_structure(chunks, datagrams=datagrams)
     if found is None:
         raise suggest(
             UsageError(f"{path}: cannot find where its frames begin"),
@@ -198,7 +205,7 @@ def _of_file(path: str, period: int | None, offset: int) -> list[bytes]:
     return list(found.frames)
 
 
-def checksum_told(match: Match) -> dict[str, Any]:
+def match_to_dict(match: ChecksumMatch) -> dict[str, Any]:
     """Return a match as a JSON object."""
     return {
         "checksum": match.algorithm.describe(),
@@ -213,7 +220,7 @@ def checksum_told(match: Match) -> dict[str, Any]:
     }
 
 
-def _text(match: Match, length: int) -> str:
+def _text(match: ChecksumMatch, length: int) -> str:
     if match.place.size > 1:
         order = f", {match.order}-endian"
     else:
@@ -272,11 +279,11 @@ def detect(
             "lidarspec detect FILE",
         )
     if source is None:
-        found = list(_everywhere(duration, start=start))
+        found = list(_detect_all_ports(duration, start=start))
     else:
         source = resolve(source)
         with Progress() as progress:
-            found = _one(
+            found = _detect_source(
                 source,
                 duration,
                 start=start,
@@ -286,12 +293,12 @@ def detect(
     if fitting or any(one.fault for one in found):
         unknown = None
     else:
-        unknown = _unknown(found)
+        unknown = _find_structure(found)
     if as_json:
         emit_json(
             {
                 "sources": [_verdict_to_dict(one) for one in found],
-                "structure": _structure_told(unknown),
+                "structure": _structure_to_dict(unknown),
             },
             output,
         )
@@ -301,7 +308,7 @@ def detect(
         emit(_structure_text(unknown), output)
     for line in _conclusions(source, found, unknown, start=start):
         note(line)
-    if not any(one.alike for one in fitting):
+    if not any(one.candidates for one in fitting):
         raise click.exceptions.Exit(_code(source, found))
 
 
@@ -311,28 +318,28 @@ def _code(source: str | None, found: Sequence[Verdict]) -> int:
     It is `DEVICE` if every live source was silent, else `NO_DATA`.
     """
     is_live = source is None or live_address(source) is not None
-    is_silent = is_live and not any(one.heard.size for one in found)
+    is_silent = is_live and not any(one.sample.size for one in found)
     if is_silent:
         return DEVICE
     return NO_DATA
 
 
-def _one(
-    source: str, duration: float, *, start: bool, tell: Callable[[str], None] = ignore
+def _detect_source(
+    source: str, duration: float, *, start: bool, tell: Callable[[str], None] = ignore_progress
 ) -> list[Verdict]:
-    found = verdicts(source, seconds=duration, tell=tell)
+    found = identify_senders(source, seconds=duration, tell=tell)
     if start and not any(one.scores for one in found):
         for heard in probe(source):
-            found = [best([*found, verdict(heard)])]
+            found = [select_best([*found, identify_sample(heard)])]
             if found[0].is_clear:
                 break
     return found
 
 
-def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
+def _detect_all_ports(duration: float, *, start: bool) -> Iterator[Verdict]:
     """Listen to all ports at the same time, and yield a verdict for each."""
-    serial = [port.path for port in serial_ports()]
-    udp = udp_ports()
+    serial = [port.path for port in list_serial_ports()]
+    udp = list_udp_ports()
     note(
         f"listening to {len(serial)} serial port{'s' * (len(serial) != 1)} and UDP"
         f" {', '.join(map(str, udp))}"
@@ -340,34 +347,34 @@ def _everywhere(duration: float, *, start: bool) -> Iterator[Verdict]:
 
     def listen(source: str) -> list[Verdict]:
         try:
-            return _one(source, duration, start=start)
+            return _detect_source(source, duration, start=start)
         except (SourceError, UsageError) as error:
             if isinstance(error, SourceError):
                 failure = error
             else:
                 failure = SourceError(str(error))
-            return [Verdict(Heard(source, failure=failure))]
+            return [Verdict(SampleBytes(source, failure=failure))]
 
     sources = [*serial, *(f"udp://:{port}" for port in udp)]
     with ThreadPoolExecutor(max_workers=len(sources) or 1) as pool:
         yield from itertools.chain.from_iterable(pool.map(listen, sources))
 
 
-def _unknown(found: Sequence[Verdict]) -> Structure | None:
+def _find_structure(found: Sequence[Verdict]) -> FrameStructure | None:
     """Return the structure of the bytes that fit no sensor."""
-    heard = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
+    heard = max((one.sample for one in found), key=lambda heard: heard.size, default=None)
     if heard is not None and heard.size:
-        return structure(heard.chunks, datagrams=heard.datagrams)
+        return find_structure(heard.chunks, datagrams=heard.datagrams)
     return None
 
 
 def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
     rows = []
     for one in found:
-        alike = {score.sensor.id for score in one.alike}
+        alike = {score.sensor.id for score in one.candidates}
         listed = one.scores
-        if voice.loudness <= 0 and (one.alike or one.others):
-            listed = one.alike  # without the sensors that were ruled out
+        if voice.loudness <= 0 and (one.candidates or one.others):
+            listed = one.candidates  # without the sensors that were ruled out
         for score in listed:
             if score.sensor.id not in alike:
                 verdict_of = "no"
@@ -377,7 +384,7 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
                 verdict_of = "perhaps"
             rows.append(
                 [
-                    _place(one.heard),
+                    _place(one.sample),
                     score.sensor.id,
                     verdict_of,
                     f"{score.share:.1%}",
@@ -387,7 +394,7 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
             )
         verdict_of = "perhaps" if alike else "yes"
         rows += [
-            [_place(one.heard), f"{name}, not installed", verdict_of, "", "", why]
+            [_place(one.sample), f"{name}, not installed", verdict_of, "", "", why]
             for name, why in one.others.items()
         ]
     return table(
@@ -395,7 +402,7 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
     )
 
 
-def _place(heard: Heard) -> str:
+def _place(heard: SampleBytes) -> str:
     where = heard.source + (f" from {heard.sender}" if heard.sender else "")
     if heard.baud is not None:
         return f"{where} at {heard.baud} baud"
@@ -403,45 +410,45 @@ def _place(heard: Heard) -> str:
 
 
 def _conclusions(
-    source: str | None, found: Sequence[Verdict], unknown: Structure | None, *, start: bool
+    source: str | None, found: Sequence[Verdict], unknown: FrameStructure | None, *, start: bool
 ) -> Iterator[str]:
-    missing = _missing(found)
+    missing = _find_uninstalled(found)
     if not sensors() and not missing:
         yield no_sensors()
-    yield from dict.fromkeys(warning for one in found for warning in one.heard.warnings)
+    yield from dict.fromkeys(warning for one in found for warning in one.sample.warnings)
     for one in found:
-        if one.heard.failure is not None:
-            yield f"{one.heard.failure}"
+        if one.sample.failure is not None:
+            yield f"{one.sample.failure}"
         elif one.sensor is not None:
-            yield f"next: lidarspec {_verb(one)} {_again(one)} {format_sensor_options(one.sensor)}"
-        elif one.alike:
+            options = format_sensor_options(one.sensor)
+            yield f"next: lidarspec {_verb(one)} {_format_source(one)} {options}"
+        elif one.candidates:
             yield (
-                f"{_place(one.heard)}: {', '.join(names(one))} send the same frames, which do not"
-                " identify"
-                " the model: choose one"
+                f"{_place(one.sample)}: {', '.join(list_candidates(one))} send the same frames,"
+                " which do not identify the model: choose one"
             )
             if files := [
                 name
-                for name in one.alike[0].sensor.configure.files
-                if one.alike[0].sensor.recognise is not None
+                for name in one.candidates[0].sensor.configure.files
+                if one.candidates[0].sensor.recognise is not None
             ]:
                 yield (f"the packets do not contain beam angles: pass -O {files[0]}=FILE")
-            options = format_sensor_options(one.alike[0].sensor)
-            yield f"next: lidarspec {_verb(one)} {_again(one)} {options}"
+            options = format_sensor_options(one.candidates[0].sensor)
+            yield f"next: lidarspec {_verb(one)} {_format_source(one)} {options}"
         elif one.others:
-            yield f"{_place(one.heard)}: {others_named(one)}"
+            yield f"{_place(one.sample)}: {describe_unsupported_models(one)}"
             relative = next(iter(one.others))
             known = find_known_sensor(relative)
             if known is not None:
                 yield f"next: {install_command(known.distribution)}"
             else:
-                yield f"next: lidarspec new {relative} --from-capture {quote(one.heard.source)}"
+                yield f"next: lidarspec new {relative} --from-capture {quote(one.sample.source)}"
     if any(one.scores for one in found):
         return
-    size = sum(one.heard.size for one in found)
+    size = sum(one.sample.size for one in found)
     for one in (faulty := [one for one in found if one.fault]):
-        yield f"{_place(one.heard)}: {one.fault}"
-        yield f"next: lidarspec crc {quote(one.heard.source)}"
+        yield f"{_place(one.sample)}: {one.fault}"
+        yield f"next: lidarspec crc {quote(one.sample.source)}"
     if faulty:
         return
     if missing:
@@ -449,7 +456,7 @@ def _conclusions(
         yield f"next: {install_commands(missing)}"
         return
     if size:
-        if any(one.heard.is_text for one in found):
+        if any(one.sample.is_text for one in found):
             kind = " of text"
         else:
             kind = ""
@@ -461,43 +468,43 @@ def _conclusions(
         yield f"next: {_following(source, unknown)}"
         return
     if source is not None and live_address(source) is None:
-        yield from [no_bytes(source, ())] * (not any(one.heard.warnings for one in found))
+        yield from [no_bytes(source, ())] * (not any(one.sample.warnings for one in found))
         yield "next: lidarspec sensors"
         return
-    yield from [] if any(one.heard.warnings for one in found) else ["no data received"]
+    yield from [] if any(one.sample.warnings for one in found) else ["no data received"]
     is_serial = source is None or (
         (address := live_address(source)) is not None and address.scheme == "serial"
     )
-    if is_serial and not start and started_first():
+    if is_serial and not start and list_start_required():
         yield (
-            f"{', '.join(sensor.id for sensor in started_first())} send nothing until they are"
-            " started"
+            f"{', '.join(sensor.id for sensor in list_start_required())} send nothing until they"
+            " are started"
         )
         yield f"next: lidarspec detect {source or ''}".rstrip() + " --start"
     else:
         yield f"next: lidarspec doctor {quote(source) if source else ''}".rstrip()
 
 
-def _missing(found: Sequence[Verdict]) -> list[KnownSensor]:
+def _find_uninstalled(found: Sequence[Verdict]) -> list[KnownSensor]:
     """Return the sensors that are not installed and may have sent most of the bytes.
 
     Returns an empty list if an installed sensor fits.
     """
     if any(one.scores or one.fault for one in found):
         return []
-    largest = max((one.heard for one in found), key=lambda heard: heard.size, default=None)
+    largest = max((one.sample for one in found), key=lambda heard: heard.size, default=None)
     if largest is not None and largest.size:
         return recognize(largest)
     return []
 
 
 def _verb(one: Verdict) -> str:
-    if live_address(one.heard.source) is None:
+    if live_address(one.sample.source) is None:
         return "read"
     return "view"
 
 
-def _following(source: str | None, unknown: Structure | None) -> str:
+def _following(source: str | None, unknown: FrameStructure | None) -> str:
     """Return the next command for bytes that fit no sensor."""
     if source is None or live_address(source) is not None:
         return f"lidarspec doctor {quote(source) if source else ''}".rstrip()
@@ -510,10 +517,10 @@ def _following(source: str | None, unknown: Structure | None) -> str:
     return f"lidarspec crc {quote(source)}{period}"
 
 
-def _again(one: Verdict) -> str:
+def _format_source(one: Verdict) -> str:
     """Return the source with the baud rate and the sender that were found."""
-    source = one.heard.source
-    heard = one.heard
+    source = one.sample.source
+    heard = one.sample
     link = data_link(one.sensor, Serial)
     if heard.baud is not None and "baud=" not in source and not (link and link.baud == heard.baud):
         source = with_option(source, "baud", heard.baud)
@@ -524,7 +531,7 @@ def _again(one: Verdict) -> str:
 
 def _verdict_to_dict(one: Verdict) -> dict[str, Any]:
     """Return a verdict as a JSON object."""
-    heard = one.heard
+    heard = one.sample
     return {
         "source": heard.source,
         "baud": heard.baud,
@@ -532,7 +539,7 @@ def _verdict_to_dict(one: Verdict) -> dict[str, Any]:
         "bytes": heard.size,
         "failure": str(heard.failure) if heard.failure else None,
         "sensor": one.sensor.id if one.sensor is not None else None,
-        "alike": [score.sensor.id for score in one.alike],
+        "alike": [score.sensor.id for score in one.candidates],
         "not_installed": dict(one.others),
         "fault": one.fault or None,
         "fits": [
@@ -547,7 +554,7 @@ def _verdict_to_dict(one: Verdict) -> dict[str, Any]:
     }
 
 
-def _structure_told(found: Structure | None) -> dict[str, Any] | None:
+def _structure_to_dict(found: FrameStructure | None) -> dict[str, Any] | None:
     if found is None:
         return None
     return {
@@ -556,11 +563,11 @@ def _structure_told(found: Structure | None) -> dict[str, Any] | None:
         "length": str(found.length) if found.length else None,
         "share": round(found.share, 4),
         "frames": len(found.frames),
-        "checksums": [checksum_told(match) for match in found.checksums],
+        "checksums": [match_to_dict(match) for match in found.checksums],
     }
 
 
-def _structure_text(found: Structure) -> str:
+def _structure_text(found: FrameStructure) -> str:
     if found.period:
         length = f"{found.period} bytes each"
     else:
@@ -615,7 +622,7 @@ def doctor(
     if source is not None and not as_json:
         note(f"listening to {source}")
     if source is None:
-        diagnoses = list(computer())
+        diagnoses = list(examine_computer())
     else:
         diagnoses = list(examine(source, sensor, seconds=duration))
     if as_json:
@@ -623,7 +630,7 @@ def doctor(
     else:
         lines = [
             f"{'ok   ' if one.ok else 'wrong'}  {one.text}"
-            + (f"\n       next: {one.mend}" if one.mend else "")
+            + (f"\n       next: {one.fix}" if one.fix else "")
             for one in diagnoses
         ]
         emit("\n".join(lines) or "no problem found with the ports of this computer", output)

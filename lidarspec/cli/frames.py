@@ -10,16 +10,16 @@ from typing import Any
 import click
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import nearest_fault, no_frame, open_input
+from lidarspec.cli.inputs import nearest_fault_error, no_frame_error, open_input
 from lidarspec.cli.listing import emit_lines
 from lidarspec.cli.options import OFFSET, count_option, selecting, sensor_option
 from lidarspec.cli.output import emit_json, emit_json_list, emit_parts, output_options, table
 from lidarspec.cli.terminal import note
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, values
 from lidarspec.explaining.formatting import TextSpan, number
-from lidarspec.explaining.input_segments import InputPiece, explain_piece, pieces
+from lidarspec.explaining.input_segments import InputPiece, explain_piece, iter_pieces
 from lidarspec.explaining.listing import LINED, Line, list_differences
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import selection as scans
@@ -49,10 +49,10 @@ def parse(
     with open_input(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id)
         wanted = FrameSelection(sensor, count=count)
-        found = wanted.frames(pieces(sensor, chunks, datagrams=given.datagrams))
+        found = wanted.frames(iter_pieces(sensor, chunks, datagrams=given.datagrams))
         first = next(found, None)
         if first is None:
-            raise no_frame(sensor, given)
+            raise no_frame_error(sensor, given)
         frames = itertools.chain([first], found)
         if as_json:
             emit_json_list(
@@ -146,8 +146,8 @@ def explain(
     with open_input(words, selection.times) as (given, chunks):
         sensor, fits = _sensor(given, sensor_id, damaged=True)
         if not given.data:
-            raise no_frame(sensor, given)
-        found = pieces(sensor, chunks, datagrams=given.datagrams, frame=frame)
+            raise no_frame_error(sensor, given)
+        found = iter_pieces(sensor, chunks, datagrams=given.datagrams, frame=frame)
         if diff is not None:
             _compare(sensor, given, found, diff, frame, as_json=as_json, output=output)
             return
@@ -289,7 +289,7 @@ class FrameSelection:
         except WireError as fault:
             raise suggest(fault, f"lidarspec show {self._sensor.id}") from None
 
-    def conclude(self, given: Heard) -> None:
+    def conclude(self, given: SampleBytes) -> None:
         """Print the counts of an input that was shown.
 
         Raises:
@@ -309,7 +309,7 @@ class FrameSelection:
                     f"no {self._frame} frame in {given.source}{others}", sensor=self._sensor.id
                 )
             raise (
-                no_frame(self._sensor, given)
+                no_frame_error(self._sensor, given)
                 if self._fault is None
                 else suggest(self._fault, f"lidarspec show {self._sensor.id}")
             )
@@ -342,7 +342,7 @@ def _stretch(text: str | None) -> tuple[float, float]:
 
 def _compare(
     sensor: Sensor,
-    given: Heard,
+    given: SampleBytes,
     found: Iterator[InputPiece],
     diff: str,
     frame: str | None,
@@ -358,14 +358,14 @@ def _compare(
     )
     first = next(frames, None)
     if first is None:
-        raise no_frame(sensor, given)
+        raise no_frame_error(sensor, given)
     if diff == "next":
         other = next((piece for piece in frames if piece.frame == first.frame), None)
         if other is None:
             raise UsageError(f"the input has no second {first.frame} frame to compare with")
     else:
         with open_input([diff]) as (heard, chunks):
-            second = pieces(sensor, chunks, datagrams=heard.datagrams, frame=frame)
+            second = iter_pieces(sensor, chunks, datagrams=heard.datagrams, frame=frame)
             other = next(
                 (piece for piece in second if piece.frame == first.frame),
                 InputPiece(0, heard.data, first.frame),
@@ -394,16 +394,16 @@ def _compare(
 
 
 def _sensor(
-    given: Heard, sensor_id: str | Sensor | None, *, damaged: bool = False
+    given: SampleBytes, sensor_id: str | Sensor | None, *, damaged: bool = False
 ) -> tuple[Sensor, list[str]]:
     """Return the sensor that is named or fits the bytes, and the ids of all that fit."""
     if sensor_id is not None:
         return named_sensor(sensor_id), []
     from lidarspec.detect.identification import (
-        fitting,
+        find_fitting_sensors,
     )  # not needed for a named sensor, and slow to import
 
-    sensors = fitting(given.chunks, datagrams=given.datagrams)
+    sensors = find_fitting_sensors(given.chunks, datagrams=given.datagrams)
     if sensors:
         fits = [sensor.id for sensor in sensors]
         note(
@@ -411,7 +411,7 @@ def _sensor(
             + (f", and also {', '.join(fits[1:])}: choose with -s" if fits[1:] else "")
         )
         return sensors[0], fits
-    fault = nearest_fault(given)
+    fault = nearest_fault_error(given)
     if not damaged or not fault.sensor:
         raise fault
     note(f"these bytes match no sensor; the closest is {fault.sensor}")

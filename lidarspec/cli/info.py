@@ -10,7 +10,7 @@ import click
 from lidarspec.cli.failures import NO_DATA
 from lidarspec.cli.output import emit_parts, output_options, size
 from lidarspec.cli.terminal import note
-from lidarspec.explaining.file_contents import contents, shown
+from lidarspec.explaining.file_contents import format_contents, read_contents
 
 
 @click.command()
@@ -27,12 +27,12 @@ def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
 
     def iter_texts() -> Iterator[str]:
         for file in files:
-            held = contents(file)
+            held = read_contents(file)
             if as_json:
                 yield json.dumps(held.to_dict(), indent=2, allow_nan=False)
             else:
                 yield f"{held.path}: {held.kind}, {size(held.size)}"
-                yield from (f"  {word:<8}  {text}" for word, text in shown(held))
+                yield from (f"  {word:<8}  {text}" for word, text in format_contents(held))
             for warning in held.warnings:
                 note(warning)
             if not any(content.sensors for content in held.contents):

@@ -26,7 +26,7 @@ import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.terminal import note
-from lidarspec.detect.sample_bytes import LOOKED_AT, Heard, beginning, leading
+from lidarspec.detect.sample_bytes import LOOKED_AT, SampleBytes, read_beginning, take_leading
 from lidarspec.errors import (
     CommandError,
     LidarSpecError,
@@ -63,7 +63,7 @@ LOOK = 0.1
 @contextlib.contextmanager
 def open_input(
     words: Sequence[str], times: Times = (None, None)
-) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
     """Open the input that command-line arguments name.
 
     Yields:
@@ -84,14 +84,14 @@ def open_input(
         try:
             if not (data := parse_hex(text)):
                 raise ValueError("no digits found")
-            reading = _beginning(
+            reading = _read_beginning(
                 text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False
             )
         except ValueError as error:
             from lidarspec.device.settings import find_device
 
             if (device := find_device(text)) is None:
-                raise _no_bytes(words, error) from None
+                raise _no_bytes_error(words, error) from None
             reading = open_input([device.source], times)
     with reading as given:
         yield given
@@ -106,7 +106,7 @@ def _is_file(text: str) -> bool:
 
 
 @contextlib.contextmanager
-def _file(path: str, times: Times) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+def _file(path: str, times: Times) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
     from lidarspec.transports.files import FileTransport
     from lidarspec.transports.open_url import transport
 
@@ -115,26 +115,28 @@ def _file(path: str, times: Times) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
             chunks = _standard_input(file)
         else:
             chunks = iter_received(file, times, path)
-        with _beginning(path, chunks, datagrams=file.datagrams, warnings=file.warnings) as given:
+        with _read_beginning(
+            path, chunks, datagrams=file.datagrams, warnings=file.warnings
+        ) as given:
             yield given
         for warning in file.warnings if given[0].chunks else ():
             note(warning)
 
 
 @contextlib.contextmanager
-def _beginning(
+def _read_beginning(
     source: str, chunks: Iterator[Chunk], *, datagrams: bool, warnings: Sequence[str] = ()
-) -> Iterator[tuple[Heard, Iterator[Chunk]]]:
+) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
     with system_errors(source):
-        head = leading(chunks, LOOKED_AT)
+        head = take_leading(chunks, LOOKED_AT)
     data = tuple(chunk.data for chunk in head)
     yield (
-        Heard(source, data, datagrams, warnings=tuple(warnings)),
-        itertools.chain(head, _rest(source, chunks)),
+        SampleBytes(source, data, datagrams, warnings=tuple(warnings)),
+        itertools.chain(head, _read_rest(source, chunks)),
     )
 
 
-def _rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
+def _read_rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
     with system_errors(source):
         yield from chunks
 
@@ -158,7 +160,7 @@ def _standard_input(file: FileTransport) -> Iterator[Chunk]:
     yield from hex_chunks("standard input", readline)
 
 
-def read(words: Sequence[str]) -> Heard:
+def read(words: Sequence[str]) -> SampleBytes:
     """Return the first `MOST` bytes of the input that command-line arguments name.
 
     Raises:
@@ -166,10 +168,10 @@ def read(words: Sequence[str]) -> Heard:
         SourceError: for a file that cannot be read.
     """
     with open_input(words) as (given, chunks):
-        return replace(given, chunks=tuple(chunk.data for chunk in leading(chunks, MOST)))
+        return replace(given, chunks=tuple(chunk.data for chunk in take_leading(chunks, MOST)))
 
 
-def _no_bytes(words: Sequence[str], error: ValueError) -> LidarSpecError:
+def _no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecError:
     """Return the error for arguments that are neither a file nor hexadecimal digits."""
     from lidarspec.transports.open_url import live_address
 
@@ -245,7 +247,7 @@ def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
         )
 
 
-def no_frame(sensor: Sensor, given: Heard) -> WireError:
+def no_frame_error(sensor: Sensor, given: SampleBytes) -> WireError:
     """Return the error for input without a frame of this sensor."""
     data = given.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
@@ -255,7 +257,7 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
             WireError(no_bytes(given.source, given.warnings), sensor=sensor.id),
             f"lidarspec build {sensor.id} --help",
         )
-    if (fault := _never_right(given)) is not None:
+    if (fault := _wrong_checksums_error(given)) is not None:
         return fault
     if len(data) > longest:
         kind = " of text" if given.is_text else ""
@@ -273,19 +275,19 @@ def no_frame(sensor: Sensor, given: Heard) -> WireError:
     return suggest(WireError("the bytes are not plausible", sensor=sensor.id, data=data), command)
 
 
-def nearest_fault(given: Heard) -> WireError:
+def nearest_fault_error(given: SampleBytes) -> WireError:
     """Return the error for input that no sensor fits.
 
     It is the error of the sensor that parsed most of the input, or a general one.
     """
-    from lidarspec.detect.identification import nearest
+    from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
 
     if not given.data:
         return suggest(WireError(no_bytes(given.source, given.warnings)), "lidarspec sensors")
-    if (fault := _never_right(given)) is not None:
+    if (fault := _wrong_checksums_error(given)) is not None:
         return fault
-    best = nearest(given.data)
+    best = find_nearest_fault(given.data)
     if best is None:
         if sensors():
             text = f"no frame of the {len(sensors())} installed sensors"
@@ -298,14 +300,14 @@ def nearest_fault(given: Heard) -> WireError:
     return suggest(best, f"lidarspec explain {quote(given.source)} -s {best.sensor}")
 
 
-def _never_right(given: Heard) -> WireError | None:
+def _wrong_checksums_error(given: SampleBytes) -> WireError | None:
     """Return an error if all frames of a sensor in the input have wrong checksums.
 
     Returns None otherwise.
     """
-    from lidarspec.detect.identification import never_right
+    from lidarspec.detect.identification import find_wrong_checksums
 
-    fault = never_right(given.chunks, datagrams=given.datagrams)
+    fault = find_wrong_checksums(given.chunks, datagrams=given.datagrams)
     if fault:
         return suggest(
             WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}"
@@ -313,7 +315,7 @@ def _never_right(given: Heard) -> WireError | None:
     return None
 
 
-def nothing_came(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
+def no_scan_error(device: Device, source: str, seconds: float | None = None) -> LidarSpecError:
     """Return the error for a source without a scan.
 
     The cause is an exception of the plugin, a file without data frames, a device that sends
@@ -324,12 +326,12 @@ def nothing_came(device: Device, source: str, seconds: float | None = None) -> L
     if (failure := stats.failure(sensor.id)) is not None:
         return failure
     if not device.is_live:
-        if stats.bytes_in and (instead := fits_instead(sensor, source)):
+        if stats.bytes_in and (instead := identify_file(sensor, source)):
             return suggest(
                 WireError(f"{source} {instead[0]}", sensor=sensor.id), f"repeat with {instead[1]}"
             )
-        given = None if stats.frames else again(source)
-        if given is not None and (fault := _never_right(given)) is not None:
+        given = None if stats.frames else reread(source)
+        if given is not None and (fault := _wrong_checksums_error(given)) is not None:
             return fault
         if given is not None and given.is_text:
             error = WireError(f"{source} is text without a data frame: {stats}", sensor=sensor.id)
@@ -382,7 +384,7 @@ def conclude(device: Device) -> None:
         raise click.exceptions.Exit(FINDINGS)
 
 
-def again(source: str) -> Heard | None:
+def reread(source: str) -> SampleBytes | None:
     """Read the beginning of a file a second time; return None if that is not possible."""
     from lidarspec.transports.open_url import transport
 
@@ -390,23 +392,23 @@ def again(source: str) -> Heard | None:
         return None
     with contextlib.closing(transport(source)) as file:
         try:
-            chunks = tuple(chunk.data for chunk in beginning(file, LOOKED_AT))
-            return Heard(source, chunks, file.datagrams, warnings=tuple(file.warnings))
+            chunks = tuple(chunk.data for chunk in read_beginning(file, LOOKED_AT))
+            return SampleBytes(source, chunks, file.datagrams, warnings=tuple(file.warnings))
         except LidarSpecError:
             return None
 
 
-def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
+def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
     """Identify a file that has no data frame of `sensor`.
 
     Returns:
         A description of its content, and the command-line options that read it; None if no sensor
         fits.
     """
-    from lidarspec.detect.identification import format_sensor_options, verdict
+    from lidarspec.detect.identification import format_sensor_options, identify_sample
 
-    given = again(source)
-    scores = verdict(given).scores if given is not None else ()
+    given = reread(source)
+    scores = identify_sample(given).scores if given is not None else ()
     own = next((score.sensor.options for score in scores if score.sensor.id == sensor.id), None)
     if own:
         assignments = " and ".join(f"{name}={value}" for name, value in own.items())
@@ -426,7 +428,7 @@ def fits_instead(sensor: Sensor, source: str) -> tuple[str, str] | None:
     )
 
 
-class Patience:
+class FirstFrameTimeout:
     """A timeout for the first frame of a live source.
 
     Args:
@@ -455,10 +457,10 @@ class Patience:
             and self._device.is_live
             and not any(name in self._device.stats.frames for name in self._awaited)
         ):
-            raise nothing_came(self._device, self._source, waited)
+            raise no_scan_error(self._device, self._source, waited)
 
 
-def scans_of(
+def iter_device_scans(
     device: Device, source: str, select: Selection | None = None, *, until: float = math.inf
 ) -> Iterator[Scan]:
     """Yield the selected scans of a device.
@@ -472,7 +474,7 @@ def scans_of(
             long.
         UsageError: if none of the scans is selected.
     """
-    patience = Patience(device, source)
+    patience = FirstFrameTimeout(device, source)
     for scan in device.scans(wait=LOOK, select=select):
         if scan is not None:
             yield scan

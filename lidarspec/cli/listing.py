@@ -6,9 +6,9 @@ import os
 import sys
 from collections.abc import Iterable
 
-from lidarspec.cli.output import drawn, emit_parts
+from lidarspec.cli.output import emit_parts, render
 from lidarspec.errors import printable
-from lidarspec.explaining.listing import Line, fold, text as plain_text
+from lidarspec.explaining.listing import Line, fold, join_text as plain_text
 
 #: The style of each role of a part of a line.
 STYLES = {
@@ -52,4 +52,4 @@ def _colour(line: Line, width: int | None) -> str:
     drawing = Text()
     for span in line if width is None else fold(line, width):
         drawing.append(printable(span.text), STYLES.get(span.role))
-    return drawn(drawing)
+    return render(drawing)

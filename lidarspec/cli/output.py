@@ -202,14 +202,14 @@ def emit_parts(
             say(part, nl=isinstance(part, str), colour=colour)
         return
     from lidarspec.formats.common import (
-        replacing,
+        replace_file,
     )  # imports the modules of scans, which only verbs that write a file need
 
     path = Path(output)
     is_replaced = path.is_file() or not path.exists()  # False for a device or a pipe
     with (
         system_errors(output),
-        replacing(path) if is_replaced else contextlib.nullcontext(path) as written,
+        replace_file(path) if is_replaced else contextlib.nullcontext(path) as written,
         written.open("wb") as file,
     ):
         for part in parts:
@@ -284,7 +284,7 @@ def _fold_row(line: Sequence[str], widths: Sequence[int], room: int) -> Iterator
         yield from (" " * HANGING + text for text in wrap(cell, room - HANGING) if text)
 
 
-def drawn(what: Text) -> str:
+def render(what: Text) -> str:
     """Render an object of rich as coloured text.
 
     Printing with rich itself would end the process on a closed pipe.

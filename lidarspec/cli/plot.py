@@ -11,19 +11,25 @@ from typing import Any
 
 import click
 
-from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came, refuse_overwriting, scans_of
+from lidarspec.cli.inputs import (
+    PATIENCE,
+    conclude,
+    iter_device_scans,
+    no_scan_error,
+    refuse_overwriting,
+)
 from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
 from lidarspec.cli.output import emit
 from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError
-from lidarspec.formats.common import replacing
-from lidarspec.points.appearance import fit, look
+from lidarspec.formats.common import replace_file
+from lidarspec.points.appearance import choose_appearance, fit_to_points
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
 from lidarspec.view import matplotlib_figures
-from lidarspec.view.live_scans import Feed
+from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.svg import svg
 
 
@@ -110,13 +116,13 @@ def plot(
 def _draw_scan(
     scan: Scan, title: str, ramp: str, max_range: float | None, output: str, suffix: str
 ) -> None:
-    view = look(scan.points, ramp=ramp, reach=max_range)
+    view = choose_appearance(scan.points, ramp=ramp, reach=max_range)
     if max_range is None:
-        view = fit(scan.points, view)
+        view = fit_to_points(scan.points, view)
     if suffix == ".svg":
         emit(svg(scan.points, view, title), output)
     else:
-        _save(matplotlib_figures.of_scan(scan, view, title), output, suffix)
+        _save(matplotlib_figures.draw_scan(scan, view, title), output, suffix)
 
 
 def _find_scan(device: Device, source: str, selection: Selection, number: int) -> Scan:
@@ -126,7 +132,7 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
     """
     chosen: Scan | None = None
     whole_count = 0
-    for scan in scans_of(device, source, selection):
+    for scan in iter_device_scans(device, source, selection):
         if scan.whole:
             whole_count += 1
         if scan.whole or chosen is None or not chosen.whole:
@@ -134,7 +140,7 @@ def _find_scan(device: Device, source: str, selection: Selection, number: int) -
         if whole_count == number:
             break
     if chosen is None:
-        raise nothing_came(device, source)
+        raise no_scan_error(device, source)
     if whole_count < number:
         plural = "" if whole_count == 1 else "s"
         note(
@@ -150,13 +156,13 @@ def _draw_over_time(
     """Return a figure of the data until a time of `time.monotonic`."""
     title = f"{device.sensor.id}, {Path(source).name if device.place else source}"
     if kind == "rates":
-        rates = matplotlib_figures.Rates(Feed(device, select=selection), end_s)
+        rates = matplotlib_figures.RateSeries(LiveScans(device, select=selection), end_s)
         conclude(device)
-        return matplotlib_figures.of_rates(rates, title)
-    scans = scans_of(device, source, selection, until=end_s)
+        return matplotlib_figures.draw_rates(rates, title)
+    scans = iter_device_scans(device, source, selection, until=end_s)
     first = next(scans, None)
     if first is None:
-        raise nothing_came(device, source)
+        raise no_scan_error(device, source)
 
     def iter_scans() -> Iterator[Scan]:
         yield first
@@ -164,8 +170,8 @@ def _draw_over_time(
         conclude(device)
 
     if kind == "ranges":
-        return matplotlib_figures.of_ranges(iter_scans(), title)
-    return matplotlib_figures.of_intensities(iter_scans(), title)
+        return matplotlib_figures.draw_ranges(iter_scans(), title)
+    return matplotlib_figures.draw_intensities(iter_scans(), title)
 
 
 def _save(figure: Any, output: str, suffix: str) -> None:
@@ -174,5 +180,5 @@ def _save(figure: Any, output: str, suffix: str) -> None:
         matplotlib_figures.save(figure, text, suffix)
         emit(text.getvalue().decode(), output)
         return
-    with replacing(Path(output)) as part:
+    with replace_file(Path(output)) as part:
         matplotlib_figures.save(figure, part, suffix)

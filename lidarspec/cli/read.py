@@ -15,7 +15,7 @@ import click
 import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import Patience, conclude, nothing_came, scans_of
+from lidarspec.cli.inputs import FirstFrameTimeout, conclude, iter_device_scans, no_scan_error
 from lidarspec.cli.options import (
     DURATION,
     SHARE,
@@ -29,9 +29,9 @@ from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UnknownFrame, UsageError
 from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import Selection, Slice
+from lidarspec.scans.selection import Selection, TimeSlice
 from lidarspec.sensor_operations import Sensor
-from lidarspec.view.live_scans import LOOK_S, Feed
+from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading, format_figure
 
 #: Width and decimals of the columns of points.
@@ -100,17 +100,19 @@ def read(
             raise UnknownFrame(frame, device.sensor.frames, place=device.sensor.id)
         until = time.monotonic() + duration if duration else math.inf
         if whole or frame:
-            rows = _packets(device, frame, until, Patience(device, source, frame), selection)
+            rows = _packets(
+                device, frame, until, FirstFrameTimeout(device, source, frame), selection
+            )
         else:
             rows = _points(
-                scans_of(device, source, selection, until=until), every_point=every_point
+                iter_device_scans(device, source, selection, until=until), every_point=every_point
             )
         printed = 0
         for line in _lines(itertools.islice(rows, count), as_json=as_json):
             say(line)
             printed += 1
         if not printed and not device.stats.frames:
-            raise nothing_came(device, source, duration)
+            raise no_scan_error(device, source, duration)
         conclude(device)
 
 
@@ -146,12 +148,16 @@ def _points(scans: Iterable[Scan], *, every_point: bool) -> Iterator[tuple[Units
 
 
 def _packets(
-    device: Device, frame: str | None, until: float, patience: Patience, selection: Selection
+    device: Device,
+    frame: str | None,
+    until: float,
+    patience: FirstFrameTimeout,
+    selection: Selection,
 ) -> Iterator[tuple[Units, Row]]:
     """Yield each packet with the fields of its header in units; arrays stay arrays."""
     if replace(selection, times=(None, None), time="device") != Selection():
         raise UsageError("packets can be selected by --slice and --time only")
-    wanted = Slice(selection.times)
+    wanted = TimeSlice(selection.times)
     number = 0
     for batch in device.packets(frame, wait=LOOK_S):
         patience.check()
@@ -349,7 +355,7 @@ def stats(
         with open_device(source, sensor_id, period=LOOK_S) as device:
             reading = _print_stats(
                 source,
-                Feed(device, select=selection),
+                LiveScans(device, select=selection),
                 StatsPrinter(device, as_json),
                 interval,
                 lasting,
@@ -367,7 +373,7 @@ def stats(
 
 
 def _print_stats(
-    source: str, feed: Feed, lines: StatsPrinter, interval: float, lasting: float
+    source: str, feed: LiveScans, lines: StatsPrinter, interval: float, lasting: float
 ) -> MeterReading:
     """Print the lines and the summary of one source, and return the summary.
 
@@ -377,20 +383,22 @@ def _print_stats(
     start = time.monotonic()
     try:
         if feed.device.is_live:
-            _by_the_clock(feed, lines, interval, start, lasting, Patience(feed.device, source))
+            _print_by_clock(
+                feed, lines, interval, start, lasting, FirstFrameTimeout(feed.device, source)
+            )
         else:
-            _by_the_packets(feed, lines, interval, lasting)
+            _print_by_packet_time(feed, lines, interval, lasting)
     except KeyboardInterrupt:
         lines.summary(_summary(feed, start))
         raise
     reading = _summary(feed, start)
     if reading.packets == 0:
-        raise nothing_came(feed.device, source, reading.seconds)
+        raise no_scan_error(feed.device, source, reading.seconds)
     lines.summary(reading)
     return reading
 
 
-def _summary(feed: Feed, start: float) -> MeterReading:
+def _summary(feed: LiveScans, start: float) -> MeterReading:
     """Return the figures of the whole input.
 
     Args:
@@ -401,33 +409,35 @@ def _summary(feed: Feed, start: float) -> MeterReading:
     )
 
 
-def _by_the_clock(
-    feed: Feed,
+def _print_by_clock(
+    feed: LiveScans,
     lines: StatsPrinter,
     interval: float,
     start: float,
     lasting: float,
-    patience: Patience,
+    patience: FirstFrameTimeout,
 ) -> None:
     """Print a line for each interval of the clock."""
     edge = last = start
     end = start + lasting
     while end - edge > ROUNDED and not feed.ended:
         edge = min(edge + interval, end)
-        feed.pump(edge)
+        feed.read(edge)
         patience.check()
         now = time.monotonic()
         lines.interval(round(now - start, 3), feed.meter.reading(feed.device.stats, now - last))
         last = now
 
 
-def _by_the_packets(feed: Feed, lines: StatsPrinter, interval: float, lasting: float) -> None:
+def _print_by_packet_time(
+    feed: LiveScans, lines: StatsPrinter, interval: float, lasting: float
+) -> None:
     """Print a line for each interval of the packets' time, at least one batch long."""
     start: int | None = None
     edges = 0
     passed = 0.0
     while not feed.ended and passed < lasting:
-        feed.pump(0.0)
+        feed.read(0.0)
         if not feed.packets:
             continue
         if feed.packets.host_ns.any():

@@ -9,7 +9,7 @@ import shlex
 import click
 
 from lidarspec.cli.failures import INTERRUPTED
-from lidarspec.cli.inputs import nothing_came, refuse_overwriting
+from lidarspec.cli.inputs import no_scan_error, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, count_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note, say
@@ -26,7 +26,7 @@ from lidarspec.errors import (
 )
 from lidarspec.framing.results import Counters
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.recording.background_writer import Appender
+from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
@@ -116,7 +116,7 @@ def record(
         raise
     except SourceError as error:
         if task.recorder is not None and task.recorder.error is error:
-            suggest(error, _view_of(task.recorder, sensor))
+            suggest(error, _view_command(task.recorder, sensor))
         raise
     assert task.recorder is not None
     try:
@@ -151,14 +151,19 @@ def _print_recording(task: SourceRecording) -> None:
         )
 
 
-def _describe_recording(task: SourceRecording, kept: Appender) -> str:
+def _describe_recording(task: SourceRecording, kept: BackgroundWriter) -> str:
     """Return the number of records and bytes in words."""
     packets = f"{task.packets} packets, " if task.packets else ""
     return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
 
 
 def _sum_up_recording(
-    task: SourceRecording, kept: Appender, source: str, sensor: Sensor | None, *, as_json: bool
+    task: SourceRecording,
+    kept: BackgroundWriter,
+    source: str,
+    sensor: Sensor | None,
+    *,
+    as_json: bool,
 ) -> None:
     """Print a summary of a recording and the next command; delete an empty file."""
     device = task.device
@@ -166,7 +171,7 @@ def _sum_up_recording(
         if not kept.discard():
             note(f"{kept.path} was not changed")
         if device is not None:
-            raise nothing_came(device, source, task.elapsed)
+            raise no_scan_error(device, source, task.elapsed)
         if live_address(source) is not None:
             raise suggest(
                 CommandError(f"{source} sent nothing"), f"lidarspec doctor {shlex.quote(source)}"
@@ -177,7 +182,7 @@ def _sum_up_recording(
     if stats is not None and (damage := _describe_damage(stats)):
         summary += f"; {damage}"
     note(summary)
-    note(f"next: {_view_of(kept, sensor)}")
+    note(f"next: {_view_command(kept, sensor)}")
     if as_json:
         facts = {"output": kept.path, "source": source, "sensor": sensor.id if sensor else None}
         counts = {
@@ -189,7 +194,7 @@ def _sum_up_recording(
         }
         emit_json({**facts, **counts, "stats": stats.to_dict() if stats else None}, None)
     if stats is not None and not stats.frames and device is not None:
-        raise nothing_came(device, source, task.elapsed)
+        raise no_scan_error(device, source, task.elapsed)
 
 
 def _describe_damage(stats: Counters) -> str:
@@ -203,7 +208,7 @@ def _describe_damage(stats: Counters) -> str:
     return ", ".join(f"{name} {value}" for name, value in counters.items() if value)
 
 
-def _view_of(kept: Appender, sensor: Sensor | None) -> str:
+def _view_command(kept: BackgroundWriter, sensor: Sensor | None) -> str:
     """Return the command that shows a recording."""
     if isinstance(kept, Recorder) and kept.header.sensor:
         return f"lidarspec view {shlex.quote(kept.path)}"
@@ -266,7 +271,7 @@ def replay(
     with contextlib.ExitStack() as undo:
         source = undo.enter_context(contextlib.closing(transport(file)))
         sensor = _find_sensor(source, sensor_id)
-        destination: Outlet | Appender
+        destination: Outlet | BackgroundWriter
         if is_file:
             destination = _make_file(source, file, place, sensor, force=force)
         else:
@@ -294,7 +299,7 @@ def replay(
         raise click.exceptions.Exit(INTERRUPTED)
 
 
-def _run(played: Replay, destination: Outlet | Appender, file: str) -> bool:
+def _run(played: Replay, destination: Outlet | BackgroundWriter, file: str) -> bool:
     """Run a replay; return whether it was interrupted before its end."""
     with contextlib.closing(destination), Progress() as progress:
         try:
@@ -322,7 +327,7 @@ def _find_sensor(source: Transport, sensor_id: str | Sensor | None) -> Sensor | 
 
 def _make_file(
     source: Transport, file: str, place: str, sensor: Sensor | None, *, force: bool
-) -> Appender:
+) -> BackgroundWriter:
     """Return a new file for the bytes of another one."""
     try:
         return recorder_like(source, file, place, sensor, overwrite=force)

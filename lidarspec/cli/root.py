@@ -18,7 +18,7 @@ import click
 
 from lidarspec._version import __version__
 from lidarspec.cli.failures import INTERRUPTED, report
-from lidarspec.cli.terminal import note, say, silence, streams, voice
+from lidarspec.cli.terminal import discard_output, note, prepare_streams, say, voice
 from lidarspec.entry_points import VERBS as PLUGGED, EntryPoint, entry_points
 from lidarspec.errors import did_you_mean, suggest
 from lidarspec.known_sensors import install_command
@@ -188,7 +188,7 @@ class Verbs(click.Group):
         if find_added_verbs():
             with formatter.section("plugins"):
                 formatter.write_dl(
-                    [(verb, _from(entry)) for verb, entry in find_added_verbs().items()]
+                    [(verb, _load_verb(entry)) for verb, entry in find_added_verbs().items()]
                 )
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[Any]:
@@ -196,7 +196,7 @@ class Verbs(click.Group):
         from click.shell_completion import CompletionItem
 
         known = {verb: text for verb, (_, text) in VERBS.items()} | {
-            verb: _from(entry) for verb, entry in find_added_verbs().items()
+            verb: _load_verb(entry) for verb, entry in find_added_verbs().items()
         }
         found = [
             CompletionItem(verb, help=text)
@@ -217,17 +217,17 @@ class Verbs(click.Group):
         sys.exit(_run(self, words))
 
 
-def _from(entry: EntryPoint) -> str:
+def _load_verb(entry: EntryPoint) -> str:
     return f"From the plugin {entry.distribution} {entry.version}."
 
 
 def _run(group: click.Group, words: list[str]) -> int:
     began = time.monotonic()
     try:
-        with streams(), group.make_context("lidarspec", words) as ctx:
+        with prepare_streams(), group.make_context("lidarspec", words) as ctx:
             group.invoke(ctx)
             if voice.loudness > 0:
-                note(_spent(time.monotonic() - began))
+                note(_format_cost(time.monotonic() - began))
         return 0
     except click.exceptions.Exit as done:
         return done.exit_code
@@ -235,7 +235,7 @@ def _run(group: click.Group, words: list[str]) -> int:
         note("interrupted")
         return INTERRUPTED
     except BrokenPipeError:
-        silence()
+        discard_output()
         return 0
     except Exception as error:
         return report(
@@ -243,7 +243,7 @@ def _run(group: click.Group, words: list[str]) -> int:
         )
 
 
-def _spent(seconds: float) -> str:
+def _format_cost(seconds: float) -> str:
     """Format the time of a verb, and its memory if the system reports it."""
     try:
         import resource

@@ -48,10 +48,10 @@ def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
 def guide() -> str:
     """Return what is installed and connected, and the first commands to type."""
     from lidarspec.device.settings import devices
-    from lidarspec.transports.ports import serial_ports
+    from lidarspec.transports.ports import list_serial_ports
 
     installed, _ = list_sensors()
-    ports = [port.path for port in serial_ports()]
+    ports = [port.path for port in list_serial_ports()]
     named = list(devices())
     example = installed[0].id if installed else "ID"
     source = (named or ports or [f"sim:{example}"])[0]
@@ -182,7 +182,7 @@ def _unit(sensor: Sensor, path: str) -> str:
 
     frame, _, field = path.partition(".")
     if frame in sensor.frames:
-        unit = schema(sensor.frames[frame].tree).named[field].unit
+        unit = schema(sensor.frames[frame].tree).scan_names[field].unit
     else:
         unit = ""
     if unit:
@@ -192,7 +192,7 @@ def _unit(sensor: Sensor, path: str) -> str:
 
 def _plan(sensor: Sensor, frame: str) -> list[str]:
     """Return the plan of a data frame in lines, or the reason why there is none."""
-    from lidarspec.frames.frame_table import Rows
+    from lidarspec.frames.frame_table import CompiledTable
     from lidarspec.framing.results import Counters, Found, pack_found
     from lidarspec.packets.stream import PacketStream
     from lidarspec.points.numpy_plan import describe
@@ -210,7 +210,7 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
         frames = [sensor.example(frame)]
     sent = pack_found([Found(frame, 0, data) for data in frames])
     packets = PacketStream(sensor, frame, Counters()).add([sent]).with_points
-    if not isinstance(packets.table, Rows) or not packets.table.groups:
+    if not isinstance(packets.table, CompiledTable) or not packets.table.groups:
         return ["plain evaluation: the example has no points"]
     largest = max(packets.table.groups, key=lambda group: group.layout.size)
     plan = plan_for(sensor.points_of(packets.frame), packets.batch(), largest)

@@ -14,14 +14,14 @@ import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import DURATION, SHARE, configuring, count_option, sensor_option
-from lidarspec.cli.output import Progress, drawn, emit_json, size
-from lidarspec.cli.terminal import ended_by_terminate, note, say
+from lidarspec.cli.output import Progress, emit_json, render, size
+from lidarspec.cli.terminal import handle_sigterm, note, say
 from lidarspec.detect.identification import format_sensor_options
 from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.errors import UsageError, suggest
 from lidarspec.known_sensors import no_sensors
 from lidarspec.plugins import registry, sensor as named_sensor
-from lidarspec.points.appearance import look
+from lidarspec.points.appearance import choose_appearance
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.scans.scan import Scan
 from lidarspec.sensor_operations import Sensor
@@ -160,8 +160,8 @@ def sim(
                 f" ({', '.join(SUFFIXES)})"
             )
         written = write_file(device, place, duration or IN_A_FILE, overwrite=force)
-        _tell(sensor, place, place, {}, as_json=as_json)
-        note(f"{_sent(device)}, {size(written)}")
+        _announce(sensor, place, place, {}, as_json=as_json)
+        note(f"{_format_sent(device)}, {size(written)}")
         return
     try:
         opened = simulated_outlet(sensor, place, link)
@@ -172,8 +172,8 @@ def sim(
         ) from None
     try:
         controls = {name: control.place for name, control in opened.controls.items()}
-        _tell(sensor, opened.place, opened.source, controls, as_json=as_json)
-        with ended_by_terminate(), Progress() as progress:
+        _announce(sensor, opened.place, opened.source, controls, as_json=as_json)
+        with handle_sigterm(), Progress() as progress:
             serve(device, opened, seconds=duration, on_pass=_watching(device, opened, progress))
     finally:
         opened.close()
@@ -181,10 +181,10 @@ def sim(
             lost = f"; {size(opened.unsent_bytes)} had no reader"
         else:
             lost = ""
-        note(f"{_sent(device)}{lost}")
+        note(f"{_format_sent(device)}{lost}")
 
 
-def _tell(
+def _announce(
     sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool
 ) -> None:
     """Print the place of the sensor, its other links, and the next command."""
@@ -216,19 +216,19 @@ def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Ca
 
     def turn() -> None:
         nonlocal heard, present
-        events = device.heard[heard:]
+        events = device.commands_received[heard:]
         if device.present != present:
             events += [f"plugged in again at {opened.place}" if device.present else "unplugged"]
         for event in events:
             progress.note(f"{time.monotonic() - began:.1f} s: {event}")
-        heard = len(device.heard)
+        heard = len(device.commands_received)
         present = device.present
-        progress(lambda: f"{time.monotonic() - began:.0f} s, {_sent(device)}")
+        progress(lambda: f"{time.monotonic() - began:.0f} s, {_format_sent(device)}")
 
     return turn
 
 
-def _sent(device: SimulatedDevice) -> str:
+def _format_sent(device: SimulatedDevice) -> str:
     frames = [f"{number} {name}" for name, number in device.sent.items()]
     return f"{', '.join(frames) or 'no'} frames sent"
 
@@ -259,7 +259,7 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
     if as_json:
         emit_json(_facts(result, whole), None)
     else:
-        say("\n".join([drawn(_picture(whole[-1])), *_summary(result, whole, errors)]), colour=True)
+        say("\n".join([render(_picture(whole[-1])), *_summary(result, whole, errors)]), colour=True)
     if result.digest != result.again:
         click.get_current_context().exit(FINDINGS)
 
@@ -268,7 +268,9 @@ def _picture(scan: Scan) -> Text:
     columns, lines = shutil.get_terminal_size((80, HIGHEST))
     width = min(columns, WIDEST)
     height = max(min(lines - SUMMARY, HIGHEST), 12)
-    return picture(scan.points, width=width, height=height, look=look(scan.points)).text()
+    return picture(
+        scan.points, width=width, height=height, look=choose_appearance(scan.points)
+    ).text()
 
 
 def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[str]:

@@ -21,7 +21,7 @@ import click
 from lidarspec.errors import SourceError, printable
 
 
-class Voice:
+class Verbosity:
     """The amount of remarks printed beside the data.
 
     Attributes:
@@ -31,7 +31,7 @@ class Voice:
     loudness = 0
 
 
-voice = Voice()
+voice = Verbosity()
 #: The sequences that change colours, and do nothing else.
 _COLOURS = re.compile(r"(\x1b\[[0-9;]*m)")
 
@@ -62,11 +62,11 @@ def note(text: str) -> None:
     try:
         click.echo(printable(text), err=True)
     except (OSError, ValueError):
-        _lose(sys.stderr)
+        _discard_stream(sys.stderr)
 
 
 @contextlib.contextmanager
-def streams() -> Iterator[None]:
+def prepare_streams() -> Iterator[None]:
     """Prepare standard input, output and error for a verb, and flush them.
 
     Closed streams are replaced. Each warning is printed once, as a remark.
@@ -103,9 +103,9 @@ def streams() -> Iterator[None]:
         sys.stdout.flush()
 
 
-def silence() -> None:
+def discard_output() -> None:
     """Discard buffered output, so that a closed pipe causes no error at exit."""
-    _lose(sys.stdout)
+    _discard_stream(sys.stdout)
 
 
 def _escape_part(part: str) -> str:
@@ -121,11 +121,11 @@ def _translate_write_errors() -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as error:
-        silence()
+        discard_output()
         raise SourceError(f"standard output: {error.strerror or error}") from None
 
 
-def _lose(stream: Any) -> None:
+def _discard_stream(stream: Any) -> None:
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
@@ -133,7 +133,7 @@ def _lose(stream: Any) -> None:
 
 
 @contextlib.contextmanager
-def ended_by_terminate() -> Iterator[None]:
+def handle_sigterm() -> Iterator[None]:
     """Handle SIGTERM like Ctrl-C, so that a symbolic link is removed."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

@@ -12,23 +12,29 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import PATIENCE, conclude, nothing_came, refuse_overwriting
+from lidarspec.cli.inputs import PATIENCE, conclude, no_scan_error, refuse_overwriting
 from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
-from lidarspec.cli.output import drawn
-from lidarspec.cli.terminal import ended_by_terminate, note, say
+from lidarspec.cli.output import render
+from lidarspec.cli.terminal import handle_sigterm, note, say
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.errors import UsageError
-from lidarspec.points.appearance import look
+from lidarspec.points.appearance import choose_appearance
 from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live
 from lidarspec.transports.protocol import Origin
-from lidarspec.view.canvas import Cells
-from lidarspec.view.live_scans import LOOK_S, Feed
+from lidarspec.view.canvas import CellGrid
+from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.page_server import PageServer, open_page_server
 from lidarspec.view.polar import picture
-from lidarspec.view.terminal_screen import Screen, Terminated, encodable, interactive, keyboard
+from lidarspec.view.terminal_screen import (
+    Screen,
+    TerminatedError,
+    find_plain_characters,
+    is_interactive,
+    keyboard,
+)
 from lidarspec.view.terminal_window import Window
 
 
@@ -114,7 +120,7 @@ def view(
     if in_rerun:
         _in_rerun(source, sensor_id, output or "", ramp, duration, selection)
         return
-    if once or not interactive():
+    if once or not is_interactive():
         with open_device(source, sensor_id) as device:
             say(_draw_once(device, source, ramp, duration or PATIENCE, selection), colour=True)
             conclude(device)
@@ -131,7 +137,7 @@ def view(
         _show(
             device,
             Window(
-                Feed(device, played=True, select=selection),
+                LiveScans(device, played=True, select=selection),
                 source,
                 ramp=ramp,
                 record=switch,
@@ -173,7 +179,7 @@ def _serve(
         report=note,
     )
     try:
-        with ended_by_terminate(), server:
+        with handle_sigterm(), server:
             say(server.link)
             if opens and not _open_in_browser(server):
                 note("no browser found: open the link yourself")
@@ -224,10 +230,10 @@ def _in_rerun(
             raise UsageError(f"{target}: a recording for Rerun requires the suffix {RERUN.suffix}")
         refuse_overwriting([target], source, sensor_id)
     with open_device(source, sensor_id, period=LOOK_S) as device:
-        feed = Feed(device, select=selection)
+        feed = LiveScans(device, select=selection)
         show(feed, target, ramp=ramp, until=time.monotonic() + (duration or math.inf))
         if feed.scan is None:
-            raise nothing_came(device, source, duration)
+            raise no_scan_error(device, source, duration)
         note(f"{target or 'shown'}: {feed.number} scans of {device.sensor.id}")
         conclude(device)
 
@@ -241,7 +247,7 @@ def _show(device: Device, window: Window, *, taken: bool) -> None:
     try:
         with Screen(sys.stdout, keyboard(taken=taken)) as screen:
             window.run(screen)
-    except Terminated as end:
+    except TerminatedError as end:
         click.get_current_context().exit(end.code)
     except EOFError:
         device.close()
@@ -255,20 +261,22 @@ def _draw_once(
     Raises:
         WireError, CommandError: if no scan arrives.
     """
-    feed = Feed(device, select=selection)
+    feed = LiveScans(device, select=selection)
     end = time.monotonic() + patience
     while (
         not feed.ended
         and time.monotonic() < end
         and not (feed.scan is not None and feed.scan.whole)
     ):
-        feed.pump(0.0)
+        feed.read(0.0)
     if feed.scan is None:
-        raise nothing_came(device, source, patience)
+        raise no_scan_error(device, source, patience)
     columns, lines = shutil.get_terminal_size((80, 24))
-    chosen = look(feed.scan.points, ramp=ramp)
-    cells: Cells = picture(feed.scan.points, width=columns, height=max(lines - 2, 4), look=chosen)
-    if not encodable(sys.stdout):
+    chosen = choose_appearance(feed.scan.points, ramp=ramp)
+    cells: CellGrid = picture(
+        feed.scan.points, width=columns, height=max(lines - 2, 4), look=chosen
+    )
+    if not find_plain_characters(sys.stdout):
         cells = cells.ascii()
     colours = f"{chosen.ramp} {' to '.join(chosen.ends)}"
-    return f"{drawn(cells.text())}\n{device.sensor.id}: {feed.scan}; colours: {colours}"
+    return f"{render(cells.text())}\n{device.sensor.id}: {feed.scan}; colours: {colours}"

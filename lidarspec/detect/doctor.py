@@ -12,8 +12,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 
-from lidarspec.detect.identification import CLEAR, Verdict, read_info, verdict, verdicts
-from lidarspec.detect.listen import LISTEN, bauds, heard_as, started_first, udp_ports
+from lidarspec.detect.identification import (
+    CLEAR,
+    Verdict,
+    identify_sample,
+    identify_senders,
+    read_info,
+)
+from lidarspec.detect.listen import (
+    LISTEN,
+    list_bauds,
+    list_start_required,
+    list_udp_ports,
+    read_sensor_sample,
+)
 from lidarspec.errors import LidarSpecError, UsageError, printable, suggestion
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
@@ -22,7 +34,7 @@ from lidarspec.transports.addresses import SourceAddress, with_option
 from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.protocol import no_bytes
-from lidarspec.transports.udp import BUFFER, shortfall
+from lidarspec.transports.udp import BUFFER, warn_of_small_buffer
 
 LOOPBACK = "lo"
 
@@ -34,12 +46,12 @@ class Diagnosis:
     Attributes:
         ok: whether there is no problem.
         text: a description.
-        mend: the command that fixes it; "" if there is none, or no problem.
+        fix: the command that fixes it; "" if there is none, or no problem.
     """
 
     ok: bool
     text: str
-    mend: str = ""
+    fix: str = ""
 
 
 def examine(
@@ -63,9 +75,9 @@ def examine(
         yield from _examine_bytes(text, sensor, seconds)
 
 
-def computer() -> Iterator[Diagnosis]:
+def examine_computer() -> Iterator[Diagnosis]:
     """Check the ports of this computer, whatever is connected to them."""
-    serial_ports = ports.serial_ports()
+    serial_ports = ports.list_serial_ports()
     if not serial_ports:
         yield Diagnosis(
             True,
@@ -75,7 +87,7 @@ def computer() -> Iterator[Diagnosis]:
     for port in serial_ports:
         yield from _permission(port.path)
         yield from _in_use(port.path)
-    for number in udp_ports():
+    for number in list_udp_ports():
         yield from _port_in_use(number)
     yield from _buffer()
 
@@ -92,12 +104,12 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
     elif os.path.getsize(name) == 0:
         yield Diagnosis(False, f"{path} is empty")
     else:
-        found_verdicts = verdicts(path)
-        found = max(found_verdicts, key=lambda one: one.heard.size)
-        if found.heard.size:
+        found_verdicts = identify_senders(path)
+        found = max(found_verdicts, key=lambda one: one.sample.size)
+        if found.sample.size:
             yield _verdict(path, found, sensor)
         yield from _several(path, found_verdicts)
-        for text in found.heard.warnings or [no_bytes(path, ())] * (not found.heard.size):
+        for text in found.sample.warnings or [no_bytes(path, ())] * (not found.sample.size):
             yield Diagnosis(False, text)
 
 
@@ -120,7 +132,7 @@ def _serial(
 
 def _permission(port: str) -> Iterator[Diagnosis]:
     if not ports.is_allowed(port):
-        group = ports.group(port)
+        group = ports.find_group(port)
         text = f"{port}: no permission to open it"
         by_group = Diagnosis(
             False,
@@ -138,7 +150,7 @@ def _rule(port: str) -> str:
 
 
 def _in_use(port: str) -> Iterator[Diagnosis]:
-    for user in ports.users(port):
+    for user in ports.find_users(port):
         yield Diagnosis(False, f"{port} is in use by {user}", f"kill {user.pid}")
 
 
@@ -174,11 +186,11 @@ def _udp_numbers(address: SourceAddress, sensor: Sensor | None) -> list[int]:
         return [port]
     if link:
         return list(link.ports)
-    return udp_ports()
+    return list_udp_ports()
 
 
 def _port_in_use(number: int) -> Iterator[Diagnosis]:
-    users = ports.udp_users(number)
+    users = ports.find_udp_users(number)
     if users is None:
         return
     for user in users:
@@ -197,7 +209,7 @@ def _buffer() -> Iterator[Diagnosis]:
         granted = int(limit.read_text(encoding="ascii"))
     except (OSError, ValueError):
         return
-    for text in shortfall(BUFFER, min(granted, BUFFER)):
+    for text in warn_of_small_buffer(BUFFER, min(granted, BUFFER)):
         said, _, command = text.partition("; next: ")
         yield Diagnosis(False, said.replace("the system gave", "the system gives at most"), command)
 
@@ -237,11 +249,13 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
     """Check whether data arrives, and whether it is valid data of the sensor."""
     try:
         if sensor is not None:
-            tried = [verdict(heard) for heard in heard_as(source, sensor, seconds)]
+            tried = [
+                identify_sample(heard) for heard in read_sensor_sample(source, sensor, seconds)
+            ]
         else:
             tried = []
         if not any(one.scores for one in tried):
-            tried += verdicts(source, seconds=seconds)
+            tried += identify_senders(source, seconds=seconds)
     except LidarSpecError as error:
         command = suggestion(error)
         yield Diagnosis(
@@ -250,7 +264,7 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
             "" if "doctor" in command and not isinstance(error, UsageError) else command,
         )
         return
-    yield _verdict(source, max(tried, key=lambda one: (bool(one.scores), one.heard.size)), sensor)
+    yield _verdict(source, max(tried, key=lambda one: (bool(one.scores), one.sample.size)), sensor)
     yield from _several(source, tried)
 
 
@@ -258,8 +272,8 @@ def _several(source: str, found: Sequence[Verdict]) -> Iterator[Diagnosis]:
     """Yield a finding for several senders of one sensor's frames."""
     senders: dict[str, list[str]] = {}
     for one in found:
-        if one.scores and one.heard.sender:
-            senders.setdefault(one.scores[0].sensor.id, []).append(one.heard.sender)
+        if one.scores and one.sample.sender:
+            senders.setdefault(one.scores[0].sensor.id, []).append(one.sample.sender)
     for name, several in senders.items():
         if len(several) > 1:
             command = f"lidarspec view {quote(with_option(source, 'src', several[0]))} -s {name}"
@@ -270,9 +284,9 @@ def _several(source: str, found: Sequence[Verdict]) -> Iterator[Diagnosis]:
 
 def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
     """Return the finding about the data of one sender."""
-    heard = found.heard
+    heard = found.sample
     ids = [score.sensor.id for score in found.scores]
-    may_be = {score.sensor.id: score.why for score in found.alike} or dict(found.others)
+    may_be = {score.sensor.id: score.why for score in found.candidates} or dict(found.others)
     quoted = quote(source)
     if not heard.size and heard.warnings:
         return Diagnosis(
@@ -283,7 +297,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
     if found.fault:
         return Diagnosis(False, found.fault, f"lidarspec crc {quoted}")
     if not found.scores:
-        if heard.baud is not None and len(bauds()) > 1:
+        if heard.baud is not None and len(list_bauds()) > 1:
             at = " at any baud rate"
         else:
             at = ""
@@ -305,7 +319,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
     name = sensor.id if sensor is not None else ids[0]
     if name not in may_be:
         other, why = next(iter(may_be.items()))
-        if found.alike:
+        if found.candidates:
             command = f"lidarspec view {quoted} -s {other}"
         else:
             command = f"lidarspec detect {quoted}"
@@ -341,7 +355,7 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
 def _nothing(source: str, sensor: Sensor | None) -> Diagnosis:
     """Return the finding for a source without data."""
     quoted = quote(source)
-    if sensor is not None and sensor in started_first():
+    if sensor is not None and sensor in list_start_required():
         start = next(name for name in sensor.on_open if sensor.commands[name].starts)
         text = f"no data received; {sensor.id} sends nothing until it is started"
         return Diagnosis(False, text, f"lidarspec send {quoted} {start} -s {sensor.id}")

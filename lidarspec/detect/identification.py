@@ -1,15 +1,16 @@
 """Identify the installed sensor that sent some bytes.
 
-`scores` decodes the bytes with each installed sensor, and rates a sensor by the share of the bytes
-in frames with a valid checksum and plausible values. `verdict` selects the best sensor.
+`rate_sensors` decodes the bytes with each installed sensor, and rates a sensor by the share of the
+bytes in frames with a valid checksum and plausible values. `identify_sample` selects the best
+sensor.
 
 `distinguish` compares related models with the same frames, by the differences that their
 `relatives` declare: packets that only one of them sends, the pace of the clock in the packets, and
 the model that a frame names, in a text or by a documented value ("0x22 NAME"). If none of these
 differences is visible, all related models remain possible, also those that are not installed.
 
-For a single frame, `fitting` returns the sensors with a frame type that matches it exactly, and
-`nearest` the error of the sensor that parsed most of it.
+For a single frame, `find_fitting_sensors` returns the sensors with a frame type that matches it
+exactly, and `find_nearest_fault` the error of the sensor that parsed most of it.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.detect.listen import LISTEN, hear, ignore
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.listen import LISTEN, ignore_progress, read_samples
+from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.detect.uninstalled_sensors import suggest_installation
 from lidarspec.device.settings import find_device
 from lidarspec.drafting.checksum_search import search
@@ -75,12 +76,12 @@ class Distinction(NamedTuple):
     """The result of a comparison of related models.
 
     Attributes:
-        alike: the candidates that may have sent the frames: id -> reason, "" if there is none.
+        candidates: the candidates that may have sent the frames: id -> reason, "" if there is none.
         others: related models, not installed, that may have sent the frames: id -> difference. If
-            `alike` is empty, one of them did.
+            `candidates` is empty, one of them did.
     """
 
-    alike: dict[str, str]
+    candidates: dict[str, str]
     others: dict[str, str]
 
 
@@ -99,12 +100,12 @@ def distinguish(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found
     reasons = {name: why for relatives in excluding.values() for name, why in relatives.items()}
     if not left:
         return Distinction({}, {name: why for name, why in reasons.items() if name not in ids})
-    timed = _select(left, _match_clock, found)
+    timed = _keep_matching(left, _match_clock, found)
     named_among = [sensor for sensor in left if sensor.id in timed] or left
     if len(timed) == 1:
         selected = timed
     else:
-        selected = _select(named_among, _match_name, found) or timed
+        selected = _keep_matching(named_among, _match_name, found) or timed
     if selected:
         return Distinction(selected, {})
     differences = {
@@ -120,14 +121,14 @@ def distinguish(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found
     )
 
 
-def contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
+def find_contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
     """Return the evidence that another model sent some frames, "" if there is none."""
     relatives = map(registry().find, sensor.relatives)  # loads only their plugins
     alike = [sensor, *(relative for relative in relatives if relative is not None)]
     result = distinguish(alike, {one.id: found for one in alike})
-    if sensor.id not in result.alike:
+    if sensor.id not in result.candidates:
         return "the frames are those of " + " or ".join(
-            f"{name} ({why})" for name, why in (result.alike or result.others).items()
+            f"{name} ({why})" for name, why in (result.candidates or result.others).items()
         )
     names = _models(sensor, found)
     fits = any(
@@ -158,13 +159,13 @@ def _excluding_relatives(sensor: Sensor, found: Sequence[Found]) -> dict[str, st
         return {}
     fields = Fields(packets.batch())
     return {
-        name: relative.told_by
+        name: relative.difference
         for name, relative in single.items()
         if np.mean(np.asarray(relative.sends(fields))) > 0.5
     }
 
 
-def _select(
+def _keep_matching(
     left: Sequence[Sensor],
     why: Callable[[Sensor, Sequence[Found]], str],
     found: Mapping[str, Sequence[Found]],
@@ -318,7 +319,7 @@ def _field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
         wholes = [part for part in _at(parsed, axis) if rest.partition(".")[0] in part]
     else:
         wholes = [parsed]
-    return next((_at(whole, rest) for whole in wholes), ""), fields.named[path]
+    return next((_at(whole, rest) for whole in wholes), ""), fields.scan_names[path]
 
 
 def _at(parsed: Any, path: str) -> Any:
@@ -363,25 +364,25 @@ class Verdict:
     """The sensors that may have sent some bytes.
 
     Attributes:
-        heard: the bytes.
+        sample: the bytes.
         scores: all sensors that fit, best first.
-        alike: the sensors that remain possible.
-        others: related models, not installed, that are also possible: id -> difference. If `alike`
-            is empty, one of them sent the bytes.
+        candidates: the sensors that remain possible.
+        others: related models, not installed, that are also possible: id -> difference. If
+            `candidates` is empty, one of them sent the bytes.
         fault: a description of frames that fit a sensor except for their checksums, or "".
     """
 
-    heard: Heard
+    sample: SampleBytes
     scores: tuple[Score, ...] = ()
-    alike: tuple[Score, ...] = ()
+    candidates: tuple[Score, ...] = ()
     others: Mapping[str, str] = field(default_factory=dict)
     fault: str = ""
 
     @property
     def sensor(self) -> Sensor | None:
         """The sensor; None if no sensor or more than one is possible."""
-        if len(self.alike) == 1 and not self.others:
-            return self.alike[0].sensor
+        if len(self.candidates) == 1 and not self.others:
+            return self.candidates[0].sensor
         return None
 
     @property
@@ -392,7 +393,7 @@ class Verdict:
         )
 
 
-def scores(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
+def rate_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
     """Return the scores of all installed sensors with at least one data frame, best first."""
     known = _sensors_with_frames()
     found = _score_each(known, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
@@ -408,7 +409,7 @@ def _sensors_with_frames() -> list[Sensor]:
     return [sensor for sensor in sensors().values() if sensor.incoming]
 
 
-def never_right(chunks: Sequence[bytes], *, datagrams: bool) -> str:
+def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
     """Describe frames that fit a sensor except for their checksums, all invalid.
 
     Returns:
@@ -511,21 +512,23 @@ def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: boo
     )
 
 
-def verdict(heard: Heard) -> Verdict:
+def identify_sample(heard: SampleBytes) -> Verdict:
     """Identify the sensor by frames, then by clocks and names, then by the baud rate."""
     fitting = [
-        score for score in scores(heard.chunks, datagrams=heard.datagrams) if score.share >= FITS
+        score
+        for score in rate_sensors(heard.chunks, datagrams=heard.datagrams)
+        if score.share >= FITS
     ]
     best = [score for score in fitting if score.share >= fitting[0].share - AS_GOOD]
     if not best:
-        return Verdict(heard, fault=never_right(heard.chunks, datagrams=heard.datagrams))
+        return Verdict(heard, fault=find_wrong_checksums(heard.chunks, datagrams=heard.datagrams))
     result = distinguish(
         [score.sensor for score in best], {score.sensor.id: score.found for score in best}
     )
     alike = [
-        replace(score, why=result.alike[score.sensor.id])
+        replace(score, why=result.candidates[score.sensor.id])
         for score in best
-        if score.sensor.id in result.alike
+        if score.sensor.id in result.candidates
     ]
     if len(alike) > 1 and heard.baud is not None:
         why = f"it runs at {heard.baud} baud"
@@ -550,8 +553,8 @@ def verdict(heard: Heard) -> Verdict:
     return Verdict(heard, (*alike, *ruled_out), tuple(alike), result.others)
 
 
-def verdicts(
-    source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore
+def identify_senders(
+    source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore_progress
 ) -> list[Verdict]:
     """Identify the sensors that send to a source: one verdict for each sender.
 
@@ -565,18 +568,18 @@ def verdicts(
         SourceError: if the source cannot be opened.
     """
     tried: list[Verdict] = []
-    for heard in hear(source, seconds=seconds, tell=tell):
-        tried.append(verdict(heard))
+    for heard in read_samples(source, seconds=seconds, tell=tell):
+        tried.append(identify_sample(heard))
         if heard.baud is not None and tried[-1].is_clear:
             break
-    if len({one.heard.baud for one in tried}) > 1:
-        return [best(tried)]
+    if len({one.sample.baud for one in tried}) > 1:
+        return [select_best(tried)]
     return tried
 
 
-def best(tried: Sequence[Verdict]) -> Verdict:
+def select_best(tried: Sequence[Verdict]) -> Verdict:
     """Return the verdict with the highest score, else the one on most bytes."""
-    return max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.heard.size))
+    return max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.sample.size))
 
 
 def detect(source: str | Path) -> Sensor:
@@ -593,25 +596,27 @@ def detect(source: str | Path) -> Sensor:
     declared_sensor = find_declared_sensor(source)
     if declared_sensor is not None:
         return declared_sensor
-    found = verdicts(resolve(source))
+    found = identify_senders(resolve(source))
     fitting = [one for one in found if one.scores]
     if not fitting:
         raise _no_sensor_error(str(source), found)
-    if not any(one.alike for one in fitting):
+    if not any(one.candidates for one in fitting):
         raise suggest(
-            WireError(f"{source}: {others_named(fitting[0])}"),
+            WireError(f"{source}: {describe_unsupported_models(fitting[0])}"),
             f"lidarspec detect {quote(str(source))}",
         )
     if len({one.sensor.id for one in fitting if one.sensor}) > 1:
-        listed = ", ".join(f"{one.sensor.id} ({one.heard.sender})" for one in fitting if one.sensor)
+        listed = ", ".join(
+            f"{one.sensor.id} ({one.sample.sender})" for one in fitting if one.sensor
+        )
         raise UsageError(
             f"{source}: several sensors send: {listed}; choose one with ?src=ADDRESS and -s"
         )
     if fitting[0].sensor is None:
-        example = format_sensor_options(fitting[0].alike[0].sensor)
+        example = format_sensor_options(fitting[0].candidates[0].sensor)
         raise UsageError(
-            f"{source}: {', '.join(names(fitting[0]))} send the same frames; name one, such as"
-            f" {example}"
+            f"{source}: {', '.join(list_candidates(fitting[0]))} send the same frames; name one,"
+            f" such as {example}"
         )
     return fitting[0].sensor
 
@@ -626,15 +631,15 @@ def format_sensor_options(sensor: Sensor) -> str:
     )
 
 
-def names(found: Verdict) -> list[str]:
+def list_candidates(found: Verdict) -> list[str]:
     """Return the ids of all possible sensors, and mark those that are not installed."""
     return [
-        *(score.sensor.id for score in found.alike),
+        *(score.sensor.id for score in found.candidates),
         *(f"{name} (not installed)" for name in found.others),
     ]
 
 
-def others_named(found: Verdict) -> str:
+def describe_unsupported_models(found: Verdict) -> str:
     """Return a message for frames of models that are known but not installed."""
     return (
         " or ".join(f"these are frames of {name} ({why})" for name, why in found.others.items())
@@ -660,7 +665,7 @@ def find_declared_sensor(source: str | Path) -> Sensor | None:
         return configured
     if str(source) == "-":
         raise UsageError("name the sensor with -s: standard input can be read only once")
-    if (simulated := simulated_sensor(source)) is not None:
+    if (simulated := find_simulated_sensor(source)) is not None:
         return simulated
     address = live_address(source)
     if address is not None and address.scheme != "sim":
@@ -672,7 +677,7 @@ def find_declared_sensor(source: str | Path) -> Sensor | None:
     return None
 
 
-def simulated_sensor(source: str | Path) -> Sensor | None:
+def find_simulated_sensor(source: str | Path) -> Sensor | None:
     """Return the sensor of a source "sim:ID", None for any other source."""
     address = live_address(source)
     if address is None or address.scheme != "sim" or not address.place:
@@ -682,7 +687,9 @@ def simulated_sensor(source: str | Path) -> Sensor | None:
 
 def _no_sensor_error(source: str, found: Sequence[Verdict]) -> Exception:
     """Return the error for a source for which no sensor fits."""
-    heard = max((one.heard for one in found), key=lambda one: one.size, default=Heard(source))
+    heard = max(
+        (one.sample for one in found), key=lambda one: one.size, default=SampleBytes(source)
+    )
     if fault := next((one.fault for one in found if one.fault), ""):
         return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {quote(str(source))}")
     if heard.size:
@@ -704,7 +711,7 @@ def _no_sensor_error(source: str, found: Sequence[Verdict]) -> Exception:
 MIN_CONSTANT_BITS = 8
 
 
-def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
+def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
     """Return the installed sensors that fit some bytes, best first.
 
     If all bytes together are exactly one frame of some sensors, only these are returned.
@@ -716,11 +723,11 @@ def fitting(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
     ]
     if whole:
         return whole
-    found = scores(chunks, datagrams=datagrams) if data else []
+    found = rate_sensors(chunks, datagrams=datagrams) if data else []
     return [score.sensor for score in found if score.share >= max(found[0].share - AS_GOOD, FITS)]
 
 
-def nearest(data: bytes) -> WireError | None:
+def find_nearest_fault(data: bytes) -> WireError | None:
     """Return the error of the installed sensor that parsed most of an invalid frame.
 
     None if the bytes do not begin like a frame of any sensor.
@@ -732,7 +739,7 @@ def nearest(data: bytes) -> WireError | None:
         except LidarSpecError as fault:
             faults += [fault] if isinstance(fault, WireError) else []
     return max(
-        (fault for fault in faults if _begins_alike(fault)),
+        (fault for fault in faults if _begins_like_frame(fault)),
         key=lambda fault: fault.offset,
         default=None,
     )
@@ -753,7 +760,7 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
     return bool(survey.status[0] == VALID and survey.sizes[0] == len(data))
 
 
-def _begins_alike(fault: WireError) -> bool:
+def _begins_like_frame(fault: WireError) -> bool:
     """Return whether invalid bytes have the constant bits at the start of a frame.
 
     At least `MIN_CONSTANT_BITS` are required, since fewer may be equal by coincidence.

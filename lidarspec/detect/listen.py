@@ -1,7 +1,8 @@
 """Read sample bytes from a source, to identify the sensor that sent them.
 
-`hear` reads the beginning of a file, or listens to a live source for about a second. Some sensors
-send nothing until they are started: `probe` sends their start commands and records the replies.
+`read_samples` reads the beginning of a file, or listens to a live source for about a second. Some
+sensors send nothing until they are started: `probe` sends their start commands and records the
+replies.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidarspec.detect.sample_bytes import LOOKED_AT, Heard, beginning
-from lidarspec.device.session import Pending, Session
+from lidarspec.detect.sample_bytes import LOOKED_AT, SampleBytes, read_beginning
+from lidarspec.device.session import PendingReply, Session
 from lidarspec.errors import LidarSpecError, SourceError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.plugins import sensors
@@ -47,7 +48,7 @@ ANY_BAUD = 115_200
 EXAMPLE_PORT = 2368
 
 
-def bauds() -> list[int]:
+def list_bauds() -> list[int]:
     """Return the declared baud rates of installed sensors, the most common first."""
     declared = [
         baud
@@ -59,19 +60,19 @@ def bauds() -> list[int]:
     return sorted(set(declared), key=lambda baud: (-declared.count(baud), baud))
 
 
-def udp_ports() -> list[int]:
+def list_udp_ports() -> list[int]:
     """Return the UDP ports that installed sensors declare for data."""
     links = (data_link(sensor, Udp) for sensor in sensors().values())
     return sorted({port for link in links if link for port in link.ports})
 
 
-def ignore(_: str) -> None:
-    """Ignore a progress message: the default of `hear(tell=...)`."""
+def ignore_progress(_: str) -> None:
+    """Ignore a progress message: the default of `read_samples(tell=...)`."""
 
 
-def hear(
-    source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore
-) -> Iterator[Heard]:
+def read_samples(
+    source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore_progress
+) -> Iterator[SampleBytes]:
     """Yield the bytes of each sender of a source.
 
     A serial port without a baud rate is tried at each rate that installed sensors declare. If it
@@ -91,9 +92,9 @@ def hear(
     if address is not None and address.scheme == "serial" and "baud" not in address.options:
         if has_no_baud(address.place):
             tell(text)
-            yield from _hear(with_option(text, "baud", ANY_BAUD), seconds, None, text)
+            yield from _read_sample(with_option(text, "baud", ANY_BAUD), seconds, None, text)
             return
-        rates = bauds()
+        rates = list_bauds()
         if not rates:
             example = with_option(text, "baud", ANY_BAUD)
             raise SourceError(
@@ -106,7 +107,7 @@ def hear(
             if is_silent and baud in other_rates:
                 return
             tell(f"{text} at {baud} baud")
-            for heard in _hear(with_option(text, "baud", baud), seconds, baud, text):
+            for heard in _read_sample(with_option(text, "baud", baud), seconds, baud, text):
                 is_silent = is_silent and not heard.size
                 yield heard
     elif (
@@ -115,16 +116,16 @@ def hear(
         and not address.host_and_port()[1]
         and "port" not in address.options
     ):
-        ports = ",".join(map(str, udp_ports()))
+        ports = ",".join(map(str, list_udp_ports()))
         if not ports:
             example = with_option(text, "port", EXAMPLE_PORT)
             raise SourceError(f"{text}: no installed sensor declares a port; name one: {example}")
-        yield from _hear(with_option(text, "port", ports), seconds, None, text)
+        yield from _read_sample(with_option(text, "port", ports), seconds, None, text)
     else:
         baud = None
         if address is not None and "baud" in address.options:
             baud = int(address.options["baud"])
-        yield from _hear(text, seconds, baud, text)
+        yield from _read_sample(text, seconds, baud, text)
 
 
 def has_no_baud(port: str) -> bool:
@@ -132,31 +133,32 @@ def has_no_baud(port: str) -> bool:
     return os.path.realpath(port).startswith("/dev/pts/")
 
 
-def _hear(source: str, seconds: float, baud: int | None, name: str) -> Iterator[Heard]:
+def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> Iterator[SampleBytes]:
     with contextlib.closing(transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
         warnings: tuple[str, ...] = ()
         if isinstance(opened, LiveTransport):
             chunks = _read_chunks(opened, seconds)
             if not chunks:
-                warnings = _strangers(opened)
+                warnings = _other_senders_warning(opened)
         else:
-            chunks = beginning(opened, LOOKED_AT, number=number)
+            chunks = read_beginning(opened, LOOKED_AT, number=number)
             warnings = tuple(opened.warnings)
-    yield from _by_sender(Heard(name, (), opened.datagrams, baud, warnings=warnings), chunks)
-
-
-def _strangers(opened: LiveTransport) -> tuple[str, ...]:
-    """Return a warning if only other senders sent datagrams."""
-    if opened.stranger is None:
-        return ()
-    others = (
-        f"{opened.foreign} datagrams came from other senders, such as {endpoint(opened.stranger)}"
+    yield from _split_by_sender(
+        SampleBytes(name, (), opened.datagrams, baud, warnings=warnings), chunks
     )
+
+
+def _other_senders_warning(opened: LiveTransport) -> tuple[str, ...]:
+    """Return a warning if only other senders sent datagrams."""
+    if opened.other_sender is None:
+        return ()
+    example = endpoint(opened.other_sender)
+    others = f"{opened.foreign} datagrams came from other senders, such as {example}"
     return (f"{opened.label}: no data from the requested sender; {others}",)
 
 
-def _by_sender(heard: Heard, chunks: Sequence[Chunk]) -> Iterator[Heard]:
+def _split_by_sender(heard: SampleBytes, chunks: Sequence[Chunk]) -> Iterator[SampleBytes]:
     """Yield a copy of `heard` with the chunks of each sender.
 
     If there is only one sender, its name is left empty.
@@ -171,7 +173,7 @@ def _by_sender(heard: Heard, chunks: Sequence[Chunk]) -> Iterator[Heard]:
         yield replace(heard, chunks=data, sender=sender if len(by_sender) > 1 else "", ports=ports)
 
 
-def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
+def read_sensor_sample(source: str | Path, sensor: Sensor, seconds: float) -> list[SampleBytes]:
     """Listen to a live source with the link settings of a sensor.
 
     Returns:
@@ -188,7 +190,7 @@ def heard_as(source: str | Path, sensor: Sensor, seconds: float) -> list[Heard]:
     else:
         baud = opened.baud
     if chunks:
-        return list(_by_sender(Heard(str(source), (), opened.datagrams, baud), chunks))
+        return list(_split_by_sender(SampleBytes(str(source), (), opened.datagrams, baud), chunks))
     return []
 
 
@@ -204,7 +206,7 @@ def _read_chunks(opened: LiveTransport, seconds: float) -> list[Chunk]:
     return chunks
 
 
-def started_first() -> list[Sensor]:
+def list_start_required() -> list[Sensor]:
     """Return the installed serial sensors that send nothing before a start command."""
     started = [
         sensor
@@ -214,7 +216,7 @@ def started_first() -> list[Sensor]:
     return [sensor for sensor in started if data_link(sensor, Serial)]
 
 
-def probe(source: str | Path) -> Iterator[Heard]:
+def probe(source: str | Path) -> Iterator[SampleBytes]:
     """Start each sensor that must be started, at each of its baud rates, and yield its bytes.
 
     The stop commands of the sensor are sent afterwards.
@@ -227,7 +229,7 @@ def probe(source: str | Path) -> Iterator[Heard]:
     if address is None or address.scheme != "serial":
         return
     plain = has_no_baud(address.place)
-    for sensor in started_first():
+    for sensor in list_start_required():
         link = data_link(sensor, Serial)
         for baud in link.bauds if link else ():
             asked = (None if plain else baud, *(sensor.command(name) for name in sensor.on_open))
@@ -239,11 +241,11 @@ def probe(source: str | Path) -> Iterator[Heard]:
             else:
                 given = with_option(source, "baud", baud)
             with contextlib.closing(live(given, sensor)) as opened:
-                chunks = _Probe(sensor, opened).run()
-            yield Heard(str(source), tuple(chunks), baud=None if plain else baud)
+                chunks = _StartProbe(sensor, opened).run()
+            yield SampleBytes(str(source), tuple(chunks), baud=None if plain else baud)
 
 
-class _Probe:
+class _StartProbe:
     """Starts a sensor, reads its data, and stops it."""
 
     def __init__(self, sensor: Sensor, opened: LiveTransport) -> None:
@@ -251,7 +253,7 @@ class _Probe:
         self._opened = opened
         self._session = Session(sensor)
         self._decoder = Decoder(sensor, stream=True)
-        self._heard: list[bytes] = []
+        self._sample: list[bytes] = []
 
     def run(self) -> list[bytes]:
         """Return all bytes received between start and stop."""
@@ -259,17 +261,17 @@ class _Probe:
             started = self._request(self._sensor.on_open)
             self._turns(lambda: all(pending.done for pending in started), ANSWERED)
             self._turns(
-                lambda: sum(map(len, self._heard)) >= PLENTY,
+                lambda: sum(map(len, self._sample)) >= PLENTY,
                 ANSWERED if any(map(_is_answered, started)) else UNANSWERED,
             )
-            found = list(self._heard)
+            found = list(self._sample)
             stopped = self._request(self._sensor.on_close)
             self._turns(lambda: all(pending.done for pending in stopped), STOPPING)
         except LidarSpecError:
-            return self._heard
+            return self._sample
         return found
 
-    def _request(self, names: tuple[str, ...]) -> list[Pending]:
+    def _request(self, names: tuple[str, ...]) -> list[PendingReply]:
         self._session.abandon("asked for something else")
         return [self._session.request(name, time.monotonic_ns()) for name in names]
 
@@ -287,11 +289,11 @@ class _Probe:
                 found = [item for chunk in chunks for item in self._decoder.feed(chunk.data)]
             else:
                 found = self._decoder.idle()
-            self._heard += [chunk.data for chunk in chunks]
+            self._sample += [chunk.data for chunk in chunks]
             self._session.receive(found, time.monotonic_ns())
 
 
-def _is_answered(pending: Pending) -> bool:
+def _is_answered(pending: PendingReply) -> bool:
     try:
         return pending.done and pending.result().confirmed
     except LidarSpecError:

@@ -21,7 +21,7 @@ MIN_TEXT_BYTES = 16
 
 
 @dataclass(frozen=True)
-class Heard:
+class SampleBytes:
     """Bytes that one sender of a source sent.
 
     Attributes:
@@ -66,15 +66,15 @@ class Heard:
         )
 
 
-def beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
+def read_beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
     """Return the start of a file: `most` bytes, or `number` chunks if that is less."""
     return [
         replace(chunk, data=chunk.data[:most])
-        for chunk in leading(itertools.islice(opened.chunks(), number), most)
+        for chunk in take_leading(itertools.islice(opened.chunks(), number), most)
     ]
 
 
-def leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:
+def take_leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:
     """Return the first chunks, until they have `most` bytes."""
     found = list[Chunk]()
     size = 0

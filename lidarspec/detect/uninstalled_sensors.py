@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.errors import WireError, suggest
 from lidarspec.framing.frame_engine import codec
 from lidarspec.known_sensors import KnownSensor, Signature, install_command, known_sensors
@@ -33,7 +33,7 @@ MIN_SYNC_COUNT_BY_CHANCE = 20
 MAX_LISTED = 6
 
 
-def signatures(sensor: Sensor) -> tuple[Signature, ...]:
+def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
     """Return the signatures of the data frames of a sensor that have enough constant bytes."""
     found = []
     for name in sensor.data_frames:
@@ -56,7 +56,7 @@ def _sync_text(constant: dict[int, int]) -> str:
     )
 
 
-def recognize(heard: Heard) -> list[KnownSensor]:
+def recognize(heard: SampleBytes) -> list[KnownSensor]:
     """Return the sensors of the table, not installed, that may have sent these bytes.
 
     If no frame matches, these are the sensors with the destination port.
@@ -76,7 +76,7 @@ def _udp_ports(row: KnownSensor) -> set[int]:
     return {port for link in row.links.values() if link.kind == "udp" for port in link.numbers}
 
 
-def _matching_share(row: KnownSensor, heard: Heard) -> float:
+def _matching_share(row: KnownSensor, heard: SampleBytes) -> float:
     is_datagram = any(link.kind == "udp" for link in row.links.values())
     if is_datagram != heard.datagrams:
         return 0.0
@@ -93,7 +93,7 @@ def _pattern(sync: str) -> bytes:
     )
 
 
-def _share_of_datagrams(signature: Signature, heard: Heard) -> float:
+def _share_of_datagrams(signature: Signature, heard: SampleBytes) -> float:
     begins = re.compile(_pattern(signature.sync), re.DOTALL)
     if signature.size:
         sizes = {signature.size}
@@ -105,7 +105,7 @@ def _share_of_datagrams(signature: Signature, heard: Heard) -> float:
     return count / len(heard.chunks)
 
 
-def _share_of_stream(signature: Signature, heard: Heard) -> float:
+def _share_of_stream(signature: Signature, heard: SampleBytes) -> float:
     data = heard.data
     offsets = [
         match.start()
@@ -139,7 +139,7 @@ def describe(found: Sequence[KnownSensor]) -> str:
     return f"this looks like data of {listed}; {' and '.join(distributions)} {verb} not installed"
 
 
-def suggest_installation(error: WireError, heard: Heard) -> WireError:
+def suggest_installation(error: WireError, heard: SampleBytes) -> WireError:
     """Add the distributions to install to the error for unknown bytes, if known."""
     missing = recognize(heard)
     if missing:

@@ -24,7 +24,7 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import EVERYTHING, Selection, Sieve
+from lidarspec.scans.selection import EVERYTHING, ScanSelector, Selection
 from lidarspec.sensor_operations import Sensor
 
 T = TypeVar("T")
@@ -47,7 +47,7 @@ class AsyncDevice:
         self._device: Device | None = None
         self._reading = ThreadPoolExecutor(1, "reader of a device")
         self._sending = ThreadPoolExecutor(1, "sender of a device")
-        self._feeds: dict[tuple[str, ...], _ThreadedIterator[Any]] = {}
+        self._iterators: dict[tuple[str, ...], _ThreadedIterator[Any]] = {}
         self._newest: Scan | None = None
 
     @property
@@ -85,15 +85,15 @@ class AsyncDevice:
 
     async def packets(self, frame: str | None = None) -> AsyncIterator[Packets]:
         """Yield packets in batches; see `Device.packets`."""
-        feed = self._get_feed("packets", *filter(None, [frame]))
+        feed = self._get_iterator("packets", *filter(None, [frame]))
         async for packets in self._fetch(feed):
             yield packets
 
     async def scans(self, *, select: Selection = EVERYTHING) -> AsyncIterator[Scan]:
         """Yield scans; see `Device.scans`. Scans before the first selected one are read."""
-        sieve = Sieve(select, self.device.source)
-        async for scan in self._fetch(self._get_feed("scans")):
-            wanted = sieve.take(scan)
+        sieve = ScanSelector(select, self.device.source)
+        async for scan in self._fetch(self._get_iterator("scans")):
+            wanted = sieve.select(scan)
             if wanted is not None:
                 yield wanted
             if sieve.ended:
@@ -103,7 +103,7 @@ class AsyncDevice:
 
     async def imu(self) -> AsyncIterator[ImuSamples]:
         """Yield the samples of the sensor's IMU; see `Device.imu`."""
-        async for samples in self._fetch(self._get_feed("imu")):
+        async for samples in self._fetch(self._get_iterator("imu")):
             yield samples
 
     async def latest(self, timeout: float | None = None) -> Scan:
@@ -154,14 +154,14 @@ class AsyncDevice:
     ) -> None:
         await self.close()
 
-    def _get_feed(self, method: str, *arguments: str) -> _ThreadedIterator[Any]:
+    def _get_iterator(self, method: str, *arguments: str) -> _ThreadedIterator[Any]:
         """Return the feed of an iterator of the device; later calls continue with the same one."""
         key = (method, *arguments)
-        if key not in self._feeds:
-            self._feeds[key] = _ThreadedIterator(
+        if key not in self._iterators:
+            self._iterators[key] = _ThreadedIterator(
                 getattr(self.device, method)(*arguments, wait=_WAIT_S)
             )
-        return self._feeds[key]
+        return self._iterators[key]
 
     async def _fetch(self, feed: _ThreadedIterator[T]) -> AsyncIterator[T]:
         """Yield the items of a feed until it ends."""

@@ -33,7 +33,7 @@ LATER = 0.25
 POLICIES = ("drop_oldest", "block")
 
 
-class Mark(Enum):
+class LinkEvent(Enum):
     """An event on a link besides data."""
 
     SILENT = "silent"
@@ -41,7 +41,7 @@ class Mark(Enum):
     BACK = "back"
 
 
-Item = Chunk | Mark | BaseException
+Item = Chunk | LinkEvent | BaseException
 Event = tuple[str, Item]
 
 
@@ -160,7 +160,7 @@ class BoundedQueue:
                 self._kept[(link, item)] = None
 
 
-class Capture:
+class CaptureThread:
     """The thread that reads a live transport.
 
     Args:
@@ -230,7 +230,7 @@ class Capture:
                 try:
                     chunks = self.transport.read(POLL)
                 except Disconnected:
-                    if not self._found_again():
+                    if not self._reconnect():
                         return
                     silence = 0.0
                     gap = True
@@ -246,7 +246,7 @@ class Capture:
                 silence += time.monotonic() - began
                 if silence >= self.transport.silence and not quiet:
                     quiet = True
-                    self._queue.put(self._link, [Mark.SILENT])
+                    self._queue.put(self._link, [LinkEvent.SILENT])
         except BaseException as error:
             self._queue.put(self._link, [error])
 
@@ -254,14 +254,14 @@ class Capture:
         """Record and queue chunks, and mark the first one after a gap or silence."""
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
-        self._look_at_the_clock(chunks[0])
+        self._follow_wall_clock(chunks[0])
         with self._handing:
             if self._log is not None:
                 for chunk in chunks:
                     self._log.write(chunk)
             self._queue.put(self._link, chunks)
 
-    def _look_at_the_clock(self, chunk: Chunk) -> None:
+    def _follow_wall_clock(self, chunk: Chunk) -> None:
         """Keep arrival times steady if the wall clock was set before a chunk arrived.
 
         The step is reported in `warnings` and recorded each time.
@@ -276,14 +276,14 @@ class Capture:
         if self._log is not None:
             self._log.event("clock", chunk.at, ahead_ns=ahead)
 
-    def _found_again(self) -> bool:
+    def _reconnect(self) -> bool:
         """Report that the device is gone, and wait until it is back.
 
         Returns False if the capture is stopped meanwhile.
         """
         self.connected = False
         self.disconnects += 1
-        self._tell(Mark.LOST, "disconnect")
+        self._queue_event(LinkEvent.LOST, "disconnect")
         pause = SOON
         while not self._stop.wait(pause):
             pause = min(pause * 2, LATER)
@@ -293,11 +293,11 @@ class Capture:
                 continue
             self.connected = True
             self.last = time.monotonic()
-            self._tell(Mark.BACK, "reconnect")
+            self._queue_event(LinkEvent.BACK, "reconnect")
             return True
         return False
 
-    def _tell(self, mark: Mark, event: str) -> None:
+    def _queue_event(self, mark: LinkEvent, event: str) -> None:
         if self._log is not None:
             self._log.event(event, self._clock.now())
         self._queue.put(self._link, [mark])

@@ -87,7 +87,7 @@ def demonstrate(
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
-        place, replies, scans, stats = _live(sensor, simulated, path, turns)
+        place, replies, scans, stats = _run_live(sensor, simulated, path, turns)
         line = simulated.lines["data"]
         recorded = path.stat().st_size
         with open_device(path, sensor) as recording:
@@ -110,7 +110,7 @@ def digest(scans: Sequence[Scan]) -> str:
     return hasher.hexdigest()
 
 
-def _live(
+def _run_live(
     sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int
 ) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
     """Return the address, replies, scans and counters of a live session.

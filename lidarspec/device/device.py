@@ -15,14 +15,19 @@ from pathlib import Path
 from shlex import quote
 from typing import Any, NoReturn, overload
 
-from lidarspec.detect.identification import contradiction, detect, read_info, simulated_sensor
-from lidarspec.device.device_input import Arrival, FileInput, Input
+from lidarspec.detect.identification import (
+    detect,
+    find_contradiction,
+    find_simulated_sensor,
+    read_info,
+)
+from lidarspec.device.device_input import Arrival, DeviceInput, FileInput
 from lidarspec.device.live_input import PERIOD, LiveInput
 from lidarspec.device.packet_reader import PacketReader
 from lidarspec.device.session import Reply
 from lidarspec.device.settings import find_device
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
-from lidarspec.framing.decoder import Witness
+from lidarspec.framing.decoder import DecoderObserver
 from lidarspec.framing.results import Counters, Found
 from lidarspec.packets.imu import ImuSamples, join_samples
 from lidarspec.packets.packets import Packets
@@ -31,11 +36,11 @@ from lidarspec.points.mount import Mount
 from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.recording.recorders import RecordTo, recorder_for
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import Selection, Sieve
+from lidarspec.scans.selection import ScanSelector, Selection
 from lidarspec.scans.stream import ScanStream
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Closing, LiveTransport, Transport
+from lidarspec.transports.protocol import ClosingContext, LiveTransport, Transport
 
 #: number of first frames that are compared with related models.
 _MAX_CHECKED_FRAMES = 64
@@ -43,7 +48,7 @@ _MAX_CHECKED_FRAMES = 64
 _LONG_WAIT_S = 3600.0
 
 
-class Device(Closing):
+class Device(ClosingContext):
     """A sensor on a source; a context manager.
 
     Attributes:
@@ -146,7 +151,7 @@ class Device(Closing):
 
         Keys are those of "serial", "firmware", "model" and "temperature" that its frames contain.
         """
-        return read_info(self.sensor, self._input.told.values())
+        return read_info(self.sensor, self._input.info_frames.values())
 
     @property
     def state(self) -> str:
@@ -235,7 +240,7 @@ class Device(Closing):
         scans = self._iter_scans(wait)
         if select is None:
             return scans
-        return Sieve(select, self.source, self.skip).of(scans)
+        return ScanSelector(select, self.source, self.skip).iter_selected(scans)
 
     def imu(self, *, wait: float | None = None) -> Iterator[ImuSamples]:
         """Yield the samples of the sensor's IMU in batches, until the input ends.
@@ -260,7 +265,7 @@ class Device(Closing):
             if arrival is not None and arrival is not ahead:
                 reader.add_imu(arrival, reader.add(arrival))
             if reader.waiting_imu is not None:
-                reader.waiting_imu.until(None)  # no scan will take them
+                reader.waiting_imu.take_until(None)  # no scan will take them
             samples = self._get_imu_samples(reader, arrival)
             if len(samples) or arrival is None or pace.is_due():
                 yield samples
@@ -348,16 +353,16 @@ class Device(Closing):
         """Read a file in portions of about `size` bytes from now on.
 
         A program that shows a file at its recorded pace uses this: counters, and the input of a
-        `Witness`, are then not far ahead of the picture. 0 is the fastest size.
+        `DecoderObserver`, are then not far ahead of the picture. 0 is the fastest size.
         """
         self._input.read_ahead(size)
 
-    def observe(self, witness: Witness) -> None:
+    def observe(self, witness: DecoderObserver) -> None:
         """Show all input that is decoded from now on, and its frames, to a witness.
 
         It is called in the thread that reads.
         """
-        self._input.decoder.witness = witness
+        self._input.decoder.observer = witness
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """Send a command and return the reply.
@@ -415,7 +420,7 @@ class Device(Closing):
         period: float,
         *,
         learns: bool,
-    ) -> Input:
+    ) -> DeviceInput:
         opened = transport(self.source, self.sensor)
         try:
             if not isinstance(opened, LiveTransport):
@@ -519,7 +524,7 @@ class Device(Closing):
         if self._is_checked or arrival is None or len(self._first_frames) >= _MAX_CHECKED_FRAMES:
             return arrival
         for frames in arrival.found:
-            self._first_frames += frames.only(slice(0, _MAX_CHECKED_FRAMES)).found()
+            self._first_frames += frames.select(slice(0, _MAX_CHECKED_FRAMES)).found()
         return arrival
 
     def _check_first_frames(self) -> list[str]:
@@ -530,9 +535,9 @@ class Device(Closing):
         has_enough = len(self._first_frames) >= _MAX_CHECKED_FRAMES or self._input.ended
         if not self._is_checked and has_enough:
             self._is_checked = True
-            simulated = simulated_sensor(self.source)
+            simulated = find_simulated_sensor(self.source)
             if simulated is None or simulated.id != self.sensor.id:
-                self._contradiction = contradiction(self.sensor, self._first_frames)
+                self._contradiction = find_contradiction(self.sensor, self._first_frames)
         if not self._contradiction:
             return []
         return [
@@ -634,7 +639,7 @@ def _make_recorder(
     return log
 
 
-def _close(source: Input | Transport, recorders: list[TrafficLog]) -> None:
+def _close(source: DeviceInput | Transport, recorders: list[TrafficLog]) -> None:
     """Close everything; recordings are closed even if the source fails."""
     try:
         source.close()

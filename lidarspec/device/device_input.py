@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lidarspec.captures.bulk import CapturedDatagrams
 from lidarspec.detect.identification import read_info
 from lidarspec.device.first_frames import FirstFrames, find_first_frames, is_searched
-from lidarspec.device.sender_filter import Senders, frame_senders
+from lidarspec.device.sender_filter import SenderCheck, frame_senders
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, SourceError
 from lidarspec.frames.schema import schema
@@ -49,7 +49,7 @@ class Arrival:
     replaced: bool = False
 
 
-class Input(Protocol):
+class DeviceInput(Protocol):
     """The source of a device's frames; the defaults here are those of a file.
 
     Attributes:
@@ -58,7 +58,7 @@ class Input(Protocol):
         stays_on: whether the sensor is left running at the end.
         sensor: the sensor, configured with the `learned` options.
         learned: the options that the sensor reported.
-        told: the last frame of each type with a field of `Sensor.info`, from any link.
+        info_frames: the last frame of each type with a field of `Sensor.info`, from any link.
     """
 
     is_live: bool = False
@@ -66,9 +66,9 @@ class Input(Protocol):
     decoder: Decoder
     stays_on: bool = True
     learned: Mapping[str, Any] = MappingProxyType({})
-    told: Mapping[str, Found] = MappingProxyType({})
+    info_frames: Mapping[str, Found] = MappingProxyType({})
 
-    def note(self, found: Sequence[Frames]) -> None:
+    def store_info_frames(self, found: Sequence[Frames]) -> None:
         """Keep the latest frame of each type that reports values of the sensor.
 
         A frame with parts is ignored if it lacks values that an earlier frame reported.
@@ -78,13 +78,13 @@ class Input(Protocol):
                 if name not in frames.names:
                     continue
                 rows = np.flatnonzero(np.equal(frames.kinds, frames.names.index(name)))
-                for item in frames.only(rows[-1:]).found():
+                for item in frames.select(rows[-1:]).found():
                     if not self._lacks_values(item):
-                        self.told = {**self.told, name: item}
+                        self.info_frames = {**self.info_frames, name: item}
 
     def _lacks_values(self, item: Found) -> bool:
         """Return whether a frame with parts lacks values that an earlier one reported."""
-        known = self.told.get(item.frame)
+        known = self.info_frames.get(item.frame)
         if known is None or not schema(self.sensor.frames[item.frame].tree).parts:
             return False
         return not read_info(self.sensor, [known]).keys() <= read_info(self.sensor, [item]).keys()
@@ -251,12 +251,12 @@ def _set_arrival(
     ]
 
 
-def answers(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
+def select_frames(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
     """Return the frames of some types, one by one."""
     picked = []
     for frames in found:
         kinds = [index for index, name in enumerate(frames.names) if name in awaited]
-        picked += frames.only(np.isin(frames.kinds, kinds)).found()
+        picked += frames.select(np.isin(frames.kinds, kinds)).found()
     return picked
 
 
@@ -265,7 +265,7 @@ BATCH_BYTES = 1 << 18
 BATCH_CHUNKS = 1024
 
 
-class FileInput(Input):
+class FileInput(DeviceInput):
     """Input from a transport that ends, such as a file.
 
     The consumer sets the pace, so nothing is ever dropped.
@@ -284,8 +284,8 @@ class FileInput(Input):
         self.sensor = sensor
         self._transport = opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
-        self.senders = Senders(source, sensor)
-        self._together = 0  # in bytes; 0 for the fastest size
+        self.senders = SenderCheck(source, sensor)
+        self._batch_bytes = 0  # in bytes; 0 for the fastest size
         self._arrivals = self._read()
 
     @property
@@ -325,7 +325,7 @@ class FileInput(Input):
         if arrival is None:
             self.state = "ended"
         else:
-            self.note(arrival.found)
+            self.store_info_frames(arrival.found)
         return arrival
 
     def skip(self, at: int) -> bool:
@@ -335,7 +335,7 @@ class FileInput(Input):
         """Do nothing: the data of a file does not arrive over time."""
 
     def read_ahead(self, size: int) -> None:
-        self._together = size
+        self._batch_bytes = size
 
     def begin(self) -> None:
         """Do nothing: a file has no sensor that could be started."""
@@ -380,29 +380,31 @@ class FileInput(Input):
         if isinstance(self._transport, CaptureTransport):
             for datagrams in self._transport.batches():
                 if datagrams.gap:
-                    yield Arrival(self.decoder.rest(), interrupted=True)
+                    yield Arrival(self.decoder.take_pending(), interrupted=True)
                 if self.decoder.stream:
                     yield from map(
                         Arrival,
-                        _decode_stream(self.decoder, datagrams, self._together or BATCH_BYTES),
+                        _decode_stream(self.decoder, datagrams, self._batch_bytes or BATCH_BYTES),
                     )
                     continue
-                for part in datagrams.parts(self._together) if self._together else [datagrams]:
+                for part in (
+                    datagrams.parts(self._batch_bytes) if self._batch_bytes else [datagrams]
+                ):
                     spans = self.decoder.decode_placed(
                         part.buffer, part.starts, part.sizes, part.at
                     )
-                    self.senders.see(part.sent(spans))
+                    self.senders.check(part.sent(spans))
                     yield Arrival([spans])
-            yield Arrival(self.decoder.rest())
+            yield Arrival(self.decoder.take_pending())
             return
         for batch in self._batches():
             if batch[0].gap or batch[0].quiet:
-                yield Arrival(self.decoder.rest(), interrupted=batch[0].gap)
+                yield Arrival(self.decoder.take_pending(), interrupted=batch[0].gap)
             found = decode_chunks(self.decoder, batch)
             if not self.decoder.stream:
-                self.senders.see(frame_senders(batch, found[0], self.decoder.stats.bytes_in))
+                self.senders.check(frame_senders(batch, found[0], self.decoder.stats.bytes_in))
             yield Arrival(found)
-        yield Arrival(self.decoder.rest())
+        yield Arrival(self.decoder.take_pending())
 
     def _batches(self) -> Iterator[list[Chunk]]:
         """Yield chunks in batches that are worth decoding together.
@@ -415,7 +417,7 @@ class FileInput(Input):
             if found and (
                 chunk.gap
                 or chunk.quiet
-                or size >= (self._together or BATCH_BYTES)
+                or size >= (self._batch_bytes or BATCH_BYTES)
                 or len(found) >= BATCH_CHUNKS
             ):
                 yield found
@@ -430,7 +432,7 @@ class FileInput(Input):
         """Yield the chunks; chunks of a stream are cut to the size of `read_ahead`."""
         for chunk in self._transport.chunks():
             rest = chunk
-            while self.decoder.stream and 0 < (size := self._together) < len(rest.data):
+            while self.decoder.stream and 0 < (size := self._batch_bytes) < len(rest.data):
                 yield replace(rest, data=rest.data[:size])
                 rest = replace(rest, data=rest.data[size:], gap=False, quiet=False)
             yield rest

@@ -28,7 +28,7 @@ from lidarspec.device.device_input import FileInput
 from lidarspec.device.packet_reader import PacketReader
 from lidarspec.errors import UsageError
 from lidarspec.expressions.columns import AROUND
-from lidarspec.frames.frame_table import Records, Rows, Table
+from lidarspec.frames.frame_table import CompiledTable, ParsedTable, Table
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters
@@ -38,13 +38,13 @@ from lidarspec.scans.stream import ScanStream
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.files import CaptureTransport, FileTransport
 from lidarspec.transports.open_url import transport
-from lidarspec.transports.protocol import Closing, LiveTransport
+from lidarspec.transports.protocol import ClosingContext, LiveTransport
 
 #: types that are pickled as they are.
 _PLAIN = (bool, int, float, str, bytes, type(None), type)
 
 
-class FileScans(Closing):
+class FileScans(ClosingContext):
     """The scans of a file: an iterator, which `survey` can skip quickly.
 
     Args:
@@ -72,7 +72,7 @@ class FileScans(Closing):
                 )
                 self._stream = self._scan_stream()
             else:
-                self._go_on(bookmark)
+                self._resume(bookmark)
         except BaseException:
             opened.close()
             raise
@@ -136,7 +136,7 @@ class FileScans(Closing):
             reader = None
         if reader is None:
             return self._input.decoder.stats.bytes_in
-        return reader.place
+        return reader.offset
 
     def _bookmark(self) -> bytes | None:
         """Return the state that is required to go on from here.
@@ -158,7 +158,7 @@ class FileScans(Closing):
             return None
         return content.getvalue()
 
-    def _go_on(self, bookmark: bytes) -> None:
+    def _resume(self, bookmark: bytes) -> None:
         opened = self._transport
         assert isinstance(opened, FileTransport)
         loaded = _Loader(
@@ -177,12 +177,12 @@ def _constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
     They are the parts of a sensor, and objects derived from it alone.
     """
     constants = dict[tuple[Any, ...], Any]()
-    _walk(sensor, (), constants, set())
+    _name_parts(sensor, (), constants, set())
     codecs = {("codec", name): codec(frame) for name, frame in sensor.frames.items()}
     return {**constants, **codecs, ("framing",): decoder.framing}
 
 
-def _walk(
+def _name_parts(
     value: Any, name: tuple[Any, ...], found: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
     """Add a value and its parts, each under the names that lead to it."""
@@ -198,7 +198,7 @@ def _walk(
     elif isinstance(value, tuple | list):
         parts = dict(enumerate(value))
     for key, part in parts.items():
-        _walk(part, (*name, key), found, seen)
+        _name_parts(part, (*name, key), found, seen)
 
 
 class _StatePickler(pickle.Pickler):
@@ -227,7 +227,7 @@ class _StatePickler(pickle.Pickler):
 
         Packets keep only the frames of other types that belong to them.
         """
-        if isinstance(obj, Rows | Records):
+        if isinstance(obj, CompiledTable | ParsedTable):
             if id(obj.schema) not in self._frames:
                 raise pickle.PicklingError(
                     "parts of frames, whose layout is in what is around them"
@@ -240,7 +240,7 @@ class _StatePickler(pickle.Pickler):
         if isinstance(obj, Packets):
             if AROUND in obj.state:
                 raise pickle.PicklingError("parts of frames")
-            state = {name: _of_these(*of) for name, of in obj.state.items()}
+            state = {name: _take_states(*of) for name, of in obj.state.items()}
             return object.__new__, (Packets,), {**vars(obj), "state": state, "_index": obj.index}
         if isinstance(obj, struct.Struct):
             return (struct.Struct, (obj.format,))
@@ -264,7 +264,7 @@ def _table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
     return codec(sensor.frames[frame]).table_of_structs(frames)
 
 
-def _of_these(table: Table | None, which: Any) -> StateOf:
+def _take_states(table: Table | None, which: Any) -> StateOf:
     """Return the state frames of some packets, and the row of each packet's frame.
 
     Frames that belong to no packet are left out.

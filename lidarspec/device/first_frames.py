@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Frames
-from lidarspec.packets.clocks import ClockReference, readings_of, told_seconds
+from lidarspec.packets.clocks import ClockReference, reference_readings, reported_seconds
 from lidarspec.sensor_operations import Sensor
 
 #: bytes of a file to search for a frame type that could tell the turn of the clock.
@@ -35,7 +35,7 @@ class FirstFrames:
 
 def is_searched(sensor: Sensor) -> bool:
     """Return whether any frames of a sensor apply from the start."""
-    return bool(sensor.state) or (sensor.clock is not None and sensor.clock.told is not None)
+    return bool(sensor.state) or (sensor.clock is not None and sensor.clock.reference is not None)
 
 
 def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstFrames:
@@ -47,8 +47,8 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
     first = FirstFrames()
     missing = set(sensor.state)
     clock = sensor.clock
-    if clock is not None and clock.told is not None:
-        teller = clock.told[0]
+    if clock is not None and clock.reference is not None:
+        teller = clock.reference[0]
     else:
         teller = ""
     has_teller = False
@@ -82,8 +82,8 @@ def _find_reference(
     assert sensor.clock is not None
     table = codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:
-        told = told_seconds(sensor.clock, table)
-        readings = readings_of(sensor, table)
+        told = reported_seconds(sensor.clock, table)
+        readings = reference_readings(sensor, table)
     except Exception:
         return None  # reported when the packets are decoded
     known = np.flatnonzero(np.isfinite(told))

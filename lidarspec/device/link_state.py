@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from shlex import quote
 
-from lidarspec.device.capture_thread import Capture
+from lidarspec.device.capture_thread import CaptureThread
 from lidarspec.device.sender_filter import SenderFilter
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
@@ -36,7 +36,7 @@ class LinkState:
         source: str | Path,
         sensor: Sensor,
         transport: LiveTransport,
-        capture: Capture,
+        capture: CaptureThread,
         decoder: Decoder,
         senders: SenderFilter,
     ) -> None:
@@ -125,7 +125,7 @@ class LinkState:
 
     @property
     def _other_sender(self) -> Sender | None:
-        return self._senders.stranger or self._transport.stranger
+        return self._senders.other_sender or self._transport.other_sender
 
     def _describe_others(self) -> str:
         """Return a part of a sentence about datagrams of other senders."""

@@ -18,11 +18,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lidarspec.device.capture_thread import BoundedQueue, Capture, Event, Mark
-from lidarspec.device.device_input import Arrival, Input, answers, decode_chunks
+from lidarspec.device.capture_thread import BoundedQueue, CaptureThread, Event, LinkEvent
+from lidarspec.device.device_input import Arrival, DeviceInput, decode_chunks, select_frames
 from lidarspec.device.link_state import LinkState
 from lidarspec.device.sender_filter import SenderFilter, frame_senders
-from lidarspec.device.session import Outgoing, Pending, Reply, Session, learn_options
+from lidarspec.device.session import OutgoingData, PendingReply, Reply, Session, learn_options
 from lidarspec.errors import (
     CommandError,
     LidarSpecError,
@@ -32,7 +32,7 @@ from lidarspec.errors import (
     refuse_text,
     suggest,
 )
-from lidarspec.framing.decoder import Decoder, backend as backend_named
+from lidarspec.framing.decoder import Decoder, select_backend as backend_named
 from lidarspec.framing.results import Counters, Frames
 from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.sensor_operations import Sensor
@@ -57,7 +57,7 @@ MAX_READY_BATCHES = 4096
 SHUTDOWN_TIMEOUT_S = 4.0
 
 
-class LiveInput(Input):
+class LiveInput(DeviceInput):
     """A sensor on a live transport.
 
     Args:
@@ -90,12 +90,12 @@ class LiveInput(Input):
         self._record = record
         self._period = period
         if learns:
-            self._teachers = [
+            self._learning_sensors = [
                 name for name in sensor.on_open if sensor.commands[name].learns is not None
             ]
         else:
-            self._teachers = []
-        self._recorder = None if self._teachers else record(sensor)
+            self._learning_sensors = []
+        self._recorder = None if self._learning_sensors else record(sensor)
         self.learned: dict[str, Any] = {}
         chosen = backend_named(backend)
         if chosen == "auto":
@@ -114,15 +114,15 @@ class LiveInput(Input):
         self._answering: dict[str, SenderFilter] = {}  # senders of replies to broadcasts
         self._clock = HostClock()
         self._turn = threading.RLock()
-        self._talk = threading.RLock()
+        self._session_lock = threading.RLock()
         self._due = 0.0
         self._stops = False
         self._closed = False
         self._failure: SourceError | None = None
         self.stays_on = False
-        self._said: list[str] = []
-        self._captures["data"] = Capture(opened, self.queue, log=self._recorder)
-        self._checked = list[Pending]()
+        self._reported_warnings: list[str] = []
+        self._captures["data"] = CaptureThread(opened, self.queue, log=self._recorder)
+        self._checked = list[PendingReply]()
         self._silent = list[CommandError]()
         self._link_state = LinkState(
             source, sensor, opened, self._captures["data"], self.decoder, self._senders
@@ -149,7 +149,7 @@ class LiveInput(Input):
         ]
         for senders in (self._senders, *self._answering.values()):
             said += senders.warnings
-        said += self._said
+        said += self._reported_warnings
         if self._recorder is not None and self._recorder.error is not None:
             said.append(f"the recording has stopped: {self._recorder.error}")
         silent = [
@@ -184,20 +184,20 @@ class LiveInput(Input):
                 reply = self.send(name)
             except CommandError as error:
                 if (
-                    name in self._teachers
+                    name in self._learning_sensors
                     and self.sensor.data_frames
                     and not self.sensor.commands[name].starts
                 ):
-                    self._said.append(
+                    self._reported_warnings.append(
                         f"{error}; it is read as it stands, without what it would say of itself"
                     )
                 elif isinstance(error, ReplyTimeout) and self._link_state.has_data:
-                    self._said.append(f"{error}; data come all the same")
+                    self._reported_warnings.append(f"{error}; data come all the same")
                 else:
                     raise suggest(error, self._link_state.suggest_command()) from None
             else:
                 self.learned |= learn_options(self.sensor, reply)
-            if self._teachers and name == self._teachers[-1]:
+            if self._learning_sensors and name == self._learning_sensors[-1]:
                 self._adopt()
 
     def _adopt(self) -> None:
@@ -208,7 +208,7 @@ class LiveInput(Input):
             raise CommandError(
                 f"{self.sensor.id}: what it says of itself cannot be: {error}"
             ) from error
-        with self._turn, self._talk:
+        with self._turn, self._session_lock:
             data = self._captures["data"]
             self._session.sensor = self.sensor
             self._senders.configure(self.sensor)
@@ -258,14 +258,14 @@ class LiveInput(Input):
                 command.link,
                 command.timeout * (1 + command.retries) if timeout is None else timeout,
             )
-        with self._talk:
+        with self._session_lock:
             self._find_own_address(name)
             pending = self._session.request(name, self._clock.now(), timeout=timeout, **arguments)
-            self._speak()
+            self._send_outgoing()
         while not pending.done:
             if self._failure is not None:
                 raise self._failure
-            self._help(pending)
+            self._decode_if_idle(pending)
         try:
             return pending.result()
         except CommandError as error:
@@ -300,8 +300,8 @@ class LiveInput(Input):
         if self._closed:
             raise SourceError(f"{self._source}: the device is closed")
         self._await_sender(link, SENDER_TIMEOUT_S)
-        with self._talk:
-            self._write(Outgoing(link, bytes(data)))
+        with self._session_lock:
+            self._write(OutgoingData(link, bytes(data)))
 
     def _await_sender(self, link: str, seconds: float) -> None:
         """Wait for a first datagram if only that reveals the address of the sensor."""
@@ -316,7 +316,7 @@ class LiveInput(Input):
             return
         limit = time.monotonic() + seconds
         while not data.addressed and self._failure is None and time.monotonic() < limit:
-            self._help()
+            self._decode_if_idle()
 
     def close(self) -> None:
         if self._closed:
@@ -344,20 +344,20 @@ class LiveInput(Input):
             for name, command in self.sensor.commands.items()
             if command.stops and not command.args
         ][:1]
-        with self._talk:
+        with self._session_lock:
             self._session.abandon("the device is being closed")
             names = self.sensor.on_close or stopping
             waiting = [self._session.request(name, self._clock.now()) for name in names]
-            self._speak()
+            self._send_outgoing()
         limit = time.monotonic() + SHUTDOWN_TIMEOUT_S
         while not all(pending.done for pending in waiting) and time.monotonic() < limit:
-            self._help(next(pending for pending in waiting if not pending.done))
+            self._decode_if_idle(next(pending for pending in waiting if not pending.done))
             self._ready.clear()
         for pending in waiting:
             with contextlib.suppress(LidarSpecError):
                 pending.result()
 
-    def _help(self, pending: Pending | None = None) -> None:
+    def _decode_if_idle(self, pending: PendingReply | None = None) -> None:
         """Run the decoders once, unless another thread runs them."""
         if not self._turn.acquire(timeout=MAX_TURN_S / 5):
             return
@@ -375,7 +375,7 @@ class LiveInput(Input):
         A request only times out after the arrived data was checked for its reply. If this runs late
         on a busy computer, replies were delayed as well.
         """
-        with self._talk:
+        with self._session_lock:
             deadline = self._session.deadline
         if deadline is None:
             left = wait
@@ -388,30 +388,32 @@ class LiveInput(Input):
         for link, run in _runs(events):
             self._take(link, run)
         if deadline is not None:
-            with self._talk:
+            with self._session_lock:
                 self._session.tick(self._clock.now())
-                self._speak()
+                self._send_outgoing()
         if self._checked:
-            self._compare()
+            self._warn_if_changed()
         elif (silent := list(self._session.unanswered.values())) and silent != self._silent:
             # at each unanswered heartbeat, once: the sensor may have restarted and lost its
             # settings
             self._silent = silent
-            self._start_again()
+            self._restart_sensor()
 
-    def _take(self, link: str, run: list[Chunk] | Mark | BaseException) -> None:
+    def _take(self, link: str, run: list[Chunk] | LinkEvent | BaseException) -> None:
         """Decode consecutive chunks of a link, or handle an event on it."""
         if isinstance(run, list):
             self._decode(link, run)
-        elif isinstance(run, Mark):
-            self._hand_on(link, self._decoders[link].rest(), interrupted=run is Mark.LOST)
-            if run is Mark.LOST:
-                with self._talk:
+        elif isinstance(run, LinkEvent):
+            self._hand_on(
+                link, self._decoders[link].take_pending(), interrupted=run is LinkEvent.LOST
+            )
+            if run is LinkEvent.LOST:
+                with self._session_lock:
                     self._session.abandon(
                         "the connection was lost", None if link == "data" else link
                     )
-            elif run is Mark.BACK:
-                self._start_again()
+            elif run is LinkEvent.BACK:
+                self._restart_sensor()
         elif self._failure is None and not self._closed:
             if isinstance(run, SourceError):
                 self._failure = run
@@ -425,18 +427,18 @@ class LiveInput(Input):
     def _decode(self, link: str, chunks: list[Chunk]) -> None:
         decoder = self._decoders[link]
         if chunks[0].gap:
-            self._hand_on(link, decoder.rest(), interrupted=True)
+            self._hand_on(link, decoder.take_pending(), interrupted=True)
         if link == "data" and chunks[0].sender is not None:  # then all of them have one
             self._decode_senders(chunks)
             return
         if link in self._answering:
-            chunks = self._of_who_answered(link, chunks)
+            chunks = self._select_first_sender(link, chunks)
         if chunks:
             self._hand_on(link, decode_chunks(decoder, chunks))
 
     def _decode_senders(self, chunks: list[Chunk]) -> None:
         """Decode chunks of the data link from several senders, of which one is the sensor."""
-        chunks = self._of_the_sensor(chunks)
+        chunks = self._select_sensor_chunks(chunks)
         if not chunks:
             return
         decoder = self.decoder
@@ -448,7 +450,7 @@ class LiveInput(Input):
             self._captures["data"].transport.accept(self._senders.address)
         self._hand_on("data", found)
 
-    def _of_the_sensor(self, chunks: list[Chunk]) -> list[Chunk]:
+    def _select_sensor_chunks(self, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks that the sensor sent.
 
         If another sensor is selected now, incomplete frames of the previous one are discarded.
@@ -456,11 +458,11 @@ class LiveInput(Input):
         mine = self._senders.select(chunks)
         self._link_state.record_senders(is_sensor=bool(mine))
         if self._senders.has_changed:
-            self.decoder.rest()
+            self.decoder.take_pending()
             self._ready.append(Arrival(interrupted=True, replaced=True))
         return mine
 
-    def _of_who_answered(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
+    def _select_first_sender(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks of the first sender that replied to a broadcast.
 
         It is the sensor, on every link.
@@ -479,27 +481,27 @@ class LiveInput(Input):
         return self._captures["data"].transport.peer() or next(iter(answered), None)
 
     def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
-        self.note(found)
-        with self._talk:
+        self.store_info_frames(found)
+        with self._session_lock:
             awaited = self._session.awaited_frames(link)
-            for item in answers(found, awaited) if awaited else ():
+            for item in select_frames(found, awaited) if awaited else ():
                 at = self._clock.now() if item.at is None else item.at
                 self._session.receive([item], at, link=link)
             if awaited:
-                self._speak()
+                self._send_outgoing()
         if link == "data":
             self._link_state.record_frames(found)
             if interrupted or any(map(len, found)):
                 self._ready.append(Arrival(found, interrupted=interrupted))
 
-    def _start_again(self) -> None:
+    def _restart_sensor(self) -> None:
         """Send the opening commands again: the device is back, and has lost its state."""
-        with self._talk:
+        with self._session_lock:
             names = self.sensor.on_open if self._stops else ()
             self._checked += [self._session.request(name, self._clock.now()) for name in names]
-            self._speak()
+            self._send_outgoing()
 
-    def _compare(self) -> None:
+    def _warn_if_changed(self) -> None:
         """Warn if the sensor that came back reports other values than before.
 
         It may be another sensor.
@@ -512,12 +514,12 @@ class LiveInput(Input):
                 others = [
                     name for name, value in again.items() if self.learned.get(name, value) != value
                 ]
-                self._said += [
+                self._reported_warnings += [
                     f"{self._source}: the sensor that came back has another {name}: open it again"
                     for name in others
                 ]
 
-    def _speak(self) -> None:
+    def _send_outgoing(self) -> None:
         """Send the outgoing data of the session."""
         for outgoing in self._session.outgoing():
             try:
@@ -527,13 +529,13 @@ class LiveInput(Input):
             except LidarSpecError as error:
                 self._session.abandon(str(error))
 
-    def _write(self, outgoing: Outgoing) -> None:
+    def _write(self, outgoing: OutgoingData) -> None:
         transport = self._open_link(outgoing.link)
         if outgoing.lines:
             try:
                 transport.lines(**outgoing.lines)
             except LidarSpecError as error:
-                self._said.append(str(error))
+                self._reported_warnings.append(str(error))
         if outgoing.data:
             transport.write(outgoing.data)
             if self._recorder is not None:
@@ -551,7 +553,7 @@ class LiveInput(Input):
             self._decoders[link] = self.sensor.decoder(
                 stream=not opened.datagrams, backend=self._backend
             )
-            self._captures[link] = Capture(opened, self.queue, link=link)
+            self._captures[link] = CaptureThread(opened, self.queue, link=link)
         return self._captures[link].transport
 
 
@@ -559,9 +561,9 @@ def _is_broadcast(link: Link | None) -> bool:
     return isinstance(link, Udp) and bool(link.broadcast)
 
 
-def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | Mark | BaseException]]:
+def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | LinkEvent | BaseException]]:
     """Join consecutive chunks of one link, up to each interruption."""
-    runs: list[tuple[str, list[Chunk] | Mark | BaseException]] = []
+    runs: list[tuple[str, list[Chunk] | LinkEvent | BaseException]] = []
     run: list[Chunk] = []  # the last run of chunks; empty after another event
     for link, item in events:
         if not isinstance(item, Chunk):

@@ -13,11 +13,11 @@ from lidarspec.device.device_input import Arrival
 from lidarspec.device.first_frames import FirstFrames
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
-from lidarspec.packets.imu import Waiting, join_samples
+from lidarspec.packets.imu import WaitingSamples, join_samples
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.stream import ScanStream, handed_out
+from lidarspec.scans.stream import ScanStream, release_yielded
 from lidarspec.sensor_operations import Sensor
 
 #: Batches that are kept until the type of the data frames is known.
@@ -57,7 +57,7 @@ class PacketReader:
         self.imu_samples = join_samples([])
 
     @property
-    def waiting_imu(self) -> Waiting | None:
+    def waiting_imu(self) -> WaitingSamples | None:
         """The IMU samples that wait for the end of their scan, if scans have any."""
         if self._imu is not None:
             return self._imu.waiting
@@ -95,7 +95,7 @@ class PacketReader:
             self._imu.waiting = waiting
         self.imu_samples = self._imu.add(arrival.found, packets)
         if self._imu.waiting is not None:
-            self._imu.waiting.keep(_MAX_WAITING_IMU_SAMPLES)
+            self._imu.waiting.keep_newest(_MAX_WAITING_IMU_SAMPLES)
         if arrival.interrupted:
             self._imu.interrupt()
 
@@ -112,7 +112,7 @@ class PacketReader:
             packets = self.add(arrival)
             self.add_imu(arrival, packets)
         if packets is not None and len(packets):
-            yield from handed_out(stream.add(packets))
+            yield from release_yielded(stream.add(packets))
         if arrival.interrupted:
             yield from stream.finish()
 

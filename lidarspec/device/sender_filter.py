@@ -2,7 +2,7 @@
 
 A sensor is an address: its data, calibration and replies come from there. The frames of one type
 come from one port of it, and from another port only after a restart; two ports that take turns are
-two sensors. A file with frames of two sensors is refused (`Senders`): the user can select one.
+two sensors. A file with frames of two sensors is refused (`SenderCheck`): the user can select one.
 From a live source the first sender of data is read (`SenderFilter`): datagrams of others are left
 out before they are decoded.
 """
@@ -26,7 +26,7 @@ from lidarspec.transports.protocol import Chunk, Sender, endpoint
 MAX_SENDERS = 16
 
 
-class Senders:
+class SenderCheck:
     """Checks that one sensor sends the frames of a file.
 
     Args:
@@ -40,7 +40,7 @@ class Senders:
         self._now: dict[str, Sender] = {}  # the current and previous senders of each frame type
         self._before: dict[str, dict[Sender, None]] = {}
 
-    def see(self, sent: Iterable[tuple[str, Sender]]) -> None:
+    def check(self, sent: Iterable[tuple[str, Sender]]) -> None:
         """Check the senders of frames.
 
         Args:
@@ -51,11 +51,15 @@ class Senders:
         """
         for name, sender in sent:
             self._owner = self._owner or sender
-            other = self._owner if sender[0] != self._owner[0] else self._younger(name, sender)
+            other = (
+                self._owner
+                if sender[0] != self._owner[0]
+                else self._find_concurrent_port(name, sender)
+            )
             if other is not None:
-                raise self._several(other, sender)
+                raise self._warn_of_senders(other, sender)
 
-    def _younger(self, name: str, sender: Sender) -> Sender | None:
+    def _find_concurrent_port(self, name: str, sender: Sender) -> Sender | None:
         """Return the port that took turns with this one for frames of a type.
 
         Returns None if there is none. The frames then come from this port.
@@ -71,7 +75,7 @@ class Senders:
         before[known], self._now[name] = None, sender
         return None
 
-    def _several(self, first: Sender, other: Sender) -> UsageError:
+    def _warn_of_senders(self, first: Sender, other: Sender) -> UsageError:
         one, two = (
             endpoint(sender) if first[0] == other[0] else sender[0] for sender in (first, other)
         )
@@ -83,7 +87,7 @@ class Senders:
         return suggest(error, f"the same with {quote(chosen)}")
 
 
-class SenderFilter(Senders):
+class SenderFilter(SenderCheck):
     """Selects the datagrams of one sensor from a live source.
 
     The sensor is the first sender of data frames, and before that the first sender of any frame.
@@ -92,7 +96,7 @@ class SenderFilter(Senders):
         datagrams: whether each datagram is a whole frame, not a piece of a stream.
 
     Attributes:
-        foreign: number of datagrams of other senders so far; `stranger` sent the first of them.
+        foreign: number of datagrams of other senders so far; `other_sender` sent the first of them.
         has_changed: whether the last call of `select` has selected another sender than the one read
             before.
     """
@@ -101,12 +105,12 @@ class SenderFilter(Senders):
         super().__init__(source, sensor)
         self.foreign = 0
         self.has_changed = False
-        self.stranger: Sender | None = None
+        self.other_sender: Sender | None = None
         self._is_sure = False
         self._datagrams = datagrams
         self._first: Sender | None = None  # sender of a stream before its first frame
         self._probes: dict[Sender, Decoder] = {}
-        self._strangers: dict[
+        self._other_senders: dict[
             Sender, None
         ] = {}  # ports of other sensors at the address of the sensor
 
@@ -128,16 +132,14 @@ class SenderFilter(Senders):
     @property
     def warnings(self) -> list[str]:
         """A warning about another sender on the same port."""
-        if self.stranger is None or self._owner is None:
+        if self.other_sender is None or self._owner is None:
             return []
         text = (
-            f"{self._source}: {endpoint(self._owner)} is read; {endpoint(self.stranger)} sends as"
-            " well, and is left out"
+            f"{self._source}: {endpoint(self._owner)} is read; {endpoint(self.other_sender)} sends"
+            " as well, and is left out"
         )
-        return [
-            f"{text}; next: the same with"
-            f" {quote(with_option(self._source, 'src', endpoint(self.stranger)))} to read that one"
-        ]
+        other = quote(with_option(self._source, "src", endpoint(self.other_sender)))
+        return [f"{text}; next: the same with {other} to read that one"]
 
     def select(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Return the datagrams that the sensor sent.
@@ -151,12 +153,12 @@ class SenderFilter(Senders):
             if chunk.sender is not None and self._replaces(chunk.sender, chunk):
                 self.has_changed = True
                 for one in mine:
-                    self._leave_out(one.sender)
+                    self._count_foreign(one.sender)
                 mine = []
             if chunk.sender is None or self._is_ours(chunk.sender):
                 mine.append(chunk)
             else:
-                self._leave_out(chunk.sender)
+                self._count_foreign(chunk.sender)
         return mine
 
     def select_ports(self, sent: Sequence[tuple[str, Sender]], found: Frames) -> Frames:
@@ -165,21 +167,21 @@ class SenderFilter(Senders):
         Args:
             sent: the type and the sender of each frame, or of each type if one sender sent all.
         """
-        known = len(self._strangers)
+        known = len(self._other_senders)
         for name, sender in sent:
-            if sender not in self._strangers:
+            if sender not in self._other_senders:
                 self._take_turns(name, sender)
                 if self._sensor.frames[name].data:
                     self._owner = sender
                 else:
                     self._owner = self._owner
-        if len(self._strangers) == known or len(sent) < len(found):
+        if len(self._other_senders) == known or len(sent) < len(found):
             return found
-        mine = [sender not in self._strangers for _, sender in sent]
+        mine = [sender not in self._other_senders for _, sender in sent]
         for (_, sender), is_mine in zip(sent, mine, strict=True):
             if not is_mine:
-                self._leave_out(sender)
-        return found.only(np.array(mine, np.bool_))
+                self._count_foreign(sender)
+        return found.select(np.array(mine, np.bool_))
 
     def _replaces(self, sender: Sender, chunk: Chunk) -> bool:
         """Decide from a chunk which sender is the sensor.
@@ -191,7 +193,7 @@ class SenderFilter(Senders):
         if (
             self._is_sure
             and owner is not None
-            and (self._datagrams or sender == owner or not self._is_near(sender, owner))
+            and (self._datagrams or sender == owner or not self._may_be_same_device(sender, owner))
         ):
             return False
         names = self._names(sender, chunk)
@@ -210,12 +212,12 @@ class SenderFilter(Senders):
             self._first = self._first or (None if self._datagrams else sender)
             return self._first in (None, sender)
         if self._datagrams:
-            return self._is_near(sender, self._owner)
+            return self._may_be_same_device(sender, self._owner)
         return sender == self._owner
 
-    def _is_near(self, sender: Sender, owner: Sender) -> bool:
+    def _may_be_same_device(self, sender: Sender, owner: Sender) -> bool:
         """Return whether a sender may be the sensor at another port."""
-        return sender[0] == owner[0] and sender not in self._strangers
+        return sender[0] == owner[0] and sender not in self._other_senders
 
     def _names(self, sender: Sender, chunk: Chunk) -> set[str]:
         """Return the types of the frames that a datagram completes.
@@ -232,18 +234,18 @@ class SenderFilter(Senders):
 
         If several ports take turns, it is the first one.
         """
-        younger = self._younger(name, sender)
+        younger = self._find_concurrent_port(name, sender)
         if younger is not None:
-            self._strangers |= dict.fromkeys([*self._before[name], younger])
-            del self._strangers[sender]
-            while len(self._strangers) > MAX_SENDERS:
-                del self._strangers[next(iter(self._strangers))]
+            self._other_senders |= dict.fromkeys([*self._before[name], younger])
+            del self._other_senders[sender]
+            while len(self._other_senders) > MAX_SENDERS:
+                del self._other_senders[next(iter(self._other_senders))]
             self._now[name], self._before[name] = sender, {}
         return self._now[name]
 
-    def _leave_out(self, sender: Sender | None) -> None:
+    def _count_foreign(self, sender: Sender | None) -> None:
         self.foreign = self.foreign + 1
-        self.stranger = self.stranger or sender
+        self.other_sender = self.other_sender or sender
 
 
 def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tuple[str, Sender]]:

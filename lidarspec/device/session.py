@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
-from lidarspec.frames.field_paths import steps
+from lidarspec.frames.field_paths import split_path
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
@@ -41,7 +41,7 @@ SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Outgoing:
+class OutgoingData:
     """Bytes to send on a link, after setting its control lines."""
 
     link: str
@@ -78,7 +78,7 @@ class Reply:
         Raises:
             UnknownField: for a path that the frame does not have.
         """
-        value = found_at(self.values, path)
+        value = get_nested(self.values, path)
         if path not in self.fields or value is _MISSING:
             raise UnknownField(
                 path, self.fields, place=f"{self.command} {self.frame or 'without a reply'}"
@@ -91,7 +91,7 @@ class Reply:
         free = [
             info
             for info in self.fields.values()
-            if info.const is None and found_at(self.values, info.path) is not _MISSING
+            if info.const is None and get_nested(self.values, info.path) is not _MISSING
         ]
         told = [
             f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}"
@@ -102,7 +102,7 @@ class Reply:
         )
 
 
-class Pending:
+class PendingReply:
     """The future result of a command: its reply or its failure."""
 
     def __init__(self, place: str) -> None:
@@ -141,7 +141,7 @@ class Pending:
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedReply:
     """The frames that can be the reply to one request.
 
     Attributes:
@@ -154,12 +154,12 @@ class Expected:
     values: Mapping[str, Any]
     refusal: str | None = None
 
-    def differs(self, frame: str, values: Any) -> list[str]:
+    def find_differences(self, frame: str, values: Any) -> list[str]:
         """Return the differences between a frame and the reply; empty if there are none."""
         if frame not in self.tables:
             return [f"a frame {frame}"]
         asked = {path: value for path, value in self.values.items() if path in self.tables[frame]}
-        got = {path: found_at(values, path) for path in asked}
+        got = {path: get_nested(values, path) for path in asked}
         wrong = [
             (path, "missing" if got[path] is _MISSING else got[path])
             for path in asked
@@ -167,7 +167,7 @@ class Expected:
         ]
         return [f"{path} {there} instead of {asked[path]}" for path, there in wrong]
 
-    def alike(self, other: Expected) -> bool:
+    def overlaps(self, other: ExpectedReply) -> bool:
         """Return whether one frame could be the reply to both."""
         return any(
             all(
@@ -179,19 +179,19 @@ class Expected:
         )
 
 
-def found_at(values: Any, path: str) -> Any:
+def get_nested(values: Any, path: str) -> Any:
     """Return the value at a path of a parsed frame.
 
     Below an array without an index, it is a list of values. If there is no value, it is `_MISSING`.
     """
-    for name in steps(path):
+    for name in split_path(path):
         if isinstance(name, int):
             if isinstance(values, list) and name < len(values):
                 values = values[name]
             else:
                 values = _MISSING
         elif isinstance(values, list):
-            values = [found_at(element, name) for element in values]
+            values = [get_nested(element, name) for element in values]
         elif isinstance(values, Mapping) and name in values:
             values = values[name]
         else:
@@ -220,9 +220,9 @@ class _PendingCommand:
     name: str
     command: Command
     data: bytes
-    expected: Expected | None
+    expected: ExpectedReply | None
     timeout: int
-    pending: Pending
+    pending: PendingReply
     sent: list[int] = field(default_factory=list)
     wrong: str = ""
 
@@ -245,10 +245,10 @@ class _PendingCommand:
 
 
 @dataclass(frozen=True, eq=False)
-class _Owed:
+class _LateReply:
     """A reply that may still arrive."""
 
-    expected: Expected
+    expected: ExpectedReply
     until: int
 
 
@@ -258,7 +258,7 @@ class _LinkQueue:
 
     queue: deque[_PendingCommand] = field(default_factory=deque)
     current: _PendingCommand | None = None
-    owed: list[_Owed] = field(default_factory=list)
+    late_replies: list[_LateReply] = field(default_factory=list)
     quiet: int = 0
 
     def ready(self) -> int | None:
@@ -271,20 +271,20 @@ class _LinkQueue:
                 self.quiet,
                 *(
                     owed.until
-                    for owed in self.owed
-                    if expected is not None and owed.expected.alike(expected)
+                    for owed in self.late_replies
+                    if expected is not None and owed.expected.overlaps(expected)
                 ),
             ]
         )
 
 
 @dataclass(eq=False)
-class _Beat:
+class _Heartbeat:
     """A command that is repeated."""
 
     arguments: dict[str, Any]
     due: int
-    pending: Pending
+    pending: PendingReply
 
 
 class Session:
@@ -309,12 +309,12 @@ class Session:
         self.unanswered: dict[str, CommandError] = {}
         self._count = 0
         self._lines: dict[str, _LinkQueue] = {}
-        self._beats: dict[str, _Beat] = {}
-        self._out: list[Outgoing] = []
+        self._heartbeats: dict[str, _Heartbeat] = {}
+        self._out: list[OutgoingData] = []
 
     def request(
         self, name: str, now: int, /, *, timeout: float | None = None, **arguments: Any
-    ) -> Pending:
+    ) -> PendingReply:
         """Queue a command, and return its future reply.
 
         It is sent as soon as its link is free.
@@ -331,7 +331,7 @@ class Session:
                 is sent.
         """
         filled = {
-            path: self._next(value)
+            path: self._fill_value(value)
             for path, value in self._fill_values(name).items()
             if path not in arguments
         }
@@ -342,25 +342,25 @@ class Session:
             sent = self.sensor.parse(data, command.frame)
         else:
             sent = None
-        values = {**command.matches, **{path: found_at(sent, path) for path in command.echoes}}
+        values = {**command.matches, **{path: get_nested(sent, path) for path in command.echoes}}
         if timeout is None:
             wait = _ns(command.timeout) * (1 + command.retries)
         else:
             wait = _ns(timeout)
-        pending = Pending(f"{self.sensor.id} {name}")
+        pending = PendingReply(f"{self.sensor.id} {name}")
         if tables:
-            expected = Expected(tables, values, command.refusal)
+            expected = ExpectedReply(tables, values, command.refusal)
         else:
             expected = None
         self._lines.setdefault(command.link, _LinkQueue()).queue.append(
             _PendingCommand(name, command, data, expected, wait, pending)
         )
         if command.every:
-            self._beats[name] = _Beat(arguments, now + _ns(command.every), pending)
+            self._heartbeats[name] = _Heartbeat(arguments, now + _ns(command.every), pending)
         self._advance(command.link, now)
         return pending
 
-    def outgoing(self) -> list[Outgoing]:
+    def outgoing(self) -> list[OutgoingData]:
         """Return everything that has to be sent now, in order, once."""
         out = self._out
         self._out = []
@@ -371,7 +371,7 @@ class Session:
         line = self._lines.get(link)
         if line is None:
             return frozenset()
-        expected = [owed.expected for owed in line.owed] + (
+        expected = [owed.expected for owed in line.late_replies] + (
             [line.current.expected] if line.current and line.current.expected else []
         )
         return frozenset(name for one in expected for name in (*one.tables, one.refusal) if name)
@@ -382,13 +382,15 @@ class Session:
         if line is None:
             return
         for item in found:
-            if (line.current is not None or line.owed) and item.frame in self.awaited_frames(link):
+            if (
+                line.current is not None or line.late_replies
+            ) and item.frame in self.awaited_frames(link):
                 self._take(line, item, now)
         self._advance(link, now)
 
     def tick(self, now: int) -> None:
         """Send again, time out, end settling, and send heartbeats that are due."""
-        for name, beat in list(self._beats.items()):
+        for name, beat in list(self._heartbeats.items()):
             if now >= beat.due:
                 beat.due = now + _ns(self.sensor.commands[name].every)
                 if beat.pending.done:
@@ -410,7 +412,7 @@ class Session:
     @property
     def deadline(self) -> int | None:
         """The time at which `tick` is needed next; None if there is none."""
-        times = [beat.due for beat in self._beats.values()]
+        times = [beat.due for beat in self._heartbeats.values()]
         for line in self._lines.values():
             current = line.current
             if current is not None:
@@ -431,9 +433,9 @@ class Session:
         expected.
         """
         for name in [
-            name for name in self._beats if link in (None, self.sensor.commands[name].link)
+            name for name in self._heartbeats if link in (None, self.sensor.commands[name].link)
         ]:
-            del self._beats[name]
+            del self._heartbeats[name]
             self.unanswered.pop(name, None)
         for line in [line for name, line in self._lines.items() if link in (None, name)]:
             waiting = list(line.queue)
@@ -452,7 +454,7 @@ class Session:
             return self.sensor.commands[name].filled
         return {}
 
-    def _next(self, value: Filled) -> Any:
+    def _fill_value(self, value: Filled) -> Any:
         """Return a value that is known only when a command is sent.
 
         It is our own address, or the next number, which all commands of the session share.
@@ -468,7 +470,7 @@ class Session:
     def _advance(self, link: str, now: int) -> None:
         """Send queued requests, up to the first that waits for a reply or is held back."""
         line = self._lines[link]
-        line.owed = [owed for owed in line.owed if owed.until > now]
+        line.late_replies = [owed for owed in line.late_replies if owed.until > now]
         while (ready := line.ready()) is not None and now >= ready:
             request = line.queue.popleft()
             self._send(request, now)
@@ -481,7 +483,7 @@ class Session:
     def _send(self, request: _PendingCommand, now: int) -> None:
         command = request.command
         request.sent.append(now)
-        self._out.append(Outgoing(command.link, request.data, command.lines))
+        self._out.append(OutgoingData(command.link, request.data, command.lines))
         self.started = (self.started or command.starts) and not command.stops
 
     def _take(self, line: _LinkQueue, item: Found, now: int) -> None:
@@ -493,7 +495,7 @@ class Session:
         if current is None or current.expected is None:
             differs = ["not asked for"]
         else:
-            differs = current.expected.differs(item.frame, values)
+            differs = current.expected.find_differences(item.frame, values)
         if current is not None and not differs and now >= current.sent[0]:
             reply = Reply(
                 current.name, item.frame, values, True, now, item.data, self._table(item.frame)
@@ -502,9 +504,9 @@ class Session:
             current.pending.settle(reply)
             self.unanswered.pop(current.name, None)
             return
-        for owed in line.owed:
-            if not owed.expected.differs(item.frame, values):
-                line.owed.remove(owed)
+        for owed in line.late_replies:
+            if not owed.expected.find_differences(item.frame, values):
+                line.late_replies.remove(owed)
                 self.late += 1
                 return
         if (
@@ -520,10 +522,12 @@ class Session:
 
         The frame does not tell which request it refuses.
         """
-        owed = next((owed for owed in line.owed if owed.expected.refusal == item.frame), None)
+        owed = next(
+            (owed for owed in line.late_replies if owed.expected.refusal == item.frame), None
+        )
         current = line.current
         if owed is not None:
-            line.owed.remove(owed)
+            line.late_replies.remove(owed)
             self.late += 1
         elif (
             current is not None
@@ -553,8 +557,9 @@ class Session:
         line.current = None
         line.quiet = since + _ns(request.command.settle)
         if request.expected is not None:
-            line.owed += [
-                _Owed(request.expected, sent + request.patience) for sent in request.sent[answers:]
+            line.late_replies += [
+                _LateReply(request.expected, sent + request.patience)
+                for sent in request.sent[answers:]
             ]
 
 
@@ -600,7 +605,7 @@ def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
         f"{path} {name} ({number})"
         for path, info in fields.items()
         for number, name in info.labels.items()
-        if found_at(values, path) == name
+        if get_nested(values, path) == name
     ]
     return ", ".join(reasons)
 

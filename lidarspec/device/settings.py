@@ -30,7 +30,14 @@ from lidarspec.plugins import names_file, sensor as named_sensor
 from lidarspec.points.mount import Mount
 from lidarspec.remote_files import is_stored
 from lidarspec.sensor_operations import Sensor
-from lidarspec.trusted_files import FILE, beside, document, foreign, is_trusted, own_settings
+from lidarspec.trusted_files import (
+    FILE,
+    find_distrust,
+    is_trusted,
+    own_settings,
+    read_document,
+    resolve_beside,
+)
 
 #: a valid name: no suffix, scheme or folder, and not the name of a port on Windows.
 _NAME = re.compile(r"(?!(?i:com|lpt)\d+$)[A-Za-z][A-Za-z0-9_-]*")
@@ -38,7 +45,7 @@ _KEYS = ("source", "sensor", "mount", "options")
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedDevice:
     """A device of a settings file.
 
     Attributes:
@@ -49,7 +56,7 @@ class Named:
         options: options of the sensor.
         file: the settings file.
         hidden: another file with a device of this name, which is not used.
-        believed: whether the file is trusted: the user's own, or in a folder that the user has
+        is_trusted: whether the file is trusted: the user's own, or in a folder that the user has
             allowed.
     """
 
@@ -60,7 +67,7 @@ class Named:
     options: Mapping[str, Any] = field(default_factory=dict)
     file: str = ""
     hidden: str = ""
-    believed: bool = True
+    is_trusted: bool = True
 
     def configure(self) -> Sensor | None:
         """Return the sensor with its options, None if it has to be detected.
@@ -75,12 +82,12 @@ class Named:
             return sensor
         place = f"{self.file}: [device.{self.name}]"
         try:
-            if self.believed:
+            if self.is_trusted:
                 options = self.options
             else:
                 options = sensor.configure.options_of_file(self.options, Path(self.file).parent)
         except UsageError as error:
-            raise self._asking(UsageError(f"{place}: {error}")) from None
+            raise self._suggest_trust(UsageError(f"{place}: {error}")) from None
         try:
             configured: Sensor = sensor.configure(**options)
         except UsageError as error:
@@ -89,7 +96,7 @@ class Named:
 
     def refusal(self) -> UsageError | None:
         """Return the reason why an untrusted file cannot have this device, else None."""
-        if self.believed:
+        if self.is_trusted:
             return None
         folder = Path(self.file).parent
         file = self.source.partition("?")[0]
@@ -103,7 +110,7 @@ class Named:
             )
         elif os.path.isfile(file):
             try:
-                beside(folder, os.path.abspath(file))
+                resolve_beside(folder, os.path.abspath(file))
             except UsageError:
                 reason = f"source {self.source!r} is a file outside {folder}"
         error = UsageError(
@@ -111,15 +118,15 @@ class Named:
             " allowed"
         )
         if reason:
-            return self._asking(error)
+            return self._suggest_trust(error)
         return None
 
-    def _asking(self, error: UsageError) -> UsageError:
+    def _suggest_trust(self, error: UsageError) -> UsageError:
         """Return the error with the command that allows the folder of the file."""
         return suggest(error, f"lidarspec trust {quote(str(Path(self.file).parent))}")
 
 
-def find_device(source: str | Path) -> Named | None:
+def find_device(source: str | Path) -> NamedDevice | None:
     """Return the device with this name, None for every other SOURCE.
 
     Raises:
@@ -130,7 +137,7 @@ def find_device(source: str | Path) -> Named | None:
     word = str(source)
     if not isinstance(source, str) or not _NAME.fullmatch(word):
         return None
-    known, faults = _known()
+    known, faults = _read_all()
     if word not in known and not os.path.exists(word):
         if faults:
             raise faults[0]
@@ -153,14 +160,14 @@ def find_device(source: str | Path) -> Named | None:
     return device
 
 
-def devices() -> dict[str, Named]:
+def devices() -> dict[str, NamedDevice]:
     """Return all devices of files without a mistake, the user's own first."""
-    return _known()[0]
+    return _read_all()[0]
 
 
-def _known() -> tuple[dict[str, Named], list[LidarSpecError]]:
+def _read_all() -> tuple[dict[str, NamedDevice], list[LidarSpecError]]:
     """Return all devices, and the errors of files that could not be read."""
-    known: dict[str, Named] = {}
+    known: dict[str, NamedDevice] = {}
     faults = []
     for path in files():
         try:
@@ -185,20 +192,20 @@ def files() -> list[Path]:
     for path in (folder / FILE for folder in (here, *here.parents)):
         if path == own or not os.path.isfile(path):
             continue
-        if not (reason := foreign(path)):
+        if not (reason := find_distrust(path)):
             return [*found, path]
         warnings.warn(f"{path} is not read: {reason}", stacklevel=2)
     return found
 
 
-def read(path: Path) -> dict[str, Named]:
+def read(path: Path) -> dict[str, NamedDevice]:
     """Return the devices of one file.
 
     Raises:
         UsageError: for a mistake in it, with table and key.
         SourceError: if it cannot be read.
     """
-    content = document(path)
+    content = read_document(path)
     is_own = path == own_settings()
     if "owners" in content and not is_own:
         raise UsageError(f"{path}: [owners] stands in your own settings alone, {own_settings()}")
@@ -208,14 +215,14 @@ def read(path: Path) -> dict[str, Named]:
         isinstance(table, dict) for table in tables.values()
     ):
         raise UsageError(f"{path}: devices are tables of their own: [device.front]")
-    believed = is_own or is_trusted(path.parent)
+    is_trusted_file = is_own or is_trusted(path.parent)
     return {
-        name: replace(_device(path, name, table), believed=believed)
+        name: replace(_device(path, name, table), is_trusted=is_trusted_file)
         for name, table in tables.items()
     }
 
 
-def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
+def _device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice:
     place = f"[device.{name}]"
     if not _NAME.fullmatch(name):
         raise UsageError(
@@ -235,7 +242,7 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
     ):
         if key in table and not isinstance(table[key], kind):
             raise UsageError(f"{path}: {place}: {key} is {expected}, not {shown(table[key])}")
-    options = {key: _beside(path, value) for key, value in table.get("options", {}).items()}
+    options = {key: _resolve_path(path, value) for key, value in table.get("options", {}).items()}
     if "mount" in table:
         mount = _mount(path, place, table["mount"])
     else:
@@ -243,14 +250,19 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> Named:
     sensor = table.get("sensor")
     if options and sensor is None:
         raise UsageError(f"{path}: {place}: options are a sensor's: name the sensor as well")
-    source = _beside(path, table["source"])
+    source = _resolve_path(path, table["source"])
     if _NAME.fullmatch(source) and not os.path.exists(source):
         raise UsageError(
             f"{path}: {place}: source {source!r} is a name again; a device names its port, address"
             " or file"
         )
-    return Named(
-        name, source, None if sensor is None else _beside(path, sensor), mount, options, str(path)
+    return NamedDevice(
+        name,
+        source,
+        None if sensor is None else _resolve_path(path, sensor),
+        mount,
+        options,
+        str(path),
     )
 
 
@@ -284,7 +296,7 @@ def _closest(word: str, known: Iterable[str]) -> str:
     return did_you_mean(word, known) or f" (known: {', '.join(known)})"
 
 
-def _beside(path: Path, value: Any) -> Any:
+def _resolve_path(path: Path, value: Any) -> Any:
     """Return a path that begins with a dot relative to the file's folder.
 
     Other values are unchanged.

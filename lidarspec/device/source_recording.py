@@ -3,8 +3,8 @@
 A live source is recorded until the recording is ended, a file as fast as the disk allows.
 
 A live source with a known sensor is a `Device`: it is started and stopped, and the data is decoded
-to be counted. Without a sensor a `Capture` reads it and nothing is sent. The recorder is made after
-the source is opened, because its format depends on the source.
+to be counted. Without a sensor a `CaptureThread` reads it and nothing is sent. The recorder is made
+after the source is opened, because its format depends on the source.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lidarspec.device.capture_thread import BoundedQueue, Capture, Mark
+from lidarspec.device.capture_thread import BoundedQueue, CaptureThread, LinkEvent
 from lidarspec.device.device import Device
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.background_writer import Appender
+from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.recording.format import Header
-from lidarspec.recording.recorders import MadeFor, recorder
+from lidarspec.recording.recorders import RecorderFactory, recorder
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.host_clock import HostClock
@@ -39,7 +39,7 @@ _FIGURES = re.compile(r"[\d.]+")
 
 def recorder_like(
     opened: Transport, source: str, target: str, sensor: Sensor | str | None, *, overwrite: bool
-) -> Appender:
+) -> BackgroundWriter:
     """Return the recorder of a new file for an open source.
 
     If the source is a recording, its sensor, source and baud rate are taken over.
@@ -73,7 +73,7 @@ class TimedLog:
         is_over: whether it ignores all further arrivals.
     """
 
-    def __init__(self, recorder: Appender, seconds: float | None) -> None:
+    def __init__(self, recorder: BackgroundWriter, seconds: float | None) -> None:
         self._recorder = recorder
         if seconds is None:
             self._limit_ns = math.inf
@@ -166,7 +166,7 @@ class SourceRecording:
         self._start = start
         self._overwrite = overwrite
         self._salvage = salvage
-        self.recorder: Appender | None = None
+        self.recorder: BackgroundWriter | None = None
         self.device: Device | None = None
         self._log: TimedLog | None = None
         self.packets = 0
@@ -193,7 +193,7 @@ class SourceRecording:
         failures = dict[str, None]()
         known = set[str]()
         with Device(
-            self._source, sensor, start=self._start, record=MadeFor(self._open_log)
+            self._source, sensor, start=self._start, record=RecorderFactory(self._open_log)
         ) as self.device:
             log = self._log
             assert log is not None
@@ -254,14 +254,14 @@ class SourceRecording:
     def _record_live(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
         """Count and discard the data that a thread records."""
         queue = BoundedQueue()
-        with contextlib.closing(Capture(source, queue, log=log)) as capture:
+        with contextlib.closing(CaptureThread(source, queue, log=log)) as capture:
             try:
                 while self._goes_on(log):
                     yield ""
                     for mark in self._count_queued(source, queue, log, TURN):
-                        if mark is Mark.LOST:
+                        if mark is LinkEvent.LOST:
                             yield f"{self._source}: the device is gone; waiting for it to come back"
-                        elif mark is Mark.BACK:
+                        elif mark is LinkEvent.BACK:
                             yield f"{self._source}: the device is back"
             finally:
                 self._end(log)
@@ -270,17 +270,17 @@ class SourceRecording:
 
     def _count_queued(
         self, source: LiveTransport, queue: BoundedQueue, log: TimedLog, wait: float
-    ) -> list[Mark]:
+    ) -> list[LinkEvent]:
         """Take all events from the queue, and count the recorded datagrams.
 
         Returns:
             The interruptions of the line meanwhile.
         """
-        marks = list[Mark]()
+        marks = list[LinkEvent]()
         for _, item in queue.take(wait):
             if isinstance(item, BaseException):
                 raise item
-            if isinstance(item, Mark):
+            if isinstance(item, LinkEvent):
                 marks.append(item)
             elif source.datagrams and log.has(item):
                 self.packets += 1
@@ -294,7 +294,7 @@ class SourceRecording:
             if not self._goes_on(log, timed=False):
                 return
             yield ""
-            self.recorder.keep_up()
+            self.recorder.wait_for_room()
             is_undated = chunk.at is None and self._source == "-"
             log.write(replace(chunk, at=clock.now()) if is_undated else chunk)
             if log.is_over:

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from lidarspec.drafting.crc_search import crc_matches
 from lidarspec.drafting.samples import (
-    Match,
-    Place,
-    Samples,
-    Span,
-    anywhere,
-    best_first,
-    doubt,
-    enough,
-    spans,
+    ChecksumMatch,
+    ChecksumPlace,
+    CoveredSpan,
+    SampleFrames,
+    accept_any_place,
+    are_enough,
+    iter_spans,
+    sort_matches,
+    weigh_evidence,
 )
-from lidarspec.frames.row_checksums import batch
+from lidarspec.frames.row_checksums import compute_checksums
 from lidarspec.spec.checksums import ByteOrder, Bytes, Checksum, Fold15, Sum, Values, WordXor, Xor
 
 #: Maximum number of matches to return.
@@ -80,7 +80,7 @@ class WordSum(Checksum):
 
 
 @dataclass(frozen=True)
-class Changed(Checksum):
+class MaskedChecksum(Checksum):
     """Another checksum with a constant.
 
     It is ``constant - value`` with `negative`, else ``constant + value``; for XORs
@@ -108,7 +108,7 @@ class Changed(Checksum):
         )
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return self._add_constant(batch(self.of, rows))
+        return self._add_constant(compute_checksums(self.of, rows))
 
     @property
     def _mask(self) -> int:
@@ -124,8 +124,11 @@ class Changed(Checksum):
 
 
 def search(
-    frames: Iterable[bytes], *, quick: bool = False, stands: Callable[[Place], bool] = anywhere
-) -> list[Match]:
+    frames: Iterable[bytes],
+    *,
+    quick: bool = False,
+    stands: Callable[[ChecksumPlace], bool] = accept_any_place,
+) -> list[ChecksumMatch]:
     """Return the checksums that match the frames, the simplest and surest first.
 
     Returns an empty list if there is none.
@@ -137,7 +140,7 @@ def search(
             long frames in the catalogue only.
         stands: returns whether a checksum may be at a place.
     """
-    samples = Samples(frames)
+    samples = SampleFrames(frames)
     if samples.shortest < 3 or not any(map(any, samples.frames)):
         return []
     matches = list(plain_matches(samples, stands))
@@ -145,12 +148,12 @@ def search(
         matches += crc_matches(samples, quick=quick, stands=stands)
     if not matches and not quick:
         matches += crc_matches(samples, mixed=True, stands=stands)
-    return best_first(matches)[:TOLD]
+    return sort_matches(matches)[:TOLD]
 
 
 def format_algorithm(algorithm: Checksum) -> str:
     """Return the algorithm as Python source; a class if the package has none."""
-    if isinstance(algorithm, Changed | WordSum):
+    if isinstance(algorithm, MaskedChecksum | WordSum):
         return _class(algorithm)
     if isinstance(algorithm, Sum):
         return f"Sum({algorithm.width})"
@@ -159,23 +162,25 @@ def format_algorithm(algorithm: Checksum) -> str:
     return f"{type(algorithm).__name__}()"
 
 
-def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) -> Iterator[Match]:
+def plain_matches(
+    samples: SampleFrames, stands: Callable[[ChecksumPlace], bool] = accept_any_place
+) -> Iterator[ChecksumMatch]:
     """Yield every plain checksum that matches, in no special order."""
-    few = samples.few(SCREENED)
+    few = samples.take_spread(SCREENED)
     tried = 0
     sure = False
     certain = False
     longest = len(few.frames[-1])
     for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
         for place in filter(stands, few.places(size)):
-            for span in spans(place, few):
+            for span in iter_spans(place, few):
                 if 2 * sum(b - a for a, b in span.ranges(place, longest)) < longest - size:
                     continue
                 for algorithm in algorithms:
                     if isinstance(algorithm, WordXor) and (span.head or span.tail):
                         continue
                     tried += 1
-                    for match in _fitting(samples, few, algorithm, place, span, tried):
+                    for match in _iter_matches(samples, few, algorithm, place, span, tried):
                         sure = sure or match.sure
                         certain = certain or (
                             match.sure and not isinstance(match.algorithm, Xor | WordXor)
@@ -188,9 +193,14 @@ def plain_matches(samples: Samples, stands: Callable[[Place], bool] = anywhere) 
     yield from _nibbles(samples)
 
 
-def _fitting(
-    samples: Samples, few: Samples, algorithm: Checksum, place: Place, span: Span, tried: int
-) -> Iterator[Match]:
+def _iter_matches(
+    samples: SampleFrames,
+    few: SampleFrames,
+    algorithm: Checksum,
+    place: ChecksumPlace,
+    span: CoveredSpan,
+    tried: int,
+) -> Iterator[ChecksumMatch]:
     """Yield an algorithm and its complements if they match.
 
     A constant is fitted only if there are several frames to prove it.
@@ -202,44 +212,44 @@ def _fitting(
         there = few.fields(place, order)
         algorithms: list[Checksum]
         if isinstance(algorithm, Fold15):
-            if enough(int((there == computed).sum()), len(few)):
+            if are_enough(int((there == computed).sum()), len(few)):
                 algorithms = [algorithm]
             else:
                 algorithms = []
         elif isinstance(algorithm, Xor | WordXor):
             algorithms = [_change(algorithm, constant) for constant in _constant(there ^ computed)]
-        elif few.alone:
+        elif few.is_single:
             if not there.any():
                 return
-            algorithms = [algorithm, Changed(algorithm, int(mask), negative=True)]
+            algorithms = [algorithm, MaskedChecksum(algorithm, int(mask), negative=True)]
         else:
             algorithms = [
                 _change(algorithm, constant) for constant in _constant((there - computed) & mask)
             ]
             algorithms += [
-                Changed(algorithm, constant, negative=True)
+                MaskedChecksum(algorithm, constant, negative=True)
                 for constant in _constant((there + computed) & mask)
             ]
         for one in algorithms:
-            constant = one.constant if isinstance(one, Changed) else 0
+            constant = one.constant if isinstance(one, MaskedChecksum) else 0
             fitted = int(constant not in (0, int(mask)))
-            right = samples.right(one, place, span, order)
-            doubtful = doubt(one.width, there, fitted, tried)
+            right = samples.count_valid(one, place, span, order)
+            doubtful = weigh_evidence(one.width, there, fitted, tried)
             if not fitted:
-                proven = enough(right, len(samples))
+                proven = are_enough(right, len(samples))
             else:
                 proven = right >= CERTAIN * len(samples)
-            if proven and doubtful > 0 and not (few.alone and fitted):
+            if proven and doubtful > 0 and not (few.is_single and fitted):
                 remarks: tuple[str, ...] = (
                     ("it contains a constant: fields outside the covered bytes, or a start value",)
                     if fitted
                     else ()
                 )
                 varied = 0.0
-                if isinstance(algorithm, Xor | WordXor) and span == Span():
+                if isinstance(algorithm, Xor | WordXor) and span == CoveredSpan():
                     remarks = (*remarks, ANYWHERE)
                     varied = samples.measure_variation(place)
-                yield Match(
+                yield ChecksumMatch(
                     one,
                     place,
                     span,
@@ -257,7 +267,7 @@ def _fitting(
 
 def _change(algorithm: Checksum, constant: int) -> Checksum:
     if constant:
-        return Changed(algorithm, constant)
+        return MaskedChecksum(algorithm, constant)
     return algorithm
 
 
@@ -265,32 +275,32 @@ def _constant(values: NDArray[np.uint64]) -> list[int]:
     """Return the value that nearly all elements have, if there is one."""
     distinct, counts = np.unique(values, return_counts=True)
     most = int(counts.argmax())
-    if enough(int(counts[most]), len(values)):
+    if are_enough(int(counts[most]), len(values)):
         return [int(distinct[most])]
     return []
 
 
-def _nibbles(samples: Samples) -> Iterator[Match]:
+def _nibbles(samples: SampleFrames) -> Iterator[ChecksumMatch]:
     """Yield an XOR that is stored in the low nibbles of two adjacent bytes."""
     for front in range(min(3, samples.shortest - 4)):
-        place = Place(front, 2)
+        place = ChecksumPlace(front, 2)
         there = samples.fields(place, "little")
         halves = (there & np.uint64(15)) | (there >> np.uint64(4)) & np.uint64(0xF0)
-        for span in (Span("behind"), Span("all"))[: 1 + (front > 0)]:
+        for span in (CoveredSpan("behind"), CoveredSpan("all"))[: 1 + (front > 0)]:
             right = int((samples.compute_checksums(Xor(), place, span) == halves).sum())
-            if enough(right, len(samples)) and doubt(8, halves, 0, 8) > 0:
+            if are_enough(right, len(samples)) and weigh_evidence(8, halves, 0, 8) > 0:
                 remark = (
                     "its halves are the low nibbles of two bytes, low half first:"
                     " name both in Checksummed(field=(...))"
                 )
-                yield Match(
+                yield ChecksumMatch(
                     Xor(),
                     place,
                     span,
                     "little",
                     right,
                     len(samples),
-                    doubt(8, halves, 0, 8),
+                    weigh_evidence(8, halves, 0, 8),
                     "Xor()",
                     (remark,),
                 )
@@ -306,10 +316,10 @@ _WIDE: tuple[Checksum, ...] = (
 
 def _class(algorithm: Checksum) -> str:
     """Return the source of a class for a checksum that the package does not have."""
-    if isinstance(algorithm, Changed):
+    if isinstance(algorithm, MaskedChecksum):
         changed = algorithm
     else:
-        changed = Changed(algorithm, 0)
+        changed = MaskedChecksum(algorithm, 0)
     base = changed.of
     steps = []
     if isinstance(base, Xor | WordXor):

@@ -22,7 +22,16 @@ from itertools import combinations, product, zip_longest
 
 import numpy as np
 
-from lidarspec.drafting.samples import Match, Place, Samples, Span, anywhere, doubt, enough, spans
+from lidarspec.drafting.samples import (
+    ChecksumMatch,
+    ChecksumPlace,
+    CoveredSpan,
+    SampleFrames,
+    accept_any_place,
+    are_enough,
+    iter_spans,
+    weigh_evidence,
+)
 from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflect
 
 #: Largest degree of the cofactors that are tried to find a divisor, one by one.
@@ -47,7 +56,7 @@ MAX_POLYNOMIALS = 64
 Codewords = list[tuple[int, int]]
 
 
-def remainder(a: int, b: int) -> int:
+def divide_remainder(a: int, b: int) -> int:
     """Return a modulo b; b must not be 0."""
     size = b.bit_length()
     while (shift := a.bit_length() - size) >= 0:
@@ -75,7 +84,7 @@ def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
     for polynomial in polynomials:
         other = polynomial
         while other:
-            divisor, other = other, remainder(divisor, other) if divisor else 0
+            divisor, other = other, divide_remainder(divisor, other) if divisor else 0
         if divisor and divisor.bit_length() <= floor:
             break
     return divisor
@@ -97,7 +106,7 @@ def divisors(polynomial: int, degree: int) -> list[int]:
         quotients = (
             quotient(polynomial, small)
             for small in range((1 << spare) | 1, 2 << spare, 2)
-            if remainder(polynomial, small) == 0
+            if divide_remainder(polynomial, small) == 0
         )
         if spare:
             return sorted(quotients)
@@ -153,7 +162,7 @@ def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[i
 
 
 @dataclass(frozen=True)
-class _Reading:
+class _BitOrder:
     """A conversion of frames to polynomials.
 
     Attributes:
@@ -179,7 +188,7 @@ class _Reading:
         """Return the polynomial that a start value adds to a message of `size` bytes."""
         return init << 8 * size
 
-    def known(self) -> list[Crc]:
+    def iter_catalogue_crcs(self) -> list[Crc]:
         """Return the CRCs of the catalogue with this width and bit order."""
         return [
             crc
@@ -193,12 +202,12 @@ class _Reading:
 
 
 def crc_matches(
-    samples: Samples,
+    samples: SampleFrames,
     *,
     mixed: bool = False,
     quick: bool = False,
-    stands: Callable[[Place], bool] = anywhere,
-) -> Iterator[Match]:
+    stands: Callable[[ChecksumPlace], bool] = accept_any_place,
+) -> Iterator[ChecksumMatch]:
     """Yield the CRCs that match, up to the first place with a sure match.
 
     Args:
@@ -212,7 +221,7 @@ def crc_matches(
     else:
         mirrors = [(False, False), (True, True)]
     picks = [
-        samples.alike(FRAMES_PER_PICK, pick)
+        samples.take_similar(FRAMES_PER_PICK, pick)
         for pick in range(PICKS if len(samples) > 2 * FRAMES_PER_PICK else 1)
     ]
     by_width = [
@@ -231,18 +240,22 @@ def crc_matches(
     ):
         width = 8 * place.size
         orders: tuple[ByteOrder, ...] = ("little", "big") if width > 8 else ("little",)
-        readings = [_Reading(width, order, *mirror) for order in orders for mirror in mirrors]
-        for span, reading in product(spans(place, samples), readings):
+        readings = [_BitOrder(width, order, *mirror) for order in orders for mirror in mirrors]
+        for span, reading in product(iter_spans(place, samples), readings):
             tried += 1
             at_end = place.offset == -place.size
             by_catalogue = samples.shortest > MAX_DIVIDED_BYTES and (quick or not at_end)
-            chosen = picks if at_end and span == Span() else picks[:1]
-            work_left -= sum(_work(some, reading, by_catalogue=by_catalogue) for some in chosen)
+            chosen = picks if at_end and span == CoveredSpan() else picks[:1]
+            work_left -= sum(
+                _estimate_cost(some, reading, by_catalogue=by_catalogue) for some in chosen
+            )
             if work_left < 0:
                 return
             found = (
                 list(
-                    _fitting(samples, some, place, span, reading, tried, by_catalogue=by_catalogue)
+                    _iter_matches(
+                        samples, some, place, span, reading, tried, by_catalogue=by_catalogue
+                    )
                 )
                 for some in chosen
             )
@@ -253,25 +266,28 @@ def crc_matches(
             return
 
 
-def _work(few: Samples, reading: _Reading, *, by_catalogue: bool) -> int:
+def _estimate_cost(few: SampleFrames, reading: _BitOrder, *, by_catalogue: bool) -> int:
     """Return the cost of one place, span and reading, in bytes of CRC computation."""
     if by_catalogue:
-        return few.shortest * len(reading.known())
+        return few.shortest * len(reading.iter_catalogue_crcs())
     return DIVISION_WORK * sum(map(len, few.frames))
 
 
-def _varies_like_crc(samples: Samples, place: Place) -> bool:
+def _varies_like_crc(samples: SampleFrames, place: ChecksumPlace) -> bool:
     """Return whether each byte of a place has as many values as the bytes of a CRC."""
     if len(samples) < 2:
         return True
     wanted = max(min(len(samples) // 2, 24), 2)
     columns = (
-        samples.fields(Place(place.offset + index, 1), "little") for index in range(place.size)
+        samples.fields(ChecksumPlace(place.offset + index, 1), "little")
+        for index in range(place.size)
     )
     return all(len(np.unique(column)) >= wanted for column in columns)
 
 
-def _codewords(samples: Samples, place: Place, span: Span, reading: _Reading) -> Codewords:
+def _codewords(
+    samples: SampleFrames, place: ChecksumPlace, span: CoveredSpan, reading: _BitOrder
+) -> Codewords:
     rows = [row.tobytes() for group in samples.cut_span(place, span) for row in group]
     stored = samples.fields(place, reading.order).tolist()
     return [
@@ -280,16 +296,16 @@ def _codewords(samples: Samples, place: Place, span: Span, reading: _Reading) ->
     ]
 
 
-def _fitting(
-    samples: Samples,
-    few: Samples,
-    place: Place,
-    span: Span,
-    reading: _Reading,
+def _iter_matches(
+    samples: SampleFrames,
+    few: SampleFrames,
+    place: ChecksumPlace,
+    span: CoveredSpan,
+    reading: _BitOrder,
     tried: int,
     *,
     by_catalogue: bool,
-) -> Iterator[Match]:
+) -> Iterator[ChecksumMatch]:
     """Yield the CRCs that match for one place, span and reading.
 
     Args:
@@ -303,14 +319,14 @@ def _fitting(
     else:
         candidates = _candidates(_codewords(few, place, span, reading), reading)
     for crc, fitted, remarks in candidates:
-        right = samples.right(crc, place, span, reading.order)
+        right = samples.count_valid(crc, place, span, reading.order)
         is_known = crc.poly in KNOWN[crc.width]
-        doubtful = doubt(
+        doubtful = weigh_evidence(
             crc.width, stored, fitted + (not is_known), tried * (len(CRCS) if is_known else 1)
         )
-        if enough(right, len(samples)) and doubtful > 0:
+        if are_enough(right, len(samples)) and doubtful > 0:
             open_ = bool(remarks)
-            yield Match(
+            yield ChecksumMatch(
                 crc,
                 place,
                 span,
@@ -325,7 +341,7 @@ def _fitting(
             )
 
 
-def _candidates(words: Codewords, reading: _Reading) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
+def _candidates(words: Codewords, reading: _BitOrder) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield candidate CRCs.
 
     Yields:
@@ -350,16 +366,16 @@ def _candidates(words: Codewords, reading: _Reading) -> Iterator[tuple[Crc, int,
         for poly in _polynomials(absolute, reading.width):
             yield reading.crc(poly, init, xorout), 0, ()
     if len(words) == 1:
-        yield from ((crc, 0, ()) for crc in reading.known())
+        yield from ((crc, 0, ()) for crc in reading.iter_catalogue_crcs())
 
 
 def _iter_catalogue(
-    few: Samples, place: Place, span: Span, reading: _Reading
+    few: SampleFrames, place: ChecksumPlace, span: CoveredSpan, reading: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield the CRCs of the catalogue that are valid for the first frame."""
     covered = few.cut_span(place, span)[0][0].tobytes()
     stored = int(few.fields(place, reading.order)[0])
-    yield from ((crc, 0, ()) for crc in reading.known() if crc(covered) == stored)
+    yield from ((crc, 0, ()) for crc in reading.iter_catalogue_crcs() if crc(covered) == stored)
 
 
 def _differences(words: Codewords) -> list[int]:
@@ -381,7 +397,7 @@ def _polynomials(multiples: Sequence[int], width: int) -> list[int]:
 
 
 def _registers(
-    words: Codewords, poly: int, reading: _Reading, *, open_: bool
+    words: Codewords, poly: int, reading: _BitOrder, *, open_: bool
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield a CRC with start value and final XOR for a polynomial.
 
@@ -389,7 +405,7 @@ def _registers(
         open_: whether all frames have one length, so that the two values are ambiguous.
     """
     first = dict(reversed(words))  # the first frame of each length
-    left = {size: remainder(word, poly) for size, word in first.items()}
+    left = {size: divide_remainder(word, poly) for size, word in first.items()}
     ones = (1 << reading.width) - 1
     usual = [
         crc.init
@@ -399,7 +415,8 @@ def _registers(
     consistent = []
     for init in dict.fromkeys((*usual, 0, ones)):
         finals = {
-            rest ^ remainder(reading.init_term(init, size), poly) for size, rest in left.items()
+            rest ^ divide_remainder(reading.init_term(init, size), poly)
+            for size, rest in left.items()
         }
         if len(finals) == 1:
             consistent.append(reading.crc(poly, init, finals.pop()))
@@ -426,7 +443,7 @@ def _registers(
 
 
 def _solve_registers(
-    left: dict[int, int], poly: int, reading: _Reading
+    left: dict[int, int], poly: int, reading: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield a CRC with start value and final XOR from linear equations.
 
@@ -438,7 +455,9 @@ def _solve_registers(
     bits = range(reading.width)
     for other, other_rest in others:
         columns = [
-            remainder(reading.init_term(1 << bit, size) ^ reading.init_term(1 << bit, other), poly)
+            divide_remainder(
+                reading.init_term(1 << bit, size) ^ reading.init_term(1 << bit, other), poly
+            )
             for bit in bits
         ]
         wanted = rest ^ other_rest
@@ -453,7 +472,9 @@ def _solve_registers(
             chosen for count in range(1 + len(free[:4])) for chosen in combinations(free[:4], count)
         )
         inits = [functools.reduce(operator.xor, chosen, first) for chosen in some]
-        pairs = [(init, rest ^ remainder(reading.init_term(init, size), poly)) for init in inits]
+        pairs = [
+            (init, rest ^ divide_remainder(reading.init_term(init, size), poly)) for init in inits
+        ]
         init, xorout = min(
             pairs, key=lambda pair: (pair[1] not in (0, (1 << reading.width) - 1), pair[0])
         )

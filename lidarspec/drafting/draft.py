@@ -36,15 +36,15 @@ from lidarspec.drafting.periods import (
     FEW,
     FRONT,
     STEADY,
-    Candidate,
-    Length,
-    candidates,
-    follows,
-    runs,
-    structure,
+    LengthField,
+    RisingField,
+    find_rising_fields,
+    find_runs,
+    find_structure,
+    share_between,
     usual_bytes,
 )
-from lidarspec.drafting.samples import Match, Place, values
+from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace, values
 from lidarspec.errors import UsageError, WireError, system_errors
 from lidarspec.spec.checksums import ByteOrder
 
@@ -83,7 +83,7 @@ MIN_CONSTANT_RUN = 2
 #: Longest range of unknown bytes that is searched for constant bytes. In longer ranges, which are
 #: mostly measurements, bytes may be constant because the scene does not change.
 MAX_CONSTANT_SEARCH_BYTES = 64
-#: A checksum with a lower `Match.doubt` may be coincidence.
+#: A checksum with a lower `ChecksumMatch.doubt` may be coincidence.
 WEAK = 12
 #: Number of frames after which most bits of a checksum have changed.
 MIN_FRAMES_FOR_CHANGE = 16
@@ -95,7 +95,7 @@ FEW_BITS = 24
 
 
 @dataclass(frozen=True)
-class Blocks:
+class RepeatedBlocks:
     """Repeated blocks of a frame.
 
     Attributes:
@@ -110,7 +110,7 @@ class Blocks:
     size: int
     count: int
     flag: bytes
-    candidates: tuple[Candidate, ...] = ()
+    candidates: tuple[RisingField, ...] = ()
 
     @property
     def end(self) -> int:
@@ -140,13 +140,13 @@ class Draft:
     datagrams: bool
     sync: bytes
     size: int | None
-    length: Length | None
+    length: LengthField | None
     frames: tuple[tuple[int, bytes], ...]
     bytes_in: int
-    candidates: tuple[Candidate, ...] = ()
-    blocks: Blocks | None = None
-    seal: Match | None = None
-    others: tuple[Match, ...] = ()
+    candidates: tuple[RisingField, ...] = ()
+    blocks: RepeatedBlocks | None = None
+    seal: ChecksumMatch | None = None
+    others: tuple[ChecksumMatch, ...] = ()
     front: int = 0
 
     @property
@@ -186,7 +186,7 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     Raises:
         WireError: if no frames of one kind are found.
     """
-    found = structure(chunks, datagrams=datagrams)
+    found = find_structure(chunks, datagrams=datagrams)
     if found is None:
         raise WireError(
             "no repeated frame structure found in these bytes", data=b"".join(chunks[:1])[:16]
@@ -203,12 +203,12 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
         or _find_sync(first, parts, max(parts[0].find(found.sync), 0))
         or replace(first, sync=found.sync)
     )
-    known = _find_count(replace(first, frames=tuple(_walk(first, parts))), parts[-1])
+    known = _find_count(replace(first, frames=tuple(_iter_frames(first, parts))), parts[-1])
     known = _find_front(known, parts)
-    known = replace(known, candidates=tuple(candidates(known.rows)))
+    known = replace(known, candidates=tuple(find_rising_fields(known.rows)))
     seals = _seals(known)
     known = replace(known, seal=seals[0] if seals else None, others=tuple(seals[1:]))
-    return _add_details(replace(known, frames=tuple(_walk(known, parts))))
+    return _add_details(replace(known, frames=tuple(_iter_frames(known, parts))))
 
 
 def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
@@ -239,7 +239,7 @@ def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None
     return None
 
 
-def _walk(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
+def _iter_frames(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
     """Yield offset and bytes of the frames that fit, in order.
 
     After a sync that begins no valid frame, the search continues at the next byte.
@@ -262,7 +262,7 @@ def _frame_size(known: Draft, part: bytes, at: int) -> int:
     size = known.size
     if size is None and known.length is not None:
         if at + known.length.end <= len(part):
-            size = known.length.of(part[at : at + known.length.end])
+            size = known.length.read(part[at : at + known.length.end])
         else:
             size = 0
     if (
@@ -277,7 +277,7 @@ def _frame_size(known: Draft, part: bytes, at: int) -> int:
     return 0
 
 
-def _has_valid_checksum(seal: Match, frame: bytes) -> bool:
+def _has_valid_checksum(seal: ChecksumMatch, frame: bytes) -> bool:
     start = seal.place.start(len(frame))
     stored = int.from_bytes(frame[start : start + seal.place.size], seal.order)
     covered = b"".join(frame[a:b] for a, b in seal.span.ranges(seal.place, len(frame)))
@@ -304,11 +304,11 @@ def _find_count(known: Draft, data: bytes) -> Draft:
         ):
             continue
         lengths = [
-            Length(place, 1, "little", unit, known.size - unit * last[place])
+            LengthField(place, 1, "little", unit, known.size - unit * last[place])
             for unit in range(MIN_ELEMENT_BYTES, MAX_ELEMENT_BYTES + 1)
         ]
         fitting = [
-            length for length in lengths if length.rest > place and length.of(rest) > len(rest)
+            length for length in lengths if length.rest > place and length.read(rest) > len(rest)
         ]
         if fitting:
             return replace(known, size=None, length=min(fitting, key=lambda length: length.rest))
@@ -326,10 +326,10 @@ def _find_front(known: Draft, parts: Sequence[bytes]) -> Draft:
     known = replace(
         known, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - MAX_CHECKSUM_BYTES)
     )
-    return replace(known, frames=tuple(_walk(known, parts)))
+    return replace(known, frames=tuple(_iter_frames(known, parts)))
 
 
-def _seals(known: Draft) -> list[Match]:
+def _seals(known: Draft) -> list[ChecksumMatch]:
     """Return the matching checksums, except at rising or nearly constant bytes."""
     frames = [frame for _, frame in known.frames]
     step = max(1, len(frames) // MAX_CHECKSUM_FRAMES)
@@ -340,10 +340,10 @@ def _seals(known: Draft) -> list[Match]:
         for match in search(some)
         if not any(_overlaps(match.place, one, shortest) for one in known.candidates)
     )
-    return [match for match in free if _can_stand(known, match) and _changes(match, some)]
+    return [match for match in free if _is_declarable(known, match) and _changes(match, some)]
 
 
-def _changes(match: Match, frames: Sequence[bytes]) -> bool:
+def _changes(match: ChecksumMatch, frames: Sequence[bytes]) -> bool:
     """Return whether most bits of a checksum change; True if there are few frames."""
     starts = [match.place.start(len(frame)) for frame in frames]
     stored = [
@@ -356,12 +356,12 @@ def _changes(match: Match, frames: Sequence[bytes]) -> bool:
     )
 
 
-def _overlaps(place: Place, one: Candidate, length: int) -> bool:
+def _overlaps(place: ChecksumPlace, one: RisingField, length: int) -> bool:
     start = place.start(length)
     return start < one.end and one.offset < start + place.size
 
 
-def _can_stand(known: Draft, match: Match) -> bool:
+def _is_declarable(known: Draft, match: ChecksumMatch) -> bool:
     """Return whether a struct can declare the checksum.
 
     It must not be in the part of varying length or split into nibbles, and has to cover one range.
@@ -391,7 +391,7 @@ def _add_details(known: Draft) -> Draft:
         blocks = None
     if blocks is not None:
         inside = rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
-        within = tuple(one for one in candidates(inside) if one.offset >= len(blocks.flag))
+        within = tuple(one for one in find_rising_fields(inside) if one.offset >= len(blocks.flag))
         if blocks.flag or any(one.offset == 0 for one in within):
             blocks = replace(blocks, candidates=within)
         else:
@@ -407,7 +407,7 @@ def _add_details(known: Draft) -> Draft:
     )
 
 
-def _find_flagged_blocks(rows: NDArray[np.uint8]) -> Blocks | None:
+def _find_flagged_blocks(rows: NDArray[np.uint8]) -> RepeatedBlocks | None:
     """Return blocks that begin with the same two bytes and fill much of the frame."""
     first, steady = rows[0], (rows == rows[0]).mean(axis=0) >= STEADY
     pairs: dict[tuple[int, int], list[int]] = {}
@@ -426,11 +426,11 @@ def _find_flagged_blocks(rows: NDArray[np.uint8]) -> Blocks | None:
         size = int(steps[0])
         count = min(len(offsets), (rows.shape[1] - offsets[0]) // size)
         if count >= MIN_BLOCKS and count * size >= MIN_BLOCKS_SHARE * rows.shape[1]:
-            blocks_found.append(Blocks(offsets[0], size, count, bytes(pair)))
+            blocks_found.append(RepeatedBlocks(offsets[0], size, count, bytes(pair)))
     return max(blocks_found, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
-def _find_blocks_of_fields(found: Sequence[Candidate], length: int) -> Blocks | None:
+def _find_blocks_of_fields(found: Sequence[RisingField], length: int) -> RepeatedBlocks | None:
     """Return the largest blocks that each begin with a rising field of one kind."""
     rows = []
     for one in found:
@@ -447,12 +447,12 @@ def _find_blocks_of_fields(found: Sequence[Candidate], length: int) -> Blocks | 
             )
             count -= one.offset + count * step > length
             if count >= MIN_BLOCKS:
-                rows.append(Blocks(one.offset, step, count, b""))
+                rows.append(RepeatedBlocks(one.offset, step, count, b""))
     return max(rows, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
 @dataclass(frozen=True)
-class Field:
+class DraftField:
     """A field of the drafted struct.
 
     Attributes:
@@ -537,7 +537,7 @@ def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, s
     return {**text, **_imports(text)}
 
 
-def _fields(draft: Draft) -> Iterator[Field]:
+def _fields(draft: Draft) -> Iterator[DraftField]:
     """Yield the fields of a frame in their order."""
     rows = draft.rows
     known = _known_fields(draft)
@@ -550,7 +550,7 @@ def _fields(draft: Draft) -> Iterator[Field]:
         }
     )
     offset = 0
-    for field in [*known, Field(draft.head, 0, "", "")]:
+    for field in [*known, DraftField(draft.head, 0, "", "")]:
         yield from _gap(rows, offset, field.start, cuts)
         if field.name:
             yield field
@@ -559,7 +559,7 @@ def _fields(draft: Draft) -> Iterator[Field]:
         yield from _varying(draft)
 
 
-def _known_fields(draft: Draft) -> list[Field]:
+def _known_fields(draft: Draft) -> list[DraftField]:
     """Return the fields with evidence, without overlaps, by offset."""
     fields = list(_header(draft))
     if (length := draft.length) is not None:
@@ -570,7 +570,7 @@ def _known_fields(draft: Draft) -> list[Field]:
             f"{of_one if len(sizes) == 1 else f'frames of {sizes[0]} to {sizes[-1]} bytes'}"
         )
         fields.append(
-            Field(
+            DraftField(
                 length.place,
                 length.size,
                 _counter_name(draft),
@@ -583,7 +583,7 @@ def _known_fields(draft: Draft) -> list[Field]:
     if draft.blocks is not None:
         fields.append(_block_field(draft, draft.blocks))
     fields += [_rising(draft, one) for one in draft.candidates]
-    chosen: list[Field] = []
+    chosen: list[DraftField] = []
     for field in fields:
         if all(
             field.start + field.size <= other.start or other.start + other.size <= field.start
@@ -593,7 +593,7 @@ def _known_fields(draft: Draft) -> list[Field]:
     return sorted(chosen, key=lambda field: field.start)
 
 
-def _header(draft: Draft) -> Iterator[Field]:
+def _header(draft: Draft) -> Iterator[DraftField]:
     """Yield the sync bytes as fields, split at the borders of the checksum's span.
 
     Sync bytes that belong to the first block are left out.
@@ -606,12 +606,14 @@ def _header(draft: Draft) -> Iterator[Field]:
     for a, b in itertools.pairwise(edges):
         if b > a:
             why = (f"{len(draft.frames)} frames begin with it",) if a == 0 else ()
-            yield Field(
+            yield DraftField(
                 a, b - a, f"header_{a}" if a else "header", f"Const({_bytes(draft.sync[a:b])})", why
             )
 
 
-def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> Iterator[Field]:
+def _gap(
+    rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]
+) -> Iterator[DraftField]:
     """Yield fields for the bytes between two known fields.
 
     The gap is split at `cuts`, the borders of the checksum's span, and at the borders of constant
@@ -621,14 +623,17 @@ def _gap(rows: NDArray[np.uint8], start: int, end: int, cuts: Sequence[int]) -> 
     if len(rows) >= FEW and end - start <= MAX_CONSTANT_SEARCH_BYTES:
         edges |= _constant_edges(rows, start, end)
     for a, b in itertools.pairwise(sorted(edges)):
-        yield Field(a, b - a, f"unknown_{a}", f"Bytes({b - a})", _constant(rows[:, a:b]))
+        yield DraftField(a, b - a, f"unknown_{a}", f"Bytes({b - a})", _constant(rows[:, a:b]))
 
 
 def _constant_edges(rows: NDArray[np.uint8], start: int, end: int) -> set[int]:
     """Return the start and end offsets of runs of constant bytes."""
     steady = (rows[:, start:end] == rows[0, start:end]).all(axis=0)
     return {
-        start + edge for run in runs(steady) if run[1] - run[0] >= MIN_CONSTANT_RUN for edge in run
+        start + edge
+        for run in find_runs(steady)
+        if run[1] - run[0] >= MIN_CONSTANT_RUN
+        for edge in run
     }
 
 
@@ -644,7 +649,7 @@ def _constant(columns: NDArray[np.uint8]) -> tuple[str, ...]:
     return (f"always {value} in {len(columns)} frames",)
 
 
-def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
+def _rising(draft: Draft, one: RisingField, what: str = "frame") -> DraftField:
     """Return the field for a counter, an angle or another rising field.
 
     Args:
@@ -664,7 +669,7 @@ def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
             first, last = (
                 values(draft.rows, each.offset, each.size, each.order) for each in (other, one)
             )
-            if same and follows(first, last, one.circle) > 1 - 1 / FEW:
+            if same and share_between(first, last, one.circle) > 1 - 1 / FEW:
                 why = (
                     *why,
                     (
@@ -673,20 +678,20 @@ def _rising(draft: Draft, one: Candidate, what: str = "frame") -> Field:
                     ),
                 )
                 break
-    return Field(one.offset, one.size, one.name, code, why)
+    return DraftField(one.offset, one.size, one.name, code, why)
 
 
-def _block_field(draft: Draft, blocks: Blocks) -> Field:
+def _block_field(draft: Draft, blocks: RepeatedBlocks) -> DraftField:
     rows = draft.rows[:, blocks.start : blocks.end].reshape(-1, blocks.size)
     fields, at = (
-        [Field(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")]
+        [DraftField(0, len(blocks.flag), "flag", f"Const({_bytes(blocks.flag)})")]
         if blocks.flag
         else [],
         len(blocks.flag),
     )
     for one in [
         *(_rising(draft, each, "block") for each in blocks.candidates),
-        Field(blocks.size, 0, "", ""),
+        DraftField(blocks.size, 0, "", ""),
     ]:
         fields += _gap(rows, at, one.start, ())
         fields += [one] if one.name else []
@@ -701,15 +706,15 @@ def _block_field(draft: Draft, blocks: Blocks) -> Field:
         f"{blocks.count} blocks of {blocks.size} bytes that begin with"
         f" {blocks.flag.hex(' ') or 'the same field'}"
     )
-    return Field(blocks.start, blocks.end - blocks.start, "blocks", code, (why,))
+    return DraftField(blocks.start, blocks.end - blocks.start, "blocks", code, (why,))
 
 
-def _varying(draft: Draft) -> Iterator[Field]:
+def _varying(draft: Draft) -> Iterator[DraftField]:
     """Yield the part of varying length, and the checksum after it."""
     assert draft.length is not None
     rest, name = draft.head + draft.tail - draft.length.rest, _counter_name(draft)
     if draft.length.unit > 1 and rest == 0:
-        yield Field(
+        yield DraftField(
             draft.head,
             0,
             "samples",
@@ -727,7 +732,7 @@ def _varying(draft: Draft) -> Iterator[Field]:
             if step > 1
             else ()
         )
-        yield Field(
+        yield DraftField(
             draft.head,
             0,
             f"unknown_{draft.head}",
@@ -744,7 +749,7 @@ def _counter_name(draft: Draft) -> str:
     return "length"
 
 
-def _check(draft: Draft, seal: Match, start: int) -> Field:
+def _check(draft: Draft, seal: ChecksumMatch, start: int) -> DraftField:
     if seal.doubt < WEAK:
         chance = "may be chance: compare with more frames"
     else:
@@ -762,10 +767,10 @@ def _check(draft: Draft, seal: Match, start: int) -> Field:
                 f" over {other.span.describe(other.place, size)}"
             ),
         )
-    return Field(start, seal.place.size, "check", _integer(seal.place.size, seal.order), why)
+    return DraftField(start, seal.place.size, "check", _integer(seal.place.size, seal.order), why)
 
 
-def _seal_text(draft: Draft, fields: Sequence[Field]) -> tuple[str, str] | None:
+def _seal_text(draft: Draft, fields: Sequence[DraftField]) -> tuple[str, str] | None:
     """Return the arguments of `Checksummed` after its struct, and the class of the checksum.
 
     The class is "" for an algorithm that lidarspec has. None if there is no checksum.
@@ -822,7 +827,7 @@ def _strength(draft: Draft) -> int:
     return 8 * (len(draft.sync) + flags + (draft.seal.place.size if draft.seal else 0))
 
 
-def _arguments(angles: Sequence[str], counters: Sequence[Candidate]) -> Iterator[str]:
+def _arguments(angles: Sequence[str], counters: Sequence[RisingField]) -> Iterator[str]:
     yield (
         f'scan=OnWrap("{angles[0]}"),{_or(angles[1:])}'
         if angles
@@ -903,7 +908,7 @@ def _bytes(data: bytes) -> str:
 
 
 @dataclass(frozen=True)
-class Names:
+class DistributionNames:
     """The names in the distribution of a sensor.
 
     Args:
@@ -964,7 +969,7 @@ class Names:
         }
 
 
-def make_example_files(names: Names, link: Link) -> dict[str, str]:
+def make_example_files(names: DistributionNames, link: Link) -> dict[str, str]:
     """Return the files of a distribution with an example sensor: path -> text."""
     values = {**names.values(), "speed_remark": ", if code is 3" if link == "serial" else ""}
     return _files(
@@ -977,7 +982,7 @@ def make_example_files(names: Names, link: Link) -> dict[str, str]:
 
 
 def make_draft_files(
-    names: Names, link: Link, draft: Draft, *, origin: str, port: int | None
+    names: DistributionNames, link: Link, draft: Draft, *, origin: str, port: int | None
 ) -> dict[str, str]:
     """Return the files of a distribution with a sensor drafted from a capture: path -> text.
 
@@ -1014,7 +1019,7 @@ def make_draft_files(
 
 
 def _files(
-    names: Names,
+    names: DistributionNames,
     link: Link,
     values: Mapping[str, str],
     vectors: str,
@@ -1049,7 +1054,9 @@ def fill_template(template: str, values: Mapping[str, str], link: Link) -> str:
 _LISTED = '[project.entry-points."lidarspec.sensors"]\n'
 
 
-def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, str]:
+def add_to_distribution(
+    folder: Path, names: DistributionNames, texts: Mapping[str, str]
+) -> dict[str, str]:
     """Return the new and changed files that add a sensor to an existing distribution.
 
     Args:
@@ -1098,7 +1105,7 @@ def joining(folder: Path, names: Names, texts: Mapping[str, str]) -> dict[str, s
     }
 
 
-def write(folder: Path, texts: Mapping[str, str]) -> None:
+def write_files(folder: Path, texts: Mapping[str, str]) -> None:
     """Write files into a folder.
 
     Raises:

@@ -1,13 +1,13 @@
 """Find frames and steadily changing fields in unknown bytes.
 
-`structure` finds the frames. Frames of one length cause a distance at which many bytes are equal.
-Their sync bytes are then the longest run of constant bytes. Frames of several lengths cause a
-frequent pair of bytes, at distances that a length field after the pair explains.
+`find_structure` finds the frames. Frames of one length cause a distance at which many bytes are
+equal. Their sync bytes are then the longest run of constant bytes. Frames of several lengths cause
+a frequent pair of bytes, at distances that a length field after the pair explains.
 
-`candidates` finds counters, angles that wrap at a full circle, and clocks. Such a field rises from
-frame to frame by about the same step. With the wrong byte order or offset it jumps instead. The
-value at which an angle wraps gives its unit: an angle in hundredths of a degree never reaches
-36 000.
+`find_rising_fields` finds counters, angles that wrap at a full circle, and clocks. Such a field
+rises from frame to frame by about the same step. With the wrong byte order or offset it jumps
+instead. The value at which an angle wraps gives its unit: an angle in hundredths of a degree never
+reaches 36 000.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.drafting.checksum_search import search
-from lidarspec.drafting.samples import Match, values
+from lidarspec.drafting.samples import ChecksumMatch, values
 from lidarspec.spec.checksums import ByteOrder
 
 Kind = Literal["counter", "angle", "rising"]
@@ -86,7 +86,7 @@ MAX_UNIT_BYTES = 16
 
 
 @dataclass(frozen=True)
-class Candidate:
+class RisingField:
     """A field that changes like a counter, an angle or a clock.
 
     Attributes:
@@ -138,7 +138,7 @@ class Candidate:
         return f"{text}, wraps at about {self.circle}"
 
 
-def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:
+def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
     """Return the rising fields of consecutive frames, without overlaps, by offset.
 
     Args:
@@ -150,20 +150,20 @@ def candidates(rows: NDArray[np.uint8]) -> list[Candidate]:
         _iter_rising_fields(rows),
         key=lambda one: (one.kind == "rising", -one.size, -one.right / one.total, one.offset),
     )
-    chosen: list[Candidate] = []
+    chosen: list[RisingField] = []
     for one in found:
         if all(one.end <= other.offset or one.offset >= other.end for other in chosen):
             chosen.append(one)
     return sorted(chosen, key=lambda one: one.offset)
 
 
-def follows(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
+def share_between(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
     """Return the share of frames with `last` between this `first` and the next."""
     modulus = circle or 1 << 40
     return float((((last - first)[:-1] % modulus) <= (np.diff(first) % modulus)).mean())
 
 
-def _iter_rising_fields(rows: NDArray[np.uint8]) -> Iterator[Candidate]:
+def _iter_rising_fields(rows: NDArray[np.uint8]) -> Iterator[RisingField]:
     varied = (rows != rows[0]).any(axis=0)
     for offset in _offsets(rows, 1):
         if varied[offset] and len(rows) >= FEW:
@@ -190,7 +190,7 @@ def _offsets(rows: NDArray[np.uint8], size: int) -> Iterable[int]:
 
 def _counter(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
-) -> Iterator[Candidate]:
+) -> Iterator[RisingField]:
     """Yield a counter: it rises by one each time, and wraps to its smallest value."""
     there = values(rows, offset, size, order)
     steps = np.diff(there)
@@ -200,7 +200,7 @@ def _counter(
     right = int((steps == 1).sum() + back.sum())
     if right >= MIN_REGULAR_SHARE * len(steps) and (steps == 1).sum() >= 2:
         wraps = int(back.sum())
-        yield Candidate(
+        yield RisingField(
             offset,
             size,
             order,
@@ -216,7 +216,7 @@ def _counter(
 
 def _rising(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
-) -> Iterator[Candidate]:
+) -> Iterator[RisingField]:
     """Yield a field that rises by about the same step each time."""
     there = values(rows, offset, size, order)
     steps = np.diff(there)
@@ -254,7 +254,7 @@ def _rising(
     kind: Kind = "angle" if circle in CIRCLES else "rising"
     spread = (int(regular.min()), usual, int(regular.max()))
     right = int(within.sum()) + len(steps) - len(moved)
-    yield Candidate(offset, size, order, kind, circle, spread, right, len(steps), wraps)
+    yield RisingField(offset, size, order, kind, circle, spread, right, len(steps), wraps)
 
 
 def _low_byte_counts(there: NDArray[np.int64]) -> bool:
@@ -286,7 +286,7 @@ def _circle(highest: int, fallen: int, usual: int) -> int:
 
 
 @dataclass(frozen=True)
-class Length:
+class LengthField:
     """A length field in the header of a frame.
 
     The frame length is `rest` + `unit` times the number of `size` bytes at `place`.
@@ -303,7 +303,7 @@ class Length:
         """The offset after the number."""
         return self.place + self.size
 
-    def of(self, frame: bytes) -> int:
+    def read(self, frame: bytes) -> int:
         """Return the frame length from the length field of a frame."""
         return self.rest + self.unit * int.from_bytes(frame[self.place : self.end], self.order)
 
@@ -316,7 +316,7 @@ class Length:
 
 
 @dataclass(frozen=True)
-class Structure:
+class FrameStructure:
     """The likely frames in unknown bytes.
 
     Attributes:
@@ -329,17 +329,17 @@ class Structure:
 
     sync: bytes
     period: int | None
-    length: Length | None
+    length: LengthField | None
     share: float
     frames: tuple[bytes, ...]
 
     @cached_property
-    def checksums(self) -> tuple[Match, ...]:
+    def checksums(self) -> tuple[ChecksumMatch, ...]:
         """The checksums that fit, likeliest first, found in about a second of search."""
         return tuple(search(self.frames, quick=True))
 
 
-def structure(chunks: Sequence[bytes], *, datagrams: bool) -> Structure | None:
+def find_structure(chunks: Sequence[bytes], *, datagrams: bool) -> FrameStructure | None:
     """Return the likely structure of unknown bytes; None if none is found.
 
     Args:
@@ -347,8 +347,8 @@ def structure(chunks: Sequence[bytes], *, datagrams: bool) -> Structure | None:
         datagrams: whether the chunks are datagrams.
     """
     if datagrams:
-        return _of_datagrams(chunks)
-    return _of_stream(np.frombuffer(b"".join(chunks)[:MAX_SEARCHED_BYTES], np.uint8))
+        return _find_in_datagrams(chunks)
+    return _find_in_stream(np.frombuffer(b"".join(chunks)[:MAX_SEARCHED_BYTES], np.uint8))
 
 
 def usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -356,18 +356,18 @@ def usual_bytes(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.array([np.bincount(column, minlength=256).argmax() for column in rows.T], np.uint8)
 
 
-def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def find_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return start and stop of each run of True."""
     edges = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-def cut(data: bytes, period: int, start: int = 0) -> list[bytes]:
+def split_frames(data: bytes, period: int, start: int = 0) -> list[bytes]:
     """Split data into frames of one length; an incomplete last one is left out."""
     return [data[first : first + period] for first in range(start, len(data) - period + 1, period)]
 
 
-def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
+def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
     """Return the structure of the datagrams with the length that most bytes are in."""
     if len(chunks) < MIN_FRAMES:
         return None
@@ -379,15 +379,15 @@ def _of_datagrams(chunks: Sequence[bytes]) -> Structure | None:
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), length)
     steady = (rows == rows[0]).all(axis=0)
     sync = frames[0][: int(np.argmin(steady)) if not steady.all() else length][:16]
-    return Structure(
+    return FrameStructure(
         sync, length, None, len(frames) * length / sum(map(len, chunks)), tuple(frames)
     )
 
 
-def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
+def _find_in_stream(data: NDArray[np.uint8]) -> FrameStructure | None:
     """Return the structure that explains more bytes; prefer one length."""
-    periodic = _periodic(data)
-    varying = _by_length(data)
+    periodic = _find_fixed_length(data)
+    varying = _find_varying_length(data)
     if periodic is None or varying is None:
         return periodic or varying
     few = len(periodic.frames) < MANY <= len(varying.frames)
@@ -396,7 +396,7 @@ def _of_stream(data: NDArray[np.uint8]) -> Structure | None:
     return periodic
 
 
-def _periodic(data: NDArray[np.uint8]) -> Structure | None:
+def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
     """Return frames of one length.
 
     Of the distances at which most bytes are equal, select the one with the largest share of
@@ -422,7 +422,7 @@ def _periodic(data: NDArray[np.uint8]) -> Structure | None:
     return _split_groups(data, shortest)
 
 
-def _split_groups(data: NDArray[np.uint8], whole: Structure) -> Structure:
+def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
     """Split frames that are groups of shorter frames; return others unchanged.
 
     A group repeats if, for example, an index runs from 0 to 5, or the data is simulated. A part
@@ -438,14 +438,14 @@ def _split_groups(data: NDArray[np.uint8], whole: Structure) -> Structure:
     return whole
 
 
-def _is_counted(found: Structure) -> bool:
+def _is_counted(found: FrameStructure) -> bool:
     rows = np.frombuffer(b"".join(found.frames), np.uint8).reshape(len(found.frames), -1)
-    return any(one.kind == "counter" for one in candidates(rows))
+    return any(one.kind == "counter" for one in find_rising_fields(rows))
 
 
 def _iter_frames_of_length(
     data: NDArray[np.uint8], period: int
-) -> Iterator[tuple[float, Structure]]:
+) -> Iterator[tuple[float, FrameStructure]]:
     """Yield frames of this length and their weight; nothing if there are none.
 
     The frames begin with the longest run of constant bytes. The weight is the share of constant
@@ -463,12 +463,14 @@ def _iter_frames_of_length(
         return
     start, length = _longest_run(steady, usual)
     sync = bytes(np.roll(usual, -start)[:length])
-    frames = [frame for frame in cut(data.tobytes(), period, start) if frame.startswith(sync)]
+    frames = [
+        frame for frame in split_frames(data.tobytes(), period, start) if frame.startswith(sync)
+    ]
     if len(frames) >= MIN_FRAMES:
         share = len(frames) * period / len(data)
         yield (
             share * steady_count / period,
-            Structure(sync[:16], period, None, share, tuple(frames)),
+            FrameStructure(sync[:16], period, None, share, tuple(frames)),
         )
 
 
@@ -501,7 +503,7 @@ def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[i
     """
     turn = int(np.argmin(steady))  # rotate to a byte that is not constant, so that no run is split
     best = (-1, 0, 0)
-    for start, end in runs(np.roll(steady, -turn)):
+    for start, end in find_runs(np.roll(steady, -turn)):
         run = np.roll(usual, -turn)[start:end]
         zeros = int(np.argmax(run != 0)) if run.any() else 0
         best = max(
@@ -511,11 +513,11 @@ def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[i
     return -best[1], best[2]
 
 
-def _by_length(data: NDArray[np.uint8]) -> Structure | None:
+def _find_varying_length(data: NDArray[np.uint8]) -> FrameStructure | None:
     """Return frames of several lengths, with a length field in the header."""
     pairs = data[:-1].astype(np.int64) << 8 | data[1:]
     counts = np.bincount(pairs, minlength=1 << 16)
-    best: tuple[float, int, Structure] | None = None
+    best: tuple[float, int, FrameStructure] | None = None
     for pair in np.argsort(counts)[::-1][:MAX_SYNC_PAIRS].tolist():
         starts = np.flatnonzero(pairs == pair)
         if pair in (0, 0xFFFF) or len(starts) < 2 * MIN_FRAMES:
@@ -539,7 +541,7 @@ def _by_length(data: NDArray[np.uint8]) -> Structure | None:
 
 def _find_length_field(
     data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes
-) -> Structure | None:
+) -> FrameStructure | None:
     """Return the frames between sync bytes that a length field explains.
 
     The length field is the byte or word after the sync bytes that gives most lengths.
@@ -551,7 +553,7 @@ def _find_length_field(
     steps = np.diff(starts)
     if len(steps) < MIN_FRAMES:
         return None
-    best: tuple[float, Length | None, NDArray[np.bool_]] = (0.0, None, np.zeros(0, np.bool_))
+    best: tuple[float, LengthField | None, NDArray[np.bool_]] = (0.0, None, np.zeros(0, np.bool_))
     kinds: tuple[tuple[int, ByteOrder], ...] = ((1, "little"), (2, "little"), (2, "big"))
     for place in range(2, HEADER):
         low = data[starts[:-1] + place].astype(np.int64)
@@ -566,7 +568,7 @@ def _find_length_field(
                 distinct = len(np.unique(steps[fits]))
                 share = float(steps[fits].sum() / len(data))
                 if distinct > 1 and number >= MIN_FRAMES and usual >= 0 and share > best[0]:
-                    best = (share, Length(place, size, order, unit, usual), fits)
+                    best = (share, LengthField(place, size, order, unit, usual), fits)
     share, length, fits = best
     if length is None:
         return None
@@ -575,7 +577,7 @@ def _find_length_field(
         whole[start : start + step]
         for start, step in zip(starts[:-1][fits].tolist(), steps[fits].tolist(), strict=True)
     ]
-    return Structure(sync, None, length, share, tuple(frames))
+    return FrameStructure(sync, None, length, share, tuple(frames))
 
 
 def _most_frequent(numbers: NDArray[np.int64]) -> tuple[int, int]:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.row_checksums import batch
+from lidarspec.frames.row_checksums import compute_checksums
 from lidarspec.spec.checksums import ByteOrder, Checksum
 
 Part = Literal["all", "before", "behind"]
@@ -32,7 +32,7 @@ SURE = 20
 
 
 @dataclass(frozen=True)
-class Place:
+class ChecksumPlace:
     """The place of a checksum: `size` bytes from `offset` on.
 
     A negative offset counts from the end of the frame.
@@ -60,7 +60,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Span:
+class CoveredSpan:
     """The bytes that a checksum covers: before its place, behind it, or both.
 
     The first `head` and the last `tail` bytes are omitted.
@@ -70,7 +70,7 @@ class Span:
     head: int = 0
     tail: int = 0
 
-    def ranges(self, place: Place, length: int) -> list[tuple[int, int]]:
+    def ranges(self, place: ChecksumPlace, length: int) -> list[tuple[int, int]]:
         """Return the byte ranges in a frame of this length."""
         start = place.start(length)
         end = start + place.size
@@ -79,7 +79,7 @@ class Span:
         chosen = {"all": [before, behind], "before": [before], "behind": [behind]}[self.part]
         return [(first, last) for first, last in chosen if last > first]
 
-    def describe(self, place: Place, length: int) -> str:
+    def describe(self, place: ChecksumPlace, length: int) -> str:
         """Describe the bytes in words."""
         if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(
             b - a for a, b in self.ranges(place, length)
@@ -97,7 +97,7 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Match:
+class ChecksumMatch:
     """A checksum that matches.
 
     Attributes:
@@ -109,12 +109,12 @@ class Match:
         remarks: further remarks.
         name: its name in the catalogue.
         open: whether other parameters match these frames as well.
-        varied: the variation of its place, as from `Samples.measure_variation`.
+        varied: the variation of its place, as from `SampleFrames.measure_variation`.
     """
 
     algorithm: Checksum
-    place: Place
-    span: Span
+    place: ChecksumPlace
+    span: CoveredSpan
     order: ByteOrder
     right: int
     total: int
@@ -155,7 +155,7 @@ def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) ->
     return total
 
 
-class Samples:
+class SampleFrames:
     """Distinct frames, grouped by length."""
 
     def __init__(self, frames: Iterable[bytes], *, most: int = 256) -> None:
@@ -166,7 +166,7 @@ class Samples:
             np.frombuffer(b"".join(group), np.uint8).reshape(len(group), -1) for group in groups
         ]
         # The same fields are read for each algorithm that is tried.
-        self._fields: dict[tuple[Place, ByteOrder], NDArray[np.uint64]] = {}
+        self._fields: dict[tuple[ChecksumPlace, ByteOrder], NDArray[np.uint64]] = {}
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -178,12 +178,12 @@ class Samples:
             return len(self.frames[0])
         return 0
 
-    def few(self, number: int) -> Samples:
+    def take_spread(self, number: int) -> SampleFrames:
         """Return `number` frames, spread over all of them."""
         step = max(1, len(self.frames) // number)
-        return Samples(self.frames[::step][:number])
+        return SampleFrames(self.frames[::step][:number])
 
-    def alike(self, number: int, pick: int) -> Samples:
+    def take_similar(self, number: int, pick: int) -> SampleFrames:
         """Return `number` frames of the most frequent length, and two of other lengths.
 
         Args:
@@ -195,13 +195,13 @@ class Samples:
         others = [
             group[2 * pick % len(group) :][:2] for group in self.groups if group is not largest
         ][:number]
-        return Samples(
+        return SampleFrames(
             row.tobytes()
             for rows in (largest[pick % step :: step][:number], *others)
             for row in rows
         )
 
-    def fields(self, place: Place, order: ByteOrder) -> NDArray[np.uint64]:
+    def fields(self, place: ChecksumPlace, order: ByteOrder) -> NDArray[np.uint64]:
         """Return the values at a place in each frame, (n,)."""
         if (place, order) not in self._fields:
             columns = [
@@ -211,7 +211,7 @@ class Samples:
             self._fields[place, order] = np.concatenate(columns).view(np.uint64)
         return self._fields[place, order]
 
-    def cut_span(self, place: Place, span: Span) -> list[NDArray[np.uint8]]:
+    def cut_span(self, place: ChecksumPlace, span: CoveredSpan) -> list[NDArray[np.uint8]]:
         """Return the bytes that a span covers, group by group: (frames, bytes) each."""
         return [
             np.concatenate([group[:, a:b] for a, b in span.ranges(place, group.shape[1])], axis=1)
@@ -219,29 +219,34 @@ class Samples:
         ]
 
     def compute_checksums(
-        self, algorithm: Checksum, place: Place, span: Span
+        self, algorithm: Checksum, place: ChecksumPlace, span: CoveredSpan
     ) -> NDArray[np.uint64]:
         """Return the checksum of each frame, (n,)."""
         return np.concatenate(
-            [batch(algorithm, np.ascontiguousarray(rows)) for rows in self.cut_span(place, span)]
+            [
+                compute_checksums(algorithm, np.ascontiguousarray(rows))
+                for rows in self.cut_span(place, span)
+            ]
         )
 
-    def right(self, algorithm: Checksum, place: Place, span: Span, order: ByteOrder) -> int:
+    def count_valid(
+        self, algorithm: Checksum, place: ChecksumPlace, span: CoveredSpan, order: ByteOrder
+    ) -> int:
         """Return the number of frames with a valid checksum."""
         return int(
             (self.compute_checksums(algorithm, place, span) == self.fields(place, order)).sum()
         )
 
-    def places(self, size: int) -> Iterator[Place]:
+    def places(self, size: int) -> Iterator[ChecksumPlace]:
         """Yield the possible places of a checksum: at the end, in front, elsewhere.
 
         Places with constant values are omitted.
         """
         last = self.shortest - size
-        first = last if self.alone else 0
+        first = last if self.is_single else 0
         near = (
             range(first, last + 1)
-            if self.alone or self.shortest <= SHORT
+            if self.is_single or self.shortest <= SHORT
             else [*range(NEAR), *range(last - NEAR, last + 1)]
         )
         by_front = sorted(
@@ -251,42 +256,44 @@ class Samples:
         for front in dict.fromkeys(by_front):
             from_end = len(self.groups) > 1 or front > last // 2
             if from_end:
-                places = [Place(front - self.shortest, size)]
+                places = [ChecksumPlace(front - self.shortest, size)]
             else:
                 places = []
             if not from_end or (len(self.groups) > 1 and front < NEAR):
-                places.append(Place(front, size))
+                places.append(ChecksumPlace(front, size))
             yield from (
                 place
                 for place in places
-                if self.alone or len(np.unique(self.fields(place, "little"))) > len(self) // 8 + 1
+                if self.is_single
+                or len(np.unique(self.fields(place, "little"))) > len(self) // 8 + 1
             )
 
     @property
-    def alone(self) -> bool:
+    def is_single(self) -> bool:
         """Whether there is only one frame, for which only the usual places are searched."""
         return len(self) == 1
 
-    def measure_variation(self, place: Place) -> float:
+    def measure_variation(self, place: ChecksumPlace) -> float:
         """Return the variation of the byte of a place that varies least.
 
         It depends on the range and on the number of distinct values. The usual place, at the end,
         has a larger weight.
         """
         columns = [
-            self.fields(Place(place.offset + index, 1), "little") for index in range(place.size)
+            self.fields(ChecksumPlace(place.offset + index, 1), "little")
+            for index in range(place.size)
         ]
         distinct = min(len(np.unique(column)) for column in columns) / min(len(self), 256)
         apart = min(int(np.ptp(column)) for column in columns) >= APART
         return 2 * apart + min(1.0, distinct * (USUAL if place.offset == -place.size else 1))
 
 
-def anywhere(_: Place) -> bool:
+def accept_any_place(_: ChecksumPlace) -> bool:
     """Return True: a checksum may stand at every place."""
     return True
 
 
-def spans(place: Place, samples: Samples) -> Iterator[Span]:
+def iter_spans(place: ChecksumPlace, samples: SampleFrames) -> Iterator[CoveredSpan]:
     """Yield the spans of a checksum at a place, the usual first.
 
     Spans that cover the same bytes of these frames are omitted.
@@ -301,11 +308,11 @@ def spans(place: Place, samples: Samples) -> Iterator[Span]:
         ("before", HEAD if at_end else 2, 0),
         ("behind", 0, 1),
     )
-    parts = (("all", 2, 0),) if samples.alone else parts
+    parts = (("all", 2, 0),) if samples.is_single else parts
     for head in range(HEAD + 1):
         for part, heads, tails in parts:
             for tail in range(tails + 1) if head <= heads else ():
-                span = Span(part, head, tail)
+                span = CoveredSpan(part, head, tail)
                 ranges = tuple(span.ranges(place, samples.shortest))
                 fits = (part == "behind" or head < before or head == 0) and (
                     tail == 0 or tail < behind
@@ -315,7 +322,7 @@ def spans(place: Place, samples: Samples) -> Iterator[Span]:
                     yield span
 
 
-def doubt(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
+def weigh_evidence(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> float:
     """Return the bits of evidence of a match.
 
     One of 2**bits wrong checksums would match as well by chance.
@@ -329,15 +336,15 @@ def doubt(width: int, values: NDArray[np.uint64], fitted: int, tried: int) -> fl
     return width * (len(np.unique(values)) - fitted) - float(np.log2(max(tried, 1)))
 
 
-def enough(right: int, total: int) -> bool:
+def are_enough(right: int, total: int) -> bool:
     """Return whether enough frames are valid for the others to be damaged ones."""
     return right >= max(1, ENOUGH * total)
 
 
-def best_first(matches: Sequence[Match]) -> list[Match]:
+def sort_matches(matches: Sequence[ChecksumMatch]) -> list[ChecksumMatch]:
     """Return the matches, the simplest and surest first."""
 
-    def key(match: Match) -> tuple[object, ...]:
+    def key(match: ChecksumMatch) -> tuple[object, ...]:
         span = match.span
         return (
             -round(match.right / match.total, 2),
@@ -352,7 +359,7 @@ def best_first(matches: Sequence[Match]) -> list[Match]:
             len(match.paste),
         )
 
-    unique = dict[object, Match]()
+    unique = dict[object, ChecksumMatch]()
     for match in sorted(matches, key=key):
         unique.setdefault((match.paste, match.place, match.order), match)
     return list(unique.values())

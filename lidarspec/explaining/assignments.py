@@ -14,8 +14,8 @@ from typing import Any
 
 from lidarspec.errors import OutOfRange, UnknownCommand, UnknownField, UsageError
 from lidarspec.frames.commands import argument_slot
-from lidarspec.frames.encode import given_value
-from lidarspec.frames.field_paths import Steps, is_index, put, steps
+from lidarspec.frames.encode import read_given
+from lidarspec.frames.field_paths import Steps, is_index, put_value, split_path
 from lidarspec.frames.schema import Schema
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Octets, Range
@@ -37,7 +37,7 @@ def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, A
     parsed = [_assignment(table, text, place) for text in assignments]
     raw_values: dict[str, Any] = {}
     for names, value in sorted(parsed, key=lambda item: any(is_index(step) for step in item[0])):
-        put(raw_values, names, value, lambda path: _length(table, raw_values, path, place))
+        put_value(raw_values, names, value, lambda path: _length(table, raw_values, path, place))
     return raw_values
 
 
@@ -45,7 +45,7 @@ def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
     path, equals, value = text.partition("=")
     if not equals or not _PATH.fullmatch(path):
         raise UsageError(f"{place}: {text!r} is not field=value")
-    names = steps(path)
+    names = split_path(path)
     plain = ".".join(str(step) for step in names if not is_index(step))
     info = table.all_fields.get(plain)
     if info is None:
@@ -130,7 +130,7 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
     if isinstance(declared, int):
         return declared
     try:
-        return int(evaluate(declared, functools.partial(given_value, given, table.fields)))  # type: ignore[arg-type]
+        return int(evaluate(declared, functools.partial(read_given, given, table.fields)))  # type: ignore[arg-type]
     except Exception:
         target: Any = given
         for name in path.removesuffix("[]").split("."):

@@ -38,7 +38,7 @@ TOLD = 3
 KINDS = {"flipped bit": (0, 8), "inserted byte": (1, 1), "lost byte": (-1, 256)}
 
 
-class Change(NamedTuple):
+class FrameChange(NamedTuple):
     """A possible change of a frame.
 
     Attributes:
@@ -63,9 +63,9 @@ class Change(NamedTuple):
         return before + bytes([after[0] ^ 1 << self.value]) + after[1:]
 
 
-def changes(
+def find_changes(
     frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets: Sequence[int] | None = None
-) -> list[Change]:
+) -> list[FrameChange]:
     """Return every single change that would explain the damage, of the likeliest kind.
 
     Undoing such a change gives one valid and plausible frame of this type.
@@ -108,7 +108,7 @@ def _deciding(frame: Frame) -> int:
 
 def _found(
     kind: str, values: int, data: bytes, size: int, engine: Codec, chosen: Sequence[int] | None
-) -> Iterator[Change]:
+) -> Iterator[FrameChange]:
     places = np.arange(max(len(data), size))
     old = np.frombuffer(data, np.uint8)
     if kind == "inserted byte":
@@ -144,7 +144,7 @@ def _found(
         else:
             right = which
         yield from (
-            Change(kind, int(offsets[first + one]), int(numbers[first + one]))
+            FrameChange(kind, int(offsets[first + one]), int(numbers[first + one]))
             for one in right.tolist()
         )
 
@@ -178,7 +178,7 @@ def describe_damage(
     Args:
         values: returns the values of a frame by path.
     """
-    matching = changes(frame, data)
+    matching = find_changes(frame, data)
     if len(matching) > TOLD:
         yield (f"one {matching[0].kind} would explain it, at any of {len(matching)} places")
         return
@@ -192,7 +192,7 @@ def describe_damage(
 
 
 def _place(
-    change: Change, before: Mapping[str, FieldValue], after: Mapping[str, FieldValue]
+    change: FrameChange, before: Mapping[str, FieldValue], after: Mapping[str, FieldValue]
 ) -> str:
     kind, offset, value = change
     if kind == "inserted byte":

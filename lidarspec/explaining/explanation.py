@@ -15,16 +15,22 @@ import numpy as np
 from lidarspec.device.session import Reply
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.explaining.damage_search import describe_damage
-from lidarspec.explaining.formatting import Difference, FieldValue, Point, Row, TextSpan
+from lidarspec.explaining.formatting import (
+    ExplainedPoint,
+    ExplainedRow,
+    FieldDifference,
+    FieldValue,
+    TextSpan,
+)
 from lidarspec.explaining.frame_rows import FrameRows
-from lidarspec.explaining.listing import Line, Listing, text
+from lidarspec.explaining.listing import Line, Listing, join_text
 from lidarspec.frames.parse import identify
 from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import examine
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, pack_found
-from lidarspec.notebook_display import drawn
+from lidarspec.notebook_display import make_display_method
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.scans.scan_ends import first_points
@@ -53,7 +59,7 @@ class Explanation:
     sensor: str
     frame: str
     data: bytes
-    rows: tuple[Row, ...]
+    rows: tuple[ExplainedRow, ...]
     fault: WireError | None = None
     notes: tuple[str, ...] = ()
 
@@ -63,10 +69,10 @@ class Explanation:
             f" {self.verdict})"
         )
 
-    _repr_html_ = drawn("explanation")
+    _repr_html_ = make_display_method("explanation")
 
     def __str__(self) -> str:
-        return "\n".join(text(line) for line in self.lines())
+        return "\n".join(join_text(line) for line in self.lines())
 
     @property
     def fields(self) -> dict[str, FieldValue]:
@@ -105,13 +111,13 @@ class Explanation:
             *((TextSpan("note: ", "note"), TextSpan(note)) for note in self.notes),
         ]
 
-    def differences(self, other: Explanation) -> list[Difference]:
+    def differences(self, other: Explanation) -> list[FieldDifference]:
         """Return the fields that differ in another frame, in wire order."""
         before = self.fields
         after = other.fields
         pairs = ((path, before.get(path), after.get(path)) for path in {**before, **after})
         compared = [
-            Difference(path, old, new, self._bytes_of(old), other._bytes_of(new))
+            FieldDifference(path, old, new, self._bytes_of(old), other._bytes_of(new))
             for path, old, new in pairs
         ]
         return [
@@ -168,7 +174,7 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
             raise
     listed_rows = FrameRows(sensor.frames[name], data, fault)
     rows = (*listed_rows.rows(), *listed_rows.rest(fault))
-    if fault is not None and not fits(sensor, data[: listed_rows.after], name):
+    if fault is not None and not is_valid_frame(sensor, data[: listed_rows.after], name):
         guesses = describe_damage(
             sensor.frames[name], data, lambda candidate: values(candidate, sensor, name)
         )
@@ -203,7 +209,7 @@ def reply_text(sensor: Sensor, reply: Reply) -> str:
     return "\n".join([result, *(f"{path}: {value}" for path, value, _ in rows)])
 
 
-def fits(sensor: Sensor, data: bytes, name: str) -> bool:
+def is_valid_frame(sensor: Sensor, data: bytes, name: str) -> bool:
     """Return whether the bytes are one valid frame of a type."""
     try:
         identify(sensor, data, frame=name)
@@ -213,8 +219,8 @@ def fits(sensor: Sensor, data: bytes, name: str) -> bool:
 
 
 def _add_points(
-    sensor: Sensor, name: str, data: bytes, rows: tuple[Row, ...]
-) -> tuple[tuple[Row, ...], tuple[str, ...]]:
+    sensor: Sensor, name: str, data: bytes, rows: tuple[ExplainedRow, ...]
+) -> tuple[tuple[ExplainedRow, ...], tuple[str, ...]]:
     """Return the rows with their points, and notes on the frame."""
     frame = sensor.frames[name]
     survey = codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
@@ -235,7 +241,7 @@ def _add_points(
     notes += ["default values are used in place of those from a frame of another type"] * bool(
         evaluated.cloud.nominal
     )
-    points = [Point.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
+    points = [ExplainedPoint.of(evaluated.cloud, index) for index in range(len(evaluated.cloud))]
     chain = packets.table.schema.chain
     parts = _find_parts_with_points(sensor, name, data)
     if not chain and not parts:
@@ -247,7 +253,7 @@ def _add_points(
     inside = evaluated.counts.astype(np.bool_)
     numbers = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
     first = first_points(evaluated)
-    rows_with_points = list[Row]()
+    rows_with_points = list[ExplainedRow]()
     for row in rows:
         part_number = next(
             (index for index, part in enumerate(parts) if f"{row.path}.".startswith(f"{part}.")),

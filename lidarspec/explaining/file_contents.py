@@ -18,8 +18,8 @@ from lidarspec.detect.identification import (
     Verdict,
     find_declared_sensor,
     format_sensor_options,
-    names,
-    verdicts,
+    identify_senders,
+    list_candidates,
 )
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, suggest
@@ -35,7 +35,7 @@ from lidarspec.transports.files import (
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
 from lidarspec.transports.robotics_logs import BagTransport
-from lidarspec.view.live_scans import Feed
+from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.rate_meter import MeterReading
 
 #: Maximum number of bytes and of packets to read from the beginning of a file, and of bytes of a
@@ -57,7 +57,7 @@ KINDS: Mapping[type[Transport], str] = {
 
 
 @dataclass
-class Flow:
+class PacketFlow:
     """The packets from one sender to one receiver; an unknown address is None.
 
     Attributes:
@@ -71,7 +71,7 @@ class Flow:
 
 
 @dataclass(frozen=True)
-class Content:
+class SensorContent:
     """The data of one sensor in a file.
 
     Attributes:
@@ -96,7 +96,7 @@ class Content:
 
 
 @dataclass
-class Contents:
+class FileContents:
     """The contents of a file.
 
     Attributes:
@@ -104,7 +104,7 @@ class Contents:
         header: the header of a recording.
         flows: senders and receivers, most bytes first; one for a byte stream.
         first_ns, last_ns: arrival of the first and the last packet, ns since 1970; None if unknown.
-        seen_ns: arrival of the last packet that was read.
+        last_read_ns: arrival of the last packet that was read.
         whole: whether all of the file was read; otherwise counts are of its beginning.
         contents: the data of each sensor.
         warnings: warnings about the file.
@@ -114,12 +114,12 @@ class Contents:
     kind: str
     size: int
     header: Header | None = None
-    flows: list[Flow] = field(default_factory=list)
+    flows: list[PacketFlow] = field(default_factory=list)
     first_ns: int | None = None
     last_ns: int | None = None
-    seen_ns: int | None = None
+    last_read_ns: int | None = None
     whole: bool = True
-    contents: list[Content] = field(default_factory=list)
+    contents: list[SensorContent] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     @property
@@ -140,11 +140,11 @@ class Contents:
         return (self.last_ns - self.first_ns) * 1e-9
 
     @property
-    def seen_seconds(self) -> float | None:
+    def read_seconds(self) -> float | None:
         """Duration in seconds of the part that was read; None if times are unknown."""
-        if self.first_ns is None or self.seen_ns is None:
+        if self.first_ns is None or self.last_read_ns is None:
             return None
-        return (self.seen_ns - self.first_ns) * 1e-9
+        return (self.last_read_ns - self.first_ns) * 1e-9
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents as a dict for JSON."""
@@ -191,7 +191,7 @@ class Contents:
         }
 
 
-def contents(path: str | Path) -> Contents:
+def read_contents(path: str | Path) -> FileContents:
     """Return the contents of a file.
 
     Raises:
@@ -213,14 +213,14 @@ def contents(path: str | Path) -> Contents:
             header = opened.header
         else:
             header = None
-        described = Contents(str(path), kind, _size(Path(file)), header)
+        described = FileContents(str(path), kind, _size(Path(file)), header)
         _count(described, opened)
         described.warnings += opened.warnings
-    described.contents += _sent(described) if described.bytes else []
+    described.contents += _find_sensors(described) if described.bytes else []
     return described
 
 
-def duration(path: str | Path) -> float | None:
+def measure_duration(path: str | Path) -> float | None:
     """Return the seconds from the first packet of a file to the last.
 
     Returns None if that would require reading all of a long file.
@@ -229,7 +229,7 @@ def duration(path: str | Path) -> float | None:
         SourceError: if the file cannot be opened.
     """
     with contextlib.closing(transport(path)) as opened:
-        described = Contents(str(path), "", 0)
+        described = FileContents(str(path), "", 0)
         _count(described, opened)
     return described.seconds
 
@@ -240,13 +240,15 @@ def _size(path: Path) -> int:
     return path.stat().st_size
 
 
-def _count(found: Contents, opened: Transport) -> None:
+def _count(found: FileContents, opened: Transport) -> None:
     """Count the beginning of the file, and find the last time."""
-    flows = dict[tuple[Sender | None, Sender | None], Flow]()
+    flows = dict[tuple[Sender | None, Sender | None], PacketFlow]()
     left = LOOKED_AT
     chunks = opened.chunks()
     for number, chunk in enumerate(chunks):
-        flow = flows.setdefault((chunk.sender, chunk.receiver), Flow(chunk.sender, chunk.receiver))
+        flow = flows.setdefault(
+            (chunk.sender, chunk.receiver), PacketFlow(chunk.sender, chunk.receiver)
+        )
         flow.packets, flow.bytes, left = (
             flow.packets + 1,
             flow.bytes + len(chunk.data),
@@ -256,15 +258,15 @@ def _count(found: Contents, opened: Transport) -> None:
             found.first_ns = chunk.at
         else:
             found.first_ns = found.first_ns
-        found.seen_ns = found.last_ns = chunk.at or found.last_ns
+        found.last_read_ns = found.last_ns = chunk.at or found.last_ns
         if left <= 0 or number >= PACKETS:
-            found.last_ns = _last(opened, chunks)
+            found.last_ns = _find_last_time(opened, chunks)
             found.whole = False
             break
     found.flows = sorted(flows.values(), key=lambda flow: -flow.bytes)
 
 
-def _last(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
+def _find_last_time(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
     """Return the time of the last packet, None if that requires reading everything."""
     last = None
     for chunk in chunks if opened.skip(_END) else ():
@@ -272,30 +274,30 @@ def _last(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
     return last
 
 
-def _sent(found: Contents) -> list[Content]:
+def _find_sensors(found: FileContents) -> list[SensorContent]:
     """Return the data of each sensor."""
     try:
         if (known := find_declared_sensor(found.path)) is not None:
-            return [Content(found.path, (known.id,), None, "", _reading(found.path, known))]
+            return [SensorContent(found.path, (known.id,), None, "", _reading(found.path, known))]
     except LidarSpecError as error:
         found.warnings.append(str(error))
-    judged = verdicts(found.path)
-    if any(one.heard.is_text for one in judged) and not any(one.alike for one in judged):
+    judged = identify_senders(found.path)
+    if any(one.sample.is_text for one in judged) and not any(one.candidates for one in judged):
         found.kind = "text"
     return [_content(found.path, one) for one in judged]
 
 
-def _content(path: str, one: Verdict) -> Content:
-    if one.heard.sender and "?" not in path:
-        source = f"{path}?src={one.heard.sender}"
+def _content(path: str, one: Verdict) -> SensorContent:
+    if one.sample.sender and "?" not in path:
+        source = f"{path}?src={one.sample.sender}"
     else:
         source = path
-    if not one.alike:
-        return Content(source, tuple(names(one)))
-    best = one.alike[0]
-    return Content(
+    if not one.candidates:
+        return SensorContent(source, tuple(list_candidates(one)))
+    best = one.candidates[0]
+    return SensorContent(
         source,
-        tuple(names(one)),
+        tuple(list_candidates(one)),
         best.share,
         format_sensor_options(best.sensor),
         _reading(source, best.sensor),
@@ -309,15 +311,15 @@ def _reading(source: str, sensor: Sensor) -> MeterReading | None:
     """
     try:
         with Device(source, sensor) as device:
-            feed = Feed(device)
+            feed = LiveScans(device)
             while not feed.ended and device.stats.bytes_in < DECODED:
-                feed.pump(0.0)
+                feed.read(0.0)
             return feed.meter.summary(device.stats)
     except LidarSpecError:
         return None
 
 
-def shown(found: Contents) -> Sequence[tuple[str, str]]:
+def format_contents(found: FileContents) -> Sequence[tuple[str, str]]:
     """Return the description of a file as lines of (word, text)."""
     lines = list[tuple[str, str]]()
     if (header := found.header) is not None:
@@ -330,7 +332,7 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
         lines.append(("time", f"{format_date(found.first_ns)}{until}"))
     else:
         lines.append(("time", "no arrival times"))
-    seconds = found.seen_seconds or 0.0
+    seconds = found.read_seconds or 0.0
     if seconds:
         rate = f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s"
     else:
@@ -366,7 +368,7 @@ def shown(found: Contents) -> Sequence[tuple[str, str]]:
     return lines
 
 
-def _describe_content(content: Content) -> Iterator[tuple[str, str]]:
+def _describe_content(content: SensorContent) -> Iterator[tuple[str, str]]:
     if not content.sensors:
         yield "sensor", f"not identified among the installed ones ({content.source})"
         return

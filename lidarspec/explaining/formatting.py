@@ -32,7 +32,7 @@ class TextSpan(NamedTuple):
     role: str = ""
 
 
-class Point(NamedTuple):
+class ExplainedPoint(NamedTuple):
     """One point of a cloud, in metres and degrees.
 
     Without a return, x, y and z are nan and the range is inf or nan.
@@ -46,7 +46,7 @@ class Point(NamedTuple):
     elevation_deg: float
 
     @classmethod
-    def of(cls, cloud: PointCloud, index: int) -> Point:
+    def of(cls, cloud: PointCloud, index: int) -> ExplainedPoint:
         """Return point number `index` of a cloud."""
         x, y, z, distance = (
             float(column[index]) for column in (cloud.x, cloud.y, cloud.z, cloud.range)
@@ -160,7 +160,7 @@ class FieldValue:
 
 
 @dataclass(frozen=True)
-class Row:
+class ExplainedRow:
     """Some bytes of a frame: one field, one bit block, or one element of an array of structs.
 
     Attributes:
@@ -181,7 +181,7 @@ class Row:
     values: tuple[FieldValue, ...] = ()
     remarks: tuple[str, ...] = ()
     right: bool = True
-    points: tuple[Point, ...] = ()
+    points: tuple[ExplainedPoint, ...] = ()
     numbers: tuple[tuple[int, int], ...] = ()
 
     @property
@@ -267,7 +267,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Difference:
+class FieldDifference:
     """A field that differs between two frames.
 
     Attributes:

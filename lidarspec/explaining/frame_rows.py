@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from lidarspec.errors import WireError
-from lidarspec.explaining.formatting import FieldValue, Row
-from lidarspec.frames.compilability import NotCompilable
+from lidarspec.explaining.formatting import ExplainedRow, FieldValue
+from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import plain_fields
 from lidarspec.frames.schema import schema, without_indices
@@ -64,7 +64,7 @@ class FrameRows:
 
     def _read_fields(self, frame: Frame, struct: bytes) -> list[WireField] | None:
         """Return the fields of the frame, the last one maybe cut off; None if it has no end."""
-        if isinstance(frame_layouts(frame), NotCompilable):
+        if isinstance(frame_layouts(frame), NotCompilableError):
             return plain_fields(frame, struct)
         examined = examine(frame.tree, struct, frame.room)
         with contextlib.suppress(Exception):  # a plugin's checksum; `fault` has the exception
@@ -83,31 +83,33 @@ class FrameRows:
             each, start=self._offsets[each.start], end=self._offsets[each.end], bits=None
         )
 
-    def rows(self) -> Iterator[Row]:
+    def rows(self) -> Iterator[ExplainedRow]:
         """Return a row for each field or bit block, and for the marks of a wire form.
 
         The fields of an array element are one row if it holds no further array.
         """
         if self._first:
-            yield Row(0, self._data[: self._first], "(start)", (), (), right=True)
+            yield ExplainedRow(0, self._data[: self._first], "(start)", (), (), right=True)
         for path, group in itertools.groupby(self._fields, lambda each: self._row_path(each.block)):
             yield self._row(path, list(group))
         if self._is_whole_text and self._end < len(self._data):
-            yield Row(self._end, self._data[self._end :], "(end)", (), (), right=True)
+            yield ExplainedRow(self._end, self._data[self._end :], "(end)", (), (), right=True)
 
     def values(self) -> dict[str, FieldValue]:
         """Return every value by its path."""
         return {value.path: value for row in self.rows() for value in row.values}
 
-    def rest(self, fault: WireError | None) -> Iterator[Row]:
+    def rest(self, fault: WireError | None) -> Iterator[ExplainedRow]:
         """Return the bytes in no field: those of one that is cut off, or after the frame."""
         left = self._data[self.after :]
         if self._is_cut_off and fault is not None:
-            yield Row(self.after, left, fault.path, (), (fault.reason,), right=False)
+            yield ExplainedRow(self.after, left, fault.path, (), (fault.reason,), right=False)
         elif fault is not None and self._has_form and not left:
-            yield Row(self.after, left, "(end)", (), (fault.reason,), right=False)
+            yield ExplainedRow(self.after, left, "(end)", (), (fault.reason,), right=False)
         elif left:
-            yield Row(self.after, left, "", (), ("after the end of the frame",), right=False)
+            yield ExplainedRow(
+                self.after, left, "", (), ("after the end of the frame",), right=False
+            )
 
     def _row_path(self, path: str) -> str:
         """Return the innermost array element that contains a field, or the field itself."""
@@ -121,7 +123,7 @@ class FrameRows:
             return path
         return head + bracket
 
-    def _row(self, path: str, group: Sequence[WireField]) -> Row:
+    def _row(self, path: str, group: Sequence[WireField]) -> ExplainedRow:
         start = group[0].start
         end = group[-1].end
         values: list[FieldValue] = []
@@ -138,7 +140,9 @@ class FrameRows:
                 text, is_right = self._verdicts[each.path]
                 remarks.append(text)
                 right = right and is_right
-        return Row(start, self._data[start:end], path, tuple(values), tuple(remarks), right)
+        return ExplainedRow(
+            start, self._data[start:end], path, tuple(values), tuple(remarks), right
+        )
 
     def _info(self, each: WireField) -> FieldInfo:
         docs = "constant" if each.path.endswith(UNNAMED) else ""

@@ -1,9 +1,9 @@
 """Split an input into pieces: valid frames, damaged frames, and the bytes between them.
 
-The decoder finds the valid frames, and `pieces` yields them as soon as it does. `explain_piece`
-searches the bytes between them for damaged frames. A damaged frame begins at constants that look
-like the start of a frame. It ends after the size of the frame, or one byte before or after that if
-another frame begins there, or at the start of the next frame.
+The decoder finds the valid frames, and `iter_pieces` yields them as soon as it does.
+`explain_piece` searches the bytes between them for damaged frames. A damaged frame begins at
+constants that look like the start of a frame. It ends after the size of the frame, or one byte
+before or after that if another frame begins there, or at the start of the next frame.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from lidarspec.errors import LidarSpecError, UnknownFrame, WireError
-from lidarspec.explaining.damage_search import changes
+from lidarspec.explaining.damage_search import find_changes
 from lidarspec.explaining.explanation import Explanation, explain
-from lidarspec.explaining.formatting import Row
+from lidarspec.explaining.formatting import ExplainedRow
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.parse import identify, layout_of
 from lidarspec.frames.wire_coder import frame_coder
@@ -64,7 +64,7 @@ class InputPiece:
         return InputPiece(self.offset + start, self.data[start:end], frame)
 
 
-def pieces(
+def iter_pieces(
     sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: str | None = None
 ) -> Iterator[InputPiece]:
     """Yield the frames of the input and the bytes between them, in order, as they are found.
@@ -179,7 +179,10 @@ def _explain_skipped(sensor: Sensor, piece: InputPiece) -> tuple[InputPiece, Exp
     is_filler = not piece.data.translate(None, bytes(sensor.fillers))
     remark = "filler" if is_filler else "outside frames"
     return piece, Explanation(
-        sensor.id, "", piece.data, (Row(0, piece.data, "", (), (remark,), right=is_filler),)
+        sensor.id,
+        "",
+        piece.data,
+        (ExplainedRow(0, piece.data, "", (), (remark,), right=is_filler),),
     )
 
 
@@ -233,7 +236,7 @@ def _find_headless_type(sensor: Sensor, data: bytes) -> str:
 
     Returns "" if no single change makes the bytes a valid frame.
     """
-    return next((name for name, frame in sensor.incoming.items() if changes(frame, data)), "")
+    return next((name for name, frame in sensor.incoming.items() if find_changes(frame, data)), "")
 
 
 def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:

@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 from lidarspec.explaining.formatting import (
-    Difference,
+    ExplainedRow,
+    FieldDifference,
     FieldValue,
-    Row,
     TextSpan,
     bit_picture,
     number,
@@ -37,7 +37,7 @@ FOLDED = 24
 Line = tuple[TextSpan, ...]
 
 
-def text(line: Line) -> str:
+def join_text(line: Line) -> str:
     """Return a line without its roles."""
     return "".join(span.text for span in line).rstrip()
 
@@ -48,7 +48,7 @@ def fold(line: Line, width: int) -> Line:
     Continuation lines start below the text.
     """
     indent = sum(len(span.text) for span in line[:FIXED])
-    if len(text(line)) <= width or indent + FOLDED > width:
+    if len(join_text(line)) <= width or indent + FOLDED > width:
         return line
     spans = list(line[:FIXED])
     column = indent
@@ -80,7 +80,7 @@ class Listing:
         every: draw the bits of all elements of an array, not only of the first.
     """
 
-    def __init__(self, rows: Sequence[Row], *, every: bool) -> None:
+    def __init__(self, rows: Sequence[ExplainedRow], *, every: bool) -> None:
         self._rows = rows
         self._drawn = [
             any(value.bits for value in row.values) and (every or row.first) for row in rows
@@ -116,7 +116,7 @@ class Listing:
             above = around
             yield from self._row(row, len(around), drawn=self._drawn[index])
 
-    def _row(self, row: Row, depth: int, *, drawn: bool) -> Iterator[Line]:
+    def _row(self, row: ExplainedRow, depth: int, *, drawn: bool) -> Iterator[Line]:
         parts = [
             row.data[start : start + self._bytes] for start in range(0, len(row.data), self._bytes)
         ] or [b""]
@@ -169,7 +169,7 @@ class Listing:
             )
 
 
-def _bits(row: Row) -> list[tuple[bytes, bytes]]:
+def _bits(row: ExplainedRow) -> list[tuple[bytes, bytes]]:
     """Return the bytes and the bit masks of each value."""
     return [
         (row.data[value.start - row.offset :][: len(value.masks)], value.masks)
@@ -181,7 +181,7 @@ def _indent_path(path: str, depth: int) -> str:
     return " " * LEVEL * depth + path.rpartition(".")[2]
 
 
-def list_differences(differences: list[Difference], sizes: tuple[int, int]) -> Iterator[Line]:
+def list_differences(differences: list[FieldDifference], sizes: tuple[int, int]) -> Iterator[Line]:
     """Yield the differences of two frames: each field with both values and its bits.
 
     Args:
@@ -202,7 +202,7 @@ def list_differences(differences: list[Difference], sizes: tuple[int, int]) -> I
     yield (TextSpan(differing if fields else f"{length}, all identical", "note"),)
 
 
-def _lines(difference: Difference) -> Iterator[Line]:
+def _lines(difference: FieldDifference) -> Iterator[Line]:
     old = difference.before
     new = difference.after
     assert old is not None
@@ -237,7 +237,7 @@ def _lines(difference: Difference) -> Iterator[Line]:
                 )
 
 
-def _missing(group: list[Difference], which: str) -> Line:
+def _missing(group: list[FieldDifference], which: str) -> Line:
     paths = [difference.path for difference in group]
     if len(paths) == 1:
         names = paths[0]

@@ -60,7 +60,7 @@ def select_frame(sensor: Sensor, frame: str) -> Sensor:
     return with_frames(sensor, {frame: replace(sensor.frames[frame], after=None)})
 
 
-def beginning(sensor: Sensor) -> str:
+def make_prefix(sensor: Sensor) -> str:
     """Return the id for use in names that must begin with a letter."""
     if sensor.id[0].isalpha():
         return sensor.id

@@ -22,10 +22,10 @@ from textwrap import indent
 from typing import Any
 
 from lidarspec._version import __version__
-from lidarspec.exports import ExportedFrame, ExportError, beginning, c_fields, messages
+from lidarspec.exports import ExportedFrame, ExportError, c_fields, make_prefix, messages
 from lidarspec.exports.c_fields import (
+    CEntry,
     CLayout,
-    Entry,
     accesses,
     arguments,
     comment,
@@ -34,7 +34,7 @@ from lidarspec.exports.c_fields import (
     quote_bytes,
     word,
 )
-from lidarspec.frames.wire_table import Extent
+from lidarspec.frames.wire_table import SizeFormula
 from lidarspec.spec import Checksum, Crc, Fold15, Sensor, Sum, WordXor, Xor, ZeroPadded
 from lidarspec.spec.checksums import byte_table, mirrored_bytes, reflect
 from lidarspec.spec.tree import (
@@ -68,7 +68,7 @@ static inline uint64_t {name}(const uint8_t *p, const int64_t (*spans)[2], size_
 
 
 @dataclass(frozen=True)
-class _Body:
+class _ChecksumBody:
     """The C code of one checksum algorithm. In it, `i` is the number of bytes covered so far.
 
     Attributes:
@@ -116,14 +116,14 @@ def checksum(algorithm: Checksum, name: str) -> str:
     )
 
 
-def _make_body(algorithm: Checksum) -> _Body:
+def _make_body(algorithm: Checksum) -> _ChecksumBody:
     match algorithm:
         case Crc():
             return _make_crc_body(algorithm)
         case Xor():
-            return _Body("uint64_t total = 0;", "total ^= byte;", "total")
+            return _ChecksumBody("uint64_t total = 0;", "total ^= byte;", "total")
         case Sum():
-            return _Body(
+            return _ChecksumBody(
                 "uint64_t total = 0;",
                 "total += byte;",
                 f"total & UINT64_C(0x{(1 << algorithm.width) - 1:x})",
@@ -141,13 +141,13 @@ def _make_body(algorithm: Checksum) -> _Body:
                 "    total = ((int64_t)i - (first > 0 ? first : 0)) % 2"
                 " ? total + ((uint64_t)byte << 8) : (total << 1) + byte;"
             )
-            return _Body(begin, step, "((total & 0x7fff) + (total >> 15)) & 0x7fff")
+            return _ChecksumBody(begin, step, "((total & 0x7fff) + (total >> 15)) & 0x7fff")
     raise ExportError(
         f"the checksum {type(algorithm).__name__} is Python code, which C does not run"
     )
 
 
-def _make_word_xor_body(algorithm: WordXor) -> _Body:
+def _make_word_xor_body(algorithm: WordXor) -> _ChecksumBody:
     halves = [half for size in algorithm.groups for half in range(size)]
     begin = (
         f"static const uint8_t halves[{len(halves)}] = {{{', '.join(map(str, halves))}}};\n"
@@ -158,12 +158,12 @@ def _make_word_xor_body(algorithm: WordXor) -> _Body:
     else:
         head = ""
     back = f"(i - {algorithm.head})" if algorithm.head else "i"
-    return _Body(
+    return _ChecksumBody(
         begin, f"total ^= (uint64_t)byte << 8 * ({head}halves[{back} % {len(halves)}]);", "total"
     )
 
 
-def _make_crc_body(crc: Crc) -> _Body:
+def _make_crc_body(crc: Crc) -> _ChecksumBody:
     """Return a CRC that uses the byte table of `lidarspec.spec.checksums`.
 
     As there, the low byte of the register is combined with the next byte of data.
@@ -186,7 +186,7 @@ def _make_crc_body(crc: Crc) -> _Body:
         result = f"lidarspec_swapped(total, {size // 8}) >> {size - crc.width}"
     if crc.refin != crc.refout:
         result = f"lidarspec_mirrored({result}, {crc.width})"
-    return _Body(
+    return _ChecksumBody(
         begin, step, f"({result}) ^ {_format_literal(crc.xorout, size)}" if crc.xorout else result
     )
 
@@ -247,7 +247,7 @@ def _iter_frame_functions(layout: CLayout, algorithms: Mapping[Checksum, str]) -
     yield _LENGTH.format(
         name=length, unused=unused, checks=checks, size=layout.size, longest=longest
     )
-    seals = dict[str, tuple[Entry, Sealed]]()
+    seals = dict[str, tuple[CEntry, Sealed]]()
     for entry in layout.entries:
         # If several checksums are around one struct, the outer one is named after the struct and
         # the inner ones after their fields.
@@ -303,7 +303,9 @@ def _iter_length_checks(layout: CLayout) -> Iterator[str]:
                 )
 
 
-def _format_checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, algorithm: str) -> str:
+def _format_checksum(
+    layout: CLayout, entry: CEntry, seal: Sealed, name: str, algorithm: str
+) -> str:
     held = [access for path in seal.fields for access in accesses(layout, path)]
     for path in seal.fields:
         if [access.depth for access in held if access.info.path == path] != [entry.depth]:
@@ -322,8 +324,8 @@ def _format_checksum(layout: CLayout, entry: Entry, seal: Sealed, name: str, alg
 
 
 def _iter_covered_spans(
-    layout: CLayout, entry: Entry, seal: Sealed, held: list[Entry]
-) -> Iterator[tuple[Extent, Extent]]:
+    layout: CLayout, entry: CEntry, seal: Sealed, held: list[CEntry]
+) -> Iterator[tuple[SizeFormula, SizeFormula]]:
     """Yield the byte ranges that a checksum covers.
 
     This is the range that the seal declares, or the whole struct without the fields that hold the
@@ -337,7 +339,7 @@ def _iter_covered_spans(
     order = {id(other.node): number for number, other in enumerate(layout.entries)}
     for access in sorted(held, key=lambda access: (order[id(access.node)], access.span[0])):
         first_byte, size = access.span
-        begin = access.start + Extent(first_byte)
+        begin = access.start + SizeFormula(first_byte)
         if str(begin) != str(start):
             yield start, begin
         start = access.start + size
@@ -345,7 +347,7 @@ def _iter_covered_spans(
         yield start, entry.start + entry.size
 
 
-def _format_stored_checksum(held: list[Entry], order: str) -> str:
+def _format_stored_checksum(held: list[CEntry], order: str) -> str:
     """Return the C expression of a checksum stored in several fields, low bits first."""
     terms = []
     shift = 0
@@ -411,7 +413,7 @@ def _format_number(value: Any) -> str:
     return f"{value}u"
 
 
-def _format_check(entry: Entry, wrong: str) -> str:
+def _format_check(entry: CEntry, wrong: str) -> str:
     """Return a C statement that returns 0 if a condition is true.
 
     For an entry in arrays, the statement loops over all elements.
@@ -470,7 +472,7 @@ def header(sensor: Sensor) -> str:
         ExportError: if the content of a frame depends on Python code, or if C cannot compute its
             layout.
     """
-    prefix = identifier(beginning(sensor))
+    prefix = identifier(make_prefix(sensor))
     title, source = (
         text.replace("*/", "* /").replace("/*", "/ *")
         for text in (f"{sensor.vendor} {sensor.model}", sensor.source)

@@ -1,6 +1,6 @@
 """The offsets of fields as C expressions, and C functions that read the fields.
 
-`CLayout` walks a frame tree once and makes an `Entry` for each node: its first byte as a C
+`CLayout` walks a frame tree once and makes a `CEntry` for each node: its first byte as a C
 expression of the frame's bytes and of array indices, its size, the conditions under which it is
 present and the counts of the arrays around it. A length or count from a header is a call of the
 function that reads it, so that expressions stay short. The entries give an accessor for each field,
@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from lidarspec.exports import ExportedFrame, ExportError, find_references
-from lidarspec.frames.wire_table import Extent, meaning, unit_text
+from lidarspec.frames.wire_table import SizeFormula, describe_field, unit_text
 from lidarspec.spec import tree
 
 #: Comparisons are function calls, because compilers warn if a narrow type cannot have a value.
@@ -93,7 +93,7 @@ class CCondition(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Entry:
+class CEntry:
     """A node at one of its positions in the frame.
 
     Attributes:
@@ -108,8 +108,8 @@ class Entry:
 
     path: str
     node: tree.Node
-    start: Extent
-    size: Extent
+    start: SizeFormula
+    size: SizeFormula
     depth: int = 0
     conditions: tuple[CCondition, ...] = ()
     loops: tuple[str, ...] = ()
@@ -121,7 +121,7 @@ class Entry:
         return " && ".join(condition.text for condition in self.conditions)
 
     @property
-    def fields(self) -> list[Entry]:
+    def fields(self) -> list[CEntry]:
         """An entry for each part of a bit block, else the entry itself."""
         if isinstance(self.node, tree.Block):
             return [replace(self, part=part) for part in self.node.parts]
@@ -159,12 +159,12 @@ class Entry:
         return raw
 
     @property
-    def span(self) -> tuple[int, Extent]:
+    def span(self) -> tuple[int, SizeFormula]:
         """The first byte of the word and the end of its last, from the start of the entry."""
         if self.part is None:
             return 0, self.size
         offsets = [segment.byte for segment in self.part.bits.segments]
-        return min(offsets), Extent(max(offsets) + 1)
+        return min(offsets), SizeFormula(max(offsets) + 1)
 
     @property
     def condition(self) -> str:
@@ -201,12 +201,12 @@ class CLayout:
     def __init__(self, message: ExportedFrame, name: Callable[[str, str], str]) -> None:
         self.message = message
         self.name = name
-        self.entries: list[Entry] = []
-        top = Entry("", message.root, Extent(), Extent())
+        self.entries: list[CEntry] = []
+        top = CEntry("", message.root, SizeFormula(), SizeFormula())
         self.size = self.extent(top)
         self._visit(top)
 
-    def find_entries(self, path: str) -> list[Entry]:
+    def find_entries(self, path: str) -> list[CEntry]:
         """Return the entries of the numbers, bytes or bits at a path.
 
         There are several if alternatives contain the field.
@@ -217,7 +217,7 @@ class CLayout:
             if any(info.path == path for info in tree.infos(entry.node))
         ]
 
-    def whole(self, path: str) -> Entry:
+    def whole(self, path: str) -> CEntry:
         """Return the entry of the whole part at a path: an array, or all alternatives."""
         return next(entry for entry in self.entries if entry.path == path)
 
@@ -247,15 +247,15 @@ class CLayout:
             return node.count
         return f"(int64_t){self.name(node.axis, 'count')}({format_size_arguments(node, depth)})"
 
-    def extent(self, entry: Entry) -> Extent:
+    def extent(self, entry: CEntry) -> SizeFormula:
         """Return the size of an entry."""
         match entry.node:
             case tree.Number() | tree.Block():
-                return Extent(entry.node.size)
+                return SizeFormula(entry.node.size)
             case tree.Blob(size=int() as size):
-                return Extent(size)
+                return SizeFormula(size)
             case tree.Blob():
-                return Extent(
+                return SizeFormula(
                     0,
                     (
                         (
@@ -271,17 +271,17 @@ class CLayout:
                 if len({str(size) for _, size in sizes}) == 1:
                     return sizes[0][1]
                 arguments = format_size_arguments(entry.node, entry.depth)
-                return Extent(0, (f"(int64_t){self.extent_name(entry)}({arguments})",))
+                return SizeFormula(0, (f"(int64_t){self.extent_name(entry)}({arguments})",))
             case tree.PartSequence():
                 raise ExportError(
                     f"{entry.path}: parts of sizes of their own, of which none has a place without"
                     " reading those before it"
                 )
             case tree.Empty():
-                return Extent()
-        return sum((self.extent(below) for below in self._below(entry)), Extent())
+                return SizeFormula()
+        return sum((self.extent(below) for below in self._below(entry)), SizeFormula())
 
-    def extent_name(self, entry: Entry) -> str:
+    def extent_name(self, entry: CEntry) -> str:
         """Return the name of the size function of a part with alternatives.
 
         Alternatives may contain each other, so that several such parts can have the same path.
@@ -294,11 +294,11 @@ class CLayout:
         alike = [id(node) for node in choices if node.name == entry.node.name]
         return self.name(entry.path, f"extent{alike.index(id(entry.node)) or ''}")
 
-    def sizes(self, entry: Entry) -> list[tuple[str, Extent]]:
+    def sizes(self, entry: CEntry) -> list[tuple[str, SizeFormula]]:
         """Return the sizes of the alternatives of a part, each with its condition."""
         return [(condition.text, self.extent(below)) for condition, below in self._cases(entry)]
 
-    def _visit(self, entry: Entry) -> None:
+    def _visit(self, entry: CEntry) -> None:
         """Store an entry and all entries in it."""
         node = entry.node
         if not isinstance(node, tree.Empty):
@@ -328,7 +328,7 @@ class CLayout:
                 self._visit(replace(below, start=start))
                 start = start + self.extent(below)
 
-    def _below(self, entry: Entry) -> Iterator[Entry]:
+    def _below(self, entry: CEntry) -> Iterator[CEntry]:
         """Yield the members of a struct, all with its own start."""
         node = entry.node
         if isinstance(node, tree.Sealed):
@@ -339,7 +339,7 @@ class CLayout:
                     entry, node=member, path=".".join(filter(None, (node.path, member.name)))
                 )
 
-    def _element(self, entry: Entry, node: tree.Repeat) -> Extent:
+    def _element(self, entry: CEntry, node: tree.Repeat) -> SizeFormula:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
         if size.terms and any(node.axis in ref.info.axes for ref in find_references(node.element)):
             raise ExportError(
@@ -348,7 +348,7 @@ class CLayout:
             )
         return size
 
-    def _cases(self, entry: Entry) -> list[tuple[CCondition, Entry]]:
+    def _cases(self, entry: CEntry) -> list[tuple[CCondition, CEntry]]:
         """Return the alternatives of a part, each with its condition."""
         node = entry.node
         is_fixed = not any(
@@ -391,16 +391,16 @@ SI: dict[str, tuple[str, float, float]] = {
 FLOATS = {2: "lidarspec_half", 4: "lidarspec_float", 8: "lidarspec_double"}
 
 
-def word(start: Extent, size: int, order: str) -> str:
+def word(start: SizeFormula, size: int, order: str) -> str:
     """Return the C expression of an unsigned integer of several bytes."""
     return f"lidarspec_{'le' if order == 'little' else 'be'}(p + {start}, {size})"
 
 
-def _bits(part: tree.Part, start: Extent) -> str:
+def _bits(part: tree.Part, start: SizeFormula) -> str:
     wide = "uint64_t" if part.bits.width > 32 else "uint32_t"
     terms = []
     for segment in part.bits.segments:
-        byte = f"p[{start + Extent(segment.byte)}]"
+        byte = f"p[{start + SizeFormula(segment.byte)}]"
         term = f"({wide})" + (f"({byte} & 0x{segment.mask:02x}u)" if segment.mask != 0xFF else byte)
         shift = segment.target - segment.low
         terms.append(f"{term} {'<<' if shift > 0 else '>>'} {abs(shift)}" if shift else term)
@@ -413,7 +413,7 @@ def _bits(part: tree.Part, start: Extent) -> str:
     return value
 
 
-def accesses(layout: CLayout, path: str) -> list[Entry]:
+def accesses(layout: CLayout, path: str) -> list[CEntry]:
     """Return an entry for each way to read a field."""
     return [
         access
@@ -442,7 +442,7 @@ def fields(layout: CLayout) -> Iterator[str]:
 Writer = Callable[[CLayout, str], Iterator[str]]
 
 
-def _functions(entry: Entry) -> Iterator[tuple[Writer, str]]:
+def _functions(entry: CEntry) -> Iterator[tuple[Writer, str]]:
     """Yield the writers of the functions for an entry, with their paths."""
     if isinstance(entry.node, tree.Block):
         for part in entry.node.parts:
@@ -508,7 +508,7 @@ def _field(layout: CLayout, path: str) -> Iterator[str]:
         f"#define {name.upper()}_{identifier(label).upper()} {value}"
         for value, label in first.info.labels.items()
     )
-    yield comment(unit_text(first.info), meaning(first.info))
+    yield comment(unit_text(first.info), describe_field(first.info))
     if isinstance(first.node, tree.Blob):
         kind = ""
         sizes = [

@@ -3,10 +3,10 @@
 A row has four bytes, and each field is a box. A repeated part is drawn once, with its count.
 
 A diagram is made in two steps. `_ItemBuilder` converts a frame tree to boxes in wire order
-(`Cell`), and to groups that are repeated or optional (`BoxGroup`). `_Sheet` draws them from top to
-bottom. A box that crosses the end of a row continues in the next row. A group starts a new row and
-has a bracket beside it. A field that is too long, or that has no fixed length, is drawn as a cut
-row.
+(`DiagramBox`), and to groups that are repeated or optional (`BoxGroup`). `_Sheet` draws them from
+top to bottom. A box that crosses the end of a row continues in the next row. A group starts a new
+row and has a bracket beside it. A field that is too long, or that has no fixed length, is drawn as
+a cut row.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from xml.sax.saxutils import escape, quoteattr
 from lidarspec.exports import ExportedFrame, messages
 from lidarspec.frames.wire_table import (
     INDICES,
-    Extent,
+    SizeFormula,
     bit_text,
-    branches,
     describe_end,
+    describe_field,
     extent,
+    format_formula,
     frame_size,
-    meaning,
-    phrase,
+    list_branches,
     unit_text,
 )
 from lidarspec.spec import Sensor, tree
@@ -35,7 +35,7 @@ SPARE_PREFIXES = ("reserved", "unused", "spare", "zeros", "padding")
 
 
 @dataclass(frozen=True)
-class Cell:
+class DiagramBox:
     """A box of a diagram.
 
     Attributes:
@@ -52,7 +52,7 @@ class Cell:
     detail: str
     tooltip: str
     role: str
-    offset: Extent
+    offset: SizeFormula
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class BoxGroup:
     optional: bool = False
 
 
-Item = Cell | BoxGroup
+Item = DiagramBox | BoxGroup
 
 
 def byte_order(message: ExportedFrame) -> str:
@@ -100,7 +100,7 @@ class _ItemBuilder:
     seals: Mapping[str, tree.Sealed]
     mixed: bool
 
-    def visit(self, node: tree.Node, start: Extent, depth: int) -> tuple[Item, ...]:
+    def visit(self, node: tree.Node, start: SizeFormula, depth: int) -> tuple[Item, ...]:
         """Return the items of a node that begins at `start`.
 
         Args:
@@ -121,7 +121,7 @@ class _ItemBuilder:
                 return (self._make_repeat_group(node, start, depth),)
             case tree.PartSequence():
                 kinds = [
-                    (kind.name, self.visit(kind.element, Extent(0, ("i",)), depth + 1))
+                    (kind.name, self.visit(kind.element, SizeFormula(0, ("i",)), depth + 1))
                     for kind in node.kinds
                 ]
                 if len(kinds) == 1:
@@ -131,14 +131,17 @@ class _ItemBuilder:
                 return (BoxGroup(f"{node.name}: {describe_end(node)}", items),)
             case tree.When() | tree.Select():
                 parts = (
-                    (label, self.visit(branch, start, depth)) for label, branch in branches(node)
+                    (label, self.visit(branch, start, depth))
+                    for label, branch in list_branches(node)
                 )
                 return tuple(
                     BoxGroup(label, items, optional=True) for label, items in parts if items
                 )
         return ()
 
-    def _iter_struct_items(self, node: tree.Struct, start: Extent, depth: int) -> Iterator[Item]:
+    def _iter_struct_items(
+        self, node: tree.Struct, start: SizeFormula, depth: int
+    ) -> Iterator[Item]:
         for member in node.members:
             named = isinstance(member, tree.Struct | tree.Sealed) or (
                 isinstance(member, tree.Block) and member.parts[0].names
@@ -146,12 +149,12 @@ class _ItemBuilder:
             for item in self.visit(member, start, depth):
                 yield (
                     replace(item, name=f"{member.name}.{item.name}")
-                    if named and isinstance(item, Cell)
+                    if named and isinstance(item, DiagramBox)
                     else item
                 )
             start = start + extent(member, member.name)
 
-    def _make_number_cell(self, node: tree.Number, start: Extent) -> Cell:
+    def _make_number_cell(self, node: tree.Number, start: SizeFormula) -> DiagramBox:
         width = 8 * node.size
         is_long = node.size > 1
         short = {"uint": "u", "int": "s", "float": "float "}[
@@ -172,7 +175,7 @@ class _ItemBuilder:
             start,
         )
 
-    def _make_blob_cell(self, node: tree.Blob, start: Extent) -> Cell:
+    def _make_blob_cell(self, node: tree.Blob, start: SizeFormula) -> DiagramBox:
         size = extent(node)
         if node.const is not None and len(node.const) <= 8:
             detail = node.const.hex(" ")
@@ -180,7 +183,7 @@ class _ItemBuilder:
             detail = f"{size} byte{'s' * (str(size) != '1')}"
         return self._make_cell(node.info, node.name, 8 * size.number, detail, "bytes", start)
 
-    def _make_block_cells(self, node: tree.Block, start: Extent) -> list[Cell]:
+    def _make_block_cells(self, node: tree.Block, start: SizeFormula) -> list[DiagramBox]:
         """Return a box for each contiguous run of bits of one value, in wire order.
 
         The highest bit of each byte is first.
@@ -199,13 +202,13 @@ class _ItemBuilder:
             else:
                 runs.append((part, low, high, byte))
         return [
-            self._make_run_cell(node, part, low, high, start + Extent(byte))
+            self._make_run_cell(node, part, low, high, start + SizeFormula(byte))
             for part, low, high, byte in runs
         ]
 
     def _make_run_cell(
-        self, node: tree.Block, part: tree.Part, low: int, high: int, start: Extent
-    ) -> Cell:
+        self, node: tree.Block, part: tree.Part, low: int, high: int, start: SizeFormula
+    ) -> DiagramBox:
         """Return the box of a run of bits, with the bit numbers if it is not the whole value."""
         width = high - low + 1
         name = (".".join(part.names) or node.name) + "".join(f"[{index}]" for index in part.indices)
@@ -220,8 +223,8 @@ class _ItemBuilder:
         return self._make_cell(part.info, name, width, detail, bit_text(part.bits), start)
 
     def _make_cell(
-        self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: Extent
-    ) -> Cell:
+        self, info: tree.FieldInfo, name: str, bits: int, detail: str, kind: str, start: SizeFormula
+    ) -> DiagramBox:
         seal = self.seals.get(info.path)
         if seal:
             role = "sum"
@@ -235,15 +238,15 @@ class _ItemBuilder:
             info.path,
             kind,
             unit_text(info),
-            meaning(info),
+            describe_field(info),
             seal.algorithm.describe() if seal else "",
         )
         tooltip = "; ".join(filter(None, description))
-        return Cell(name or "(constant)", bits, detail, tooltip, role, start)
+        return DiagramBox(name or "(constant)", bits, detail, tooltip, role, start)
 
-    def _make_repeat_group(self, node: tree.Repeat, start: Extent, depth: int) -> BoxGroup:
+    def _make_repeat_group(self, node: tree.Repeat, start: SizeFormula, depth: int) -> BoxGroup:
         step = extent(node.element, node.name).times(INDICES[depth % len(INDICES)])
-        count = node.count if isinstance(node.count, int) else phrase(node.count)
+        count = node.count if isinstance(node.count, int) else format_formula(node.count)
         return BoxGroup(
             f"{node.name} \u00d7\u00a0{count}", self.visit(node.element, start + step, depth + 1)
         )
@@ -298,7 +301,7 @@ def svg(sensor: Sensor) -> str:
         )
         sheet.title(f"{sensor.vendor} {sensor.model}: {message.name}", detail)
         sheet.items(
-            _ItemBuilder(message.seals, mixed=not order).visit(message.root, Extent(), 0), 0
+            _ItemBuilder(message.seals, mixed=not order).visit(message.root, SizeFormula(), 0), 0
         )
         sheet.close()
     return sheet.document(f"{sensor.id}: packet diagrams")
@@ -407,7 +410,7 @@ class _Sheet:
         )
         self.parts += _draw_bracket_label(x + 12, (top + self.top) / 2, group.label)
 
-    def _draw_box(self, cell: Cell) -> None:
+    def _draw_box(self, cell: DiagramBox) -> None:
         """Draw a field as a piece in each row that it covers, with its name in the widest."""
         pieces: list[Piece] = []
         left = cell.bits
@@ -435,7 +438,7 @@ class _Sheet:
                     fill=FAINT,
                 )
 
-    def _draw_cut_row(self, cell: Cell) -> None:
+    def _draw_cut_row(self, cell: DiagramBox) -> None:
         """Draw a field that is too long, or has no fixed length, as a row with jagged cuts."""
         self._end_row()
         self._draw_offset(cell, 0)
@@ -450,13 +453,13 @@ class _Sheet:
         self.top = self.top + ROW_HEIGHT
         self.used = 0
 
-    def _draw_offset(self, cell: Cell, more: int) -> None:
+    def _draw_offset(self, cell: DiagramBox, more: int) -> None:
         """Draw the offset of the current row at its left, a long formula in two lines.
 
         Args:
             more: the bytes of the field in the rows before.
         """
-        text = str(cell.offset + Extent(more))
+        text = str(cell.offset + SizeFormula(more))
         middle = text.find(" + ", len(text) // 2 - 4)
         if len(text) <= MAX_OFFSET_LETTERS or middle < 0:
             lines = [text]
@@ -475,7 +478,7 @@ def _depth(group: BoxGroup) -> int:
     return max((1 + _depth(item) for item in group.items if isinstance(item, BoxGroup)), default=0)
 
 
-def _draw_outline(pieces: Sequence[Piece], cell: Cell) -> Iterator[str]:
+def _draw_outline(pieces: Sequence[Piece], cell: DiagramBox) -> Iterator[str]:
     """Yield the filled pieces of a box, and their common outline."""
     rects = "".join(
         f'<rect x="{x:g}" y="{y:g}" width="{bits * BIT_WIDTH}" height="{ROW_HEIGHT}"/>'
@@ -524,7 +527,9 @@ def _touches(one: Piece, other: Piece) -> bool:
     )
 
 
-def _draw_label(x: float, y: float, width: float, cell: Cell, fill: str = INK) -> Iterator[str]:
+def _draw_label(
+    x: float, y: float, width: float, cell: DiagramBox, fill: str = INK
+) -> Iterator[str]:
     """Yield the name and the detail of a box, as large as there is room.
 
     A name that does not fit in the smallest size is written vertically.

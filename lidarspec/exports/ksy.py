@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lidarspec.exports import ExportedFrame, ExportError, beginning, messages
-from lidarspec.frames.wire_table import meaning, unit_text
+from lidarspec.exports import ExportedFrame, ExportError, make_prefix, messages
+from lidarspec.frames.wire_table import describe_field, unit_text
 from lidarspec.spec import Sensor, tree
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.fields import slug
@@ -31,7 +31,7 @@ LISTED = 16
 _WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
 
 
-class Byte(int):
+class HexNumber(int):
     """A number that is written in hexadecimal."""
 
     def __repr__(self) -> str:
@@ -116,11 +116,11 @@ def number(formula: tree.Formula, scope: Scope) -> str:
     return tree.write(formula, functools.partial(format_reference, scope), _OPERATIONS)
 
 
-def truth(formula: tree.Formula, scope: Scope) -> str:
+def to_condition(formula: tree.Formula, scope: Scope) -> str:
     """Return a formula as a condition, true if it is not 0."""
     match formula:
         case tree.Op("not", (operand,)):
-            return f"not ({truth(operand, scope)})"
+            return f"not ({to_condition(operand, scope)})"
         case tree.Op(symbol, (left, right)) if symbol in tree.COMPARISONS:
             return f"{number(left, scope)} {symbol} {number(right, scope)}"
         case int():
@@ -193,7 +193,7 @@ def inline(
     }
 
 
-def odd(node: tree.Node) -> tree.Node:
+def as_block(node: tree.Node) -> tree.Node:
     """Return the node, or an equivalent block for an integer of an unusual size.
 
     Kaitai has no type for such integers.
@@ -296,7 +296,7 @@ def ksy(sensor: Sensor) -> str:
         raise ExportError(
             f"{sensor.id}: two frame types have one name in Kaitai, where names are in lower case"
         )
-    name = identifier(beginning(sensor))
+    name = identifier(make_prefix(sensor))
     document = {
         "meta": {"id": name, "title": f"{sensor.vendor} {sensor.model}", "ks-version": "0.10"},
         "doc": (
@@ -310,13 +310,13 @@ def ksy(sensor: Sensor) -> str:
 
 def _frame(sensor: Sensor, message: ExportedFrame) -> Attribute:
     try:
-        return _Types(message.seals).struct(message.root, ())
+        return _KaitaiWriter(message.seals).struct(message.root, ())
     except ExportError as refused:
         raise ExportError(f"{sensor.id} {message.name}: {refused}") from None
 
 
 @dataclass
-class _Type:
+class _KaitaiType:
     """A Kaitai type under construction."""
 
     seq: list[Attribute] = field(default_factory=list)
@@ -339,7 +339,7 @@ class _Type:
 
 
 @dataclass
-class _Types:
+class _KaitaiWriter:
     """Writes the types of one frame.
 
     Attributes:
@@ -350,14 +350,14 @@ class _Types:
 
     def struct(self, node: tree.Struct | tree.Sealed, scope: Scope) -> Attribute:
         """Return the type of a struct inside the types of `scope`."""
-        kaitai = _Type()
+        kaitai = _KaitaiType()
         for member in node.struct.members:
             self._member(kaitai, member, (*scope, node.struct.path))
         return kaitai.done(node.struct.path)
 
-    def _member(self, kaitai: _Type, node: tree.Node, scope: Scope, **more: Any) -> None:
+    def _member(self, kaitai: _KaitaiType, node: tree.Node, scope: Scope, **more: Any) -> None:
         """Add a part to a type, with further keys of its attribute."""
-        node = odd(node)
+        node = as_block(node)
         match node:
             case tree.Empty():
                 return
@@ -366,7 +366,7 @@ class _Types:
                     {
                         "id": identifier(node.name),
                         "size": 0,
-                        "valid": {"expr": truth(node.condition, scope)},
+                        "valid": {"expr": to_condition(node.condition, scope)},
                         **more,
                     }
                 )
@@ -376,14 +376,14 @@ class _Types:
                 )
             case tree.When(otherwise=tree.Empty()):
                 self._member(
-                    kaitai, node.then, scope, **more, **{"if": truth(node.condition, scope)}
+                    kaitai, node.then, scope, **more, **{"if": to_condition(node.condition, scope)}
                 )
             case tree.When():
                 cases = {"1": node.then, "0": node.otherwise}
                 self._switch(
                     kaitai,
                     node.name,
-                    f"{truth(node.condition, scope)} ? 1 : 0",
+                    f"{to_condition(node.condition, scope)} ? 1 : 0",
                     cases,
                     scope,
                     **more,
@@ -405,7 +405,9 @@ class _Types:
             case _:
                 self._add_typed(kaitai, node.name, node, scope, **more)
 
-    def _parts(self, kaitai: _Type, node: tree.PartSequence, scope: Scope, **more: Any) -> None:
+    def _parts(
+        self, kaitai: _KaitaiType, node: tree.PartSequence, scope: Scope, **more: Any
+    ) -> None:
         """Add parts of one kind; Kaitai has to know a type before it reads it."""
         if len(node.kinds) > 1:
             raise ExportError(
@@ -413,7 +415,7 @@ class _Types:
             )
         (kind,), name = node.kinds, identifier(node.name)
         if node.within is not None:
-            inner = _Type(
+            inner = _KaitaiType(
                 [{"id": "value", "type": "part", "repeat": "eos"}],
                 types={"part": self._type(kind.element, (*scope, None))},
             )
@@ -432,7 +434,7 @@ class _Types:
         self._add_typed(kaitai, node.name, kind.element, scope, **more)
 
     def _add_typed(
-        self, kaitai: _Type, name: str, node: tree.Node, scope: Scope, **more: Any
+        self, kaitai: _KaitaiType, name: str, node: tree.Node, scope: Scope, **more: Any
     ) -> None:
         """Add an attribute with a type of its own."""
         name = identifier(name)
@@ -443,7 +445,7 @@ class _Types:
         """Return a type for any part: its own, or one that holds it as `value`."""
         if isinstance(node, tree.Struct | tree.Sealed):
             return self.struct(node, scope)
-        kaitai = _Type()
+        kaitai = _KaitaiType()
         if isinstance(node, tree.Block):
             kaitai.seq, kaitai.instances = block_type(node, self._doc)
             for part in node.parts:
@@ -453,9 +455,9 @@ class _Types:
         self._member(kaitai, _value(node), (*scope, None))
         return kaitai.done(node.name)
 
-    def _repeat(self, kaitai: _Type, node: tree.Repeat, scope: Scope, **more: Any) -> None:
+    def _repeat(self, kaitai: _KaitaiType, node: tree.Repeat, scope: Scope, **more: Any) -> None:
         more |= {"repeat": "expr", "repeat-expr": _size(node.count, scope)}
-        element = odd(node.element)
+        element = as_block(node.element)
         if isinstance(element, tree.Number | tree.Blob):
             kaitai.seq.append(self._plain(element, scope) | {"id": identifier(node.name)} | more)
         elif isinstance(element, tree.Block) and (plain := inline(element, more)) is not None:
@@ -465,7 +467,7 @@ class _Types:
 
     def _switch(
         self,
-        kaitai: _Type,
+        kaitai: _KaitaiType,
         name: str,
         key: str,
         cases: Mapping[str, tree.Node],
@@ -495,7 +497,7 @@ class _Types:
             kind: Attribute = (
                 {"size": size}
                 if node.const is None
-                else {"contents": [Byte(byte) for byte in node.const]}
+                else {"contents": [HexNumber(byte) for byte in node.const]}
             )
             return head | kind | self._doc(node.info)
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
@@ -523,13 +525,13 @@ class _Types:
             unchecked = "a length, which is not checked here"
         else:
             unchecked = ""
-        text = "; ".join(filter(None, (unit_text(info), meaning(info), unchecked, sealed)))
+        text = "; ".join(filter(None, (unit_text(info), describe_field(info), unchecked, sealed)))
         if text:
             return {"doc": text}
         return {}
 
     def _physical(
-        self, kaitai: _Type, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = ""
+        self, kaitai: _KaitaiType, info: tree.FieldInfo, more: Mapping[str, Any], *, name: str = ""
     ) -> None:
         """Add an instance with the physical value of a field that has a scale."""
         own = identifier(name or info.name)

@@ -123,7 +123,9 @@ def _clock(clock: Clock) -> str:
         again = f", starts again at {clock.wraps_at:g} s"
     else:
         again = ""
-    return fields + again + (f", completed by {clock.told[0]} frames" if clock.told else "")
+    return (
+        fields + again + (f", completed by {clock.reference[0]} frames" if clock.reference else "")
+    )
 
 
 def _commands(sensor: Sensor) -> Iterator[str]:

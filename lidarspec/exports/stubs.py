@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 from lidarspec.exports import ExportedFrame, ExportError, messages
 from lidarspec.frames.schema import schema
-from lidarspec.frames.wire_table import meaning, unit_text
+from lidarspec.frames.wire_table import describe_field, unit_text
 from lidarspec.spec import Command, Sensor
 from lidarspec.spec.arguments import Address, Octets, Range, Text
 from lidarspec.spec.tree import (
@@ -53,10 +53,10 @@ def pyi(sensor: Sensor) -> str:
         ExportError: if a frame contains Python code, or two frame types have the same class name.
     """
     frames = messages(sensor, on_wire=False)
-    names = {message.name: camel(message.name) for message in frames}
+    names = {message.name: to_class_name(message.name) for message in frames}
     if len(set(names.values())) < len(names):
         raise ExportError(f"{sensor.id}: two frame types have one class name")
-    classes = _Classes({camel(sensor.id)})
+    classes = _StubClasses({to_class_name(sensor.id)})
     for message in frames:
         names[message.name] = classes.add(
             message.root, names[message.name], f"A frame of the type {message.name}."
@@ -69,7 +69,7 @@ def pyi(sensor: Sensor) -> str:
     return "\n\n".join(part.rstrip() + "\n" for part in parts)
 
 
-def camel(name: str) -> str:
+def to_class_name(name: str) -> str:
     """Return a name in the spelling of a class."""
     words = "".join(part[:1].upper() + part[1:] for part in re.split(r"\W+|_+", name) if part)
     if words[:1].isalpha():
@@ -85,7 +85,7 @@ from lidarspec import Sensor'''
 
 
 @dataclass
-class _Classes:
+class _StubClasses:
     """The classes written so far, inner ones first, and the names in use."""
 
     taken: set[str]
@@ -127,7 +127,7 @@ class _Classes:
             else:
                 infos = []
         description = "; ".join(
-            filter(None, (text(info) for info in infos[:1] for text in (unit_text, meaning)))
+            filter(None, (text(info) for info in infos[:1] for text in (unit_text, describe_field)))
         )
         line = f"    {name}: {kind}" + (
             "  # a keyword: getattr()" if keyword.iskeyword(name) else ""
@@ -150,12 +150,13 @@ class _Classes:
                     return "int"
                 return "list[int]"
             case Struct() | Sealed() | Block():
-                return self.add(node, owner + camel(name), f"`{name}` of `{owner}`.")
+                return self.add(node, owner + to_class_name(name), f"`{name}` of `{owner}`.")
             case Repeat():
                 return f"list[{self._type(owner, name, node.element)}]"
             case PartSequence():
                 types = [
-                    self._type(owner, name + camel(kind.name), kind.element) for kind in node.kinds
+                    self._type(owner, name + to_class_name(kind.name), kind.element)
+                    for kind in node.kinds
                 ]
                 return f"list[{' | '.join(types)}]"
             case When() | Select():
@@ -185,7 +186,7 @@ def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, 
     return f'''FrameName = Literal[{literals}]
 FieldPath = Literal[{fields}]
 
-class {camel(sensor.id)}(Sensor):
+class {to_class_name(sensor.id)}(Sensor):
     """The sensor itself: cast what `lidarspec.sensor("{sensor.id}")` returns to it."""
 
 {parses}

@@ -45,7 +45,7 @@ from lidarspec.spec.bits import BitField
 WIDTH = 140
 
 
-class Code(str):
+class LuaCode(str):
     """Lua code, which is not quoted."""
 
 
@@ -67,20 +67,20 @@ _OPERATIONS = {
 }
 
 
-def formula(value: tree.Formula) -> Code:
+def formula(value: tree.Formula) -> LuaCode:
     """Return a formula as a number, or as a Lua function of the values of fields."""
     if isinstance(value, int):
-        return Code(str(value))
+        return LuaCode(str(value))
     return _function(value)
 
 
-def _function(value: tree.Formula, missing: str = "") -> Code:
+def _function(value: tree.Formula, missing: str = "") -> LuaCode:
     """Return a formula as a Lua function of the field values.
 
     Args:
         missing: Lua text after each value, such as `" or 0"` for fields that can be missing.
     """
-    return Code(
+    return LuaCode(
         "function(v) return"
         f" {tree.write(value, lambda ref: f'(v[{quote_lua(ref.path)}]{missing})', _OPERATIONS)} end"
     )
@@ -88,7 +88,7 @@ def _function(value: tree.Formula, missing: str = "") -> Code:
 
 def lua(value: Any, indent: str = "") -> str:
     """Return plain data as a Lua expression, on one line if it fits."""
-    if isinstance(value, Code):
+    if isinstance(value, LuaCode):
         return str(value)
     if isinstance(value, str):
         return quote_lua(value)
@@ -231,7 +231,7 @@ class _TableWriter:
             "size": formula(node.size),
             "keep": self._keep(path),
         }
-        table["const"] = Code(quote_lua(node.const)) if node.const is not None else None
+        table["const"] = LuaCode(quote_lua(node.const)) if node.const is not None else None
         return table | {
             "skip": (
                 self._skip(node.info, node.size)
@@ -297,7 +297,7 @@ class _TableWriter:
         lengths = [
             {"path": path, "value": _function(value, " or 0")}
             for path, value in inside.items()
-            if node.path == _around(path, *(ref.path for ref in tree.refs(value)))
+            if node.path == _common_path(path, *(ref.path for ref in tree.refs(value)))
         ]
         return {
             "kind": "struct",
@@ -397,7 +397,7 @@ class _TableWriter:
         base: str,
         labels: Any = None,
         mask: int | None = None,
-    ) -> Code:
+    ) -> LuaCode:
         """Return Lua code that makes a Wireshark field.
 
         Wireshark requires the same type family for all fields with one name, so a name that is used
@@ -418,7 +418,7 @@ class _TableWriter:
         else:
             valued = "nil"
         masked = f"0x{mask:x}" if mask is not None else "nil"
-        return Code(
+        return LuaCode(
             f"new({quote_lua(abbreviation)}, {quote_lua(name)}, ftypes.{kind}, base.{base}, {valued},"
             f" {masked}, {quote_lua(docs)})"
         )
@@ -488,7 +488,7 @@ def _leaves(node: tree.Node) -> list[tree.Node | tree.Part]:
     ]
 
 
-def _around(*paths: str) -> str:
+def _common_path(*paths: str) -> str:
     """Return the path of the innermost struct that contains all of these fields."""
     parents = [path.split(".")[:-1] for path in paths]
     depth = next(

@@ -30,11 +30,11 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UnknownField
-from lidarspec.frames.arrays import deep
-from lidarspec.frames.frame_table import Group, Rows, Table
+from lidarspec.frames.arrays import add_axes
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
 from lidarspec.frames.schema import without_indices
 from lidarspec.spec.tree import FieldInfo, Ref
-from lidarspec.spec.vocabulary import ELEMENTWISE, Along, row_numbers
+from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis, row_numbers
 
 BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 
@@ -86,10 +86,10 @@ class Batch:
         """Return the state for the next batch, if it starts with packet `ready` of this one."""
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
 
-    def of(self, group: Group) -> Batch:
+    def of(self, group: LayoutRows) -> Batch:
         """The packets of a group, in its order, as a batch of their own, which no other follows."""
-        table = Rows(
-            self.table.schema, [Group(group.layout, np.arange(len(group.where)), group.rows)]
+        table = CompiledTable(
+            self.table.schema, [LayoutRows(group.layout, np.arange(len(group.where)), group.rows)]
         )
         state = {name: (frames, which[group.where]) for name, (frames, which) in self.state.items()}
         return Batch(table, self.breaks[group.where], state, self.defaults, nominal=self.nominal)
@@ -179,7 +179,7 @@ class Column(NDArrayOperatorsMixin):
         """
         arrays, axes, ready = align(values, self.batch)
         try:
-            array = call(function, arrays)
+            array = call_aligned(function, arrays)
         except TypeError:
             if function in BITWISE:
                 raise SpecError(NO_BITS, rule="LS213") from None
@@ -188,7 +188,7 @@ class Column(NDArrayOperatorsMixin):
                 raise SpecError(NO_TEXT.format(texts[0])) from None
             raise
         except ValueError:
-            together({str(place): array for place, array in enumerate(arrays, 1)}, axes)
+            broadcast_shape({str(place): array for place, array in enumerate(arrays, 1)}, axes)
             raise
         names = (*axes, *(f"<{index}>" for index in range(len(axes), array.ndim - 1)))
         return Column(array, names, self.batch, ready=ready)
@@ -211,7 +211,7 @@ class Column(NDArrayOperatorsMixin):
         places = sorted(names)[len(axes) - len(own) :]
         array = self.array
         for index, place in zip(own, places, strict=True):
-            array = _reaching(array, 1 + index, self.batch.table, names[place])
+            array = _pad_to_extent(array, 1 + index, self.batch.table, names[place])
         lengths = dict(zip(places, (array.shape[1 + index] for index in own), strict=True))
         depth = max(schema.depth(), len(self.axes), *(place + 1 for place in names))
         array = array.reshape(len(array), *(lengths.get(place, 1) for place in range(depth)))
@@ -223,7 +223,7 @@ class Column(NDArrayOperatorsMixin):
         )
 
     @property
-    def index(self) -> Along:
+    def index(self) -> AlongAxis:
         """0, 1, 2 ... along the innermost array that the values are in.
 
         Raises:
@@ -237,9 +237,9 @@ class Column(NDArrayOperatorsMixin):
             names = list(schema.fields[self.source].axes)
         if not names:
             raise SpecError("there is an index of arrays only, and these values are in none")
-        return Along((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
+        return AlongAxis((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
 
-    def steps(self) -> Along | NDArray[np.intp]:
+    def steps(self) -> AlongAxis | NDArray[np.intp]:
         """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column
         is the count.
         """
@@ -258,7 +258,7 @@ class Column(NDArrayOperatorsMixin):
             axis = None
         if axis is None:
             return np.arange(most)
-        return Along((axis,), np.arange(_reach(self.batch.table, axis, most)))
+        return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
         """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k
@@ -266,9 +266,11 @@ class Column(NDArrayOperatorsMixin):
         """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
-        place = _spot(table.shape[1:], [None] * depth, [1] * depth, self.batch.table, without=own)
+        place = _find_axis(
+            table.shape[1:], [None] * depth, [1] * depth, self.batch.table, without=own
+        )
         found = table.take(
-            row_numbers(deep(self.array, depth).squeeze(1 + place), len(table)), axis=0
+            row_numbers(add_axes(self.array, depth).squeeze(1 + place), len(table)), axis=0
         )
         axes = [*self.axes, *(None,) * (depth - len(self.axes))]
         axes[place] = f"?{self.batch.table.schema.chain[place]}"
@@ -313,7 +315,7 @@ class Column(NDArrayOperatorsMixin):
                 int(np.searchsorted(row.starts, certain, side="right")) - 1 if certain >= 0 else 0,
             )
         self.batch.left.append(
-            lambda upto: _tail(
+            lambda upto: _take_connected_tail(
                 values, edges, len(carried) + row.starts[upto], 0 if step > 0 else size
             )
         )
@@ -428,7 +430,7 @@ def align(
     named = {
         at: {schema.places[axis]: axis for axis in map(schema.axis, v.axes)}
         for at, v in enumerate(values)
-        if isinstance(v, Along)
+        if isinstance(v, AlongAxis)
     }
     depth = max(
         [len(column.axes) for column in columns]
@@ -440,20 +442,20 @@ def align(
     for column in columns:
         for place, name in enumerate(column.axes):
             axes[place], lengths[place] = (
-                _met(axes[place], name),
+                _merge_axis_names(axes[place], name),
                 max(lengths[place], column.array.shape[1 + place]),
             )
     for at, places in named.items():
         for place, axis in places.items():
             length = _length(values[at], axis)
             axes[place], lengths[place] = (
-                _met(axes[place], f"{axis}?" if length != 1 else None),
+                _merge_axis_names(axes[place], f"{axis}?" if length != 1 else None),
                 max(lengths[place], length),
             )
     arrays = []
     for at, value in enumerate(values):
         if isinstance(value, Column):
-            arrays.append(deep(value.array, depth))
+            arrays.append(add_axes(value.array, depth))
         elif at in named:
             names = tuple(
                 named[at].get(place, "").rpartition(".")[2]
@@ -483,7 +485,7 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
     ]
 
 
-def _met(known: str | None, name: str | None) -> str | None:
+def _merge_axis_names(known: str | None, name: str | None) -> str | None:
     """The name of an axis that has two, of which one may be None.
 
     Raises:
@@ -503,7 +505,7 @@ def _met(known: str | None, name: str | None) -> str | None:
     return min(known, name, key=lambda one: (one.startswith("?"), one.endswith("?")))
 
 
-def _length(value: Along, axis: str) -> int:
+def _length(value: AlongAxis, axis: str) -> int:
     """Return the number of elements along an array."""
     return int(
         value.array.shape[
@@ -526,7 +528,8 @@ def _place(
         return array
     if array.ndim < depth:
         array = array.reshape(
-            *array.shape, *(1,) * (depth - array.ndim - _spot(array.shape, axes, lengths, table))
+            *array.shape,
+            *(1,) * (depth - array.ndim - _find_axis(array.shape, axes, lengths, table)),
         )
     for place in range(max(depth - array.ndim, 0), depth):
         if array.shape[place - depth] != 1 and axes[place] is None:
@@ -539,7 +542,7 @@ def _place(
     return array
 
 
-def _spot(
+def _find_axis(
     shape: tuple[int, ...],
     axes: Sequence[str | None],
     lengths: Sequence[int],
@@ -597,7 +600,7 @@ def _spot(
     raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 
-def of_points(
+def align_points(
     parts: Mapping[str, Any], batch: Batch
 ) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
     """The parts of points as `align` gives them, and the shape that they have together, (n, ...).
@@ -613,7 +616,9 @@ def of_points(
     )
     (_, *arrays), axes, ready = align((anchor, *parts.values()), batch)
     named = dict(zip(parts, arrays, strict=True))
-    shape = together({"": np.empty((len(batch), *(1,) * len(axes)), np.bool_), **named}, axes)
+    shape = broadcast_shape(
+        {"": np.empty((len(batch), *(1,) * len(axes)), np.bool_), **named}, axes
+    )
     stray = next((name.strip("?") for name in axes if name is not None and "?" in name), None)
     if stray is not None or len(shape) > 1 + len(axes):
         if stray is not None:
@@ -621,14 +626,14 @@ def of_points(
         else:
             where = "along a further axis"
         raise SpecError(
-            f"points {where}, where no field of theirs is ({_lengths(named, axes)}); numbers go"
-            " along an array with along(...)",
+            f"points {where}, where no field of theirs is ({_describe_lengths(named, axes)});"
+            " numbers go along an array with along(...)",
             rule="LS214",
         )
     return arrays, axes, ready, shape
 
 
-def _reach(table: Table, axis: str, length: int) -> int:
+def _find_extent(table: Table, axis: str, length: int) -> int:
     """How far along an axis values are; no further than the array where frames say its length and
     have no array around it.
     """
@@ -637,7 +642,7 @@ def _reach(table: Table, axis: str, length: int) -> int:
     return length
 
 
-def _reaching(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:
+def _pad_to_extent(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:
     """An array at a place of its shape as far along an axis as frames go; nan where they have
     nothing to put there.
     """
@@ -647,11 +652,13 @@ def _reaching(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArr
         gaps = [(0, missing * (place == other)) for other in range(array.ndim)]
         return np.pad(array.astype(np.float64), gaps, constant_values=np.nan)
     if missing:
-        return array.take(range(_reach(table, axis, length)), axis=place)
+        return array.take(range(_find_extent(table, axis, length)), axis=place)
     return array
 
 
-def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> tuple[int, ...]:
+def broadcast_shape(
+    arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]
+) -> tuple[int, ...]:
     """The shape that arrays broadcast to.
 
     Args:
@@ -665,11 +672,11 @@ def together(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -
         return np.broadcast_shapes(*(array.shape for array in arrays.values()))
     except ValueError:
         raise SpecError(
-            f"lengths that do not go together: {_lengths(arrays, axes)}", rule="LS214"
+            f"lengths that do not go together: {_describe_lengths(arrays, axes)}", rule="LS214"
         ) from None
 
 
-def _lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> str:
+def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> str:
     """How long arrays are along which axes: "range: samples 3, azimuth: samples 4"; those of one
     number are left out.
     """
@@ -691,7 +698,7 @@ def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
     return all(isinstance(value, Column | int | float) for value in values)
 
 
-def call(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
+def call_aligned(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
     """Return the result of a function of aligned arrays, in the shape that they broadcast to."""
     return np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
 
@@ -710,7 +717,7 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
     return rest
 
 
-def _tail(
+def _take_connected_tail(
     values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int
 ) -> NDArray[np.float64]:
     """The last values before `end` that nothing lost separates from it."""
@@ -758,7 +765,7 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
         array = array.reshape(
             len(array), *(lengths.get(place, 1) for place in range(places[-1] + 1))
         )
-    return deep(array, depth)
+    return add_axes(array, depth)
 
 
 def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
@@ -783,7 +790,7 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
         array += info.offset
     there = table.present(info.path)
     if there is not None:
-        array = np.where(deep(there, array.ndim - 1), array, np.nan)
+        array = np.where(add_axes(there, array.ndim - 1), array, np.nan)
     return array
 
 
@@ -818,7 +825,7 @@ class Fields:
             return Fields(self._batch, f"{path}.", self._frame)
         axis = base.rpartition(".")[0]
         if name == "index" and not self._frame and axis in self._batch.table.schema.arrays:
-            return Along((axis,), np.arange(self._batch.table.length(axis)))
+            return AlongAxis((axis,), np.arange(self._batch.table.length(axis)))
         raise UnknownField(
             path,
             known,

@@ -15,8 +15,8 @@ clocks differ only in what they say the fields are. The compilers of points (`po
 the fields that a value is made of, conditions and sums taken apart. For them a value is *full*
 where each point has its own, else *low*: then it is computed once for its packet or block, plainly.
 
-A node's axes are those of its sample. What is no column (`vocabulary.Along`, plain arrays) is lined
-up with these as it is noted down, so that whoever computes with the graph broadcasts arrays.
+A node's axes are those of its sample. What is no column (`vocabulary.AlongAxis`, plain arrays) is
+lined up with these as it is noted down, so that whoever computes with the graph broadcasts arrays.
 
 Room is left for what is to come. More columns of a point (M5): further values that are traced.
 """
@@ -33,11 +33,11 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.expressions.columns import NO_TRUTH, Batch, Column, Fields, align, call
-from lidarspec.frames.frame_table import Group, Rows, Table
+from lidarspec.expressions.columns import NO_TRUTH, Batch, Column, Fields, align, call_aligned
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
 from lidarspec.frames.schema import Schema
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.spec.vocabulary import ELEMENTWISE, Along
+from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis
 
 
 class UntraceableError(Exception):
@@ -135,7 +135,7 @@ class Node:
             known if not is_node else arg.reshape(*arg.shape, *known) if known else arg
             for arg, (is_node, known) in zip(args, self._operands, strict=True)
         ]
-        return call(self.function, arrays)
+        return call_aligned(self.function, arrays)
 
 
 @dataclass
@@ -159,18 +159,18 @@ class Tape:
         args: tuple[Any, ...],
         sample: Column,
         path: str = "",
-    ) -> Traced:
+    ) -> TracedColumn:
         """A new node, as a traced column; a field that was read before has one already."""
         if path in self._read:
-            return Traced(self._read[path], self)
+            return TracedColumn(self._read[path], self)
         node = Node(kind, function, tuple(map(node_of, args)), sample, len(self.nodes), path)
         self.nodes.append(node)
         if path:
             self._read[path] = node
-        return Traced(node, self)
+        return TracedColumn(node, self)
 
 
-class Traced(NDArrayOperatorsMixin):
+class TracedColumn(NDArrayOperatorsMixin):
     """A column that notes down what is done to it; offers what `Column` offers to expressions."""
 
     def __init__(self, node: Node, tape: Tape) -> None:
@@ -182,7 +182,9 @@ class Traced(NDArrayOperatorsMixin):
         """Its values, as far as they are known: of the sample."""
         return self.node.sample.array
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Traced:
+    def __array_ufunc__(
+        self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any
+    ) -> TracedColumn:
         if kwargs.get("out") is not None:
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
@@ -193,24 +195,26 @@ class Traced(NDArrayOperatorsMixin):
 
     def __array_function__(
         self, function: Callable[..., Any], types: Any, args: Any, kwargs: Any
-    ) -> Traced:
+    ) -> TracedColumn:
         if function not in ELEMENTWISE:
             raise UntraceableError(f"np.{function.__name__} is not elementwise")
         return self.apply_function(
             (lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args
         )
 
-    def apply_function(self, function: Callable[..., Any], *values: Any) -> Traced:
+    def apply_function(self, function: Callable[..., Any], *values: Any) -> TracedColumn:
         """Record the call of a function of arrays."""
-        samples = [value.node.sample if isinstance(value, Traced) else value for value in values]
+        samples = [
+            value.node.sample if isinstance(value, TracedColumn) else value for value in values
+        ]
         arrays, _, _ = align(
             tuple(samples), self.node.sample.batch
         )  # what is no column is noted down in its place
         table = _fold(function, values, arrays)
         if table is not None:
-            return Traced(table[0], self._tape).gather(table[1])
+            return TracedColumn(table[0], self._tape).gather(table[1])
         args = tuple(
-            value if isinstance(value, Traced | int | float) else array
+            value if isinstance(value, TracedColumn | int | float) else array
             for value, array in zip(values, arrays, strict=True)
         )
         return self._tape.add(
@@ -218,7 +222,7 @@ class Traced(NDArrayOperatorsMixin):
         )
 
     @property
-    def index(self) -> Along:
+    def index(self) -> AlongAxis:
         """0, 1, 2 ... along the innermost array that the values are in."""
         return self.node.sample.index
 
@@ -238,7 +242,7 @@ class Traced(NDArrayOperatorsMixin):
             return self  # which stands on them already
         return self._tape.add("on", lambda column: column.on(*axes), (self,), sample)
 
-    def gather(self, table: NDArray[np.float64]) -> Traced:
+    def gather(self, table: NDArray[np.float64]) -> TracedColumn:
         """The rows of a table at these indices, noted down."""
         return self._tape.add(
             "rows",
@@ -247,13 +251,13 @@ class Traced(NDArrayOperatorsMixin):
             self.node.sample.gather(table),
         )
 
-    def running(self) -> Traced:
+    def running(self) -> TracedColumn:
         """The sum so far along the innermost array, noted down."""
         return self._tape.add(
             "running", lambda column: column.running(), (self,), self.node.sample.running()
         )
 
-    def steps(self) -> Along | NDArray[np.intp]:
+    def steps(self) -> AlongAxis | NDArray[np.intp]:
         """0, 1, 2 ... up to the largest value in the sample; the tape remembers how many these
         were.
         """
@@ -261,15 +265,15 @@ class Traced(NDArrayOperatorsMixin):
         self._tape.steps.append((self.node, len(found)))
         return found
 
-    def shift(self, step: int) -> Traced:
+    def shift(self, step: int) -> TracedColumn:
         """The value `step` places later (earlier if negative) in stream order, noted down."""
         return self._tape.add(
             "shift", lambda column: column.shift(step), (self,), self.node.sample.shift(step)
         )
 
-    def latest(self, where: Any = None) -> Traced:
+    def latest(self, where: Any = None) -> TracedColumn:
         """The most recent value at which `where` was true, noted down."""
-        if isinstance(where, Traced):
+        if isinstance(where, TracedColumn):
             condition = where.node.sample
         else:
             condition = where
@@ -294,7 +298,7 @@ class Traced(NDArrayOperatorsMixin):
     def __len__(self) -> int:
         raise UntraceableError("the length of a column")
 
-    def __getitem__(self, index: Any) -> Traced:
+    def __getitem__(self, index: Any) -> TracedColumn:
         """An element of a field that is an array: a field by itself."""
         node = self.node
         return self._tape.add(
@@ -327,7 +331,7 @@ class TracedFields:
         path = f"{self._path}.{name}".lstrip(".")
         before = self._read
         value, read = getattr(self._real, name), lambda fields: getattr(before(fields), name)
-        if isinstance(value, Along):
+        if isinstance(value, AlongAxis):
             return value
         if not isinstance(value, Column):
             return TracedFields(value, self._tape, path, read)
@@ -358,7 +362,7 @@ def _fold(
     Returns:
         The indices and the table; None where it is none.
     """
-    nodes = [value.node for value in values if isinstance(value, Traced)]
+    nodes = [value.node for value in values if isinstance(value, TracedColumn)]
     if any(node.kind != "rows" or node.args[0] is not nodes[0].args[0] for node in nodes):
         return None
     (index, first), shape = nodes[0].args, nodes[0].sample.array.shape
@@ -368,7 +372,7 @@ def _fold(
     )
     known: list[Any] = []
     for value, array in zip(values, arrays, strict=True):
-        if isinstance(value, Traced):
+        if isinstance(value, TracedColumn):
             known.append(value.node.args[1])
         elif np.size(value) == 1 or (
             has_rows and array.shape[-1] == np.size(array) == first.shape[1]
@@ -376,7 +380,7 @@ def _fold(
             known.append(np.asarray(array).reshape(-1))
         else:
             return None
-    table = call(function, known)
+    table = call_aligned(function, known)
     if table.dtype == np.float64 and table.shape == first.shape:
         return (index, table)
     return None
@@ -384,7 +388,7 @@ def _fold(
 
 def node_of(value: Any) -> Any:
     """The node of a traced column; what is none as it is."""
-    if isinstance(value, Traced):
+    if isinstance(value, TracedColumn):
         return value.node
     return value
 
@@ -400,12 +404,12 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
         return function(TracedFields(Fields(sample), tape)), tape
 
 
-def sample_of(batch: Batch, group: Group) -> Batch:
+def make_sample(batch: Batch, group: LayoutRows) -> Batch:
     """The first frame of a group of a batch, twice, as a batch to trace functions on: enough to
     tell what all packets share.
     """
     return batch.of(
-        Group(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]]))
+        LayoutRows(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]]))
     )
 
 
@@ -537,17 +541,17 @@ class HeaderFunction:
     def __call__(self, batch: Batch) -> list[NDArray[np.int64]]:
         """The integers of each term, (n,) or (1,)."""
         table = batch.table
-        if not self._is_tried and isinstance(table, Rows):
-            self._is_tried, self._terms = True, self._apart(batch, table)
+        if not self._is_tried and isinstance(table, CompiledTable):
+            self._is_tried, self._terms = True, self._split_terms(batch, table)
         if self._terms is None:  # only the function itself can tell
             return [
                 self._made(term, len(batch)) for term in _several(self._function(Fields(batch)))
             ]
         return [term(table) for term in self._terms]
 
-    def _apart(self, batch: Batch, table: Rows) -> list[_ResultPart] | None:
+    def _split_terms(self, batch: Batch, table: CompiledTable) -> list[_ResultPart] | None:
         try:
-            traced, _ = trace(self._function, sample_of(batch, table.groups[0]))
+            traced, _ = trace(self._function, make_sample(batch, table.groups[0]))
             return [
                 _ResultPart(Expression.of(term.node, table.schema), self._made)
                 for term in _several(traced)
@@ -616,14 +620,14 @@ def header_function(function: Callable[[Any], Any], schema: Schema, made: Made) 
     return HeaderFunction(function, made)
 
 
-def conjuncts(node: Node) -> Iterator[Node]:
+def split_condition(node: Node) -> Iterator[Node]:
     """The conditions that have to hold together for a condition to hold."""
     both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
     if both and all(
         isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args
     ):
         for arg in node.args:
-            yield from conjuncts(arg)
+            yield from split_condition(arg)
     else:
         yield node
 
@@ -683,17 +687,17 @@ def is_nan_where(node: Node) -> bool:
     return isinstance(node.args[2], Node) and bool(np.isnan(node.args[1]).all())
 
 
-def key(node: Node) -> tuple[Any, ...]:
+def make_key(node: Node) -> tuple[Any, ...]:
     """Return a key that is equal for equal expressions of one field."""
     if node.kind == "field":
         return ("field", node.path)
     return (
         node.function,
-        *(key(arg) if isinstance(arg, Node) else np.asarray(arg).item() for arg in node.args),
+        *(make_key(arg) if isinstance(arg, Node) else np.asarray(arg).item() for arg in node.args),
     )
 
 
-def terms(value: Any, width: int) -> list[Term]:
+def split_sum(value: Any, width: int) -> list[Term]:
     """An expression as a sum."""
     if not isinstance(value, Node):
         return [Term(np.asarray(value, np.float64))]
@@ -703,18 +707,20 @@ def terms(value: Any, width: int) -> list[Term]:
     args = value.args
     if value.kind == "call" and only_field(value) is None:
         if function in FACTORS:
-            return _scale(value, terms(args[0], width), FACTORS[function])
+            return _scale(value, split_sum(args[0], width), FACTORS[function])
         if function in (np.add, np.subtract):
             sign = 1.0 if function is np.add else -1.0
-            return terms(args[0], width) + [term.times(sign) for term in terms(args[1], width)]
+            return split_sum(args[0], width) + [
+                term.times(sign) for term in split_sum(args[1], width)
+            ]
         if function in (np.multiply, np.true_divide) and not isinstance(args[1], Node):
             if function is np.multiply:
                 factor = np.asarray(args[1], np.float64)
             else:
                 factor = 1 / np.asarray(args[1], np.float64)
-            return _scale(value, terms(args[0], width), factor)
+            return _scale(value, split_sum(args[0], width), factor)
         if function is np.multiply and not isinstance(args[0], Node):
-            return _scale(value, terms(args[1], width), np.asarray(args[0], np.float64))
+            return _scale(value, split_sum(args[1], width), np.asarray(args[0], np.float64))
     return [Term(np.ones(()), full=value)]
 
 

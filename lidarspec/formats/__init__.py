@@ -41,7 +41,7 @@ from lidarspec.errors import (
 from lidarspec.formats.arrays import NPY, NPZ, ZARR
 from lidarspec.formats.arrow_tables import ARROW, FEATHER, PARQUET
 from lidarspec.formats.bags import BAG, DB3, MCAP, ROSBAG2
-from lidarspec.formats.common import replacing
+from lidarspec.formats.common import replace_file
 from lidarspec.formats.e57 import E57
 from lidarspec.formats.foxglove import FOXGLOVE
 from lidarspec.formats.las import LAS, LAZ
@@ -89,10 +89,14 @@ def format_of(path: str | Path) -> Format:
     Raises:
         UnknownFormat: with a suggestion.
     """
-    return _longest(path, BUILT_IN) or _longest(path, known := formats()) or _unknown(path, known)
+    return (
+        _find_by_suffix(path, BUILT_IN)
+        or _find_by_suffix(path, known := formats())
+        or _unknown_format_error(path, known)
+    )
 
 
-def _longest(path: str | Path, known: Mapping[str, Format]) -> Format | None:
+def _find_by_suffix(path: str | Path, known: Mapping[str, Format]) -> Format | None:
     """Return the format with the longest suffix of a name, such as .csv.gz."""
     name = Path(path).name.lower()
     return max(
@@ -102,7 +106,7 @@ def _longest(path: str | Path, known: Mapping[str, Format]) -> Format | None:
     )
 
 
-def _unknown(path: str | Path, known: Mapping[str, Format]) -> NoReturn:
+def _unknown_format_error(path: str | Path, known: Mapping[str, Format]) -> NoReturn:
     raise UnknownFormat(Path(path).suffix or str(path), known, place=str(path))
 
 
@@ -117,15 +121,15 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
     """
     path = Path(path)
     known = {format.suffix: format for format in (CSV, NPZ)}
-    chosen = _longest(path, known) or _unknown(path, known)
-    with replacing(path) as part:
+    chosen = _find_by_suffix(path, known) or _unknown_format_error(path, known)
+    with replace_file(path) as part:
         if chosen is CSV:
             write_columns(part, samples.columns)
         else:
             np.savez(part, **samples.columns)  # type: ignore[arg-type]  # no column is called allow_pickle
 
 
-def targets(path: str | Path) -> list[str]:
+def find_existing(path: str | Path) -> list[str]:
     """Return the existing files that `write` may replace.
 
     For a path without placeholders, it is that path, existing or not.
@@ -182,8 +186,8 @@ def write(
         every_point = True
         if is_alone:
             chosen = dataclasses.replace(chosen, write=partial(chosen.write, organized=True))
-    for target, held in _each(path, scans) if PLACE.search(str(path)) else [(path, scans)]:
-        with replacing(target) as part:
+    for target, held in _iter_files(path, scans) if PLACE.search(str(path)) else [(path, scans)]:
+        with replace_file(target) as part:
             chosen.write(part, held, every_point=every_point, **beside)
 
 
@@ -224,7 +228,7 @@ def _iter_organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterat
         yield scan
 
 
-def _each(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Scan]]]:
+def _iter_files(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Scan]]]:
     """Yield each file, and the scans for it."""
     begun = set[str]()
     for name, group in itertools.groupby(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from lidarspec.formats.common import Spool, picture, select_points
+from lidarspec.formats.common import ColumnSpool, select_points, to_image
 from lidarspec.formats.point_rows import NAMES, PointRows, write_rows
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import units_of
@@ -36,7 +36,9 @@ OF_SCANS: dict[str, tuple[DTypeLike, str]] = {
 }
 
 
-def put(archive: zipfile.ZipFile, name: str, column: Spool, height: int | None = None) -> None:
+def write_array(
+    archive: zipfile.ZipFile, name: str, column: ColumnSpool, height: int | None = None
+) -> None:
     """Add a column to an archive as a NumPy array.
 
     Args:
@@ -59,8 +61,8 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
     height: int | None = None
     with contextlib.ExitStack() as files:
 
-        def column(dtype: DTypeLike) -> Spool:
-            return files.enter_context(contextlib.closing(Spool(path.parent, dtype)))
+        def column(dtype: DTypeLike) -> ColumnSpool:
+            return files.enter_context(contextlib.closing(ColumnSpool(path.parent, dtype)))
 
         of_scans = {
             "stamp_ns": column(np.int64),
@@ -68,14 +70,14 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
             "complete": column(np.bool_),
         }
         numbers = column(np.int32)
-        columns = dict[str, Spool]()
+        columns = dict[str, ColumnSpool]()
         units = dict[str, str]()
         for number, scan in enumerate(scans):
             cloud = select_points(scan, every_point=every_point)
             own = cloud.columns
             if organized:
-                height = len(picture(cloud.valid, cloud))
-                own = {name: picture(column, cloud).ravel() for name, column in own.items()}
+                height = len(to_image(cloud.valid, cloud))
+                own = {name: to_image(column, cloud).ravel() for name, column in own.items()}
             if not number:
                 columns = {name: column(values.dtype) for name, values in own.items()}
             if not number:
@@ -91,9 +93,9 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
             kept.add(np.array([unit]))
         with zipfile.ZipFile(path, "w") as archive:
             for name, kept in {**columns, "scan": numbers}.items():
-                put(archive, name, kept, height)
+                write_array(archive, name, kept, height)
             for name, kept in {**of_scans, **unit_columns}.items():
-                put(archive, name, kept)
+                write_array(archive, name, kept)
 
 
 def write_npy(

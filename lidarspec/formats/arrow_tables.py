@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarspec.formats.common import behind, select_points
+from lidarspec.formats.common import select_points, write_in_thread
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import PointCloud, units_of
 from lidarspec.points.table_types import arrow_schema
@@ -39,14 +39,16 @@ def _write(
     `sensor`, `source` (the facts about its format), `frame` (the directions of x, y and z), `units`
     as JSON, and `calibration`: "nominal" or "own".
     """
-    made = tables(scans, path, every_point=every_point)
+    made = iter_tables(scans, path, every_point=every_point)
     first = next(made)
-    with open_writer(path, first.schema) as writer, behind(writer.write_table) as write:
+    with open_writer(path, first.schema) as writer, write_in_thread(writer.write_table) as write:
         for table in itertools.chain([first], made):
             write(table)
 
 
-def tables(scans: Iterable[Scan], path: Path | None = None, *, every_point: bool) -> Iterator[Any]:
+def iter_tables(
+    scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
+) -> Iterator[Any]:
     """Yield the points of scans as tables of at least `ROWS` rows, and at least one.
 
     Args:

@@ -17,9 +17,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from lidarspec.formats.messages import CLOUD, SCAN, Message, Messages
+from lidarspec.formats.messages import CLOUD, SCAN, RosMessage, RosMessages
 from lidarspec.optional_libraries import import_library
-from lidarspec.scans.beams import Planes
+from lidarspec.scans.beams import PlanarScans
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Format
 from lidarspec.transports.robotics_logs import RAW
@@ -42,14 +42,14 @@ class BagWriter:
     """
 
     def __init__(self, release: str) -> None:
-        self._messages = Messages(release)
-        self._planes = Planes()
+        self._messages = RosMessages(release)
+        self._planes = PlanarScans()
         self.types = self._messages.types
         self.units = dict[str, str]()
 
     def messages(
         self, scans: Iterable[Scan], packets: Iterable[Chunk], *, every_point: bool
-    ) -> Iterator[Message]:
+    ) -> Iterator[RosMessage]:
         """Yield the messages of scans and packets, merged by time if both are in order.
 
         Raises:
@@ -61,11 +61,11 @@ class BagWriter:
             key=attrgetter("at"),
         )
 
-    def _of_scans(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[Message]:
+    def _of_scans(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[RosMessage]:
         for number, scan in enumerate(scans):
             self.units |= {name: unit for name, unit in scan.points.units.items() if unit}
             yield self._messages.cloud(scan, scan.stamp_ns, every_point=every_point, number=number)
-            if (planar := self._planes.scan(scan)) is not None:
+            if (planar := self._planes.project(scan)) is not None:
                 yield self._messages.laserscan(
                     scan, planar, planar.stamp_ns, number=number
                 )._replace(at=scan.stamp_ns)
@@ -136,7 +136,7 @@ def write_ros2(
         (bag if storage == "mcap" else bag / "scans.db3").rename(path)
 
 
-def _record(log: Any, held: BagWriter, every: Iterable[Message]) -> None:
+def _record(log: Any, held: BagWriter, every: Iterable[RosMessage]) -> None:
     """Write messages with a writer of rosbags."""
     connections = dict[str, Any]()
     with log:

@@ -25,7 +25,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import SourceError, UsageError, suggest, system_errors
 from lidarspec.points.cloud import COLUMNS, PointCloud
-from lidarspec.remote_files import take_away
+from lidarspec.remote_files import remove
 from lidarspec.scans.scan import Scan
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
@@ -41,7 +41,7 @@ _Piece = TypeVar("_Piece")
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replace_file(path: Path) -> Iterator[Path]:
     """Yield a path to write to; it replaces a file or folder when the block ends.
 
     If the block fails, the new file is removed.
@@ -55,17 +55,17 @@ def replacing(path: Path) -> Iterator[Path]:
     part = path_while_written(path)
     try:
         with contextlib.suppress(SourceError):
-            take_away(part)
+            remove(part)
         with system_errors(path):
             path.parent.stat()  # a missing folder is reported before anything is made
             yield part
             if path.is_dir() and part.is_dir():
                 refuse_foreign_files(path)
-                take_away(path)
+                remove(path)
             os.replace(part, path)
     finally:
         with contextlib.suppress(SourceError):
-            take_away(part)
+            remove(part)
 
 
 def refuse_foreign_files(folder: Path) -> None:
@@ -87,7 +87,7 @@ def refuse_foreign_files(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def behind(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
+def write_in_thread(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
     """Yield a function that writes pieces in a thread, while the next piece is made.
 
     At the end everything is written. An error is raised with the next piece, or at the end.
@@ -122,7 +122,9 @@ def find_points(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | N
     return np.flatnonzero(cloud.valid)
 
 
-def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[str, NDArray[Any]]:
+def select_columns(
+    scan: Scan, names: Iterable[str], *, every_point: bool
+) -> dict[str, NDArray[Any]]:
     """Return the requested columns that a scan has, for the points to write.
 
     "valid" and additional columns may be requested too.
@@ -142,7 +144,7 @@ def columns_of(scan: Scan, names: Iterable[str], *, every_point: bool) -> dict[s
     }
 
 
-def picture(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
+def to_image(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
     """Return values of organized points, (n,), as (rows, columns).
 
     There is a row for each ring; several returns are side by side.
@@ -158,7 +160,7 @@ def picture(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
     return values.reshape(-1, height, returns).swapaxes(0, 1).reshape(height, -1)
 
 
-class Spool:
+class ColumnSpool:
     """The values of one column in an unnamed file in the folder of the target."""
 
     def __init__(self, folder: Path, dtype: DTypeLike) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.common import GPS_EPOCH, columns_of
+from lidarspec.formats.common import GPS_EPOCH, select_columns
 from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
@@ -69,7 +69,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             files.callback(file.image_file.cancel)
             file.image_file.extensionsAdd(PREFIX, EXTENSION)
             for number, scan in enumerate(scans):
-                own = columns_of(scan, (*NAMES, *scan.points.extra), every_point=every_point)
+                own = select_columns(scan, (*NAMES, *scan.points.extra), every_point=every_point)
                 _add(libe57, file, _header(number, scan), _columns(own))
             file.close()
         except libe57.E57Exception as error:  # it omits the text of system errors

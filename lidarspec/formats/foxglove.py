@@ -13,10 +13,10 @@ from typing import Any
 
 from lidarspec.errors import UsageError
 from lidarspec.formats.bags import CHUNK, TOPICS
-from lidarspec.formats.messages import CLOUD, SCAN, fields_of, records
+from lidarspec.formats.messages import CLOUD, SCAN, describe_fields, make_records
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import PointCloud
-from lidarspec.scans.beams import Planes
+from lidarspec.scans.beams import PlanarScans
 from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
@@ -33,7 +33,7 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
     """
     mcap = import_library("mcap.writer", "foxglove")
     support = import_library("mcap_protobuf.writer", "foxglove")
-    planes = Planes()
+    planes = PlanarScans()
     units = dict[str, str]()
     with path.open("wb") as file:
         log = support.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
@@ -42,7 +42,7 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
                 raise UsageError(f"a scan at {scan.stamp_ns} ns: logs begin in 1970")
             units |= {name: unit for name, unit in scan.points.units.items() if unit}
             messages = {TOPICS[CLOUD]: _cloud(scan.points, every_point=every_point)}
-            if (planar := planes.scan(scan)) is not None:
+            if (planar := planes.project(scan)) is not None:
                 messages[TOPICS[SCAN]] = _planar(
                     planar, is_graded=scan.points.intensity is not None
                 )
@@ -57,10 +57,10 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
 
 
 def _cloud(cloud: PointCloud, *, every_point: bool) -> Any:
-    points = records(cloud, every_point=every_point)
+    points = make_records(cloud, every_point=every_point)
     fields = [
         {"name": name, "offset": offset, "type": FIELD_TYPES[kind]}
-        for name, offset, kind in fields_of(cloud, points)
+        for name, offset, kind in describe_fields(cloud, points)
     ]
     message = import_library("foxglove_schemas_protobuf.PointCloud_pb2", "foxglove").PointCloud
     return message(point_stride=points.itemsize, fields=fields, data=points.tobytes())

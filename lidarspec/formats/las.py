@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
-from lidarspec.formats.common import GPS_EPOCH, behind, columns_of
+from lidarspec.formats.common import GPS_EPOCH, select_columns, write_in_thread
 from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
@@ -67,7 +67,9 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
             closefd=False,
         )
         for number, scan in enumerate(scans):
-            own = columns_of(scan, (*PLACED, *EXTRA, *scan.points.extra), every_point=every_point)
+            own = select_columns(
+                scan, (*PLACED, *EXTRA, *scan.points.extra), every_point=every_point
+            )
             own["scan"] = np.full(len(own["x"]), number, np.uint32)
             if writer is None:
                 further = _describe(laspy, header, own, scan)
@@ -75,7 +77,7 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_compresse
                     np.zeros((2, ROWS), header.point_format.dtype())
                 )  # one is filled while the other is written
                 writer = files.enter_context(opened())
-                write = files.enter_context(behind(writer.write_points))
+                write = files.enter_context(write_in_thread(writer.write_points))
             own["returns"] = _returns(own)
             own["time"] = own.get("time", np.zeros(len(own["x"]))) + (scan.stamp_ns - EPOCH) * 1e-9
             for start in range(0, len(own["x"]), ROWS):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
-from lidarspec.formats.common import picture
+from lidarspec.formats.common import to_image
 from lidarspec.optional_libraries import import_library
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
@@ -28,7 +28,7 @@ FIELD_TYPES = {"i1": 1, "u1": 2, "b1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f
 _SECOND = 1_000_000_000
 
 
-class Message(NamedTuple):
+class RosMessage(NamedTuple):
     """A serialized message: its type, its time in ns, its bytes."""
 
     kind: str
@@ -36,7 +36,7 @@ class Message(NamedTuple):
     data: memoryview
 
 
-class Messages:
+class RosMessages:
     """Makes messages.
 
     Args:
@@ -57,7 +57,7 @@ class Messages:
             self._serialized = self.types.serialize_cdr
         self._counts = release.startswith("ROS1")
 
-    def raw(self, packet: Chunk, *, datagram: bool = True) -> Message:
+    def raw(self, packet: Chunk, *, datagram: bool = True) -> RosMessage:
         """Return a raw packet as a message, which `transports.robotics_logs` reads again.
 
         Args:
@@ -74,7 +74,7 @@ class Messages:
             RAW, at, layout=layout, data=np.frombuffer(STAMP.pack(at) + packet.data, np.uint8)
         )
 
-    def cloud(self, scan: Scan, at: int, *, every_point: bool, number: int = 0) -> Message:
+    def cloud(self, scan: Scan, at: int, *, every_point: bool, number: int = 0) -> RosMessage:
         """Return the points of a scan.
 
         Organized points have the sensor's rows, with several returns side by side. Others, and
@@ -86,15 +86,16 @@ class Messages:
             number: of the scan, for messages of ROS 1.
         """
         cloud = scan.points
-        points = records(cloud, every_point=every_point)
+        points = make_records(cloud, every_point=every_point)
         fields = [
-            (name, offset, FIELD_TYPES[kind]) for name, offset, kind in fields_of(cloud, points)
+            (name, offset, FIELD_TYPES[kind])
+            for name, offset, kind in describe_fields(cloud, points)
         ]
         points = points.view(
             np.dtype((np.void, points.itemsize))
         )  # copied as a whole, because a copy of records skips the padding between fields
         if every_point and cloud.shape and len(cloud):
-            points = picture(points, cloud)
+            points = to_image(points, cloud)
         height, width = np.atleast_2d(points).shape
         field = self.types.types["sensor_msgs/msg/PointField"]
         return self._message(
@@ -111,7 +112,7 @@ class Messages:
             is_dense=not every_point or bool(cloud.valid.all()),
         )
 
-    def laserscan(self, scan: Scan, planar: LaserScan, at: int, *, number: int = 0) -> Message:
+    def laserscan(self, scan: Scan, planar: LaserScan, at: int, *, number: int = 0) -> RosMessage:
         """Return a planar scan on a grid of angles; arguments as for `cloud`."""
         names = self.types.types[SCAN].__dataclass_fields__
         values = {name: getattr(planar, name) for name in names if hasattr(planar, name)}
@@ -119,7 +120,7 @@ class Messages:
             values["intensities"] = np.empty(0, np.float32)
         return self._message(SCAN, at, **values, header=self._header(number, at, scan.frame_id))
 
-    def imu(self, felt: ImuSamples, index: int, at: int, frame_id: str) -> Message:
+    def imu(self, samples: ImuSamples, index: int, at: int, frame_id: str) -> RosMessage:
         """Return one IMU sample, by REP-145.
 
         The first covariance is -1 for a quantity that is not measured, and 0 for one with unknown
@@ -128,7 +129,7 @@ class Messages:
         vector = self.types.types["geometry_msgs/msg/Vector3"]
         values: dict[str, Any] = {}
         for name in ("angular_velocity", "linear_acceleration"):
-            measured = getattr(felt, name)[index]
+            measured = getattr(samples, name)[index]
             known = bool(np.isfinite(measured).all())
             values |= {
                 name: vector(*np.where(known, measured, 0.0).tolist()),
@@ -138,8 +139,8 @@ class Messages:
         turned = {"orientation": upright, "orientation_covariance": _covariance(known=False)}
         return self._message(IMU, at, header=self._header(0, at, frame_id), **turned, **values)
 
-    def _message(self, name: str, at: int, **values: Any) -> Message:
-        return Message(name, at, self._serialized(self.types.types[name](**values), name))
+    def _message(self, name: str, at: int, **values: Any) -> RosMessage:
+        return RosMessage(name, at, self._serialized(self.types.types[name](**values), name))
 
     def _header(self, number: int, stamp_ns: int, frame_id: str) -> Any:
         counted = {"seq": number} if self._counts else {}
@@ -161,7 +162,7 @@ def _covariance(*, known: bool) -> NDArray[np.float64]:
     return values
 
 
-def fields_of(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, str]]:
+def describe_fields(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, str]]:
     """Return name, offset and type ("f4") of each field of a cloud's records.
 
     Columns that the cloud lacks are omitted.
@@ -178,7 +179,7 @@ def fields_of(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, int, s
     ]
 
 
-def records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
+def make_records(cloud: PointCloud, *, every_point: bool) -> NDArray[Any]:
     """Return the points to write in PCL's layout, in types that messages support."""
     points = cloud.to_structured()
     if not every_point:

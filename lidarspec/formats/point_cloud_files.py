@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, suggest
-from lidarspec.formats.common import Spool
-from lidarspec.formats.point_rows import PointRows, room, write_rows
+from lidarspec.formats.common import ColumnSpool
+from lidarspec.formats.point_rows import PointRows, pad_header, write_rows
 from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
@@ -60,7 +60,7 @@ def write_lzf_pcd(
     with contextlib.ExitStack() as files, path.open("wb") as target:
         names = rows.dtype.names or ()
         fields = {
-            name: files.enter_context(contextlib.closing(Spool(path.parent, np.uint8)))
+            name: files.enter_context(contextlib.closing(ColumnSpool(path.parent, np.uint8)))
             for name in names
         }
         for block in rows:
@@ -107,7 +107,7 @@ def _pcd_header(rows: PointRows, data: str = "binary") -> bytes:
     width, height = rows.shape or (rows.length, 1)
     types = [rows.dtype[name] for name in rows.dtype.names or ()]
     lines = [
-        "# .PCD v0.7 - Point Cloud Data file format" + room(width, rows.length),
+        "# .PCD v0.7 - Point Cloud Data file format" + pad_header(width, rows.length),
         *(f"# {fact}" for fact in rows.facts),
         "VERSION 0.7",
         f"FIELDS {' '.join(rows.dtype.names or ())}",
@@ -141,7 +141,10 @@ def _ply_header(rows: PointRows) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *(f"comment {fact}" for fact in ["made by lidarspec" + room(rows.length), *rows.facts]),
+        *(
+            f"comment {fact}"
+            for fact in ["made by lidarspec" + pad_header(rows.length), *rows.facts]
+        ),
         f"element vertex {rows.length}",
         *(
             f"property {_PLY_NAMES[rows.dtype[name].str[1:]]} {name}"

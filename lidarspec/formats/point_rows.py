@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.common import behind, columns_of, picture
+from lidarspec.formats.common import select_columns, to_image, write_in_thread
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.table_types import STRUCTURED
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.stream import handed_out
+from lidarspec.scans.stream import release_yielded
 
 #: the first columns of a row; additional columns follow.
 NAMES = STRUCTURED.names or ()
@@ -70,12 +70,12 @@ class PointRows:
                 for name, column in columns.items()
             }
             if is_picture and every_point and len(first) == 1 and cloud.shape:
-                height, width = picture(np.empty(len(cloud), np.bool_), cloud).shape
+                height, width = to_image(np.empty(len(cloud), np.bool_), cloud).shape
                 self.shape = width, height
             units = [f"unit {name} {unit}" for name, unit in cloud.units.items() if unit]
             self.facts = [f"sensor {first[0].sensor.id}", f"stamp_ns {cloud.stamp_ns}", *units]
         self.dtype = layout(types)
-        self._scans = itertools.chain(handed_out(first), scans)
+        self._scans = itertools.chain(release_yielded(first), scans)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         return itertools.starmap(self.fill, self.parts())
@@ -92,7 +92,7 @@ class PointRows:
             rows[name] = column
         self.length += len(rows)
         if self.shape:
-            return picture(rows, points).reshape(-1)
+            return to_image(rows, points).reshape(-1)
         return rows
 
     def _columns(self, scan: Scan, number: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
@@ -100,7 +100,7 @@ class PointRows:
 
         The column "scan" has the number of the scan.
         """
-        columns = columns_of(scan, names, every_point=self._every_point)
+        columns = select_columns(scan, names, every_point=self._every_point)
         return columns | (
             {"scan": np.full(len(columns["x"]), number, np.int32)} if "scan" in names else {}
         )
@@ -120,13 +120,13 @@ def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]
             for start in range(0, len(data), PIECE):
                 file.write(data[start : start + PIECE])
 
-        with behind(append) as write:
+        with write_in_thread(append) as write:
             for part in rows.parts():
                 write(part)
         file.seek(0)
         file.write(header(rows))
 
 
-def room(*numbers: int) -> str:
+def pad_header(*numbers: int) -> str:
     """Return spaces that make the length of a header independent of these numbers."""
     return " " * sum(FIGURES - len(str(number)) for number in numbers)

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.common import columns_of
+from lidarspec.formats.common import select_columns
 from lidarspec.optional_libraries import import_library
-from lidarspec.points.appearance import STEPS, Look, look, steps
+from lidarspec.points.appearance import STEPS, CloudAppearance, choose_appearance, ramp_indices
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp
 from lidarspec.scans.scan import Scan
@@ -62,7 +62,7 @@ class RerunRecording:
         self._number = 0
         self._home = ""
         self._waiting = 0
-        self._copy: _Copy | None = None
+        self._copy: _PipeCopy | None = None
 
     def __enter__(self) -> RerunRecording:
         return self
@@ -93,7 +93,7 @@ class RerunRecording:
             with _translate_errors():
                 self.stream.save(path)
             return
-        self._copy = _Copy(path)
+        self._copy = _PipeCopy(path)
         self._copy.start()
         with _translate_errors(), os.fdopen(self._copy.end, "wb"):
             self.stream.save(f"/dev/fd/{self._copy.end}")
@@ -119,7 +119,7 @@ class RerunRecording:
             "time",
             *scan.points.extra,
         )
-        columns = columns_of(scan, names, every_point=every_point)
+        columns = select_columns(scan, names, every_point=every_point)
         places = np.stack([columns.pop(name) for name in "xyz"], axis=-1)
         if every_point:
             shown = scan.points
@@ -217,7 +217,7 @@ class RerunRecording:
         )
 
 
-class _Copy(threading.Thread):
+class _PipeCopy(threading.Thread):
     """Copies the output of the Rerun SDK from a pipe to a file.
 
     If a disk is full, the SDK may wait forever for its own file.
@@ -262,15 +262,15 @@ class _Colours:
     """The colours of points, on the scale of the first cloud."""
 
     def __init__(self) -> None:
-        self._look: Look | None = None
+        self._look: CloudAppearance | None = None
 
     def __call__(self, cloud: PointCloud, ramp: str) -> NDArray[np.uint8]:
         """Return the colours of points, (n, 3): red, green and blue."""
-        shown = self._look or look(cloud, ramp=ramp)
+        shown = self._look or choose_appearance(cloud, ramp=ramp)
         if len(cloud):  # an empty cloud has no scale
             self._look = shown
         colours = np.array(make_ramp("dark", STEPS), np.uint8)  # the viewer is dark
-        return colours[steps(cloud, shown)]
+        return colours[ramp_indices(cloud, shown)]
 
 
 def write_rerun(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.common import behind, find_points, select_points
+from lidarspec.formats.common import find_points, select_points, write_in_thread
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
@@ -44,7 +44,7 @@ def text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str]
         if is_zipped:
             file = files.enter_context(gzip.GzipFile("", "wb", _LEVEL, file, mtime=0))
         text = files.enter_context(io.TextIOWrapper(file, encoding="ascii", newline=""))
-        yield files.enter_context(behind(text.write))
+        yield files.enter_context(write_in_thread(text.write))
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bool = False) -> None:

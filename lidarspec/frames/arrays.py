@@ -28,11 +28,11 @@ def repeat(value: int, *shape: int) -> NDArray[np.int64]:
     return np.ndarray(shape, np.int64, memory, 0, (0,) * len(shape))
 
 
-def some(
+def select_values(
     values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice
 ) -> NDArray[np.int64]:
     """The values, (k,), that a mask, indices or a slice pick; equal ones stay `repeat`."""
-    value = alike(values)
+    value = broadcast_value(values)
     if value is None or isinstance(which, slice):
         return values[which]
     return repeat(value, int(np.count_nonzero(which)) if which.dtype == np.bool_ else len(which))
@@ -60,14 +60,14 @@ def _numbers() -> NDArray[np.int64]:
     return found
 
 
-def alike(values: NDArray[np.int64]) -> int | None:
+def broadcast_value(values: NDArray[np.int64]) -> int | None:
     """Return the value of a zero-stride array, as from `repeat`, else None."""
     if values.strides == (0,) and len(values):
         return values.item(0)
     return None
 
 
-def by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:
+def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:
     """Return each different value, ascending, with the indices of its occurrences.
 
     The indices are ascending, (k,).
@@ -117,7 +117,7 @@ def keep_freed_memory() -> None:
     np.empty(KEPT, np.uint8)
 
 
-def deep(array: NDArray[Any], depth: int) -> NDArray[Any]:
+def add_axes(array: NDArray[Any], depth: int) -> NDArray[Any]:
     """Return values of packets, (n, ...), with `depth` axes behind the first.
 
     Additional axes have length 1.

@@ -16,8 +16,8 @@ from lidarspec.errors import (
     UsageError,
     struct_error,
 )
-from lidarspec.frames.compilability import NotCompilable
-from lidarspec.frames.encode import encode, fill_counts, known_paths
+from lidarspec.frames.compilability import NotCompilableError
+from lidarspec.frames.encode import encode, fill_counts, list_paths
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import build_plain
 from lidarspec.frames.schema import Schema, schema
@@ -51,10 +51,10 @@ def build(
         raise UsageError(f"{sensor.id} {frame}: fields come by name, not as {type(value).__name__}")
     declared = sensor.frames[frame]
     place = f"{sensor.id} {frame}"
-    checker = _Values(schema(declared.tree), known_paths(declared.tree), place, units=units)
+    checker = _Values(schema(declared.tree), list_paths(declared.tree), place, units=units)
     given = checker.check({**(value or {}), **values}, "")
     layouts = frame_layouts(declared)
-    if isinstance(layouts, NotCompilable):
+    if isinstance(layouts, NotCompilableError):
         fill_counts(given, schema(declared.tree))
         return build_plain(declared, given, place)
     try:

@@ -18,7 +18,7 @@ from lidarspec.errors import (
     UsageError,
 )
 from lidarspec.frames.build import build
-from lidarspec.frames.field_paths import put, steps
+from lidarspec.frames.field_paths import put_value, split_path
 from lidarspec.frames.schema import schema
 from lidarspec.spec.arguments import Address, Count, Filled, Range, Taken
 from lidarspec.spec.sensor import SensorDescription
@@ -49,24 +49,24 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
     values: Any = {}
     for path, value in command.values.items():
         if path in command.filled:
-            filled = _found_out(sensor, name, path, value, arguments.get(path))
+            filled = _find_out_value(sensor, name, path, value, arguments.get(path))
         else:
             filled = copy.deepcopy(value)
-        values = put(values, steps(path), filled)
+        values = put_value(values, split_path(path), filled)
     for argument, declared in command.arguments.items():
         slot = argument_slot(sensor, name, argument)
         if argument not in arguments:
             raise MissingField(argument, place=place)
-        values = put(
+        values = put_value(
             values,
-            steps(declared.path),
+            split_path(declared.path),
             raw_argument(slot, declared.kind, arguments[argument], argument, place),
         )
     return build(sensor, command.frame, None, values)
 
 
 @dataclass(frozen=True)
-class Slot:
+class ArgumentSlot:
     """The destination of an argument.
 
     `room` is the number of bytes, or of numbers in an array. It is None if it varies.
@@ -77,7 +77,7 @@ class Slot:
     is_array: bool = False
 
 
-def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Slot:
+def argument_slot(sensor: SensorDescription, name: str, argument: str) -> ArgumentSlot:
     """Return the place of a command argument in its frame.
 
     Raises:
@@ -104,9 +104,9 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Slot:
     return slot
 
 
-def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> Slot:
+def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> ArgumentSlot:
     frame = sensor.commands[name].frame or ""
-    names = steps(path)
+    names = split_path(path)
     table = schema(sensor.frames[frame].tree) if frame else None
     if table is not None:
         info = table.all_fields.get(".".join(step for step in names if isinstance(step, str)))
@@ -147,10 +147,12 @@ def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> Slot:
         room = info.bits // 8
     else:
         room = None
-    return Slot(info, room if isinstance(room, int) else None, bool(left) and info.kind != "bytes")
+    return ArgumentSlot(
+        info, room if isinstance(room, int) else None, bool(left) and info.kind != "bytes"
+    )
 
 
-def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str) -> Any:
+def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, place: str) -> Any:
     """The raw value of a field that an argument stands for.
 
     Raises:
@@ -178,7 +180,7 @@ def raw_argument(slot: Slot, kind: Taken, value: Any, argument: str, place: str)
     return _to_raw_value(slot, data)
 
 
-def _to_raw_value(slot: Slot, data: bytes) -> Any:
+def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
     """Return bytes as the raw value of a field.
 
     The field is plain bytes, an array of numbers, or one number in network order.
@@ -190,7 +192,9 @@ def _to_raw_value(slot: Slot, data: bytes) -> Any:
     return int.from_bytes(data, "big")
 
 
-def _found_out(sensor: SensorDescription, name: str, path: str, value: Filled, given: Any) -> Any:
+def _find_out_value(
+    sensor: SensorDescription, name: str, path: str, value: Filled, given: Any
+) -> Any:
     """Return a value that is known only when a command is sent.
 
     If it is not given, the first number is used, or an address of zeros.

@@ -10,7 +10,7 @@ from lidarspec.frames.schema import schema
 from lidarspec.spec import tree
 
 
-class NotCompilable(Exception):
+class NotCompilableError(Exception):
     """A part of a struct that has no computable place; attributes `path` and `reason`."""
 
     def __init__(self, path: str, reason: str) -> None:
@@ -20,7 +20,7 @@ class NotCompilable(Exception):
 
 
 def check_compilable(root: tree.Node) -> None:
-    """Raise `NotCompilable` if a tree has a part without a computable place.
+    """Raise `NotCompilableError` if a tree has a part without a computable place.
 
     It is also raised for values that no column can hold.
     """
@@ -31,17 +31,17 @@ def check_compilable(root: tree.Node) -> None:
 def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
     match node:
         case tree.Opaque():
-            raise NotCompilable(node.info.path, node.reason)
+            raise NotCompilableError(node.info.path, node.reason)
         case tree.Sealed():
             if in_array:
-                raise NotCompilable(path, "a checksum inside an array")
+                raise NotCompilableError(path, "a checksum inside an array")
             _ = node.algorithm
         case tree.PartSequence() if in_array:
-            raise NotCompilable(path, "parts inside an array")
+            raise NotCompilableError(path, "parts inside an array")
         case tree.Block():
             for part in node.parts:
                 if len(part.indices) > 1:
-                    raise NotCompilable(part.info.path, "an array of arrays of bits")
+                    raise NotCompilableError(part.info.path, "an array of arrays of bits")
     for formula in tree.formulas(node):
         _check_traced(formula)
         for ref in tree.refs(formula):
@@ -64,7 +64,7 @@ def _check(node: tree.Node, path: str, *, in_array: bool) -> None:
 def _check_traced(formula: object) -> None:
     if isinstance(formula, tree.Untraced):
         path, _, reason = formula.reason.partition(": ")
-        raise NotCompilable(path, reason)
+        raise NotCompilableError(path, reason)
 
 
 def _check_part(kind: tree.Kind, path: str) -> None:
@@ -73,27 +73,27 @@ def _check_part(kind: tree.Kind, path: str) -> None:
         for ref in () if kind.following is None else tree.refs(kind.following):
             check_control(ref.info)
         check_compilable(kind.root)
-    except NotCompilable as reason:
-        raise NotCompilable(f"{path}.{reason.path}".rstrip("."), reason.reason) from None
+    except NotCompilableError as reason:
+        raise NotCompilableError(f"{path}.{reason.path}".rstrip("."), reason.reason) from None
 
 
 def _check_columns(root: tree.Node) -> None:
-    """Raise `NotCompilable` if a field of a tree has values that no column holds."""
+    """Raise `NotCompilableError` if a field of a tree has values that no column holds."""
     for info in schema(root).fields.values():
         if info.dtype is None:
             wide = f"its {info.bits} bits are more than a column holds"
-            raise NotCompilable(
+            raise NotCompilableError(
                 info.path,
                 wide if info.bits > 64 else "its values are not all plain numbers of one kind",
             )
 
 
 def check_control(info: tree.FieldInfo) -> None:
-    """Raise `NotCompilable` if a layout cannot be made to depend on a field."""
+    """Raise `NotCompilableError` if a layout cannot be made to depend on a field."""
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
-        raise NotCompilable(
+        raise NotCompilableError(
             info.path,
             "elements of one array differ in layout: Parts(struct, count) reads such in bulk",
         )
     if info.axes or info.kind != "int":
-        raise NotCompilable(info.path, "the layout depends on a field that is not one integer")
+        raise NotCompilableError(info.path, "the layout depends on a field that is not one integer")

@@ -14,8 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Condition, Layout, set_bits
-from lidarspec.frames.layout_tree import HeaderWalk, TooLong, Unknown, Unlike
-from lidarspec.frames.wire_fields import Examined, WireField
+from lidarspec.frames.layout_tree import (
+    HeaderWalk,
+    TooLongError,
+    UnknownPartError,
+    UnknownSelectorError,
+)
+from lidarspec.frames.wire_fields import ExaminedFrame, WireField
 from lidarspec.spec.tree import format_hex, format_values
 
 #: kinds of faults.
@@ -81,7 +86,7 @@ class Fault:
         return f"{where}: {self.path} needs {self.needed} byte{plural}, {left} left"
 
 
-def find_fault(examined: Examined) -> Fault | None:
+def find_fault(examined: ExaminedFrame) -> Fault | None:
     """Return the first fault of a frame; None if it is sound.
 
     Raises:
@@ -95,7 +100,7 @@ def find_fault(examined: Examined) -> Fault | None:
     return min(faults, key=lambda fault: fault.end, default=None)
 
 
-def find_shortage(examined: Examined) -> Fault | None:
+def find_shortage(examined: ExaminedFrame) -> Fault | None:
     """Return why the values of a frame cannot be read at all; None if they can.
 
     Raises:
@@ -107,7 +112,7 @@ def find_shortage(examined: Examined) -> Fault | None:
     return None
 
 
-def _faults(examined: Examined) -> Iterator[Fault]:
+def _faults(examined: ExaminedFrame) -> Iterator[Fault]:
     cut_off: WireField | None = None
     for each in examined.fields():
         if each.raw is None:
@@ -142,7 +147,7 @@ def _fault_of_field(each: WireField) -> Fault | None:
     return None
 
 
-def _faults_of_layout(examined: Examined) -> Iterator[Fault]:
+def _faults_of_layout(examined: ExaminedFrame) -> Iterator[Fault]:
     """Return wrong lengths and broken conditions of a frame that is all there, and of its parts."""
     layout = examined.layout
     if layout is None or layout.size > len(examined.data):
@@ -155,10 +160,10 @@ def _faults_of_layout(examined: Examined) -> Iterator[Fault]:
             yield from _faults_of_layout(part)
         broken = examined.broken_part(axis)
         if broken is not None:
-            yield _misfit(broken)
+            yield _describe_misfit(broken)
 
 
-def _misfit(part: Examined) -> Fault:
+def _describe_misfit(part: ExaminedFrame) -> Fault:
     """Return why a part does not fit the bytes that there are for parts."""
     shortage = find_shortage(part)
     if shortage is not None:
@@ -167,7 +172,9 @@ def _misfit(part: Examined) -> Fault:
     return Fault(LENGTH, part.prefix, part.start, "filled by its parts", None, end)
 
 
-def _wrong_lengths(examined: Examined, layout: Layout, row: NDArray[np.uint8]) -> Iterator[Fault]:
+def _wrong_lengths(
+    examined: ExaminedFrame, layout: Layout, row: NDArray[np.uint8]
+) -> Iterator[Fault]:
     """Return the fields that say how long a part is, and are wrong."""
     if not layout.held:
         return
@@ -185,7 +192,7 @@ def _wrong_lengths(examined: Examined, layout: Layout, row: NDArray[np.uint8]) -
         # Usually the part is measured in the struct around that of its length.
         around = ".".join(leaf.info.path.split(".")[:-2])
         end = examined.start + layout.places.get(around, (0, layout.size))[1]
-        offset = examined.start + leaf.held[0]
+        offset = examined.start + leaf.byte_span[0]
         offset += sum(step * stride for step, stride in zip(indices, leaf.strides, strict=False))
         expected = leaf.load(right)[index].item()
         got = leaf.load(row)[index].item()
@@ -193,7 +200,7 @@ def _wrong_lengths(examined: Examined, layout: Layout, row: NDArray[np.uint8]) -
 
 
 def _broken_conditions(
-    examined: Examined, layout: Layout, row: NDArray[np.uint8]
+    examined: ExaminedFrame, layout: Layout, row: NDArray[np.uint8]
 ) -> Iterator[Fault]:
     for condition in layout.conditions:
         if condition.formula is None:
@@ -201,7 +208,7 @@ def _broken_conditions(
         if layout.meets_condition(condition, row)[0]:
             continue
         leaves = [layout.leaves[info.path] for info in condition.fields]
-        end = examined.start + max((leaf.held[1] for leaf in leaves), default=0)
+        end = examined.start + max((leaf.byte_span[1] for leaf in leaves), default=0)
         path = f"{examined.prefix}.{_first_failure(condition, layout, row)}".strip(".")
         yield Fault(CONDITION, path, end, "a condition that holds", "one that does not", end)
 
@@ -224,7 +231,7 @@ def _with_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> str
     return path
 
 
-def _ending(examined: Examined, cut_off: WireField | None) -> Fault:
+def _ending(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
     """Return why a frame has no end: its bytes end, or its header leads to none.
 
     Raises:
@@ -234,14 +241,14 @@ def _ending(examined: Examined, cut_off: WireField | None) -> Fault:
     if part is not None and part.failure is not None:
         return _ending(part, cut_off)
     failure = examined.failure
-    if failure is None or isinstance(failure, Unknown):
+    if failure is None or isinstance(failure, UnknownSelectorError):
         return _shortage(examined, cut_off)
-    if isinstance(failure, TooLong | Unlike):
+    if isinstance(failure, TooLongError | UnknownPartError):
         return _refusal(examined, failure)
     raise failure
 
 
-def _open_part(examined: Examined) -> Examined | None:
+def _open_part(examined: ExaminedFrame) -> ExaminedFrame | None:
     """Return the last of the parts that have no end; None if there are none."""
     if isinstance(examined.known, HeaderWalk):
         for axis, region in examined.known.open_regions.items():
@@ -250,7 +257,7 @@ def _open_part(examined: Examined) -> Examined | None:
     return None
 
 
-def _shortage(examined: Examined, cut_off: WireField | None) -> Fault:
+def _shortage(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
     end = examined.start + len(examined.data)
     size = None
     if examined.layout is not None and not examined.prefix:
@@ -262,11 +269,11 @@ def _shortage(examined: Examined, cut_off: WireField | None) -> Fault:
     return Fault(CUT_OFF, cut_off.block, cut_off.start, size, end, end, needed, is_bounded)
 
 
-def _refusal(examined: Examined, failure: TooLong | Unlike) -> Fault:
+def _refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPartError) -> Fault:
     """Return why a header leads to no frame."""
     end = examined.start + len(examined.data)
     path = f"{examined.prefix}.{failure}".strip(".") or "frame"
-    if isinstance(failure, Unlike):
+    if isinstance(failure, UnknownPartError):
         return Fault(LENGTH, path, end, "made of known parts", None, end)
     length = next((each for each in examined.fields() if each.path == path), None)
     if length is not None and length.info.held:

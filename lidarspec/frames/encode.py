@@ -19,12 +19,12 @@ from construct import Container
 from numpy.typing import NDArray
 
 from lidarspec.errors import MissingField, OutOfRange, UsageError
-from lidarspec.frames.field_paths import steps
+from lidarspec.frames.field_paths import split_path
 from lidarspec.frames.layout import Layout, Leaf, Seal
-from lidarspec.frames.layout_tree import TooLong, kinds_of
-from lidarspec.frames.parts import FOUND, Layouts, Measure
+from lidarspec.frames.layout_tree import TooLongError, kinds_of
+from lidarspec.frames.parts import FOUND, LayoutLookup, PartsSize
 from lidarspec.frames.schema import Schema, counting_field, schema
-from lidarspec.spec.syntax import WireNaN, member
+from lidarspec.spec.syntax import WireNaN, get_member
 from lidarspec.spec.tree import (
     Blob,
     Block,
@@ -50,7 +50,7 @@ from lidarspec.spec.tree import (
 MAX_COUNT_TRIED = 65535
 
 
-def encode(layouts: Layouts, given: Container, place: str) -> bytes:
+def encode(layouts: LayoutLookup, given: Container, place: str) -> bytes:
     """Return the bytes of a frame.
 
     Args:
@@ -69,7 +69,7 @@ class _Encoder:
 
     def __init__(
         self,
-        layouts: Layouts,
+        layouts: LayoutLookup,
         given: Container,
         place: str,
         prefix: str = "",
@@ -121,13 +121,13 @@ class _Encoder:
         """Return the layout that the values of the header fields lead to."""
         try:
             return self._layouts.layout_for(self._read_header)
-        except TooLong as fault:
+        except TooLongError as fault:
             raise UsageError(
                 f"{self._place}: {self._prefix or fault or 'the frame'}: these values give no"
                 f" frame of at most {self._layouts.limit} bytes"
             ) from None
 
-    def _read_header(self, leaf: Leaf | Measure) -> int:
+    def _read_header(self, leaf: Leaf | PartsSize) -> int:
         """Return the value of a field that decides the layout."""
         path = leaf.info.path
         if path in self._totals:
@@ -143,7 +143,7 @@ class _Encoder:
             return self._around[path[2:]]
         value: Any = self._given
         names = ""
-        for step in steps(path):
+        for step in split_path(path):
             if isinstance(value, list) and not isinstance(step, int):
                 value = value[self._indices[names]]
             if isinstance(step, int):
@@ -161,7 +161,7 @@ class _Encoder:
             value = self._find_implied(info)
         if value is None:
             return None
-        return raw_of(info, value)
+        return to_raw(info, value)
 
     def _find_implied(self, info: FieldInfo) -> Any:
         """Return the value that a field has if none is given; None if it has to be given."""
@@ -173,7 +173,7 @@ class _Encoder:
 
     def _encode_parts(self, node: PartSequence) -> list[bytes]:
         """Return the bytes of parts, and fill in the fields that count or measure them."""
-        given = member(self._given, node.axis, None)
+        given = get_member(self._given, node.axis, None)
         if given is None:
             raise self._missing(node.axis)
         if not isinstance(given, list) or not all(isinstance(part, dict) for part in given):
@@ -183,7 +183,7 @@ class _Encoder:
             found = self.read(ref.path)
             if found is not None:
                 around[ref.path] = int(found)
-        kinds = [kind_of(node, part) for part in given]
+        kinds = [find_kind(node, part) for part in given]
         layouts = {
             kind.node: kind.layouts
             for kind in kinds_of(node, tuple(around.items()), self._layouts.limit)
@@ -310,7 +310,7 @@ class _Encoder:
                 raise MissingField(shown, place=self._place)
             column.append(bytes(size) if info.kind == "bytes" else 0)
             return
-        if info.const is not None and raw_of(info, value) != info.const:
+        if info.const is not None and to_raw(info, value) != info.const:
             raise self._wrong(shown, format_hex(info.const), value)
         if info.kind == "bytes":
             column.append(self._bytes(shown, value, size))
@@ -334,7 +334,7 @@ class _Encoder:
         return value
 
     def _integer(self, info: FieldInfo, shown: str, value: Any) -> int:
-        raw = raw_of(info, value)
+        raw = to_raw(info, value)
         if not isinstance(raw, int):
             if info.labels and isinstance(raw, str):
                 raise self._wrong(shown, f"one of {', '.join(info.labels.values())}", raw)
@@ -377,7 +377,7 @@ class _Encoder:
     def _is_absent(self, seal: Seal, row: NDArray[np.uint8]) -> bool:
         """Return whether the given checksum means "not filled"."""
         if not seal.absent or any(
-            member(self._given, leaf.info.path, None) is None for leaf in seal.leaves
+            get_member(self._given, leaf.info.path, None) is None for leaf in seal.leaves
         ):
             return False
         return int(seal.load_stored(row)[0]) in seal.absent
@@ -410,7 +410,7 @@ class _Encoder:
     def _missing_count_error(self, path: str) -> UsageError:
         """Return why a field that decides the layout has no value."""
         for axis, counting in self._schema.counting_fields.items():
-            array = member(self._given, axis, None)
+            array = get_member(self._given, axis, None)
             if array is not None and counting == path:
                 return self._wrong(self._shown(axis), "a list of its elements", array)
         return self._missing(path)
@@ -424,7 +424,7 @@ class _Encoder:
         )
 
 
-def raw_of(info: FieldInfo, value: Any) -> Any:
+def to_raw(info: FieldInfo, value: Any) -> Any:
     """Return the raw value of a field: the number behind a name of an Enum, else the value."""
     if isinstance(value, str) and info.labels:
         return next((raw for raw, name in info.labels.items() if name == value), value)
@@ -440,7 +440,7 @@ def fill_counts(given: Container, table: Schema) -> None:
     """
     counted = set[str]()
     for axis, count in table.arrays.items():
-        array = member(given, axis, None)
+        array = get_member(given, axis, None)
         path = table.counting_fields[axis]
         if not isinstance(array, list | bytes) or path is None or path in counted:
             continue
@@ -466,7 +466,7 @@ def fill_in(
         return
     holder, name = _holder(given, path)
     if isinstance(holder, dict) and holder.get(name) is None:
-        read = functools.partial(given_value, given, fields)
+        read = functools.partial(read_given, given, fields)
         holder[name] = _find_count(formula, read, holder, name, value, fields[path], axis)
 
 
@@ -511,7 +511,7 @@ def _find_count(
     raise UsageError(f"{axis}: no value of {field} gives {length}")
 
 
-def kind_of(node: PartSequence, part: Mapping[str, Any]) -> Kind:
+def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     """Return the kind of a part that is given by its values.
 
     It is the first that has all fields of these, and no other constant; else the first.
@@ -519,7 +519,7 @@ def kind_of(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     for kind in node.kinds:
         fields = schema(kind.root)
         constants = [(info, part.get(path)) for path, info in fields.fields.items()]
-        is_known = part.keys() <= {*known_paths(kind.root), *fields.parts}
+        is_known = part.keys() <= {*list_paths(kind.root), *fields.parts}
         if is_known and all(
             value in (None, info.const, info.labels.get(info.const))
             for info, value in constants
@@ -530,7 +530,7 @@ def kind_of(node: PartSequence, part: Mapping[str, Any]) -> Kind:
 
 
 @functools.lru_cache(maxsize=1024)
-def known_paths(root: Node) -> frozenset[str]:
+def list_paths(root: Node) -> frozenset[str]:
     """Return the paths of all fields of a frame type, and of the structs and arrays around them."""
     table = schema(root)
     paths = {*table.all_fields, *table.arrays}
@@ -541,15 +541,15 @@ def known_paths(root: Node) -> frozenset[str]:
     return frozenset(".".join(names[:depth]) for names in split for depth in range(len(names) + 1))
 
 
-def given_value(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> Any:
+def read_given(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> Any:
     """Return a value that is given for a frame, as formulas read it (`lidarspec.spec.tree.Read`).
 
     Raises:
         LookupError: if there is none.
     """
     value: Any = given
-    for step in steps(path):
+    for step in split_path(path):
         value = value[step]
     if value is None:
         return None
-    return raw_of(fields[path], value)
+    return to_raw(fields[path], value)

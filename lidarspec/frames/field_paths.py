@@ -10,7 +10,7 @@ from typing import Any
 Steps = list[int | str]
 
 
-def steps(path: str) -> Steps:
+def split_path(path: str) -> Steps:
     """Return the names and indices of a path: ["points", 3, "distance"] of "points[3].distance"."""
     return [int(step) if step.isdigit() else step for step in re.findall(r"\w+|\*", path)]
 
@@ -20,7 +20,7 @@ def is_index(step: int | str) -> bool:
     return step == "*" or isinstance(step, int)
 
 
-def put(
+def put_value(
     target: Any,
     path: Steps,
     value: Any,
@@ -39,7 +39,7 @@ def put(
     if not is_index(step):
         target = {} if target is None else target
         below = f"{place.removesuffix('[]')}.{step}".removeprefix(".")
-        target[step] = put(target.get(step), rest, value, length, below)
+        target[step] = put_value(target.get(step), rest, value, length, below)
         return target
     target = [] if target is None else list(target)
     indices = range(length(place) or len(target)) if step == "*" else [int(step)]
@@ -48,5 +48,5 @@ def put(
         element = target[index]
         if isinstance(element, dict):
             element = dict(element)
-        target[index] = put(element, rest, value, length, f"{place}[]")
+        target[index] = put_value(element, rest, value, length, f"{place}[]")
     return target

@@ -1,8 +1,8 @@
 """Tables: frames of one type as columns of raw values, in stream order.
 
-There are two tables with the same interface. `Rows` loads fields from bytes by their layout.
-`Records` collects them from Containers that construct parsed. Arrays of variable length are padded
-with zeros to the longest; `counts` returns the lengths.
+There are two tables with the same interface. `CompiledTable` loads fields from bytes by their
+layout. `ParsedTable` collects them from Containers that construct parsed. Arrays of variable length
+are padded with zeros to the longest; `counts` returns the lengths.
 
 Parts (frames within a frame) form a table of their own, without padding. `parts` also returns the
 frame that contains each part.
@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.frames.arrays import count_up, deep, is_counted, repeat
+from lidarspec.frames.arrays import add_axes, count_up, is_counted, repeat
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf, rows_at
 from lidarspec.frames.schema import Schema, schema, without_indices
-from lidarspec.spec.syntax import leaves, member
+from lidarspec.spec.syntax import get_member, leaves
 
 if TYPE_CHECKING:
-    from lidarspec.frames.parts import Walked
+    from lidarspec.frames.parts import FoundParts
 
 
 class Table(Protocol):
@@ -67,7 +67,7 @@ class Table(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class LayoutRows:
     """Frames of one layout.
 
     Attributes:
@@ -93,14 +93,14 @@ class Group:
         return np.argsort(self.where)
 
 
-class Rows:
+class CompiledTable:
     """A `Table` of frames whose layout is compiled."""
 
-    def __init__(self, schema: Schema, groups: Sequence[Group]) -> None:
+    def __init__(self, schema: Schema, groups: Sequence[LayoutRows]) -> None:
         self.schema = schema
         self.groups = [group for group in groups if len(group.where)]
         self._length = sum(len(group.where) for group in self.groups)
-        self._walks: dict[str, list[tuple[Group, NDArray[np.uint8], Walked]]] = {}
+        self._walks: dict[str, list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]] = {}
 
     def __len__(self) -> int:
         return self._length
@@ -126,7 +126,7 @@ class Rows:
                 column[corner] = values
         return column
 
-    def _load(self, leaf: Leaf, path: str, group: Group) -> NDArray[Any]:
+    def _load(self, leaf: Leaf, path: str, group: LayoutRows) -> NDArray[Any]:
         """Return the raw values of a field in the frames of a group.
 
         An index in the path removes the axis of which it selects one element.
@@ -179,7 +179,7 @@ class Rows:
                 return bytes(group.rows[spot[0]].tobytes())
         raise IndexError(index)
 
-    def take(self, which: NDArray[np.intp]) -> Rows:
+    def take(self, which: NDArray[np.intp]) -> CompiledTable:
         if (
             len(self.groups) == 1
             and len(which)
@@ -188,9 +188,13 @@ class Rows:
         ):
             only = self.groups[0]
             if only.is_in_order:
-                return Rows(
+                return CompiledTable(
                     self.schema,
-                    [Group(only.layout, count_up(len(which)), only.rows[which[0] : which[-1] + 1])],
+                    [
+                        LayoutRows(
+                            only.layout, count_up(len(which)), only.rows[which[0] : which[-1] + 1]
+                        )
+                    ],
                 )
         new_index = np.full(len(self), -1, np.intp)
         new_index[which] = np.arange(len(which))
@@ -198,10 +202,10 @@ class Rows:
         for group in self.groups:
             indices = new_index[group.where]
             is_kept = indices >= 0
-            groups.append(Group(group.layout, indices[is_kept], group.rows[is_kept]))
-        return Rows(self.schema, groups)
+            groups.append(LayoutRows(group.layout, indices[is_kept], group.rows[is_kept]))
+        return CompiledTable(self.schema, groups)
 
-    def walks(self, axis: str) -> list[tuple[Group, NDArray[np.uint8], Walked]]:
+    def walks(self, axis: str) -> list[tuple[LayoutRows, NDArray[np.uint8], FoundParts]]:
         """Return the groups that have these parts, each with a buffer and the parts in it.
 
         The result is cached, because the clock, the points and each kind of parts use it.
@@ -215,7 +219,7 @@ class Rows:
             ]
         return self._walks[axis]
 
-    def parts(self, axis: str, kind: str = "") -> tuple[Rows, NDArray[np.intp]]:
+    def parts(self, axis: str, kind: str = "") -> tuple[CompiledTable, NDArray[np.intp]]:
         node = self.schema.parts[axis]
         wanted = next(number for number, one in enumerate(node.kinds) if one.name == kind)
         found = list[_PartRows]()
@@ -233,12 +237,12 @@ class Rows:
         for piece in found:  # in the order of the rounds; each frame has at most one part in each
             ranks.append(following[piece.frames])
             following[piece.frames] += 1
-        return Rows(schema(node.kinds[wanted].root), _group_by_layout(found, ranks)), np.repeat(
-            np.arange(len(self)), counts
-        )
+        return CompiledTable(
+            schema(node.kinds[wanted].root), _group_by_layout(found, ranks)
+        ), np.repeat(np.arange(len(self)), counts)
 
     @staticmethod
-    def join(tables: Sequence[Rows]) -> Rows:
+    def join(tables: Sequence[CompiledTable]) -> CompiledTable:
         """Return several tables of one frame type as one table, in this order."""
         alone = [table.groups[0] for table in tables if len(table.groups) == 1]
         if (
@@ -247,16 +251,18 @@ class Rows:
             and all(group.is_in_order for group in alone)
         ):
             rows = _stack_rows([group.rows for group in alone])
-            return Rows(tables[0].schema, [Group(alone[0].layout, count_up(len(rows)), rows)])
-        found: dict[int, list[Group]] = {}
+            return CompiledTable(
+                tables[0].schema, [LayoutRows(alone[0].layout, count_up(len(rows)), rows)]
+            )
+        found: dict[int, list[LayoutRows]] = {}
         start = 0
         for table in tables:
             for group in table.groups:
                 found.setdefault(id(group.layout), []).append(
-                    Group(group.layout, group.where + start, group.rows)
+                    LayoutRows(group.layout, group.where + start, group.rows)
                 )
             start += len(table)
-        return Rows(tables[0].schema, [_merge_groups(groups) for groups in found.values()])
+        return CompiledTable(tables[0].schema, [_merge_groups(groups) for groups in found.values()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +278,9 @@ class _PartRows:
     frames: NDArray[np.intp]
 
 
-def _group_by_layout(pieces: Sequence[_PartRows], ranks: Sequence[NDArray[np.intp]]) -> list[Group]:
+def _group_by_layout(
+    pieces: Sequence[_PartRows], ranks: Sequence[NDArray[np.intp]]
+) -> list[LayoutRows]:
     """Return the parts of all pieces as groups of one layout each.
 
     Args:
@@ -289,7 +297,7 @@ def _group_by_layout(pieces: Sequence[_PartRows], ranks: Sequence[NDArray[np.int
     ]
 
 
-def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> Group:
+def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> LayoutRows:
     """Return pieces of one layout in one buffer as a group, in stream order."""
     where = np.concatenate([own for _, own in parts])
     spots = np.concatenate([piece.spots for piece, _ in parts])
@@ -300,18 +308,18 @@ def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> Group:
         order[where] = np.arange(len(where))
     else:
         order = np.argsort(where)
-    return Group(
+    return LayoutRows(
         first.layout,
         where[order],
         rows_at(first.buffer, spots[order], first.layout.size, gathered=False),
     )
 
 
-def _merge_groups(groups: list[Group]) -> Group:
+def _merge_groups(groups: list[LayoutRows]) -> LayoutRows:
     """Return groups of one layout as one group."""
     if len(groups) == 1:
         return groups[0]
-    return Group(
+    return LayoutRows(
         groups[0].layout,
         np.concatenate([g.where for g in groups]),
         _stack_rows([g.rows for g in groups]),
@@ -354,7 +362,7 @@ def ascends(where: NDArray[np.intp]) -> bool:
     )
 
 
-class Records:
+class ParsedTable:
     """A `Table` of frames that construct parsed.
 
     It is used for structs that do not compile, and as the second engine in tests.
@@ -401,7 +409,11 @@ class Records:
             )
             if known is None:
                 return inside
-            return inside & known if known.ndim == 1 else deep(inside, elements.ndim - 1) & elements
+            return (
+                inside & known
+                if known.ndim == 1
+                else add_axes(inside, elements.ndim - 1) & elements
+            )
         there = [
             _find_present(_collect_values(parsed, path.split("."), len(axes)))
             for parsed in self._parsed
@@ -436,8 +448,10 @@ class Records:
                     inside,
                 )
             spots = np.broadcast_to(np.clip(spots, 0, column.shape[place] - 1), len(self))
-            column = np.take_along_axis(column, deep(spots, column.ndim - 1), place).squeeze(place)
-        return np.where(deep(inside, column.ndim - 1), column, 0).astype(column.dtype), inside
+            column = np.take_along_axis(column, add_axes(spots, column.ndim - 1), place).squeeze(
+                place
+            )
+        return np.where(add_axes(inside, column.ndim - 1), column, 0).astype(column.dtype), inside
 
     def counts(self, axis: str) -> NDArray[np.intp]:
         lengths = self._lengths(axis)
@@ -467,16 +481,16 @@ class Records:
     def frame(self, index: int) -> bytes:
         return self._frames[index]
 
-    def take(self, which: NDArray[np.intp]) -> Records:
-        return Records(
+    def take(self, which: NDArray[np.intp]) -> ParsedTable:
+        return ParsedTable(
             self.schema, [self._parsed[i] for i in which], [self._frames[i] for i in which]
         )
 
-    def parts(self, axis: str, kind: str = "") -> tuple[Records, NDArray[np.intp]]:
+    def parts(self, axis: str, kind: str = "") -> tuple[ParsedTable, NDArray[np.intp]]:
         node = self.schema.parts[axis]
         found = list[tuple[int, Any, bytes]]()
         for index, (parsed, frame) in enumerate(zip(self._parsed, self._frames, strict=True)):
-            pieces = member(parsed, axis, None)
+            pieces = get_member(parsed, axis, None)
             if pieces is not None:
                 spans = zip(pieces, pieces.spans, strict=True)
                 found += [
@@ -487,17 +501,17 @@ class Records:
         own = next(one for one in node.kinds if one.name == kind)
         frames = np.array([index for index, _, _ in found], np.intp)
         return (
-            Records(
+            ParsedTable(
                 schema(own.root), [part for _, part, _ in found], [data for _, _, data in found]
             ),
             frames,
         )
 
     @staticmethod
-    def join(tables: Sequence[Records]) -> Records:
+    def join(tables: Sequence[ParsedTable]) -> ParsedTable:
         """Return several tables of one frame type as one table, in this order."""
         parsed = [item for table in tables for item in table._parsed]
-        return Records(
+        return ParsedTable(
             tables[0].schema, parsed, [frame for table in tables for frame in table._frames]
         )
 

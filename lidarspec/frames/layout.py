@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.frames.row_checksums import over
+from lidarspec.frames.row_checksums import compute_over_spans
 from lidarspec.spec.bits import BitField, Segment
 from lidarspec.spec.checksums import Checksum, Single, single
 from lidarspec.spec.tree import (
@@ -171,9 +171,9 @@ class Leaf:
                 (len(buffer) - self.size + 1,), self.wire, buffer.data, 0, (1,)
             )
             return which, windows[spots].astype(self._native)
-        return which, self._alone.load(rows_at(buffer, spots, self.size))
+        return which, self._is_scalar.load(rows_at(buffer, spots, self.size))
 
-    def of(self, frame: bytes | memoryview) -> int | None:
+    def read_first(self, frame: bytes | memoryview) -> int | None:
         """Return its value in the first bytes of a frame, None if they are too few."""
         if self.offset + self.size <= len(frame):
             return self.scalar(frame)
@@ -223,8 +223,8 @@ class Leaf:
         )
 
     @cached_property
-    def _alone(self) -> Leaf:
-        return self.at(self.offset)
+    def _is_scalar(self) -> Leaf:
+        return self.shift(self.offset)
 
     @cached_property
     def _native(self) -> np.dtype[Any]:
@@ -291,7 +291,7 @@ class Leaf:
         return total
 
     @property
-    def held(self) -> tuple[int, int]:
+    def byte_span(self) -> tuple[int, int]:
         """The offsets of its first byte and of the byte after its last.
 
         In arrays, they belong to the first element.
@@ -338,7 +338,7 @@ class Leaf:
             elements=bit_fields,
         )
 
-    def at(self, offset: int) -> Leaf:
+    def shift(self, offset: int) -> Leaf:
         """Return the leaf with its offset counted from `offset`."""
         return replace(self, offset=self.offset - offset)
 
@@ -366,7 +366,7 @@ class Seal:
     def covers(self, other: Seal) -> bool:
         """Return whether it covers a field that holds the other checksum."""
         return any(
-            start < leaf.held[1] and leaf.held[0] < end
+            start < leaf.byte_span[1] and leaf.byte_span[0] < end
             for start, end in self.spans
             for leaf in other.leaves
         )
@@ -400,7 +400,7 @@ class Seal:
         """
         values = None if sums is None else sums(self, rows)
         if values is None:
-            return over(self.algorithm, rows, self.spans or ((0, 0),))
+            return compute_over_spans(self.algorithm, rows, self.spans or ((0, 0),))
         return values
 
     def fill(self, rows: Bytes2D) -> None:
@@ -514,7 +514,7 @@ class Condition:
         return np.int64
 
 
-class Test(Protocol):
+class FrameTest(Protocol):
     """A test of fields that valid frames pass."""
 
     @property
@@ -529,7 +529,7 @@ class Test(Protocol):
         """
 
 
-def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
+def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
     """Return which frames, given as rows of bytes, pass a test with all elements, (n,)."""
     raw = {
         info.path: leaf.load(rows)
@@ -542,7 +542,7 @@ def holding(test: Test, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np
 
 
 @dataclass(frozen=True, eq=False)
-class Refusal:
+class LayoutRefusal:
     """The result for a header that leads to no layout.
 
     Attributes:
@@ -594,7 +594,7 @@ class Layout:
     def known(self) -> Mapping[int, tuple[int, int]]:
         """The bits that all frames of this layout have: offset -> (mask, value).
 
-        They are the constants and the lengths in `held`.
+        They are the constants and the lengths in `byte_span`.
         """
         both = dict(self.constants)
         for spot, (mask, value) in self.held.items():
@@ -636,7 +636,7 @@ class Layout:
 
     def meets_condition(self, condition: Condition, rows: Bytes2D) -> NDArray[np.bool_]:
         """Return which frames, given as rows of bytes, meet one of the conditions, (n,)."""
-        return holding(condition, self.leaves, rows)
+        return find_passing(condition, self.leaves, rows)
 
     def seal(self, rows: Bytes2D) -> None:
         """Write constants, lengths and checksums into frames given as rows of bytes."""
@@ -666,14 +666,14 @@ Marks = tuple[tuple[int, int, int], ...]
 Word = tuple[int, np.dtype[Any], Any, Any]
 
 
-def marks(constants: Mapping[int, tuple[int, int]]) -> Marks:
+def sort_constants(constants: Mapping[int, tuple[int, int]]) -> Marks:
     """Return constants sorted by offset, whole bytes first because they are more distinctive."""
     found = [(spot, mask, value) for spot, (mask, value) in constants.items()]
     return tuple(sorted(found, key=lambda mark: (mark[1] != 0xFF, mark[0])))
 
 
 @lru_cache(maxsize=2048)
-def words(constants: Marks) -> tuple[Word, ...]:
+def merge_constants(constants: Marks) -> tuple[Word, ...]:
     """Return constants merged into words of 1, 2, 4 or 8 bytes.
 
     The first and the last byte of each word have constant bits.
@@ -694,7 +694,7 @@ def words(constants: Marks) -> tuple[Word, ...]:
     return tuple(found)
 
 
-def exclude(some: Marks, others: Marks) -> bool:
+def are_contradictory(some: Marks, others: Marks) -> bool:
     """Return whether two sets of constants contradict each other."""
     known = {spot: (mask, value) for spot, mask, value in others}
     both = [
@@ -705,20 +705,20 @@ def exclude(some: Marks, others: Marks) -> bool:
     return any(mask & differing for mask, differing in both)
 
 
-def equal(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
+def match_word(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
     """Return whether values read at the offset of a word match it, element by element."""
     _, _, mask, value = word
     return np.asarray((found if mask is None else found & mask) == value)
 
 
-def right(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
+def match_constants(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
     """Return which rows have all constants, (n,); None if all rows do."""
     held: NDArray[np.bool_] | None = None
     for word in constants:
         spot, dtype, _, _ = word
         if spot + dtype.itemsize > rows.shape[1]:
             return np.zeros(len(rows), np.bool_)
-        each = equal(elements(rows, dtype, spot, (), ()), word)
+        each = match_word(elements(rows, dtype, spot, (), ()), word)
         number = np.count_nonzero(each)
         if number < len(rows):
             if held is None:

@@ -2,12 +2,12 @@
 
 A count, condition or key in a struct makes the layout depend on header fields, here called
 *selectors*. `layout_of` walks the tree of the struct with a cursor, for given values of the
-selectors. If it needs another selector, it raises `Unknown`.
+selectors. If it needs another selector, it raises `UnknownSelectorError`.
 
 `HeaderTree` is a decision tree that caches the results. Each inner node is a selector, each branch
-is a value of it, and each leaf is a `Layout`, or a `Refusal` with the reason why there is none.
-`HeaderTree.classify` sorts many candidates through the tree at once, so the struct is walked only
-once for each distinct header.
+is a value of it, and each leaf is a `Layout`, or a `LayoutRefusal` with the reason why there is
+none. `HeaderTree.classify` sorts many candidates through the tree at once, so the struct is walked
+only once for each distinct header.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
-from lidarspec.frames.arrays import by_value
-from lidarspec.frames.compilability import NotCompilable, check_compilable
-from lidarspec.frames.layout import Condition, Layout, Leaf, Refusal, Seal
-from lidarspec.frames.parts import CONSTANT, FAILED, Measure, PartKind, PartRule, Region
-from lidarspec.frames.schema import ByPath, without_indices
+from lidarspec.frames.arrays import group_by_value
+from lidarspec.frames.compilability import NotCompilableError, check_compilable
+from lidarspec.frames.layout import Condition, Layout, LayoutRefusal, Leaf, Seal
+from lidarspec.frames.parts import CONSTANT, FAILED, PartKind, PartRule, PartsSize, Region
+from lidarspec.frames.schema import PathMapping, without_indices
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, whole_bytes
 from lidarspec.spec.description import Frame
 
 
-class Unknown(Exception):
+class UnknownSelectorError(Exception):
     """The layout depends on a field whose value is not given, or on the size of parts.
 
     Attributes:
         leaf: where it stands.
     """
 
-    def __init__(self, leaf: Leaf | Measure) -> None:
+    def __init__(self, leaf: Leaf | PartsSize) -> None:
         self.leaf = leaf
         super().__init__(leaf.info.path)
 
 
-class TooLong(Exception):
+class TooLongError(Exception):
     """The header has an invalid length: longer than the maximum of the frame type, or 0.
 
     Attributes:
@@ -61,11 +61,11 @@ class TooLong(Exception):
         super().__init__(path)
 
 
-class Unlike(Exception):
+class UnknownPartError(Exception):
     """The constants of a part match no kind of parts."""
 
 
-class CutOff(Exception):
+class CutOffError(Exception):
     """The input ends before the end of a frame."""
 
 
@@ -97,7 +97,7 @@ def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
     """
     walk.visit(root, "")
     if not walk.cursor:
-        raise TooLong("")
+        raise TooLongError("")
     return walk.layout()
 
 
@@ -111,11 +111,11 @@ def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     return walk.constants
 
 
-def _unknown(leaf: Leaf | Measure, _: HeaderWalk) -> int:
-    raise Unknown(leaf)
+def _unknown(leaf: Leaf | PartsSize, _: HeaderWalk) -> int:
+    raise UnknownSelectorError(leaf)
 
 
-Asked = Callable[[Leaf | Measure, "HeaderWalk"], int]
+Asked = Callable[[Leaf | PartsSize, "HeaderWalk"], int]
 
 
 @dataclass
@@ -144,7 +144,7 @@ class HeaderWalk:
     #: elements without a byte, of all arrays.
     empty: int = 0
     #: fields that formulas can ask for by now; None for a field that the header leaves out.
-    parts: dict[str, Leaf | Measure | None] = field(default_factory=dict)
+    parts: dict[str, Leaf | PartsSize | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
         """The layout that the walk found."""
@@ -152,7 +152,7 @@ class HeaderWalk:
         self.asked = _unknown  # what follows from the header asks for no more of it
         seals = tuple(_in_order(self.seals))
         following = tuple(self._following())
-        leaves = ByPath(self.leaves, Leaf.element)
+        leaves = PathMapping(self.leaves, Leaf.element)
         found = (
             self.cursor,
             leaves,
@@ -181,7 +181,7 @@ class HeaderWalk:
         part = self.parts[path]
         if part is None:
             return None
-        if isinstance(part, Measure) and part.region.size is not None:
+        if isinstance(part, PartsSize) and part.region.size is not None:
             return part.region.size
         if path not in self.values:
             return self.asked(part, self)
@@ -226,13 +226,13 @@ class HeaderWalk:
             case tree.Check() if 0 not in shape:
                 self.conditions[node] = Condition.of(node)
             case tree.Never():
-                raise TooLong(path)
+                raise TooLongError(path)
             case tree.Opaque():
-                raise NotCompilable(node.info.path, node.reason)
+                raise NotCompilableError(node.info.path, node.reason)
         if self.cursor > self.limit:
-            raise TooLong(path)
+            raise TooLongError(path)
         if self.room is not None and self.cursor > self.room:
-            raise CutOff(path)
+            raise CutOffError(path)
         if path and not shape:
             self.places[path] = (start, self.cursor)
 
@@ -261,7 +261,7 @@ class HeaderWalk:
         depth = len(strides)
         self.empty += 0 if size else math.prod(shape) * count
         if start + size * count > self.limit or self.empty > self.limit:
-            raise TooLong(path)
+            raise TooLongError(path)
         for name, leaf in self.leaves.items():
             if node.axis in leaf.info.axes:
                 self.leaves[name] = replace(
@@ -290,7 +290,7 @@ class HeaderWalk:
             given,
             rule.within,
         )
-        self.parts[node.total.path] = Measure(node.total, region)
+        self.parts[node.total.path] = PartsSize(node.total, region)
         self.open_regions[node.axis] = region
         if rule.within is not None:
             size = rule.within
@@ -299,9 +299,9 @@ class HeaderWalk:
         if size == -FAILED:
             raise ValueError(f"an expression in {path} fails")
         if size < 0:
-            raise Unlike(path) if size == -CONSTANT else TooLong(path)
+            raise UnknownPartError(path) if size == -CONSTANT else TooLongError(path)
         self.regions[node.axis] = region = replace(region, size=size)
-        self.parts[node.total.path] = Measure(node.total, region)
+        self.parts[node.total.path] = PartsSize(node.total, region)
         self.cursor += size
 
     def _no_element(
@@ -315,7 +315,7 @@ class HeaderWalk:
         constants = dict(self.constants)
         try:
             self.visit(node, path, shape, strides)
-        except Unknown:
+        except UnknownSelectorError:
             raise
         except Exception:
             pass  # whatever an expression raises: what construct never looks at cannot fail
@@ -406,7 +406,7 @@ class HeaderWalk:
         if node.over is not None:
             spans = [(self.places[node.over[0]][0], self.places[node.over[1]][1])]
         else:
-            held = sorted(leaf.held for leaf in leaves)
+            held = sorted(leaf.byte_span for leaf in leaves)
             edges = [start, *(edge for span in held for edge in span), self.cursor]
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
         self.seals.append(Seal(leaves, tuple(spans), node.algorithm, node.absent, self.cursor))
@@ -423,7 +423,7 @@ class HeaderWalk:
             if rebuilt is not None:
                 value = operator.index(tree.evaluate(rebuilt, self._read_known))
                 if not low <= value <= high:
-                    raise TooLong(leaf.info.path, value)
+                    raise TooLongError(leaf.info.path, value)
                 leaf.store(
                     rows,
                     np.array([value, -1 if low else high], leaf.info.dtype).reshape(
@@ -457,7 +457,7 @@ class HeaderWalk:
     def _count(self, formula: tree.Formula, path: str) -> int:
         count = operator.index(self._value(formula))
         if not 0 <= count <= self.limit:
-            raise TooLong(path, count)
+            raise TooLongError(path, count)
         return count
 
 
@@ -500,19 +500,19 @@ class HeaderNode:
 
     values: Mapping[str, int] = field(default_factory=dict)
     above: HeaderNode | None = None
-    leaf: Leaf | Measure | None = None
+    leaf: Leaf | PartsSize | None = None
     before: Mapping[str, Leaf] = field(default_factory=dict)
     constants: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     least: int = 0
     value_classes: _ValueClasses | None = None
     children: dict[int, HeaderNode] = field(default_factory=dict)
-    result: Layout | Refusal | None = None
+    result: Layout | LayoutRefusal | None = None
 
-    def meant(self, value: int) -> int:
+    def find_representative(self, value: int) -> int:
         """Return the representative of all values with the same layout as `value`."""
         if self.value_classes is None:
             return value
-        return self.value_classes.one(value)
+        return self.value_classes.representative(value)
 
     def child(self, value: int) -> HeaderNode:
         """The branch of a value."""
@@ -525,7 +525,7 @@ class HeaderNode:
 #: what reads the field of a node in some of the candidates: the indices of those that have it, None
 #: for all; and its values.
 Reader = Callable[[HeaderNode, NDArray[np.intp]], tuple[NDArray[np.intp] | None, NDArray[Any]]]
-Group = tuple[Layout | Refusal, NDArray[np.intp]]
+Group = tuple[Layout | LayoutRefusal, NDArray[np.intp]]
 
 
 @dataclass(frozen=True)
@@ -562,10 +562,10 @@ class _ValueClasses:
             (node, formula)
             for node in known
             for formula in tree.formulas(node)
-            if _asks(formula, info)
+            if _depends_on(formula, info)
         ]
         if any(
-            own.rebuilt is not None and not own.held and _asks(own.rebuilt, info)
+            own.rebuilt is not None and not own.held and _depends_on(own.rebuilt, info)
             for node in known
             for own in tree.infos(node)
         ):
@@ -608,13 +608,13 @@ class _ValueClasses:
             )
         return cls(info.limits, low, high)
 
-    def refuse(self, value: int) -> _ValueClasses:
+    def mark_too_long(self, value: int) -> _ValueClasses:
         """The same, where the frame of a value is known to be too long."""
         if self.rises is not None and self.rises <= value < self.high:
             return replace(self, high=value)
         return self
 
-    def one(self, value: int) -> int:
+    def representative(self, value: int) -> int:
         """The value that stands for one that means the same."""
         if self.keys:
             if value in self.keys:
@@ -622,7 +622,7 @@ class _ValueClasses:
             return self.other
         return min(max(value, self.low), self.high)
 
-    def all(self, values: NDArray[Any]) -> NDArray[Any]:
+    def representatives(self, values: NDArray[Any]) -> NDArray[Any]:
         """Those that stand for many, of their shape and type."""
         if (self.low, self.high) == self.limits and not self.keys:
             return values
@@ -635,7 +635,7 @@ class _ValueClasses:
         return np.asarray(np.clip(values, self.low, self.high))
 
 
-def _asks(formula: tree.Formula, info: tree.FieldInfo) -> bool:
+def _depends_on(formula: tree.Formula, info: tree.FieldInfo) -> bool:
     """Return whether a formula depends on a field."""
     return any(ref.path == info.path for ref in tree.refs(formula))
 
@@ -651,16 +651,16 @@ def _counts(node: tree.Node, formula: tree.Formula) -> bool:
     is_number = isinstance(node, tree.Repeat | tree.Blob) or (
         isinstance(node, tree.PartSequence) and formula is node.count
     )
-    return is_number and _rises(formula)
+    return is_number and _is_increasing(formula)
 
 
-def _rises(formula: tree.Formula) -> bool:
+def _is_increasing(formula: tree.Formula) -> bool:
     """Whether a formula is of one field, and never falls as that grows."""
     match formula:
         case tree.Ref() | tree.Op("+", (int(), tree.Ref())):
             return True
         case tree.Op("+" | "-" | "*" | "//" | ">>" as symbol, (first, int() as second)):
-            return _rises(first) and (second > 0 or symbol in "+-")
+            return _is_increasing(first) and (second > 0 or symbol in "+-")
     return False
 
 
@@ -761,7 +761,7 @@ class HeaderTree:
         self._given = given or {}
         self._root = HeaderNode()
         self._size = 0
-        self._told: dict[str, _ValueClasses] = {}
+        self._value_classes: dict[str, _ValueClasses] = {}
 
     @functools.cached_property
     def _prefix(self) -> dict[int, tuple[int, int]]:
@@ -785,12 +785,12 @@ class HeaderTree:
         groups: list[Group] = []
         for result, which in self.group_by_layout(len(offsets), places.read, places):
             groups.append((result, which))
-            if isinstance(result, Refusal) and result.constants:
+            if isinstance(result, LayoutRefusal) and result.constants:
                 wrong = places.wrong(result.constants, which)
                 groups[-1] = result, which[~wrong]
                 places.refuted.append(which[wrong])
         return groups + [
-            (Refusal(by_constant=True), which) for which in places.refuted if len(which)
+            (LayoutRefusal(by_constant=True), which) for which in places.refuted if len(which)
         ]
 
     def group_by_layout(
@@ -823,13 +823,15 @@ class HeaderTree:
             there, values = read(node, which)
             which = which if there is None else which[there]
             if node.value_classes is not None:
-                values = node.value_classes.all(values)
+                values = node.value_classes.representatives(values)
             if not len(which):
                 continue
             if np.count_nonzero(values == values[0]) == len(values):
                 stack.append((node.child(values.item(0)), which))
             else:
-                stack += [(node.child(value), which[rows]) for value, rows in by_value(values, FEW)]
+                stack += [
+                    (node.child(value), which[rows]) for value, rows in group_by_value(values, FEW)
+                ]
         return groups
 
     def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
@@ -857,9 +859,9 @@ class HeaderTree:
                 return None
             values = leaf.load(rows)
             if node.value_classes is not None:
-                values = node.value_classes.all(values)
+                values = node.value_classes.representatives(values)
             if np.count_nonzero(values == values[0]) < len(rows) or (
-                isinstance(leaf, Measure) and values[0] < 0
+                isinstance(leaf, PartsSize) and values[0] < 0
             ):
                 return None
             node = node.child(values.item(0))
@@ -888,11 +890,11 @@ class HeaderTree:
             self._root = HeaderNode()
             self._size = 0
 
-    def layout(self, frame: bytes) -> Layout | Refusal | None:
+    def layout(self, frame: bytes) -> Layout | LayoutRefusal | None:
         """The layout of one frame, or None where its header is not all there."""
         return self._end(frame, self._root).result
 
-    def layout_for(self, read: Callable[[Leaf | Measure], int]) -> Layout:
+    def layout_for(self, read: Callable[[Leaf | PartsSize], int]) -> Layout:
         """Return the layout that values of header fields lead to.
 
         Args:
@@ -907,7 +909,7 @@ class HeaderTree:
             if node.leaf is None:
                 self._explore(node)
             else:
-                node = node.child(node.meant(read(node.leaf)))
+                node = node.child(node.find_representative(read(node.leaf)))
         if isinstance(node.result, Layout):
             return node.result
         return layout_of(self.root, node.values, self.limit, self._given)  # raises the reason
@@ -917,10 +919,10 @@ class HeaderTree:
     ) -> HeaderNode:
         """Return the end of the header of a frame from a node on, as `_explore` does."""
         while node.leaf is not None:
-            value = node.leaf.of(data)
+            value = node.leaf.read_first(data)
             if value is None:
                 return node
-            node = node.child(node.meant(value))
+            node = node.child(node.find_representative(value))
         if node.result is not None:
             return node
         return self._explore(node, data, is_all=is_all)
@@ -940,18 +942,18 @@ class HeaderTree:
             is_all: there are no more bytes of this frame.
         """
 
-        def size_asked(leaf: Leaf | Measure, walk: HeaderWalk) -> int:
+        def size_asked(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
             nonlocal node
             node.leaf, node.before, node.value_classes, node.constants = (
                 leaf,
                 dict(walk.leaves),
-                self._telling(leaf),
-                self._behind(walk),
+                self._get_value_classes(leaf),
+                self._new_constants(walk),
             )
-            value = leaf.of(data)
+            value = leaf.read_first(data)
             if value is None:
-                raise Unknown(leaf)
-            node = node.child(node.meant(value))
+                raise UnknownSelectorError(leaf)
+            node = node.child(node.find_representative(value))
             self._size += 1
             walk.values = node.values
             return node.values[leaf.info.path]
@@ -964,30 +966,30 @@ class HeaderTree:
         )
         try:
             node.result = walk_layout(walk, self.root)
-        except Unknown:
+        except UnknownSelectorError:
             pass
-        except CutOff:
-            node.constants = self._behind(walk)
+        except CutOffError:
+            node.constants = self._new_constants(walk)
             node.least = walk.cursor
-        except TooLong:
-            node.result = Refusal(constants=self._behind(walk))
-        except Unlike:
-            node.result = Refusal(by_constant=True)
+        except TooLongError:
+            node.result = LayoutRefusal(constants=self._new_constants(walk))
+        except UnknownPartError:
+            node.result = LayoutRefusal(by_constant=True)
         except SpecError:
             raise
         except Exception as error:
-            node.result = Refusal(PluginError.of(error, "struct"))
+            node.result = LayoutRefusal(PluginError.of(error, "struct"))
         above = node.above
         if (
             above is not None
             and above.value_classes is not None
-            and isinstance(node.result, Refusal)
+            and isinstance(node.result, LayoutRefusal)
             and not node.result.error
         ):
-            above.value_classes = above.value_classes.refuse([*node.values.values()][-1])
+            above.value_classes = above.value_classes.mark_too_long([*node.values.values()][-1])
         return node
 
-    def _behind(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
+    def _new_constants(self, walk: HeaderWalk) -> dict[int, tuple[int, int]]:
         """Return the constants found by a walk, without the common prefix.
 
         Candidates are known to have the constants that all frames begin with.
@@ -996,12 +998,12 @@ class HeaderTree:
             spot: known for spot, known in walk.constants.items() if self._prefix.get(spot) != known
         }
 
-    def _telling(self, leaf: Leaf | Measure) -> _ValueClasses | None:
+    def _get_value_classes(self, leaf: Leaf | PartsSize) -> _ValueClasses | None:
         if not isinstance(leaf, Leaf):
             return None  # nothing is known of parts before they are walked
-        if leaf.info.path not in self._told:
-            self._told[leaf.info.path] = _ValueClasses.of(leaf.info, self.root, self.limit)
-        return self._told[leaf.info.path]
+        if leaf.info.path not in self._value_classes:
+            self._value_classes[leaf.info.path] = _ValueClasses.of(leaf.info, self.root, self.limit)
+        return self._value_classes[leaf.info.path]
 
 
 @functools.lru_cache(maxsize=256)
@@ -1017,10 +1019,10 @@ def kinds_of(
 
 
 @functools.lru_cache(maxsize=2048)
-def frame_layouts(frame: Frame) -> HeaderTree | NotCompilable:
+def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
     """The layouts of a frame type, or why they cannot be computed."""
     try:
         check_compilable(frame.tree)
         return HeaderTree(frame.tree, frame.room)
-    except NotCompilable as reason:
+    except NotCompilableError as reason:
         return reason

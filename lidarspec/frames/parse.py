@@ -18,14 +18,14 @@ from construct import Container, ListContainer
 
 from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text, struct_error
 from lidarspec.frames import diagnose
-from lidarspec.frames.compilability import NotCompilable
-from lidarspec.frames.layout import Layout, Leaf, Refusal
+from lidarspec.frames.compilability import NotCompilableError
+from lidarspec.frames.layout import Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.parts import Region
 from lidarspec.frames.plain import parse_plain, plain_fault
 from lidarspec.frames.schema import schema
 from lidarspec.frames.wire_coder import frame_coder
-from lidarspec.frames.wire_fields import Examined, examine
+from lidarspec.frames.wire_fields import ExaminedFrame, examine
 from lidarspec.spec.bits import BitField
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
@@ -118,7 +118,7 @@ def _find_sound(
 def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
     """Return the values of a frame in a 1-tuple if it is valid, else None."""
     layouts = frame_layouts(frame)
-    if isinstance(layouts, NotCompilable):
+    if isinstance(layouts, NotCompilableError):
         values, size = parse_plain(frame, data)
         if size == len(data):
             return (values,)
@@ -165,7 +165,7 @@ def _parse_unsound(
 def _find_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
     """Return the first fault of an invalid frame as an error."""
     frame = sensor.frames[name]
-    if isinstance(frame_layouts(frame), NotCompilable):
+    if isinstance(frame_layouts(frame), NotCompilableError):
         return plain_fault(sensor, name, data)
     decoded = frame_coder(frame).decode(data)
     problem = decoded.problem
@@ -188,7 +188,7 @@ def _find_field_fault(
     sensor: SensorDescription,
     name: str,
     data: bytes,
-    examined: Examined,
+    examined: ExaminedFrame,
     to_wire_offset: Callable[[int], int],
 ) -> WireError:
     """Return the first fault of the fields of a frame as an error.
@@ -205,8 +205,8 @@ def _find_field_fault(
 def _run_search(
     sensor: SensorDescription,
     name: str,
-    find: Callable[[Examined], diagnose.Fault | None],
-    examined: Examined,
+    find: Callable[[ExaminedFrame], diagnose.Fault | None],
+    examined: ExaminedFrame,
 ) -> diagnose.Fault | None:
     """Run a search for a fault and return its result.
 
@@ -246,7 +246,7 @@ def _parse_unverified(sensor: SensorDescription, name: str, data: bytes) -> Any:
         WireError: if the frame is truncated, or if its header leads to no layout.
     """
     frame = sensor.frames[name]
-    if isinstance(frame_layouts(frame), NotCompilable):
+    if isinstance(frame_layouts(frame), NotCompilableError):
         try:
             return parse_plain(frame, data, verify=False)[0]
         except Exception:
@@ -550,13 +550,13 @@ def _read_rows(readers: Sequence[Reader], frame: bytes) -> Sequence[ListContaine
     return [ListContainer(row) for row in zip(*(reader(frame) for reader in readers), strict=True)]
 
 
-def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | Refusal | None:
+def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | LayoutRefusal | None:
     """Return the layout that the header of this frame leads to.
 
     Returns None if the type is not compiled, or if the header is incomplete.
     """
     layouts = frame_layouts(sensor.frames[name])
-    if isinstance(layouts, NotCompilable):
+    if isinstance(layouts, NotCompilableError):
         return None
     return layouts.layout(data)
 

@@ -22,13 +22,13 @@ from lidarspec.errors import PluginError
 from lidarspec.frames.layout import (
     Bytes2D,
     Layout,
+    LayoutRefusal,
     Leaf,
-    Refusal,
     Word,
-    equal,
-    marks,
+    match_word,
+    merge_constants,
+    sort_constants,
     span,
-    words,
 )
 from lidarspec.spec import tree
 
@@ -49,7 +49,7 @@ FAILED = 4
 ANY = -1
 
 
-class Layouts(Protocol):
+class LayoutLookup(Protocol):
     """Lookup of the layouts of a frame type or of a kind of parts (implemented by `HeaderTree`)."""
 
     root: tree.Node
@@ -57,7 +57,7 @@ class Layouts(Protocol):
 
     def classify(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
-    ) -> list[tuple[Layout | Refusal, Offsets]]:
+    ) -> list[tuple[Layout | LayoutRefusal, Offsets]]:
         """Return the candidates at these offsets, grouped by layout.
 
         Candidates with an incomplete header are left out.
@@ -70,7 +70,7 @@ class Layouts(Protocol):
             Each layout, or reason for refusal, with the indices of its candidates.
         """
 
-    def layout_for(self, read: Callable[[Leaf | Measure], int]) -> Layout:
+    def layout_for(self, read: Callable[[Leaf | PartsSize], int]) -> Layout:
         """Return the layout for the values of the header fields that `read` returns."""
 
 
@@ -85,13 +85,13 @@ class PartKind:
     """
 
     node: tree.Kind
-    layouts: Layouts
+    layouts: LayoutLookup
     prefix: Mapping[int, tuple[int, int]]
 
     @cached_property
     def start(self) -> tuple[Word, ...]:
         """The constants in `prefix` as words."""
-        return words(marks(self.prefix))
+        return merge_constants(sort_constants(self.prefix))
 
     @cached_property
     def is_checked(self) -> bool:
@@ -111,7 +111,7 @@ class PartKind:
                 for offset, constant in layout.constants.items()
                 if self.prefix.get(offset) != constant
             }
-            cached = layout.notes[PartKind] = words(marks(constants))
+            cached = layout.notes[PartKind] = merge_constants(sort_constants(constants))
         further: tuple[Word, ...] = cached
         return further
 
@@ -148,7 +148,7 @@ class PartRound:
 
 
 @dataclass(frozen=True, eq=False)
-class Walked:
+class FoundParts:
     """The parts of n frames.
 
     Attributes:
@@ -202,7 +202,7 @@ class Region:
 
     def walk(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
-    ) -> Walked:
+    ) -> FoundParts:
         """Return the parts of the frames at these offsets.
 
         Args:
@@ -210,7 +210,7 @@ class Region:
         """
         return _PartWalk(self, buffer, offsets + self.start, stops).run()
 
-    def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], Walked]:
+    def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], FoundParts]:
         """Return a buffer with whole frames, given as rows of bytes, and their parts."""
         return span(rows), self.walk(span(rows), np.arange(len(rows)) * rows.strides[0])
 
@@ -260,13 +260,13 @@ class _PartWalk:
         self._status = np.zeros(len(starts), np.uint8)
         self._errors = list[PluginError]()
 
-    def run(self) -> Walked:
+    def run(self) -> FoundParts:
         """Find all parts, round by round."""
         rounds = list[list[PartRound]]()
         active = np.arange(len(self._starts))
         while len(active := self._select_unfinished(active, len(rounds))):
             rounds.append(self._find_next_parts(active))
-        return Walked(self._status, self._ends - self._starts, rounds, tuple(self._errors))
+        return FoundParts(self._status, self._ends - self._starts, rounds, tuple(self._errors))
 
     def _select_unfinished(self, active: Offsets, number: int) -> Offsets:
         """Return the frames that have another part.
@@ -310,7 +310,7 @@ class _PartWalk:
                 self._buffer, self._ends[own], self._stops_of(own)
             ):
                 has_header[which] = True
-                if isinstance(layout, Refusal):
+                if isinstance(layout, LayoutRefusal):
                     self._set_refusal(layout, own[which])
                     continue
                 owners = own[which]
@@ -340,10 +340,12 @@ class _PartWalk:
     ) -> NDArray[np.bool_] | None:
         """Return in which frames the next part has these constants, None if in all."""
         if constants:
-            return right_at(self._buffer, self._ends[which], constants, self._stops_of(which))
+            return match_constants_at(
+                self._buffer, self._ends[which], constants, self._stops_of(which)
+            )
         return None
 
-    def _set_refusal(self, refused: Refusal, which: Offsets) -> None:
+    def _set_refusal(self, refused: LayoutRefusal, which: Offsets) -> None:
         if refused.error:
             self._status[which] = FAILED
         elif refused.by_constant:
@@ -359,7 +361,7 @@ class _PartWalk:
         """
         if not layout.held:
             return which
-        matches = self._match_constants(which, words(marks(layout.held)))
+        matches = self._match_constants(which, merge_constants(sort_constants(layout.held)))
         if matches is None:
             return which
         self._status[which[~matches]] = LENGTH
@@ -418,7 +420,7 @@ class _PartWalk:
             return -1
 
 
-def right_at(
+def match_constants_at(
     buffer: NDArray[np.uint8],
     spots: Offsets,
     constants: tuple[Word, ...],
@@ -438,7 +440,7 @@ def right_at(
         room = len(buffer) - spot - dtype.itemsize
         if bool((spots <= (room if stops is None else stops - spot - dtype.itemsize)).all()):
             windows: NDArray[Any] = np.ndarray((room + 1,), dtype, buffer.data, spot, (1,))
-            each = equal(windows[spots], word)
+            each = match_word(windows[spots], word)
         else:
             if stops is None:
                 ends = [len(buffer)] * len(spots)
@@ -465,7 +467,7 @@ def _is_start_of(data: bytes, word: Word) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Measure:
+class PartsSize:
     """The size of all parts of a region, in the form of a header field.
 
     A layout is chosen by the values of header fields, and by this size.
@@ -490,8 +492,8 @@ class Measure:
         there = np.flatnonzero(~cut_off | is_all)
         return there, values[there]
 
-    def of(self, frame: bytes | memoryview) -> int | None:
-        """Return the size as `Leaf.of` does."""
+    def read_first(self, frame: bytes | memoryview) -> int | None:
+        """Return the size as `Leaf.read_first` does."""
         values = self.read(np.frombuffer(frame, np.uint8), np.zeros(1, np.intp))[1]
         if len(values):
             return int(values[0])

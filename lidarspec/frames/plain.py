@@ -18,7 +18,7 @@ from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_fields import WireField
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.syntax import Mismatch, clean, field_path, leaves
+from lidarspec.spec.syntax import MismatchError, field_path, leaves, remove_private
 from lidarspec.spec.tree import FieldInfo
 
 #: how often a frame is built until its lengths agree.
@@ -34,7 +34,7 @@ def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any,
     """
     stream = io.BytesIO(data)
     values = frame.prepared.parse_stream(stream, _verify=verify)
-    return clean(values), stream.tell()
+    return remove_private(values), stream.tell()
 
 
 def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
@@ -54,7 +54,7 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
             data = bytes(frame.prepared.build(values, _sizes=sizes))
             if sizes == known:
                 break
-    except Mismatch as fault:
+    except MismatchError as fault:
         path = field_path(fault.path)
         if fault.reason == "missing":
             raise MissingField(path, place=place) from None
@@ -127,7 +127,7 @@ def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
     stream = io.BytesIO(data)
     try:
         frame.prepared.parse_stream(stream, _verify=True)
-    except Mismatch as fault:
+    except MismatchError as fault:
         path = field_path(fault.path)
         reason = (
             f"{path} at byte {fault.offset}: {fault.reason} {fault.got}, expected {fault.expected}"

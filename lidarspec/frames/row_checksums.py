@@ -2,24 +2,25 @@
 
 The results equal those of one call for each row.
 
-`over` and `batch` know the algorithms of `lidarspec.spec.checksums`; one of an author's own is
-asked for its `batch`.
+`compute_over_spans` and `compute_checksums` know the algorithms of `lidarspec.spec.checksums`; one
+of an author's own is asked for its `batch`.
 
-`words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight bytes
-of every row.
+`load_words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight
+bytes of every row.
 
 A CRC is linear: the register after a row is the XOR of the contributions of its bytes. To *advance*
-a byte by d is to compute its contribution d bytes later. `registers` chooses one of four methods:
+a byte by d is to compute its contribution d bytes later. `compute_registers` chooses one of four
+methods:
 
 * `_by_place`: for few and short rows. One table lookup for each byte; the table depends on the
   position of the byte in the row.
 * `_by_zlib`: for longer rows of the usual CRC-32. One call of `zlib.crc32` for each row.
-* `_narrow`: for registers of at most one byte. The front half of each row is advanced to the back
-  half, by a table of 256 entries, and XORed onto it. This is repeated until one byte is left. For
-  many rows, `_sum_words` first reduces each row to one word without tables.
-* `_wide`: for all others. The register of all rows advances two bytes at a time, by a table of
-  65,536 entries. Long rows are split into segments that are computed side by side and then joined
-  in pairs.
+* `_narrow_registers`: for registers of at most one byte. The front half of each row is advanced to
+  the back half, by a table of 256 entries, and XORed onto it. This is repeated until one byte is
+  left. For many rows, `_sum_words` first reduces each row to one word without tables.
+* `_wide_registers`: for all others. The register of all rows advances two bytes at a time, by a
+  table of 65,536 entries. Long rows are split into segments that are computed side by side and then
+  joined in pairs.
 
 `_sum_words` uses that in GF(2) the eighth power of a polynomial p(x) is p(x**8). A byte advanced by
 eight is therefore the XOR of the same byte advanced by n, for each term x**n of the polynomial with
@@ -80,19 +81,19 @@ _BYTE = np.uint64(0xFF)
 _BYTE_BITS = np.uint64(8)
 
 
-def batch(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
+def compute_checksums(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
     """Return the checksum of each row, (n,), for frames of one length, (n, m).
 
     The rows may be contiguous or not.
     """
-    return over(algorithm, rows, ((0, rows.shape[1]),))
+    return compute_over_spans(algorithm, rows, ((0, rows.shape[1]),))
 
 
-def over(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> Values:
+def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> Values:
     """Return the checksum of some bytes of each row, (n,), one span after another."""
     values = _TOGETHER.get(type(algorithm))
     if values is None or _are_few(algorithm, rows, spans):
-        return algorithm.batch(cut(rows, spans))
+        return algorithm.batch(gather_spans(rows, spans))
     step = max(1, BLOCK_BYTES // max(rows.shape[1], 1))
     if len(rows) <= step:
         return values(algorithm, rows, spans)
@@ -121,7 +122,9 @@ def _count_bytes(spans: Spans) -> int:
 def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
     return finalize(
         algorithm,
-        registers(rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin),
+        compute_registers(
+            rows, spans, algorithm.start, algorithm.width, algorithm.poly, algorithm.refin
+        ),
     )
 
 
@@ -143,29 +146,29 @@ def finalize(algorithm: Crc, left: NDArray[Any]) -> Values:
 
 
 def _xor(algorithm: Xor, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    columns = words(rows, spans=spans)
-    return folded_xor(xor(columns, range(len(columns))))
+    columns = load_words(rows, spans=spans)
+    return fold_xor(xor_words(columns, range(len(columns))))
 
 
 def _sum(algorithm: Sum, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    return byte_sums(words(rows, spans=spans)) & np.uint64((1 << algorithm.width) - 1)
+    return sum_bytes(load_words(rows, spans=spans)) & np.uint64((1 << algorithm.width) - 1)
 
 
 def _word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    columns = words(rows, spans=spans)
+    columns = load_words(rows, spans=spans)
     low, high, part = np.zeros((3, len(rows)), np.uint64)
     for which, masks in _word_masks(algorithm, len(columns)):
-        total = xor(columns, which)
+        total = xor_words(columns, which)
         np.bitwise_xor(low, np.bitwise_and(total, masks[0], out=part), out=low)
         np.bitwise_xor(high, np.bitwise_and(total, masks[1], out=part), out=high)
-    return folded_xor(low) | folded_xor(high) << np.uint64(8)
+    return fold_xor(low) | fold_xor(high) << np.uint64(8)
 
 
 @lru_cache(maxsize=512)
 def _word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
-    """Return masks of the low and high bytes in `number` words of `words`.
+    """Return masks of the low and high bytes in `number` words of `load_words`.
 
     Words with equal masks are grouped: their indices, and (low, high).
     """
@@ -180,7 +183,7 @@ def _word_masks(
 
 
 def _fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    rows = cut(rows, spans)
+    rows = gather_spans(rows, spans)
     tail = rows[:, rows.shape[1] % 2 - 60 :]
     total = np.zeros(len(rows), np.uint64)
     last = (tail.shape[1] - 1) // 2
@@ -190,8 +193,10 @@ def _fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:
 
 
 def _zero_padded(algorithm: ZeroPadded, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    rows = cut(rows, spans)
-    return batch(algorithm.algorithm, np.pad(rows, ((0, 0), (0, -rows.shape[1] % algorithm.to))))
+    rows = gather_spans(rows, spans)
+    return compute_checksums(
+        algorithm.algorithm, np.pad(rows, ((0, 0), (0, -rows.shape[1] % algorithm.to)))
+    )
 
 
 _TOGETHER: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values]] = {
@@ -204,7 +209,7 @@ _TOGETHER: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values
 }
 
 
-def words(
+def load_words(
     rows: NDArray[np.uint8], *, spans: Spans | None = None, zeros_first: bool = False
 ) -> NDArray[np.uint64]:
     """Return rows as columns of little-endian 8-byte words, (words, n), contiguous.
@@ -277,7 +282,7 @@ def _pieces(
     return number, runs, parts
 
 
-def xor(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.uint64]:
+def xor_words(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.uint64]:
     """The XOR of some words of each row, (n,)."""
     total = np.zeros(columns.shape[1], np.uint64)
     if len(which):
@@ -287,7 +292,7 @@ def xor(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.uint64]
     return total
 
 
-def folded_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def fold_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """The XOR of the eight bytes of each word, (n,); `total` is used up."""
     part = np.empty_like(total)
     for bits in (32, 16, 8):
@@ -295,7 +300,7 @@ def folded_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return np.bitwise_and(total, _BYTE, out=total)
 
 
-def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def sum_bytes(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """The sum of all bytes of each row; (n,)."""
     total = np.zeros(columns.shape[1], np.uint64)
     even = np.uint64(0x00FF00FF00FF00FF)
@@ -307,7 +312,7 @@ def byte_sums(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return total
 
 
-def registers(
+def compute_registers(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[Any]:
     """Return the register after some bytes of each row, (n,).
@@ -318,11 +323,13 @@ def registers(
     if 0 < length <= SHORT and len(rows) * length <= FEW:
         return _by_place(rows, spans, length, start, width, poly, refin)
     if length > SHORT and (width, poly, refin) == ZLIB:
-        return _by_zlib(cut(rows, spans), start)
-    return (_narrow if width <= 8 else _wide)(rows, spans, start, width, poly, refin)
+        return _by_zlib(gather_spans(rows, spans), start)
+    return (_narrow_registers if width <= 8 else _wide_registers)(
+        rows, spans, start, width, poly, refin
+    )
 
 
-def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
+def gather_spans(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
     """The bytes of each row that some spans cover, one span after another, (n, bytes)."""
     parts = [rows[:, start:stop] for start, stop in spans]
     if len(parts) == 1:
@@ -331,7 +338,7 @@ def cut(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
 
 
 def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
-    """Return `registers` of CRC-32 by `zlib`, row by row.
+    """Return `compute_registers` of CRC-32 by `zlib`, row by row.
 
     zlib starts from the inverted register and ends with it inverted.
     """
@@ -351,17 +358,19 @@ def _by_place(
     poly: int,
     refin: bool,
 ) -> NDArray[Any]:
-    """Return `registers` of a few short rows, by a table for each position.
+    """Return `compute_registers` of a few short rows, by a table for each position.
 
     The result is the XOR of the final contributions of all bytes.
     """
-    table, firsts, begun = places(length, start, width, poly, refin)
-    found: NDArray[Any] = np.bitwise_xor.reduce(table.take(cut(rows, spans) + firsts), axis=1)
+    table, firsts, begun = make_place_tables(length, start, width, poly, refin)
+    found: NDArray[Any] = np.bitwise_xor.reduce(
+        table.take(gather_spans(rows, spans) + firsts), axis=1
+    )
     return np.bitwise_xor(found, begun, out=found) if begun else found
 
 
 @lru_cache(maxsize=64)
-def places(
+def make_place_tables(
     length: int, start: int, width: int, poly: int, refin: bool
 ) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
     """Return the contribution of each byte value at each position to the final register.
@@ -385,14 +394,14 @@ def places(
     return np.concatenate(found[::-1]), np.arange(length) * 256, begun
 
 
-def _narrow(
+def _narrow_registers(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[np.uint8]:
-    """`registers` of at most one byte, in one byte."""
+    """`compute_registers` of at most one byte, in one byte."""
     length = _count_bytes(spans)
     if not length:
         return np.full(len(rows), start, np.uint8)
-    left = words(rows, spans=spans, zeros_first=True)
+    left = load_words(rows, spans=spans, zeros_first=True)
     if start:
         left[0] ^= np.uint64(start << 8 * (-length % 8))
     if len(rows) >= MANY and len(left) > 1:
@@ -447,11 +456,11 @@ def _shares(number: int, poly: int) -> tuple[int, ...]:
     return tuple(reversed(found))
 
 
-def _wide(
+def _wide_registers(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[Any]:
-    """`registers` of any width."""
-    rows = cut(rows, spans)
+    """`compute_registers` of any width."""
+    rows = gather_spans(rows, spans)
     (count, length), table = rows.shape, _word_table(width, poly, refin)
     # A power of two, small enough that there are many segments, to hide NumPy's cost per call.
     segment = min(max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2)

@@ -59,7 +59,7 @@ def without_indices(path: str) -> tuple[str, dict[str, int]]:
     return names, indices
 
 
-class ByPath(dict[str, _Field]):
+class PathMapping(dict[str, _Field]):
     """A mapping from paths to values of fields, also of elements of arrays.
 
     An element is a field by itself: "columns[0].timestamp".
@@ -140,7 +140,7 @@ class Schema:
         )
 
     @cached_property
-    def named(self) -> Mapping[str, FieldInfo]:
+    def scan_names(self) -> Mapping[str, FieldInfo]:
         """The fields of the frame and its parts, by the names that scans and clocks use.
 
         A field of a kind follows the name of the kind: "tags.points.angle".
@@ -150,7 +150,7 @@ class Schema:
             for kind in node.kinds:
                 before = f"{axis}.{kind.name}".rstrip(".")
                 found |= {
-                    f"{before}.{path}": info for path, info in schema(kind.root).named.items()
+                    f"{before}.{path}": info for path, info in schema(kind.root).scan_names.items()
                 }
         return found
 
@@ -230,7 +230,7 @@ def schema(root: Node) -> Schema:
         for kind in node.kinds:
             _walk(kind.element, inside, {}, optional=False)
     return Schema(
-        ByPath(_with_docs(fields, structs), functools.partial(_element, arrays)),
+        PathMapping(_with_docs(fields, structs), functools.partial(_element, arrays)),
         arrays,
         {axis: node for axis, node in parts.items() if not node.total.axes},
         _with_docs(inside, structs),

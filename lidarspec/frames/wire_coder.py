@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.frames.compilability import NotCompilable
-from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Refusal
+from lidarspec.frames.compilability import NotCompilableError
+from lidarspec.frames.layout import Bytes2D, Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, frame_layouts, prefix_of
-from lidarspec.frames.parts import Measure
+from lidarspec.frames.parts import PartsSize
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import Decoded, NumberRun, Problem, Run, TextRun, WireForm
 
@@ -93,7 +93,7 @@ class _FieldFinder:
 
     def __call__(self, struct: bytes) -> Sequence[Run]:
         self._node = self._tree.header(struct, since=self._node)
-        if isinstance(self._node.leaf, Measure):
+        if isinstance(self._node.leaf, PartsSize):
             raise SpecError(
                 "parts are found by their bytes, and these frames are text",
                 path=self._node.leaf.info.path,
@@ -126,7 +126,7 @@ class FormCoder(Coder):
 
     def __init__(self, frame: Frame, form: WireForm) -> None:
         tree = frame_layouts(frame)
-        if isinstance(tree, NotCompilable):
+        if isinstance(tree, NotCompilableError):
             raise SpecError(
                 f"a wire form needs fields with computable places: {tree.reason}", path=tree.path
             )
@@ -169,10 +169,10 @@ class FormCoder(Coder):
             return size
         return None
 
-    def refusal(self, struct: bytes) -> Refusal | None:
+    def refusal(self, struct: bytes) -> LayoutRefusal | None:
         """Return why the header of a struct leads to no layout; None if that is not known."""
         result = self.tree.header(struct).result
-        if isinstance(result, Refusal):
+        if isinstance(result, LayoutRefusal):
             return result
         return None
 

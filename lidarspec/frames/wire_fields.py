@@ -1,7 +1,7 @@
 """The fields of one frame with their places, also of a damaged or truncated frame.
 
 `examine` finds the layout of the bytes, or the beginning of it if the bytes end early, and
-`Examined.fields` walks along the frame tree with it. Errors (`lidarspec.frames.diagnose`) and
+`ExaminedFrame.fields` walks along the frame tree with it. Errors (`lidarspec.frames.diagnose`) and
 explanations use both.
 """
 
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from lidarspec.frames.layout import Layout, Leaf, Seal
-from lidarspec.frames.layout_tree import HeaderWalk, Unknown, walk_layout
-from lidarspec.frames.parts import FOUND, Measure, PartKind, Region
+from lidarspec.frames.layout_tree import HeaderWalk, UnknownSelectorError, walk_layout
+from lidarspec.frames.parts import FOUND, PartKind, PartsSize, Region
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField
 
@@ -68,7 +68,7 @@ class PlacedSeal:
     @property
     def offset(self) -> int:
         """The first byte of that field."""
-        return self.start + self.seal.leaves[0].held[0]
+        return self.start + self.seal.leaves[0].byte_span[0]
 
     @property
     def end(self) -> int:
@@ -85,20 +85,20 @@ class PlacedSeal:
 class ExaminedParts:
     """The parts of a frame at a path; the last one is broken unless `is_whole`."""
 
-    parts: list[Examined]
+    parts: list[ExaminedFrame]
     is_whole: bool
 
 
 @dataclass(frozen=True, eq=False)
-class Examined:
+class ExaminedFrame:
     """One frame, or a part of one, with its layout as far as the bytes determine it.
 
     Attributes:
         root: the frame type.
         data: the bytes.
         known: the layout; or as much of it as is known before `failure`.
-        failure: what ended the walk through the tree: `Unknown` if the bytes end, `TooLong`,
-            `Unlike`, or an error of an expression; None for a layout.
+        failure: what ended the walk through the tree: `UnknownSelectorError` if the bytes end,
+            `TooLongError`, `UnknownPartError`, or an error of an expression; None for a layout.
         start: of a part, its first byte in the frame.
         prefix: of a part, its path in the frame.
         is_bounded: of a part, whether the frame has bytes behind those of the parts.
@@ -152,11 +152,11 @@ class Examined:
             return self.known.open_regions.get(axis)
         return None
 
-    def parts_of(self, axis: str) -> list[Examined]:
+    def parts_of(self, axis: str) -> list[ExaminedFrame]:
         """Return the parts at a path, as far as they can be told apart."""
         return self._examined_parts(axis).parts
 
-    def broken_part(self, axis: str) -> Examined | None:
+    def broken_part(self, axis: str) -> ExaminedFrame | None:
         """Return the part at a path that is no valid part; None if all are there."""
         found = self._examined_parts(axis)
         if found.is_whole:
@@ -177,19 +177,19 @@ def examine(
     start: int = 0,
     prefix: str = "",
     is_bounded: bool = False,
-) -> Examined:
+) -> ExaminedFrame:
     """Find the layout of one frame, as far as its bytes determine it.
 
     Args:
         limit: the longest frame, in bytes.
         given: of a part, values of fields of the frame around it, by their path there.
-        start, prefix, is_bounded: of a part, as of `Examined`.
+        start, prefix, is_bounded: of a part, as of `ExaminedFrame`.
     """
 
-    def read(leaf: Leaf | Measure, walk: HeaderWalk) -> int:
-        value = leaf.of(data)
+    def read(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
+        value = leaf.read_first(data)
         if value is None:
-            raise Unknown(leaf)
+            raise UnknownSelectorError(leaf)
         walk.values = {**walk.values, leaf.info.path: value}
         return value
 
@@ -197,17 +197,17 @@ def examine(
     try:
         layout = walk_layout(walk, root)
     except Exception as failure:  # an expression of the struct may raise anything
-        return Examined(root, data, walk, failure, limit, start, prefix, is_bounded)
-    return Examined(root, data, layout, None, limit, start, prefix, is_bounded)
+        return ExaminedFrame(root, data, walk, failure, limit, start, prefix, is_bounded)
+    return ExaminedFrame(root, data, layout, None, limit, start, prefix, is_bounded)
 
 
-def _examine_parts(around: Examined, axis: str) -> ExaminedParts:
+def _examine_parts(around: ExaminedFrame, axis: str) -> ExaminedParts:
     region = around.region(axis)
     assert region is not None
     data = np.frombuffer(around.data, np.uint8)
     walked = region.walk(data, np.zeros(1, np.intp))
     pieces = [piece for pieces in walked.rounds for piece in pieces]
-    found = list[Examined]()
+    found = list[ExaminedFrame]()
     for index, piece in enumerate(pieces):
         start = int(piece.spots[0])
         stop = start + piece.layout.size
@@ -226,8 +226,14 @@ def _examine_parts(around: Examined, axis: str) -> ExaminedParts:
 
 
 def _examine_part(
-    around: Examined, region: Region, axis: str, index: int, kind: PartKind, start: int, end: int
-) -> Examined:
+    around: ExaminedFrame,
+    region: Region,
+    axis: str,
+    index: int,
+    kind: PartKind,
+    start: int,
+    end: int,
+) -> ExaminedFrame:
     prefix = f"{around.prefix}.{axis}[{index}]".strip(".")
     is_bounded = around.is_bounded or end < len(around.data)
     return examine(
@@ -257,7 +263,7 @@ def _likely_kind(region: Region, data: bytes) -> PartKind:
 class _Cursor:
     """A walk along the fields of one frame."""
 
-    def __init__(self, examined: Examined) -> None:
+    def __init__(self, examined: ExaminedFrame) -> None:
         self._examined = examined
         self._known = examined.known
         self._data = examined.data

@@ -44,26 +44,28 @@ class WireRow:
 
 
 @dataclass(frozen=True)
-class Extent:
+class SizeFormula:
     """A number of bytes: a constant, and formulas of header fields and indices added to it."""
 
     number: int = 0
     terms: tuple[str, ...] = ()
 
-    def __add__(self, other: Extent) -> Extent:
-        return Extent(self.number + other.number, self.terms + other.terms)
+    def __add__(self, other: SizeFormula) -> SizeFormula:
+        return SizeFormula(self.number + other.number, self.terms + other.terms)
 
-    def times(self, factor: int | str) -> Extent:
+    def times(self, factor: int | str) -> SizeFormula:
         """The extent of so many elements."""
         if isinstance(factor, int):
-            return Extent(self.number * factor, tuple(f"{factor}*({term})" for term in self.terms))
+            return SizeFormula(
+                self.number * factor, tuple(f"{factor}*({term})" for term in self.terms)
+            )
         if str(self) == "0":
             return self
         if self.terms:
             size = f"({self})"
         else:
             size = str(self)
-        return Extent(
+        return SizeFormula(
             0,
             (
                 (
@@ -90,7 +92,7 @@ def wire_table(frame: Frame) -> tuple[WireRow, ...]:
         if isinstance(node, tree.Sealed)
         for path in node.fields
     }
-    return tuple(_rows(frame.tree, "", Extent(), "", seals))
+    return tuple(_rows(frame.tree, "", SizeFormula(), "", seals))
 
 
 def frame_size(frame: Frame) -> str:
@@ -98,7 +100,7 @@ def frame_size(frame: Frame) -> str:
     return str(extent(frame.tree))
 
 
-def extent(node: tree.Node, shown: str = "") -> Extent:
+def extent(node: tree.Node, shown: str = "") -> SizeFormula:
     """Return the size of a part.
 
     Args:
@@ -106,12 +108,12 @@ def extent(node: tree.Node, shown: str = "") -> Extent:
     """
     match node:
         case tree.Number() | tree.Block():
-            return Extent(node.size)
+            return SizeFormula(node.size)
         case tree.Blob() | tree.Opaque():
             return _length(node.size, shown)
         case tree.Struct():
             return sum(
-                (extent(member, _member(shown, member)) for member in node.members), Extent()
+                (extent(member, _member(shown, member)) for member in node.members), SizeFormula()
             )
         case tree.Sealed():
             return extent(node.body, shown)
@@ -128,20 +130,20 @@ def extent(node: tree.Node, shown: str = "") -> Extent:
             if len(sizes) == 1:
                 return sizes.pop()
             return _length(None, shown)
-    return Extent()
+    return SizeFormula()
 
 
-def _length(size: tree.Formula | None, shown: str) -> Extent:
+def _length(size: tree.Formula | None, shown: str) -> SizeFormula:
     """A declared length; None for one that only the bytes tell."""
     if isinstance(size, int):
-        return Extent(size)
-    return Extent(0, (f"size({shown})" if size is None else phrase(size),))
+        return SizeFormula(size)
+    return SizeFormula(0, (f"size({shown})" if size is None else format_formula(size),))
 
 
 def _count(node: tree.Repeat) -> int | str:
     if isinstance(node.count, int):
         return node.count
-    return phrase(node.count)
+    return format_formula(node.count)
 
 
 def _member(shown: str, member: tree.Node) -> str:
@@ -156,7 +158,7 @@ def _element(shown: str) -> tuple[str, str]:
 
 
 def _rows(
-    node: tree.Node, shown: str, start: Extent, condition: str, seals: Mapping[str, str]
+    node: tree.Node, shown: str, start: SizeFormula, condition: str, seals: Mapping[str, str]
 ) -> Iterator[WireRow]:
     """The rows of a part that begins at `start`, and is there under a condition."""
     match node:
@@ -185,9 +187,11 @@ def _rows(
             )
             for kind in node.kinds:
                 said = f"{kind.name} in it" if kind.name else ""
-                yield from _rows(kind.element, element, Extent(0, (f"at({element})",)), said, seals)
+                yield from _rows(
+                    kind.element, element, SizeFormula(0, (f"at({element})",)), said, seals
+                )
         case tree.When() | tree.Select():
-            for asked, branch in branches(node):
+            for asked, branch in list_branches(node):
                 yield from _rows(branch, shown, start, asked, seals)
         case tree.Check():
             yield WireRow(
@@ -196,7 +200,7 @@ def _rows(
                 "check",
                 shown,
                 "",
-                "; ".join(filter(None, (condition, f"holds: {phrase(node.condition)}"))),
+                "; ".join(filter(None, (condition, f"holds: {format_formula(node.condition)}"))),
             )
         case tree.Never():
             yield WireRow(str(start), "0", "no frame", shown, "", condition)
@@ -226,7 +230,7 @@ def _row(
     condition: str,
     seals: Mapping[str, str],
 ) -> WireRow:
-    says = "; ".join(filter(None, (condition, meaning(info), seals.get(info.path, ""))))
+    says = "; ".join(filter(None, (condition, describe_field(info), seals.get(info.path, ""))))
     return WireRow(offset, size, kind, shown, unit_text(info), says)
 
 
@@ -259,12 +263,12 @@ def _type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
     return "bytes"
 
 
-def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
+def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     """The alternatives of a part, each with its condition in words."""
     if isinstance(node, tree.When):
-        asked = phrase(node.condition)
+        asked = format_formula(node.condition)
         return [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
-    key = phrase(node.key)
+    key = format_formula(node.key)
     if isinstance(node.key, tree.Ref):
         labels = node.key.info.labels
     else:
@@ -276,20 +280,22 @@ def branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
 def describe_end(node: tree.PartSequence) -> str:
     """Describe what determines the last one of some parts."""
     if node.count is not None:
-        return f"{phrase(node.count)} parts of sizes of their own"
+        return f"{format_formula(node.count)} parts of sizes of their own"
     if node.within is not None:
-        return f"as many parts as fill {phrase(node.within)} bytes"
+        return f"as many parts as fill {format_formula(node.within)} bytes"
     assert node.size is not None
     following = ", ".join(
-        dict.fromkeys(phrase(kind.following) for kind in node.kinds if kind.following is not None)
+        dict.fromkeys(
+            format_formula(kind.following) for kind in node.kinds if kind.following is not None
+        )
     )
     return (
-        f"a chain: {phrase(node.size)} bytes, then as many as {following} of the part before says;"
-        " 0 ends it"
+        f"a chain: {format_formula(node.size)} bytes, then as many as {following} of the part"
+        " before says; 0 ends it"
     )
 
 
-def phrase(formula: tree.Formula) -> str:
+def format_formula(formula: tree.Formula) -> str:
     """Return a formula as text, with the whole paths of its fields.
 
     Returns "?" for a function that cannot be read.
@@ -340,7 +346,7 @@ def unit_text(info: tree.FieldInfo) -> str:
     return f"{info.scale:.10g} {info.unit}".strip() + shift
 
 
-def meaning(info: tree.FieldInfo) -> str:
+def describe_field(info: tree.FieldInfo) -> str:
     """Return the description of a field.
 
     It has its constant, the formula it follows from, its text and the names of its values.
@@ -355,7 +361,7 @@ def meaning(info: tree.FieldInfo) -> str:
         else ""
     )
     if info.rebuilt is not None:
-        follows = phrase(info.rebuilt)
+        follows = format_formula(info.rebuilt)
     else:
         follows = "?"
     labels = ", ".join(f"{value} {name}" for value, name in info.labels.items())

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
 from lidarspec.frames.arrays import repeat
-from lidarspec.frames.layout import Marks, Sums, words
+from lidarspec.frames.layout import Marks, Sums, merge_constants
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CONSTANT, COUNTED, PLUGIN, SHORT, VALID, Frames
-from lidarspec.framing.weak_frames import Runs, find_runs
+from lidarspec.framing.weak_frames import WeakRuns, find_runs
 
 #: candidates of one type in a piece; if there are more, the piece is made shorter, so that memory
 #: stays small.
@@ -65,7 +65,7 @@ class SearchState:
 
 
 @dataclass
-class Piece:
+class PieceResult:
     """The result for one piece of a stream.
 
     Attributes:
@@ -109,7 +109,7 @@ class Framing:
         self.sums = sums
         self.named = {codec.frame.after for codec in self.codecs} - {None}
         self.marks = [codec.marks for codec in self.codecs]
-        self.words = [words(marks) for marks in self.marks]
+        self.words = [merge_constants(marks) for marks in self.marks]
         #: bytes up to the end of the last constant of each type.
         self.ends = [
             max((offset + dtype.itemsize for offset, dtype, _, _ in own), default=0)
@@ -125,7 +125,7 @@ class Framing:
         self._active: dict[str | None, list[int]] = {}
         self._filters: dict[tuple[int, ...], ConstantFilter] = {}
 
-    def active(self, mode: SearchState) -> list[int]:
+    def active_types(self, mode: SearchState) -> list[int]:
         """Return the types that are looked for now, in order."""
         active = self._active.get(mode.after)
         if active is None:
@@ -245,7 +245,7 @@ class ConstantFilter:
 
 
 @dataclass(frozen=True, eq=False)
-class Live:
+class LiveCandidates:
     """The candidates of a piece that may be taken while the same types are looked for.
 
     Attributes:
@@ -257,7 +257,7 @@ class Live:
 
     frames: Frames
     ends: Offsets
-    runs: dict[int, Runs]
+    runs: dict[int, WeakRuns]
 
 
 class Candidates:
@@ -280,7 +280,7 @@ class Candidates:
     ) -> None:
         self._framing = framing
         self.buffer = buffer
-        if not all(framing.marks[kind] for kind in framing.active(mode)):
+        if not all(framing.marks[kind] for kind in framing.active_types(mode)):
             self.buffer = buffer[: max(MAX_CANDIDATES, framing.reach)]  # each offset is one
         self._offsets_by_prefix: dict[Marks, Offsets] = {}
         self.judged: dict[int, Frames] = {}
@@ -307,15 +307,15 @@ class Candidates:
         self.final = final and self.is_whole
         self._judge(found)
 
-    def live(self, mode: SearchState) -> Live | None:
+    def find_live(self, mode: SearchState) -> LiveCandidates | None:
         """Return the candidates that may be taken; None if there are too many."""
         found = self._find(mode)
         if any(len(offsets) > MAX_CANDIDATES for offsets in found.values()):
             return None
         self._judge(found)
         parts = list[Frames]()
-        all_runs = dict[int, Runs]()
-        active = self._framing.active(mode)
+        all_runs = dict[int, WeakRuns]()
+        active = self._framing.active_types(mode)
         for kind in active:
             own = self.judged.get(kind)
             if own is None:
@@ -333,19 +333,19 @@ class Candidates:
             elif kind in self._live:
                 own = self._live[kind]
             else:
-                own = self._live[kind] = alive(own, final=self.final)
+                own = self._live[kind] = select_live(own, final=self.final)
             parts.append(own)
         frames = self._merge([*parts, *self._wait(active)])
         ends = frames.starts + frames.sizes
         for kind, runs in all_runs.items():
             is_own = frames.kinds == kind
             ends[is_own] = runs.ends[runs.frames.starts.searchsorted(frames.starts[is_own])]
-        return Live(frames, ends, all_runs)
+        return LiveCandidates(frames, ends, all_runs)
 
     def _merge(self, parts: Sequence[Frames]) -> Frames:
         if parts:
-            return merge(parts)
-        return Frames.none(self.buffer)
+            return merge_by_offset(parts)
+        return Frames.make_empty(self.buffer)
 
     def _wait(self, kinds: Sequence[int]) -> list[Frames]:
         """Return the candidates of some types whose constants have not all arrived.
@@ -372,7 +372,7 @@ class Candidates:
     def _find(self, mode: SearchState) -> dict[int, Offsets]:
         """Return where the constants of types stand that have not been looked for before."""
         groups: dict[Marks, list[int]] = {}
-        for kind in self._framing.active(mode):
+        for kind in self._framing.active_types(mode):
             if kind not in self._known:
                 groups.setdefault(self._framing.marks[kind][:SHARED_MARKS], []).append(kind)
         found: dict[int, Offsets] = {}
@@ -399,7 +399,7 @@ class Candidates:
             own = self._framing.survey(kind, self.buffer, offsets[:number])
             if not own.is_sound:
                 is_right = own.status != CONSTANT
-                own = own if is_right.all() else own.only(is_right)
+                own = own if is_right.all() else own.select(is_right)
             self.judged[kind] = own
 
     def _count_arrived(self, kind: int, offsets: Offsets) -> int:
@@ -410,7 +410,7 @@ class Candidates:
         return int(offsets.searchsorted(last, "right"))
 
 
-def alive(candidates: Frames, *, final: bool) -> Frames:
+def select_live(candidates: Frames, *, final: bool) -> Frames:
     """Return the candidates that are valid or, if more bytes follow, incomplete."""
     if candidates.is_sound:
         return candidates
@@ -419,21 +419,21 @@ def alive(candidates: Frames, *, final: bool) -> Frames:
     if number == len(candidates):
         return candidates
     if not number:
-        return Frames.none(candidates.buffer)
-    return candidates.only(is_live)
+        return Frames.make_empty(candidates.buffer)
+    return candidates.select(is_live)
 
 
-def merge(candidates: Sequence[Frames]) -> Frames:
+def merge_by_offset(candidates: Sequence[Frames]) -> Frames:
     """Return live candidates of several types by offset, one for each offset.
 
     At the same offset, the type that comes first is kept.
     """
     parts = [own for own in candidates if len(own)]
     if not parts:
-        return Frames.none(candidates[0].buffer)
+        return Frames.make_empty(candidates[0].buffer)
     live = Frames.join(parts)
     if len(parts) == 1:
         return live
     order = np.lexsort((live.kinds, live.starts))
     is_first = np.diff(live.starts[order], prepend=-1) > 0
-    return live.only(order[is_first])
+    return live.select(order[is_first])

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.compilability import NotCompilable
+from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.framing.results import Counters, Indices, Numbers
@@ -59,7 +59,7 @@ class _PartialMessage:
 
 
 @dataclass(frozen=True, eq=False)
-class Joined:
+class JoinedMessages:
     """Messages, in the order of their last fragments.
 
     Attributes:
@@ -78,7 +78,7 @@ class Joined:
     heads: int
 
 
-class Assembly:
+class FragmentAssembler:
     """Joins the fragments of one link.
 
     Args:
@@ -95,7 +95,7 @@ class Assembly:
         self._longest = longest
         self._stats = stats
         layouts = frame_layouts(Frame(rule.struct, max_length=DATAGRAM))
-        if isinstance(layouts, NotCompilable):
+        if isinstance(layouts, NotCompilableError):
             raise rule.wrong(str(layouts))
         self._layouts = layouts
         self._waiting: dict[Hashable, _PartialMessage] = {}
@@ -114,7 +114,7 @@ class Assembly:
         sizes: Indices,
         at: NDArray[np.int64],
         base: int,
-    ) -> Joined:
+    ) -> JoinedMessages:
         """Return the messages that datagrams complete, among other datagrams.
 
         Args:
@@ -144,7 +144,7 @@ class Assembly:
         lengths = np.array(list(map(len, data)), np.intp)
         left = self._dropped
         self._dropped = 0
-        return Joined(
+        return JoinedMessages(
             np.frombuffer(b"".join(data), np.uint8),
             np.cumsum(lengths) - lengths,
             lengths,

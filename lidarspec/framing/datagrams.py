@@ -16,10 +16,10 @@ import bisect
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.arrays import alike, repeat
-from lidarspec.frames.layout import Layout, equal
-from lidarspec.framing.candidates import Bytes1D, Framing, Piece, SearchState
-from lidarspec.framing.regular_rows import steady_datagrams, step_between
+from lidarspec.frames.arrays import broadcast_value, repeat
+from lidarspec.frames.layout import Layout, match_word
+from lidarspec.framing.candidates import Bytes1D, Framing, PieceResult, SearchState
+from lidarspec.framing.regular_rows import find_common_step, find_regular_datagrams
 from lidarspec.framing.results import (
     CONSTANT,
     LENGTH,
@@ -34,9 +34,9 @@ from lidarspec.framing.results import (
 )
 
 
-def sorted_datagrams(
+def sort_datagrams(
     framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: SearchState
-) -> Piece:
+) -> PieceResult:
     """The type of each datagram.
 
     Args:
@@ -47,9 +47,9 @@ def sorted_datagrams(
     Returns:
         All datagrams as frames, those that are none with the kind -1.
     """
-    steady = steady_datagrams(framing, buffer, starts, sizes, mode)
+    steady = find_regular_datagrams(framing, buffer, starts, sizes, mode)
     if steady is not None and steady.is_sound:
-        return Piece(steady, len(buffer))
+        return PieceResult(steady, len(buffer))
     return _DatagramBatch(framing, buffer, array_of(starts), sizes, steady).sort(mode)
 
 
@@ -74,21 +74,21 @@ class _DatagramBatch:
         self._sizes = sizes
         self._steady = steady
         self._known: dict[str | None, tuple[int, Frames, Status, list[int]]] = {}
-        self._piece = Piece(Frames.none(buffer), len(buffer))
+        self._piece = PieceResult(Frames.make_empty(buffer), len(buffer))
 
-    def sort(self, mode: SearchState) -> Piece:
+    def sort(self, mode: SearchState) -> PieceResult:
         """All of them."""
         position = 0
         parts = list[Frames]()
         while position < len(self._starts):
-            part = self._from(position, mode)
+            part = self._sort_from(position, mode)
             parts.append(part)
             position += len(part)
         if parts:
             self._piece.frames = Frames.join(parts)
         return self._piece
 
-    def _from(self, position: int, mode: SearchState) -> Frames:
+    def _sort_from(self, position: int, mode: SearchState) -> Frames:
         """The types from here up to the datagram that changes what is looked for."""
         if mode.after not in self._known:
             frames, reasons = self._judge(self._starts[position:], self._sizes[position:], mode)
@@ -105,7 +105,7 @@ class _DatagramBatch:
             stop = spots[index] + 1
         else:
             stop = len(self._starts)
-        frames = frames.only(slice(position - first, stop - first))
+        frames = frames.select(slice(position - first, stop - first))
         lost = np.flatnonzero(frames.kinds < 0)
         if len(lost):
             frames = self._count_rejected(frames, lost, reasons[position - first :][lost], mode)
@@ -125,7 +125,7 @@ class _DatagramBatch:
             where each is to be judged alone.
         """
         number = len(starts)
-        known = alike(sizes)
+        known = broadcast_value(sizes)
         if known is not None:
             least = known
             most = known
@@ -140,7 +140,9 @@ class _DatagramBatch:
         reasons = np.zeros(number, np.uint8)
         left = np.arange(number)
         layouts: tuple[Layout, ...] = ()
-        fixed = [(kind, self._framing.codecs[kind].size) for kind in self._framing.active(mode)]
+        fixed = [
+            (kind, self._framing.codecs[kind].size) for kind in self._framing.active_types(mode)
+        ]
         others = [
             kind for kind, size in fixed if size is not None and not least <= size <= most
         ]  # they can only say why not
@@ -163,7 +165,7 @@ class _DatagramBatch:
                 fits &= frames.status == VALID
             elif len(own) == number and fits.all():
                 return frames, reasons
-            if alike(kinds) is not None:
+            if broadcast_value(kinds) is not None:
                 kinds, forms = np.full((2, number), -1, np.intp)
             kinds[which[fits]] = kind
             forms[which[fits]] = np.where(frames.forms < 0, -1, frames.forms + len(layouts))[fits]
@@ -196,27 +198,27 @@ class _DatagramBatch:
         parts = list[Frames]()
         begun = 0
         for index in lost[reasons == PLUGIN].tolist():
-            alone = self._judged_alone(frames.only(slice(index, index + 1)), mode)
+            alone = self._judge_alone(frames.select(slice(index, index + 1)), mode)
             if alone is None:
                 continue
-            parts += [frames.only(slice(begun, index)), alone]
+            parts += [frames.select(slice(begun, index)), alone]
             begun = index + 1
             if self._framing.switches(alone.kinds.item(0), mode):
-                frames = frames.only(slice(0, begun))
+                frames = frames.select(slice(0, begun))
                 break
         counted = (reasons != PLUGIN) & (lost < len(frames))
         self._count(reasons[counted], frames.sizes[lost[counted]], mode)
         if parts:
-            return Frames.join([*parts, frames.only(slice(begun, None))])
+            return Frames.join([*parts, frames.select(slice(begun, None))])
         return frames
 
-    def _judged_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
+    def _judge_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
         """One datagram as a frame, None where it is none; counts why."""
         rejected = 0
         start = datagram.starts
         size = datagram.sizes
         data = self._buffer[start.item(0) : start.item(0) + size.item(0)]
-        for kind in self._framing.active(mode) if len(data) else ():
+        for kind in self._framing.active_types(mode) if len(data) else ():
             if not self._has_constants(kind, start, size).all():
                 continue
             frame = self._framing.survey(kind, data, np.zeros(1, np.intp))
@@ -234,7 +236,7 @@ class _DatagramBatch:
 
         Without the constants of a frame they count as such, or as too short to have them.
         """
-        least = min(self._framing.ends[kind] for kind in self._framing.active(mode))
+        least = min(self._framing.ends[kind] for kind in self._framing.active_types(mode))
         unknown = np.isin(reasons, (VALID, CONSTANT))
         others = unknown & (sizes >= max(least, 1))
         if number := int(np.count_nonzero(others)):
@@ -247,7 +249,7 @@ class _DatagramBatch:
         """Return the mask of datagrams that have the constants of a type."""
         constants = self._framing.words[kind]
         end = self._framing.ends[kind]
-        size = alike(sizes)
+        size = broadcast_value(sizes)
         if size is None or size < end:
             whole = sizes >= end
             if not whole.all():
@@ -255,7 +257,7 @@ class _DatagramBatch:
                 marked[whole] = self._has_constants(kind, starts[whole], sizes[whole])
                 return marked
         marked = np.ones(len(starts), np.bool_)
-        step = step_between(starts)
+        step = find_common_step(starts)
         for word in constants if len(starts) else ():
             spot, dtype, _, _ = word
             if step:
@@ -270,5 +272,5 @@ class _DatagramBatch:
                     spot,
                     (1,),
                 )[starts]
-            marked &= equal(values, word)
+            marked &= match_word(values, word)
         return marked

@@ -18,20 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, UsageError, refuse_text
-from lidarspec.frames.arrays import alike, keep_freed_memory, repeat
+from lidarspec.frames.arrays import broadcast_value, keep_freed_memory, repeat
 from lidarspec.frames.layout import Sums
-from lidarspec.framing.candidates import Bytes1D, Framing, Piece, SearchState
-from lidarspec.framing.datagram_assembly import Assembly, Joined
-from lidarspec.framing.datagrams import sorted_datagrams
+from lidarspec.framing.candidates import Bytes1D, Framing, PieceResult, SearchState
+from lidarspec.framing.datagram_assembly import FragmentAssembler, JoinedMessages
+from lidarspec.framing.datagrams import sort_datagrams
 from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.regular_rows import steady_stream
+from lidarspec.framing.regular_rows import find_regular_frames
 from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
-from lidarspec.framing.search import leftmost
+from lidarspec.framing.search import find_frames
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Udp
 from lidarspec.spec.sensor import SensorDescription
 
-__all__ = ["BACKENDS", "Decoder", "backend", "frames_of", "is_stream"]
+__all__ = ["BACKENDS", "Decoder", "select_backend", "frames_of", "is_stream"]
 
 #: bytes of a stream looked at in one go: at most, where frames follow one another and where not;
 #: and at least.
@@ -52,7 +52,7 @@ BACKENDS = ("auto", "numpy", "jit")
 BACKEND = "LIDARSPEC_BACKEND"
 
 
-class Witness(Protocol):
+class DecoderObserver(Protocol):
     """Observer of the input and the results of a decoder."""
 
     def observe_input(
@@ -63,7 +63,7 @@ class Witness(Protocol):
         `decoder.stats` does not count it yet. The buffer does not change.
         """
 
-    def found(self, frames: Frames) -> None:
+    def observe_frames(self, frames: Frames) -> None:
         """Frames, in stream order."""
 
 
@@ -78,7 +78,7 @@ class Decoder:
 
     Attributes:
         framing: the rules by which its frames are told apart, which no byte changes.
-        witness: who is shown its bytes and frames; None for nobody.
+        observer: who is shown its bytes and frames; None for nobody.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Decoder:
         self.stream = stream
         self.backend = backend
         self.stats = Counters()
-        self.witness: Witness | None = None
+        self.observer: DecoderObserver | None = None
         keep_freed_memory()
         self.framing = _framing(tuple(sensor.incoming), tuple(sensor.incoming.values()), sums)
         answer = sensor.options.get(
@@ -109,11 +109,11 @@ class Decoder:
         self._need = 0
         self._gap = 0
         self._fillers = bytes(sensor.fillers)
-        self._assembly: Assembly | None = None
+        self._assembly: FragmentAssembler | None = None
         link = sensor.links.get("data")
         if isinstance(link, Udp) and link.assembled is not None and not stream:
             longest = max(frame.max_length for frame in sensor.incoming.values())
-            self._assembly = Assembly(link.assembled, longest, self.stats)
+            self._assembly = FragmentAssembler(link.assembled, longest, self.stats)
         self._least = max(LEAST, 2 * self.framing.reach)
         # Weak frames take long to find, but not as regular rows, which follow the first piece.
         if self.framing.has_weak_types:
@@ -149,7 +149,7 @@ class Decoder:
         Returns:
             The frames found.
         """
-        return [found for frames in self.rest() for found in frames.found()]
+        return [found for frames in self.take_pending() for found in frames.found()]
 
     def finish(self) -> list[Found]:
         """Handle the end of the input: give up candidates that wait for bytes.
@@ -176,9 +176,9 @@ class Decoder:
             view = memoryview(data).cast("B")
         if not self.stream:
             return [self.datagrams([view], [at])]
-        if self.witness is not None:
+        if self.observer is not None:
             buffer = np.frombuffer(data if isinstance(data, bytes) else bytes(view), np.uint8)
-            self.witness.observe_input(self, buffer, range(1), repeat(len(view), 1))
+            self.observer.observe_input(self, buffer, range(1), repeat(len(view), 1))
         self.stats.bytes_in += len(view)
         found: list[Frames] = []
         start = 0
@@ -196,7 +196,7 @@ class Decoder:
         self.stats.pending = len(self._pending)
         return found
 
-    def rest(self) -> list[Frames]:
+    def take_pending(self) -> list[Frames]:
         """The frames among the bytes that wait for others, as arrays: these will not come."""
         found: list[Frames] = []
         self._need = 0
@@ -251,15 +251,15 @@ class Decoder:
             starts, sizes: of each datagram, in the order of their arrival.
             at: their arrival times in ns, -1 where nobody knows.
         """
-        size = alike(sizes)
+        size = broadcast_value(sizes)
         if size is None:
             total = int(sizes.sum())
         else:
             total = size * len(sizes)
         places = _places(sizes, self._base)
         joined = None
-        if self.witness is not None:
-            self.witness.observe_input(self, buffer, starts, sizes)
+        if self.observer is not None:
+            self.observer.observe_input(self, buffer, starts, sizes)
         if self._assembly is not None:
             joined = self._assembly.join(buffer, starts, sizes, at, self._base)
             buffer = joined.buffer
@@ -270,13 +270,13 @@ class Decoder:
             self.stats.bytes_skipped += joined.heads
             self.stats.bytes_filler += joined.heads
             self.stats.pending = self._assembly.pending
-        piece = sorted_datagrams(self.framing, buffer, starts, sizes, self._mode)
+        piece = sort_datagrams(self.framing, buffer, starts, sizes, self._mode)
         frames = piece.frames
         self._base = self._base + total
         self.stats.bytes_in = self.stats.bytes_in + total
         self._count_rejected(piece.rejected, piece.errors)
         gaps = repeat(0, len(frames))
-        kind = alike(frames.kinds)
+        kind = broadcast_value(frames.kinds)
         if kind is not None:
             is_good = kind >= 0
         else:
@@ -285,15 +285,15 @@ class Decoder:
             good = frames.kinds >= 0
             gaps = self._lost(buffer, frames.starts, sizes, good, joined)
             if not is_good:
-                frames = frames.only(good)
+                frames = frames.select(good)
                 places = array_of(places)[good]
                 at = at[good]
         self._count(frames.kinds)
-        return self._shown(frames.locate(self.framing.names, places, gaps, at))
+        return self._observe(frames.locate(self.framing.names, places, gaps, at))
 
-    def _shown(self, frames: Frames) -> Frames:
-        if self.witness is not None:
-            self.witness.found(frames)
+    def _observe(self, frames: Frames) -> Frames:
+        if self.observer is not None:
+            self.observer.observe_frames(frames)
         return frames
 
     def _lost(
@@ -302,7 +302,7 @@ class Decoder:
         starts: NDArray[np.intp],
         sizes: NDArray[np.intp],
         good: NDArray[np.bool_],
-        joined: Joined | None,
+        joined: JoinedMessages | None,
     ) -> NDArray[np.int64]:
         """Return the invalid bytes before each frame in datagrams, and count them.
 
@@ -354,23 +354,23 @@ class Decoder:
             self._need = piece.need if piece.waiting and last else 0
             if piece.waiting and last:
                 break
-            most = LONGEST if 2 * frames.total > piece.end else PIECE
+            most = LONGEST if 2 * frames.total_bytes > piece.end else PIECE
             self._size = min(max(4 * piece.end, self._least), max(most, self._least))
         return start
 
-    def _piece(self, buffer: Bytes1D, *, final: bool) -> Piece:
+    def _piece(self, buffer: Bytes1D, *, final: bool) -> PieceResult:
         """Return a piece of a stream cut into frames.
 
         It is cut into rows as long as the frames are regular, else by search.
         """
         piece = None
         if not final:
-            piece = steady_stream(self.framing, buffer, self._mode, self._base)
+            piece = find_regular_frames(self.framing, buffer, self._mode, self._base)
         if piece is None:
-            piece = leftmost(self.framing, buffer, self._mode, self._base, final=final)
+            piece = find_frames(self.framing, buffer, self._mode, self._base, final=final)
         return piece
 
-    def _enter(self, buffer: NDArray[np.uint8], piece: Piece, at: int | None) -> Frames:
+    def _enter(self, buffer: NDArray[np.uint8], piece: PieceResult, at: int | None) -> Frames:
         """Return the frames of a piece at their offsets in the input; count everything."""
         frames = piece.frames
         base = self._base
@@ -382,7 +382,7 @@ class Decoder:
             places = range(places.start + base, places.stop + base, places.step)
         else:
             places = places + base
-        return self._shown(
+        return self._observe(
             frames.locate(
                 self.framing.names, places, gaps, repeat(-1 if at is None else at, len(frames))
             )
@@ -425,7 +425,7 @@ class Decoder:
     def _count(self, kinds: NDArray[np.intp]) -> None:
         frames = self.stats.frames
         known = len(frames)
-        only = alike(kinds)
+        only = broadcast_value(kinds)
         for kind, number in (
             [(only, len(kinds))]
             if only is not None
@@ -449,7 +449,7 @@ def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums | Non
 
 def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
     """Return the offsets of consecutive pieces of these sizes, from `first` on."""
-    if size := alike(sizes):
+    if size := broadcast_value(sizes):
         return range(first, first + len(sizes) * size, size)
     starts = np.cumsum(sizes)
     starts -= sizes
@@ -457,7 +457,7 @@ def _places(sizes: NDArray[np.intp], first: int = 0) -> Numbers:
     return starts
 
 
-def backend(name: str) -> str:
+def select_backend(name: str) -> str:
     """Return the back end for a name.
 
     For "auto" it is the value of LIDARSPEC_BACKEND, if that is set.
@@ -481,7 +481,7 @@ def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
         data: bytes for a decoder of a stream, else an iterable or (n, size) array of datagrams.
     """
     if decoder.stream:
-        return decoder.frames(data) + decoder.rest()
+        return decoder.frames(data) + decoder.take_pending()
     packets: Any = (
         np.ascontiguousarray(data, np.uint8) if isinstance(data, np.ndarray) else list(data)
     )
@@ -492,7 +492,7 @@ def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
         step = 1
     return [
         decoder.datagrams(packets[start : start + step]) for start in range(0, len(packets), step)
-    ] + decoder.rest()
+    ] + decoder.take_pending()
 
 
 def is_stream(data: Any) -> bool:

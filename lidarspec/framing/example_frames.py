@@ -26,19 +26,19 @@ from lidarspec.errors import (
     struct_error,
 )
 from lidarspec.frames.build import build
-from lidarspec.frames.frame_table import Group, Rows
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout, Leaf
-from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
-from lidarspec.frames.parts import Measure
+from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, layout_of
+from lidarspec.frames.parts import PartsSize
 from lidarspec.frames.schema import schema
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.plausibility import plausibility
+from lidarspec.framing.plausibility import check_plausibility
 from lidarspec.framing.results import VALID
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
-from lidarspec.spec.syntax import Fault, member, random_value
+from lidarspec.spec.syntax import Fault, get_member, random_value
 from lidarspec.spec.tree import Node, Ref, Select, nodes, refs
 
 #: How often random frames are made, and how often where a sensor's own `sweep` helps if none is
@@ -83,7 +83,7 @@ def random_frame(
     for attempt in range(
         TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP
     ):
-        layout, chosen = header(engine, source, drawn)
+        layout, chosen = make_random_header(engine, source, drawn)
         number = min(GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1))
         rows = _random(engine, layout, number, source)
         _store_drawn(layout, rows, chosen, drawn, source)
@@ -93,7 +93,7 @@ def random_frame(
     return _make_along_sweep(sensor, frame, engine, source, drawn)
 
 
-def header(
+def make_random_header(
     engine: Codec, source: random.Random, drawn: Drawn = NOTHING
 ) -> tuple[Layout, dict[str, int]]:
     """A layout of a header chosen at random, with the values of the fields it depends on, by path.
@@ -106,7 +106,7 @@ def header(
     """
     keys = sorted(_switch_keys(engine.frame.tree))
     for _ in range(HEADERS):
-        with contextlib.suppress(TooLong, ArithmeticError, LookupError, TypeError, ValueError):
+        with contextlib.suppress(TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
             return _header(engine.frame, source, drawn, keys)
     raise SpecError("no header was found that gives a frame within its longest length")
 
@@ -118,8 +118,8 @@ def _header(
     while True:
         try:
             return layout_of(frame.tree, values, frame.room), values
-        except Unknown as unknown:
-            if isinstance(unknown.leaf, Measure):
+        except UnknownSelectorError as unknown:
+            if isinstance(unknown.leaf, PartsSize):
                 raise SpecError(
                     "a header alone does not make a frame of parts", path=unknown.leaf.info.path
                 ) from None
@@ -211,7 +211,7 @@ def _left_open(values: Any, root: Node) -> Any:
         rules = (node.count, node.size, node.within)
         asked = [ref.path for rule in rules if rule is not None for ref in refs(rule)[:1]]
         for kind, part in (
-            (kind, part) for part in member(values, node.axis, []) for kind in node.kinds
+            (kind, part) for part in get_member(values, node.axis, []) for kind in node.kinds
         ):
             own = () if kind.following is None else refs(kind.following)[:1]
             for path in (ref.path for ref in own):
@@ -225,7 +225,7 @@ def _left_open(values: Any, root: Node) -> Any:
 def _blank(values: Any, path: str) -> None:
     """Take a field out of nested mappings, where it is."""
     *parents, name = path.split(".")
-    member(values, ".".join(parents), {}).pop(name, None) if parents else values.pop(name, None)
+    get_member(values, ".".join(parents), {}).pop(name, None) if parents else values.pop(name, None)
 
 
 def _set_headers(
@@ -243,11 +243,13 @@ def _plausible(
 ) -> list[bytes]:
     if layout.conditions:
         rows = rows[layout.meets(rows)]
-    table = Rows(codec(sensor.frames[frame]).schema, [Group(layout, np.arange(len(rows)), rows)])
+    table = CompiledTable(
+        codec(sensor.frames[frame]).schema, [LayoutRows(layout, np.arange(len(rows)), rows)]
+    )
     if sensor.frames[frame].plausible is None:
         return _sent(sensor, frame, layout, rows)
     errors: list[PluginError] = []
-    good = np.flatnonzero(plausibility(sensor.frames[frame], table, errors) == 0)
+    good = np.flatnonzero(check_plausibility(sensor.frames[frame], table, errors) == 0)
     if errors:
         raise SpecError(
             errors[0].reason, path=f"{frame}.plausible", sensor=sensor.id, rule=errors[0].rule
@@ -280,7 +282,9 @@ def _make_along_sweep(
         )
     for _ in range(TRIES):
         values = sweep(source.randrange(10_000))
-        layout, chosen = header(engine, source, {**_draw_stated(engine, values), **drawn})
+        layout, chosen = make_random_header(
+            engine, source, {**_draw_stated(engine, values), **drawn}
+        )
         rows = _random(engine, layout, 1, source)
         for path, value in values.items():
             leaf = layout.leaves.get(path)
@@ -330,10 +334,10 @@ def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
     found: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():
         if path in fields and np.ndim(value) == 0 and not isinstance(value, bytes):
-            found[path] = functools.partial(draw_always, fields[path].raw(float(value)))
+            found[path] = functools.partial(return_raw, fields[path].raw(float(value)))
     return found
 
 
-def draw_always(raw: int, _: random.Random) -> int:
+def return_raw(raw: int, _: random.Random) -> int:
     """Return the same raw value each time: for what is drawn from chance elsewhere."""
     return raw

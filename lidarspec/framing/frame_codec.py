@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
 from lidarspec.frames.frame_table import Table
-from lidarspec.frames.layout import Layout, Sums, marks
+from lidarspec.frames.layout import Layout, Sums, sort_constants
 from lidarspec.frames.layout_tree import prefix_of
 from lidarspec.frames.schema import schema
-from lidarspec.framing.plausibility import Conditions, Judge
+from lidarspec.framing.plausibility import CandidateChecker, StructConditions
 from lidarspec.framing.results import Frames, Status
 from lidarspec.spec.description import Frame
 from lidarspec.spec.syntax import fixed_size
@@ -40,9 +40,9 @@ class Codec:
         self.frame = frame
         self.schema = schema(frame.tree)
         self.prefix = prefix_of(frame.tree, frame.room)
-        self.marks = marks(self.prefix)
+        self.marks = sort_constants(self.prefix)
         self.size = fixed_size(frame.prepared) or None
-        self._conditions: Conditions | None = None
+        self._conditions: StructConditions | None = None
 
     def survey(
         self,
@@ -93,15 +93,15 @@ class Codec:
         """The constants that candidates are known to have before they are judged."""
         return self.prefix
 
-    def judge(self, layout: Layout) -> Judge:
+    def make_checker(self, layout: Layout) -> CandidateChecker:
         """Return the judge of candidates of a layout that have the constants at the start."""
-        judge = layout.notes.get(Judge)
+        judge = layout.notes.get(CandidateChecker)
         if judge is None:
-            self._conditions = self._conditions or Conditions(
+            self._conditions = self._conditions or StructConditions(
                 self.frame.plausible, self.schema, layout
             )
-            tests = self._conditions.met(layout), self._conditions.checks(layout)
-            judge = layout.notes[Judge] = Judge(
+            tests = self._conditions.make_struct_conditions(layout), self._conditions.checks(layout)
+            judge = layout.notes[CandidateChecker] = CandidateChecker(
                 self.frame, self.schema, layout, self._checked_constants, *tests
             )
         return judge

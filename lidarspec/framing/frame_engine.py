@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.frames.arrays import alike, count_up, repeat
-from lidarspec.frames.compilability import NotCompilable
-from lidarspec.frames.frame_table import Group, Rows
-from lidarspec.frames.layout import Layout, Refusal, Sums, rows_at
+from lidarspec.frames.arrays import broadcast_value, count_up, repeat
+from lidarspec.frames.compilability import NotCompilableError
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows
+from lidarspec.frames.layout import Layout, LayoutRefusal, Sums, rows_at
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.wire_coder import FormCoder, frame_coder
 from lidarspec.framing.frame_codec import Codec
@@ -33,7 +33,7 @@ from lidarspec.framing.results import (
     Status,
 )
 from lidarspec.framing.text_frames import TextCodec
-from lidarspec.framing.variable_lengths import AlikeLayouts, LayoutGroup, Together
+from lidarspec.framing.variable_lengths import JointChecker, LayoutFamilies, LayoutGroup
 from lidarspec.spec.description import Frame
 
 #: bytes of candidates looked at in one go, so that memory stays small on hostile streams.
@@ -49,13 +49,13 @@ class CompiledCodec(Codec):
 
     def __init__(self, frame: Frame) -> None:
         layouts = frame_layouts(frame)
-        if isinstance(layouts, NotCompilable):
+        if isinstance(layouts, NotCompilableError):
             raise layouts
         super().__init__(frame)
         self.tree = layouts
         layout = layouts.layout(b"")
         self.layout = layout if isinstance(layout, Layout) else None
-        self._alike = AlikeLayouts()
+        self._families = LayoutFamilies()
 
     def survey(
         self,
@@ -98,7 +98,7 @@ class CompiledCodec(Codec):
         short = list[tuple[NDArray[np.intp], NDArray[np.intp]]]()
         left = list[LayoutGroup]()
         for layout, which in groups:
-            if isinstance(layout, Refusal):
+            if isinstance(layout, LayoutRefusal):
                 if layout.error:
                     status[which] = PLUGIN
                 elif layout.by_constant:
@@ -111,7 +111,7 @@ class CompiledCodec(Codec):
             layouts.append(layout)
             left.append((layout, which))
         sizes = np.array([*(layout.size for layout in layouts), 0], np.intp)[forms]
-        together, left = self._alike.split(left, self.judge)
+        together, left = self._families.split(left, self.make_checker)
         for some in together:
             left += self._judge_together(buffer, offsets, stops, some, status, sizes, sums)
         for layout, which in left:
@@ -124,7 +124,7 @@ class CompiledCodec(Codec):
                 gathered=gathered,
                 sums=sums,
             )
-            short += [(which, own)] if alike(own) is None else []
+            short += [(which, own)] if broadcast_value(own) is None else []
         for which, own in short:
             sizes[which] = own
         return Frames(
@@ -143,7 +143,7 @@ class CompiledCodec(Codec):
         buffer: NDArray[np.uint8],
         offsets: NDArray[np.intp],
         stops: NDArray[np.intp] | None,
-        together: Together,
+        together: JointChecker,
         status: NDArray[np.uint8],
         sizes: NDArray[np.intp],
         sums: Sums | None,
@@ -180,7 +180,7 @@ class CompiledCodec(Codec):
         if layout is None or layout.size != rows.shape[1]:
             return None
         errors: list[PluginError] = []
-        return layout, self.judge(layout)(rows, errors, sums), tuple(errors)
+        return layout, self.make_checker(layout)(rows, errors, sums), tuple(errors)
 
     def _judge_layout(
         self,
@@ -204,7 +204,7 @@ class CompiledCodec(Codec):
         number = len(offsets)
         own = offsets if count == number else offsets[whole]
         gathered = gathered and (count == number or bool(whole[:count].all()))
-        judge = self.judge(layout)
+        judge = self.make_checker(layout)
         step = max(BLOCK // layout.size, 1)
         kept = None
         if count <= step or not gathered:
@@ -227,13 +227,13 @@ class CompiledCodec(Codec):
         )
         return status, sizes, kept
 
-    def table(self, frames: Iterable[bytes]) -> Rows:
+    def table(self, frames: Iterable[bytes]) -> CompiledTable:
         frames = list(frames)
         joined = np.frombuffer(b"".join(frames), np.uint8)
         sizes = np.array([len(frame) for frame in frames], np.intp)
         return self.gather(Frames(joined, repeat(0, len(frames)), np.cumsum(sizes) - sizes, sizes))
 
-    def gather(self, frames: Frames) -> Rows:
+    def gather(self, frames: Frames) -> CompiledTable:
         """Return frames of this type as columns.
 
         Nothing is copied if the frames take at least half of the buffer.
@@ -243,7 +243,9 @@ class CompiledCodec(Codec):
                 rows = frames.rows
             else:
                 rows = np.ascontiguousarray(frames.rows)
-            return Rows(self.schema, [Group(frames.layout, count_up(len(rows)), rows)])
+            return CompiledTable(
+                self.schema, [LayoutRows(frames.layout, count_up(len(rows)), rows)]
+            )
         known = (
             frames.by_layout()
             if frames.layouts
@@ -251,7 +253,7 @@ class CompiledCodec(Codec):
         )
         groups = []
         for layout, which in known:
-            if isinstance(layout, Refusal):
+            if isinstance(layout, LayoutRefusal):
                 continue
             if len(which) == len(frames):
                 starts = frames.starts
@@ -259,11 +261,11 @@ class CompiledCodec(Codec):
                 starts = frames.starts[which]
             is_sparse = 2 * len(which) * layout.size < len(frames.buffer)
             groups.append(
-                Group(
+                LayoutRows(
                     layout, which, rows_at(frames.buffer, starts, layout.size, gathered=is_sparse)
                 )
             )
-        return Rows(self.schema, groups)
+        return CompiledTable(self.schema, groups)
 
 
 def _partial(
@@ -305,5 +307,5 @@ def codec(frame: Frame) -> CompiledCodec | PlainCodec | TextCodec:
         return TextCodec(frame, coder)
     try:
         return CompiledCodec(frame)
-    except NotCompilable as refusal:
+    except NotCompilableError as refusal:
         return PlainCodec(frame, str(refusal))

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import repeat
-from lidarspec.frames.frame_table import Records
+from lidarspec.frames.frame_table import ParsedTable
 from lidarspec.frames.layout import Sums
 from lidarspec.framing.frame_codec import Codec
-from lidarspec.framing.plausibility import plausibility
+from lidarspec.framing.plausibility import check_plausibility
 from lidarspec.framing.results import (
     CHECKSUM,
     CONSTANT,
@@ -35,7 +35,7 @@ from lidarspec.framing.results import (
 )
 from lidarspec.spec import tree
 from lidarspec.spec.description import Frame
-from lidarspec.spec.syntax import Mismatch
+from lidarspec.spec.syntax import MismatchError
 from lidarspec.spec.wire_forms import next_places
 
 
@@ -161,9 +161,9 @@ class PlainCodec(Codec):
             errors=tuple(errors),
         )
 
-    def table(self, frames: Iterable[bytes]) -> Records:
+    def table(self, frames: Iterable[bytes]) -> ParsedTable:
         frames = list(frames)
-        return Records(
+        return ParsedTable(
             self.schema,
             [self.frame.prepared.parse(frame, _verify=False) for frame in frames],
             frames,
@@ -176,7 +176,7 @@ class PlainCodec(Codec):
             size = stream.tell()
             if not size:
                 return LENGTH, 0
-        except Mismatch as mismatch:
+        except MismatchError as mismatch:
             return {"checksum": CHECKSUM, "length": LENGTH, "value": IMPLAUSIBLE}.get(
                 mismatch.reason, CONSTANT
             ), 0
@@ -194,5 +194,7 @@ class PlainCodec(Codec):
         if self.frame.plausible is None:
             return VALID, size
         return int(
-            plausibility(self.frame, Records(self.schema, [parsed], [data[:size]]), errors)[0]
+            check_plausibility(
+                self.frame, ParsedTable(self.schema, [parsed], [data[:size]]), errors
+            )[0]
         ), size

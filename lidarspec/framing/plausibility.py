@@ -24,27 +24,27 @@ from lidarspec.errors import PluginError
 from lidarspec.expressions.columns import Batch, Fields
 from lidarspec.expressions.graph import (
     Expression,
-    Traced,
-    conjuncts,
-    sample_of,
+    TracedColumn,
+    make_sample,
+    split_condition,
     trace,
     values_of,
 )
 from lidarspec.frames.arrays import take_rows
-from lidarspec.frames.frame_table import Group, Rows, Table
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
 from lidarspec.frames.layout import (
     Bytes2D,
+    FrameTest,
     Layout,
     Leaf,
     Seal,
     Sums,
-    Test,
     elements,
-    holding,
-    marks,
-    right,
+    find_passing,
+    match_constants,
+    merge_constants,
     rows_at,
-    words,
+    sort_constants,
 )
 from lidarspec.frames.parts import Region
 from lidarspec.frames.schema import Schema
@@ -61,7 +61,7 @@ OF_PARTS = np.array([VALID, LENGTH, LENGTH, CONSTANT, PLUGIN], np.uint8)
 Check = Callable[[Bytes2D], NDArray[np.bool_]]
 
 
-class Judge:
+class CandidateChecker:
     """Judges candidates of one layout, whose first constants (`prefix`) are known to be right.
 
     Args:
@@ -85,12 +85,12 @@ class Judge:
         self._frame = frame
         self._schema = schema
         self._layout = layout
-        self._met = met
+        self._struct_conditions = met
         self._checks = checks
         self.checks = [*met, *(checks or ())]
         self.is_complete = checks is not None or frame.plausible is None
-        self._constants = words(
-            marks(
+        self._constants = merge_constants(
+            sort_constants(
                 {
                     spot: known
                     for spot, known in layout.constants.items()
@@ -98,7 +98,7 @@ class Judge:
                 }
             )
         )
-        self._held = words(marks(layout.held))
+        self._held = merge_constants(sort_constants(layout.held))
 
     def __call__(
         self, rows: Bytes2D, errors: list[PluginError], sums: Sums | None = None
@@ -112,24 +112,24 @@ class Judge:
         """
         status = np.zeros(len(rows), np.uint8)
         self.check_constants(status, rows)
-        _parts_among(self._layout, status, rows, errors, sums)
+        _check_valid_parts(self._layout, status, rows, errors, sums)
         for seal in self._layout.seals:
-            _among(status, rows, functools.partial(intactness, seal, errors, sums))
+            _check_valid(status, rows, functools.partial(check_seal, seal, errors, sums))
         if np.count_nonzero(status) == len(status):
             return status
-        self._check(status, rows, self._met)
+        self._check(status, rows, self._struct_conditions)
         if self._checks is not None:
             self._check(status, rows, self._checks)
         elif self._frame.plausible is not None:
-            _among(status, rows, lambda some: self._ask_plugin(some, errors))
+            _check_valid(status, rows, lambda some: self._ask_plugin(some, errors))
         return status
 
     def check_constants(self, status: NDArray[np.uint8], rows: Bytes2D) -> None:
         """Set the status of valid candidates with a wrong constant or length."""
-        held = right(self._constants, rows) if len(rows) else None
+        held = match_constants(self._constants, rows) if len(rows) else None
         if held is not None:
             status[~held] = CONSTANT
-        held = right(self._held, rows) if len(rows) else None
+        held = match_constants(self._held, rows) if len(rows) else None
         if held is not None:
             status[~held & (status == VALID)] = LENGTH
 
@@ -140,14 +140,14 @@ class Judge:
                 status[~held & (status == VALID)] = IMPLAUSIBLE
 
     def _ask_plugin(self, rows: Bytes2D, errors: list[PluginError]) -> NDArray[np.uint8]:
-        return plausibility(
+        return check_plausibility(
             self._frame,
-            Rows(self._schema, [Group(self._layout, np.arange(len(rows)), rows)]),
+            CompiledTable(self._schema, [LayoutRows(self._layout, np.arange(len(rows)), rows)]),
             errors,
         )
 
 
-def _among(
+def _check_valid(
     status: NDArray[np.uint8], rows: Bytes2D, judge: Callable[[Bytes2D], NDArray[np.uint8]]
 ) -> None:
     """Judge those that are valid so far."""
@@ -159,7 +159,7 @@ def _among(
         status[left] = judge(take_rows(rows, left))
 
 
-def _parts_among(
+def _check_valid_parts(
     layout: Layout,
     status: NDArray[np.uint8],
     rows: Bytes2D,
@@ -172,10 +172,10 @@ def _parts_among(
     """
     for region in layout.regions.values():
         if not region.is_measured or region.has_checks:
-            _among(status, rows, functools.partial(_by_parts, region, errors, sums))
+            _check_valid(status, rows, functools.partial(_check_parts, region, errors, sums))
 
 
-def _by_parts(
+def _check_parts(
     region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
     """The status of each frame, (n,), by its parts."""
@@ -185,9 +185,9 @@ def _by_parts(
     for piece in (piece for pieces in walked.rounds for piece in pieces):
         parts = rows_at(buffer, piece.spots, piece.layout.size)
         verdicts = np.zeros(len(parts), np.uint8)
-        _parts_among(piece.layout, verdicts, parts, errors, sums)
+        _check_valid_parts(piece.layout, verdicts, parts, errors, sums)
         for seal in piece.layout.seals:
-            _among(verdicts, parts, functools.partial(intactness, seal, errors, sums))
+            _check_valid(verdicts, parts, functools.partial(check_seal, seal, errors, sums))
         if piece.layout.conditions:
             verdicts[(verdicts == VALID) & ~piece.layout.meets(parts)] = IMPLAUSIBLE
         bad = (verdicts != VALID) & (status[piece.owners] == VALID)
@@ -195,7 +195,7 @@ def _by_parts(
     return status
 
 
-def intactness(
+def check_seal(
     seal: Seal, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
     """`VALID`, `CHECKSUM` or `PLUGIN` for each frame, (n,), by one of its checksums."""
@@ -207,7 +207,7 @@ def intactness(
         return np.full(len(rows), PLUGIN, np.uint8)
 
 
-def plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArray[np.uint8]:
+def check_plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArray[np.uint8]:
     """`VALID`, `IMPLAUSIBLE` or `PLUGIN` for each frame of a table, (n,), by the frame's own test.
 
     The frames are of one layout, so that no array is padded.
@@ -228,7 +228,7 @@ def plausibility(frame: Frame, table: Table, errors: list[PluginError]) -> NDArr
         return np.full(len(table), PLUGIN, np.uint8)
 
 
-class Conditions:
+class StructConditions:
     """The tests of one frame type: its own, and those of its struct.
 
     Args:
@@ -243,7 +243,7 @@ class Conditions:
         self._parts = [] if plausible is None else _parts(plausible, schema, layout)
         self._tables: dict[tuple[Any, ...], _LookupTable] = {}
 
-    def met(self, layout: Layout) -> list[Check]:
+    def make_struct_conditions(self, layout: Layout) -> list[Check]:
         """Return the conditions of the struct on the values of frames of a layout, as checks."""
         every = (
             (
@@ -275,17 +275,17 @@ class Conditions:
         together = list[Expression]()
         for part, own in zip(self._parts, leaves, strict=True):
             check = self._check(part, own)
-            if isinstance(check, Lookup) or part.fields[0].axes:
+            if isinstance(check, LookupCondition) or part.fields[0].axes:
                 checks.append(check)
             else:
                 together.append(part)
         if together:
-            every = AllOf(tuple(together))
+            every = ConditionGroup(tuple(together))
             own = {path: leaf for part in leaves for path, leaf in part.items()}
-            checks.append(functools.partial(holding, every, own))
+            checks.append(functools.partial(find_passing, every, own))
         return checks
 
-    def _check(self, part: Test, leaves: Mapping[str, Leaf]) -> Check:
+    def _check(self, part: FrameTest, leaves: Mapping[str, Leaf]) -> Check:
         places = {(leaf.shape, leaf.strides) for leaf in leaves.values()}
         first, last = _window(leaves.values())
         if (
@@ -293,7 +293,9 @@ class Conditions:
             or len(places) > 1
             or any(len(shape) != len(strides) for shape, strides in places)
         ):
-            return functools.partial(holding, part, leaves)  # more bytes than a table is made for
+            return functools.partial(
+                find_passing, part, leaves
+            )  # more bytes than a table is made for
         key = (
             part,
             *(
@@ -303,15 +305,16 @@ class Conditions:
         )
         if key not in self._tables:
             single = {
-                path: replace(leaf.at(first), shape=(), strides=()) for path, leaf in leaves.items()
+                path: replace(leaf.shift(first), shape=(), strides=())
+                for path, leaf in leaves.items()
             }
             self._tables[key] = _table(part, single, last - first)
         shape, strides = places.pop() if places else ((), ())
-        return Lookup(self._tables[key], first, shape, strides)
+        return LookupCondition(self._tables[key], first, shape, strides)
 
 
 @dataclass(frozen=True, eq=False)
-class AllOf:
+class ConditionGroup:
     """Conditions on fields outside of arrays, which share what they have in common."""
 
     parts: tuple[Expression, ...]
@@ -365,7 +368,7 @@ class _LookupTable:
 
 
 @dataclass(frozen=True, eq=False)
-class Lookup:
+class LookupCondition:
     """A condition on one or two bytes, evaluated by a table.
 
     It applies to each frame, or to each element of an array.
@@ -414,7 +417,7 @@ class Lookup:
         return self.table.holds(values)
 
 
-def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
+def _table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
     """A condition on so many bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(
@@ -422,7 +425,7 @@ def _table(part: Test, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
         )  # so that it takes little memory at a time
         listed = np.concatenate(
             [
-                holding(part, leaves, codes.view(np.uint8).reshape(len(codes), -1))
+                find_passing(part, leaves, codes.view(np.uint8).reshape(len(codes), -1))
                 for codes in blocks
             ]
         )
@@ -451,7 +454,7 @@ def _bits(listed: NDArray[np.bool_]) -> tuple[int, tuple[int, ...]] | None:
 
 def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
     """First byte that the first elements of some fields take, and the one after their last."""
-    spans = [leaf.held for leaf in leaves]
+    spans = [leaf.byte_span for leaf in leaves]
     if spans:
         return (min(start for start, _ in spans), max(stop for _, stop in spans))
     return (0, 0)
@@ -460,13 +463,14 @@ def _window(leaves: Iterable[Leaf]) -> tuple[int, int]:
 def _parts(
     plausible: Callable[[Any], Any], schema: Schema, layout: Layout
 ) -> list[Expression] | None:
-    blank = Group(layout, np.zeros(1, np.intp), np.zeros((1, layout.size), np.uint8))
+    blank = LayoutRows(layout, np.zeros(1, np.intp), np.zeros((1, layout.size), np.uint8))
     try:
         answer, _ = trace(
-            plausible, sample_of(Batch(Rows(schema, [blank]), np.zeros(1, np.bool_)), blank)
+            plausible,
+            make_sample(Batch(CompiledTable(schema, [blank]), np.zeros(1, np.bool_)), blank),
         )
-        if not isinstance(answer, Traced):
+        if not isinstance(answer, TracedColumn):
             return None
-        return [Expression.of(node, schema) for node in conjuncts(answer.node)]
+        return [Expression.of(node, schema) for node in split_condition(answer.node)]
     except Exception:  # the function itself will say so, frame by frame
         return None

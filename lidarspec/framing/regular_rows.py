@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.arrays import alike, repeat
-from lidarspec.frames.layout import Bytes2D, Layout, Marks, exclude, right
-from lidarspec.framing.candidates import Framing, Piece, SearchState
+from lidarspec.frames.arrays import broadcast_value, repeat
+from lidarspec.frames.layout import Bytes2D, Layout, Marks, are_contradictory, match_constants
+from lidarspec.framing.candidates import Framing, PieceResult, SearchState
 from lidarspec.framing.results import Frames, Indices, Numbers
 
 #: rows whose constants are compared before those of all rows.
@@ -25,9 +25,9 @@ SMALL_PIECE_BYTES = 1 << 16
 DISTINCTIVE_CONSTANTS = 4
 
 
-def steady_stream(
+def find_regular_frames(
     framing: Framing, buffer: NDArray[np.uint8], mode: SearchState, base: int
-) -> Piece | None:
+) -> PieceResult | None:
     """Return the frames of a piece from its first byte on; None if it has to be searched.
 
     Args:
@@ -41,8 +41,8 @@ def steady_stream(
     if not number:
         return None
     rows = buffer[: number * mode.size].reshape(number, mode.size)
-    for kind in framing.active(mode):
-        lead = leading(framing, kind, rows)
+    for kind in framing.active_types(mode):
+        lead = count_leading_matches(framing, kind, rows)
         if lead is None:
             continue
         is_weak = framing.is_weak(kind)
@@ -62,11 +62,11 @@ def steady_stream(
             return None
         if is_weak:
             mode.run_end = base + valid * mode.size
-        return _piece(framing, mode, frames.only(slice(0, valid)))
+        return _piece(framing, mode, frames.select(slice(0, valid)))
     return None
 
 
-def steady_datagrams(
+def find_regular_datagrams(
     framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: SearchState
 ) -> Frames | None:
     """Return datagrams of one size at equal distances, judged as frames of one type and layout.
@@ -78,8 +78,8 @@ def steady_datagrams(
     rows = _rows(buffer, starts, sizes)
     if rows is None:
         return None
-    kind = _likely(framing, rows, mode)
-    if kind is None or right(framing.words[kind], rows) is not None:
+    kind = _guess_type(framing, rows, mode)
+    if kind is None or match_constants(framing.words[kind], rows) is not None:
         return None
     if framing.switches(kind, mode):
         return None
@@ -116,7 +116,7 @@ def judge_rows(
     )
 
 
-def leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
+def count_leading_matches(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
     """Return how many leading rows have the constants of a type.
 
     Constants are compared as far as the rows go. Returns None if no row has them.
@@ -125,7 +125,7 @@ def leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
         word for word in framing.words[kind] if word[0] + word[1].itemsize <= rows.shape[1]
     )
     for some in (rows[:FIRST_ROWS], rows):
-        marked = right(constants, some)
+        marked = match_constants(constants, some)
         if marked is not None and np.count_nonzero(marked):
             return int(marked.argmin())
     if marked is None:
@@ -133,7 +133,7 @@ def leading(framing: Framing, kind: int, rows: Bytes2D) -> int | None:
     return None
 
 
-def step_between(starts: Indices) -> int:
+def find_common_step(starts: Indices) -> int:
     """Return the bytes from each start to the next; 0 if they differ."""
     steps = starts[1:] - starts[:-1]
     step = steps.item(0) if len(steps) else 0
@@ -142,14 +142,14 @@ def step_between(starts: Indices) -> int:
     return 0
 
 
-def _piece(framing: Framing, mode: SearchState, frames: Frames) -> Piece:
+def _piece(framing: Framing, mode: SearchState, frames: Frames) -> PieceResult:
     """Return a piece that ends with some frames, and waits for a next one that has begun."""
     end = len(frames) * mode.size
     rest = frames.buffer[end:]
     need = 0
     if frames.layout is not None and 0 < len(rest) < mode.size:
         need = _count_needed(framing, mode, frames.kinds.item(0), frames.layout, rest.tobytes())
-    return Piece(frames, end, need > 0, need)
+    return PieceResult(frames, end, need > 0, need)
 
 
 def _count_needed(
@@ -160,7 +160,8 @@ def _count_needed(
     Returns 0 if the bytes may be another frame.
     """
     first = next(
-        (other for other in framing.active(mode) if _begins(framing.marks[other], rest)), None
+        (other for other in framing.active_types(mode) if _begins_with(framing.marks[other], rest)),
+        None,
     )
     if first != kind or framing.codecs[kind].size != layout.size:
         return 0
@@ -173,7 +174,7 @@ def _count_needed(
     return need
 
 
-def _begins(marks: Marks, data: bytes) -> bool:
+def _begins_with(marks: Marks, data: bytes) -> bool:
     """Return whether the constants are right as far as the bytes go."""
     return all(offset >= len(data) or data[offset] & mask == value for offset, mask, value in marks)
 
@@ -185,25 +186,25 @@ def _rows(buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices) -> Bytes2D
     """
     count = len(sizes)
     size = sizes.item(0) if count else 0
-    if not size or (alike(sizes) is None and np.count_nonzero(sizes == size) < count):
+    if not size or (broadcast_value(sizes) is None and np.count_nonzero(sizes == size) < count):
         return None
     if isinstance(starts, range):
         step = starts.step
     else:
-        step = size if count == 1 else step_between(starts)
+        step = size if count == 1 else find_common_step(starts)
     if step < size:
         return None
     return np.ndarray((count, size), np.uint8, buffer, int(starts[0]), (step, 1))
 
 
-def _likely(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | None:
+def _guess_type(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | None:
     """Return the type with the constants of the first datagram.
 
     Returns None if there is none, or if any datagram has the constants of an earlier type as well.
     """
     first = rows[0].tobytes()
     before = list[int]()
-    for kind in framing.active(mode):
+    for kind in framing.active_types(mode):
         if framing.codecs[kind].size not in (None, len(first)) or framing.ends[kind] > len(first):
             continue
         constants = framing.marks[kind][:DISTINCTIVE_CONSTANTS]
@@ -217,7 +218,7 @@ def _likely(framing: Framing, rows: Bytes2D, mode: SearchState) -> int | None:
 
 def _has_both(framing: Framing, kind: int, other: int, rows: Bytes2D) -> bool:
     """Return whether any row with the constants of one type has those of another as well."""
-    if exclude(framing.marks[kind], framing.marks[other]):
+    if are_contradictory(framing.marks[kind], framing.marks[other]):
         return False
-    marked = right(framing.words[kind], rows)
+    marked = match_constants(framing.words[kind], rows)
     return marked is None or bool(np.count_nonzero(marked))

@@ -19,7 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError
-from lidarspec.frames.arrays import alike, by_value, count_up, repeat, some, take_rows
+from lidarspec.frames.arrays import (
+    broadcast_value,
+    count_up,
+    group_by_value,
+    repeat,
+    select_values,
+    take_rows,
+)
 from lidarspec.frames.layout import Bytes2D, Layout
 
 Indices = NDArray[np.intp]
@@ -227,7 +234,7 @@ class Frames:
         self.names: tuple[str, ...] = ()
 
     @classmethod
-    def none(cls, buffer: NDArray[np.uint8]) -> Frames:
+    def make_empty(cls, buffer: NDArray[np.uint8]) -> Frames:
         """No frames."""
         return cls(buffer, repeat(-1, 0), range(0), repeat(0, 0))
 
@@ -281,15 +288,15 @@ class Frames:
     @property
     def layout(self) -> Layout | None:
         """The layout that all frames have; None where they differ, or nobody knows."""
-        form = alike(self.forms)
+        form = broadcast_value(self.forms)
         if form is None or form < 0:
             return None
         return self.layouts[form]
 
     @property
-    def total(self) -> int:
+    def total_bytes(self) -> int:
         """The bytes of all frames together."""
-        size = alike(self.sizes)
+        size = broadcast_value(self.sizes)
         if size is None:
             return int(self.sizes.sum())
         return size * len(self)
@@ -299,7 +306,7 @@ class Frames:
         """Whether all candidates are frames."""
         return not np.count_nonzero(self.status)
 
-    def only(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
+    def select(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
         """The frames that a mask, ascending indices or a slice choose."""
         if not (isinstance(which, slice) or which.dtype != np.bool_):
             which = np.flatnonzero(which)
@@ -310,7 +317,7 @@ class Frames:
             else:
                 rows = take_rows(rows, which[: which.searchsorted(len(rows))])
         chosen = {
-            name: some(getattr(self, name), which)
+            name: select_values(getattr(self, name), which)
             for name in ("kinds", "sizes", "forms", "status", "gaps", "at")
             if name in vars(self)
         }
@@ -323,7 +330,7 @@ class Frames:
 
     def by_layout(self) -> list[tuple[Layout, Indices]]:
         """Each layout that is known, with the indices of its frames, (k,)."""
-        form = alike(self.forms)
+        form = broadcast_value(self.forms)
         if form is not None:
             if form >= 0:
                 return [(self.layouts[form], count_up(len(self)))]
@@ -335,7 +342,9 @@ class Frames:
             ]
             return [(layout, which) for layout, which in groups if len(which)]
         return [
-            (self.layouts[form], which) for form, which in by_value(self.forms, FEW) if form >= 0
+            (self.layouts[form], which)
+            for form, which in group_by_value(self.forms, FEW)
+            if form >= 0
         ]
 
     def locate(
@@ -417,7 +426,7 @@ def array_of(numbers: Numbers) -> NDArray[np.int64]:
 
 def _shift(forms: Indices, first: int) -> Indices:
     """Indices of layouts that stand behind others."""
-    form = alike(forms)
+    form = broadcast_value(forms)
     if form is None:
         return np.where(forms < 0, -1, forms + first)
     return repeat(form + first if form >= 0 else -1, len(forms))

@@ -21,9 +21,9 @@ from lidarspec.framing.candidates import (
     Bytes1D,
     Candidates,
     Framing,
-    Live,
+    LiveCandidates,
     Offsets,
-    Piece,
+    PieceResult,
     SearchState,
 )
 from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
@@ -33,9 +33,9 @@ from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
 MIN_STAY_BYTES = 1 << 12
 
 
-def leftmost(
+def find_frames(
     framing: Framing, buffer: Bytes1D, mode: SearchState, base: int, *, final: bool
-) -> Piece:
+) -> PieceResult:
     """Cut one piece.
 
     Args:
@@ -45,19 +45,19 @@ def leftmost(
         final: give up candidates that need more bytes than there are.
     """
     candidates = Candidates(framing, buffer, mode, final=final)
-    piece = Piece(Frames.none(candidates.buffer), len(candidates.buffer))
+    piece = PieceResult(Frames.make_empty(candidates.buffer), len(candidates.buffer))
     stays = [(0, mode.after)]
-    walks = dict[str | None, _Walk]()
+    walks = dict[str | None, _FrameWalk]()
     position = 0
     while position < piece.end:
         after = mode.after
         walk = walks.get(after)
         if walk is None:
-            live = candidates.live(mode)
+            live = candidates.find_live(mode)
             if live is None:
                 piece.end = position
                 break
-            walk = walks[after] = _Walk(framing, candidates, live, mode, base)
+            walk = walks[after] = _FrameWalk(framing, candidates, live, mode, base)
         position = walk.advance(position, piece)
         if mode.after == after:
             break
@@ -71,13 +71,13 @@ def leftmost(
     if parts:
         piece.frames = Frames.join(parts)
         if len(parts) > 1:
-            piece.frames = piece.frames.only(np.argsort(piece.frames.starts))
+            piece.frames = piece.frames.select(np.argsort(piece.frames.starts))
         _remember_size(mode, piece.frames, stays[-1][0])
     count_rejected(framing, piece, candidates, stays)
     return piece
 
 
-class _Walk:
+class _FrameWalk:
     """A walk through a piece while the same types are looked for, as often as they are again.
 
     Args:
@@ -87,7 +87,12 @@ class _Walk:
     """
 
     def __init__(
-        self, framing: Framing, candidates: Candidates, live: Live, mode: SearchState, base: int
+        self,
+        framing: Framing,
+        candidates: Candidates,
+        live: LiveCandidates,
+        mode: SearchState,
+        base: int,
     ) -> None:
         self._framing = framing
         self._mode = mode
@@ -115,7 +120,7 @@ class _Walk:
         self._taken: list[tuple[int, int]] = []  # first and last rows that follow one another
         self._continued: list[tuple[int, int]] = []  # kinds and offsets of runs that go on
 
-    def advance(self, position: int, piece: Piece) -> int:
+    def advance(self, position: int, piece: PieceResult) -> int:
         """Take valid candidates up to the end, or to a frame that changes the mode.
 
         Returns the end of that frame.
@@ -155,13 +160,13 @@ class _Walk:
         """Return all that were taken, in parts that may lie between one another."""
         if len(self._taken) == 1:
             first, last = self._taken[0]
-            taken = self._frames.only(slice(first, last + 1))
+            taken = self._frames.select(slice(first, last + 1))
         else:
-            taken = self._frames.only(_rows_of(np.array(self._taken, np.intp).reshape(-1, 2)))
+            taken = self._frames.select(_rows_of(np.array(self._taken, np.intp).reshape(-1, 2)))
         parts = [taken]
         if self._runs:
             is_weak = np.isin(taken.kinds, list(self._runs))
-            parts = [taken.only(~is_weak)]
+            parts = [taken.select(~is_weak)]
             for kind, runs in self._runs.items():
                 continued = [offset for other, offset in self._continued if other == kind]
                 offsets = [taken.starts[taken.kinds == kind], np.array(continued, np.intp)]
@@ -222,7 +227,10 @@ def _remember_size(mode: SearchState, frames: Frames, since: int) -> None:
 
 
 def count_rejected(
-    framing: Framing, piece: Piece, candidates: Candidates, stays: list[tuple[int, str | None]]
+    framing: Framing,
+    piece: PieceResult,
+    candidates: Candidates,
+    stays: list[tuple[int, str | None]],
 ) -> None:
     """Count the rejected candidates outside the frames.
 

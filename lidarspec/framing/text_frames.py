@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import repeat
-from lidarspec.frames.frame_table import Group, Rows, Table
-from lidarspec.frames.layout import Refusal, Sums, marks, rows_at
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
+from lidarspec.frames.layout import LayoutRefusal, Sums, rows_at, sort_constants
 from lidarspec.frames.wire_coder import FormCoder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Frames
@@ -40,7 +40,7 @@ class TextCodec(Codec):
         self._found = dict[bytes, bytes]()
         self.size = None
         self.prefix = {offset: (0xFF, byte) for offset, byte in coder.prefix.items()}
-        self.marks = marks(self.prefix)
+        self.marks = sort_constants(self.prefix)
         self._prefix_size = max(self.prefix, default=-1) + 1
 
     @property
@@ -91,7 +91,7 @@ class TextCodec(Codec):
         owners = np.array(list(structs), np.intp)
         groups, refused = self._group(list(structs.values()))
         for group in groups:
-            judge = self.judge(group.layout)
+            judge = self.make_checker(group.layout)
             status[owners[group.where]] = judge(group.rows, errors, sums)
         for refusal, where in refused:
             if refusal.error is not None:
@@ -128,7 +128,7 @@ class TextCodec(Codec):
 
     def _group(
         self, structs: Sequence[bytes]
-    ) -> tuple[list[Group], list[tuple[Refusal, NDArray[np.intp]]]]:
+    ) -> tuple[list[LayoutRows], list[tuple[LayoutRefusal, NDArray[np.intp]]]]:
         """Return structs by layout, and the indices of refused structs by refusal.
 
         Structs with no layout of their size are left out.
@@ -136,14 +136,16 @@ class TextCodec(Codec):
         sizes = np.array([len(struct) for struct in structs], np.intp)
         starts = np.cumsum(sizes) - sizes
         joined = np.frombuffer(b"".join(structs), np.uint8)
-        groups = list[Group]()
-        refused = list[tuple[Refusal, NDArray[np.intp]]]()
+        groups = list[LayoutRows]()
+        refused = list[tuple[LayoutRefusal, NDArray[np.intp]]]()
         for layout, which in self._coder.tree.classify(joined, starts, starts + sizes):
-            if isinstance(layout, Refusal):
+            if isinstance(layout, LayoutRefusal):
                 refused.append((layout, which))
                 continue
             fitting = which[sizes[which] == layout.size]
-            groups.append(Group(layout, fitting, rows_at(joined, starts[fitting], layout.size)))
+            groups.append(
+                LayoutRows(layout, fitting, rows_at(joined, starts[fitting], layout.size))
+            )
         return groups, refused
 
     def table(self, frames: Iterable[bytes]) -> Table:
@@ -154,4 +156,4 @@ class TextCodec(Codec):
         )
 
     def table_of_structs(self, structs: Iterable[bytes]) -> Table:
-        return Rows(self.schema, self._group(list(structs))[0])
+        return CompiledTable(self.schema, self._group(list(structs))[0])

@@ -4,13 +4,13 @@ A false header announces any length, so noise with headers in it has candidates 
 layouts, with one or two candidates each. Judging the candidates of a layout takes a few dozen calls
 of NumPy, whether there is one or a thousand. Most of these layouts differ only in the length of an
 array at their end: they have the same constants, checksums over the same bytes up to the same
-distance from the end, and tests of the same fields. `AlikeLayouts` finds such layouts. Their
+distance from the end, and tests of the same fields. `LayoutFamilies` finds such layouts. Their
 candidates become rows of one array, and whatever follows a candidate in its row is left out: a
 checksum gets zeros in its place, which do not change those in `ZERO_EXTENDED`, and a test leaves
 out elements.
 
-The verdicts are those of `plausibility.Judge`. A test that is more than a lookup of one or two
-bytes is left to it.
+The verdicts are those of `plausibility.CandidateChecker`. A test that is more than a lookup of one
+or two bytes is left to it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Seal, Sums, rows_at
-from lidarspec.framing.plausibility import Check, Judge, Lookup
+from lidarspec.framing.plausibility import CandidateChecker, Check, LookupCondition
 from lidarspec.framing.results import CHECKSUM, IMPLAUSIBLE, VALID
 from lidarspec.spec.checksums import Checksum, Sum, WordXor, Xor
 
@@ -33,7 +33,7 @@ Status = NDArray[np.uint8]
 #: A layout, and the indices of its candidates.
 LayoutGroup = tuple[Layout, Offsets]
 #: Makes the judge of a layout.
-MakeJudge = Callable[[Layout], Judge]
+MakeJudge = Callable[[Layout], CandidateChecker]
 
 #: Layouts are judged together if they are at least so many, and have fewer candidates each.
 MANY_LAYOUTS = 4
@@ -51,20 +51,20 @@ BLOCK_BYTES = 1 << 19
 
 
 @dataclass(frozen=True)
-class Likeness:
+class LayoutFamily:
     """The key by which layouts that differ only in the length of an array are grouped.
 
     Attributes:
         number: the same for all that are alike.
-        lengths: of the outermost array of each test, in the order of `Judge.checks`; 0 for a test
-            of no array.
+        lengths: of the outermost array of each test, in the order of `CandidateChecker.checks`; 0
+            for a test of no array.
     """
 
     number: int
     lengths: tuple[int, ...]
 
 
-class AlikeLayouts:
+class LayoutFamilies:
     """Tells which layouts of a frame type are alike."""
 
     def __init__(self) -> None:
@@ -73,15 +73,15 @@ class AlikeLayouts:
 
     def split(
         self, groups: list[LayoutGroup], make_judge: MakeJudge
-    ) -> tuple[list[Together], list[LayoutGroup]]:
+    ) -> tuple[list[JointChecker], list[LayoutGroup]]:
         """Return the groups to judge together, and those to judge layout by layout."""
         if len(groups) < MANY_LAYOUTS:
             return [], groups
         left = list[LayoutGroup]()
-        alike = dict[int, list[tuple[LayoutGroup, Likeness]]]()
+        alike = dict[int, list[tuple[LayoutGroup, LayoutFamily]]]()
         for layout, which in groups:
             if len(which) < MANY_CANDIDATES:
-                likeness = self.likeness(layout, make_judge(layout))
+                likeness = self.find_family(layout, make_judge(layout))
             else:
                 likeness = None
             if likeness is None:
@@ -94,20 +94,20 @@ class AlikeLayouts:
             if len(some) < MANY_LAYOUTS:
                 left += some_groups
             else:
-                together.append(Together(some_groups, likenesses, make_judge))
+                together.append(JointChecker(some_groups, likenesses, make_judge))
         return together, left
 
-    def likeness(self, layout: Layout, judge: Judge) -> Likeness | None:
+    def find_family(self, layout: Layout, judge: CandidateChecker) -> LayoutFamily | None:
         """Return the relation of a layout to others, for judging them together.
 
         Returns None if its candidates cannot be judged together with others.
         """
         if self not in layout.notes:  # decoders of one frame type share its layouts
             layout.notes[self] = self._find(layout, judge)
-        known: Likeness | None = layout.notes[self]
+        known: LayoutFamily | None = layout.notes[self]
         return known
 
-    def _find(self, layout: Layout, judge: Judge) -> Likeness | None:
+    def _find(self, layout: Layout, judge: CandidateChecker) -> LayoutFamily | None:
         if layout.regions or not all(_is_extended(seal) for seal in layout.seals):
             return None
         constants = tuple(sorted(layout.constants.items()))
@@ -119,7 +119,7 @@ class AlikeLayouts:
             if len(self._numbers) >= MAX_KEYS:
                 self._numbers.clear()
             self._numbers[key] = next(self._next)
-        return Likeness(self._numbers[key], tuple(map(_length, judge.checks)))
+        return LayoutFamily(self._numbers[key], tuple(map(_length, judge.checks)))
 
 
 def _is_extended(seal: Seal) -> bool:
@@ -147,12 +147,12 @@ def _place(leaf: Leaf, seal: Seal, size: int) -> tuple[str, int]:
 
 
 def _test_key(check: Check) -> Hashable:
-    if isinstance(check, Lookup):
+    if isinstance(check, LookupCondition):
         return (check.table, check.offset, check.shape[1:], check.strides)
     return None
 
 
-class Together:
+class JointChecker:
     """Judges candidates of layouts that are alike.
 
     Args:
@@ -167,7 +167,10 @@ class Together:
     """
 
     def __init__(
-        self, groups: Sequence[LayoutGroup], likenesses: Sequence[Likeness], make_judge: MakeJudge
+        self,
+        groups: Sequence[LayoutGroup],
+        likenesses: Sequence[LayoutFamily],
+        make_judge: MakeJudge,
     ) -> None:
         self.layouts = [layout for layout, _ in groups]
         self.which = np.concatenate([which for _, which in groups])
@@ -177,7 +180,7 @@ class Together:
         self._lengths = np.array([likeness.lengths for likeness in likenesses], np.intp).T
         first = make_judge(self.layouts[0])
         self.is_final = first.is_complete and all(
-            isinstance(check, Lookup) for check in first.checks
+            isinstance(check, LookupCondition) for check in first.checks
         )
 
     def by_layout(self, chosen: NDArray[np.bool_]) -> list[LayoutGroup]:
@@ -224,7 +227,7 @@ class Together:
             right = _are_intact(seal, rows, sizes, sums)
             status[~right & (status == VALID)] = CHECKSUM
         for index, check in enumerate(judge.checks):
-            if isinstance(check, Lookup):
+            if isinstance(check, LookupCondition):
                 right = check.holds_within(rows, self._lengths[index, forms])
                 status[~right & (status == VALID)] = IMPLAUSIBLE
         return status
@@ -232,7 +235,7 @@ class Together:
 
 def _length(check: Check) -> int:
     """Return how many elements the outermost array of a test has; 0 if it is of no array."""
-    if isinstance(check, Lookup) and check.shape:
+    if isinstance(check, LookupCondition) and check.shape:
         return check.shape[0]
     return 0
 

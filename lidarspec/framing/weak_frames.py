@@ -25,7 +25,7 @@ from lidarspec.framing.results import SHORT, VALID, Frames, Indices
 
 
 @dataclass(frozen=True, eq=False)
-class Runs:
+class WeakRuns:
     """The runs of one weak type in a piece of a stream.
 
     Attributes:
@@ -63,7 +63,7 @@ class Runs:
             rows = self.following[rows]
         is_head = rows != count
         is_short = (rows > count) | (self.frames.status == SHORT)
-        heads = self.frames.only(is_head)
+        heads = self.frames.select(is_head)
         heads.status = np.where(is_short[is_head], SHORT, VALID)
         return heads
 
@@ -82,7 +82,7 @@ class Runs:
         is_member[self.frames.starts.searchsorted(offsets)] = True
         for jumps in self._jumps:
             is_member[jumps[np.flatnonzero(is_member)]] = True
-        return self.frames.only(is_member)
+        return self.frames.select(is_member)
 
     @cached_property
     def _jumps(self) -> list[Indices]:
@@ -112,7 +112,7 @@ def find_runs(
     confirm: int,
     is_single: bool,
     final: bool,
-) -> Runs:
+) -> WeakRuns:
     """Return the runs of a weak type.
 
     Args:
@@ -122,7 +122,7 @@ def find_runs(
         is_single: whether a frame of the type changes which types are looked for.
         final: no bytes follow: candidates that are short of bytes are invalid.
     """
-    frames = candidates.only(candidates.status <= (VALID if final else SHORT))
+    frames = candidates.select(candidates.status <= (VALID if final else SHORT))
     is_short = frames.status == SHORT
     count = len(frames)
     ends_here = count
@@ -138,7 +138,7 @@ def find_runs(
     rows, is_found = _find(earlier.starts, stops)
     own[is_found] = np.where(earlier.status[rows[is_found]] == SHORT, waits, ends_here)
     own[is_short] = waits
-    return Runs(frames, following, confirm, is_single)
+    return WeakRuns(frames, following, confirm, is_single)
 
 
 def _find(values: Indices, wanted: Indices) -> tuple[Indices, NDArray[np.bool_]]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.expressions.columns import Batch
-from lidarspec.frames.arrays import alike
+from lidarspec.frames.arrays import broadcast_value
 from lidarspec.framing.results import Counters
 from lidarspec.packets.clocks import Times
 from lidarspec.packets.pace import read_paces, shortest_pace
@@ -82,10 +82,10 @@ class ArrivalOrder:
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Return the rows that have skipped bytes before them, and the packets these would be."""
         sizes = batch.table.sizes
-        size = alike(sizes)
+        size = broadcast_value(sizes)
         rows = np.empty(0, np.intp)
         packets = np.empty(0, np.int64)
-        if alike(skipped) != 0:
+        if broadcast_value(skipped) != 0:
             rows = np.flatnonzero(skipped > 0)
             if size is not None:
                 largest = sizes[rows]

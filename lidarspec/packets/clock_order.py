@@ -49,7 +49,7 @@ _time_of = attrgetter("time")
 
 
 @dataclass
-class Neighbour:
+class RecentPacket:
     """One of the newest packets.
 
     Attributes:
@@ -81,11 +81,11 @@ class ClockOrder:
         self._stats = stats
         self._clock = clock
         self._arrived: int | None = None  # time of the packet that arrived last, ns
-        self._newest: Neighbour | None = None
-        self._neighbours = list[Neighbour]()  # by their times
+        self._newest: RecentPacket | None = None
+        self._neighbours = list[RecentPacket]()  # by their times
         self._offset = 0  # from a time to an order
         self._gaps = gaps
-        self._leap: tuple[int, Neighbour] | None = (
+        self._leap: tuple[int, RecentPacket] | None = (
             None  # the time before the clock leapt, ns, and the packet after
         )
 
@@ -165,13 +165,13 @@ class ClockOrder:
             else:
                 checksum = None
             time = times.item(row)
-            self._newest = Neighbour(
+            self._newest = RecentPacket(
                 time, time + self._offset, first + row - start, 0, checksum, self._angle_at(row)
             )
             self._neighbours.append(self._newest)
         return first
 
-    def _place(self, batch: Batch, row: int, time: int, pace: float) -> Neighbour:
+    def _place(self, batch: Batch, row: int, time: int, pace: float) -> RecentPacket:
         """Return the place of a packet that does not follow the newest one."""
         checksum = crc32(batch.table.frame(row))
         if self._newest is None or not self._neighbours:
@@ -200,7 +200,7 @@ class ClockOrder:
         self._stats.lost += missing
         batch.breaks[row] |= missing > 0
         order = max(time + self._offset, newest.order + 1)
-        self._newest = Neighbour(
+        self._newest = RecentPacket(
             time, order, newest.index + 1 + missing, missing, checksum, angle, masked
         )
         self._neighbours.append(self._newest)
@@ -235,7 +235,7 @@ class ClockOrder:
         is_full = len(self._neighbours) >= MAX_PLACES_LATE
         return passed < -MAX_LATE_NS or (is_full and time < self._neighbours[0].time)
 
-    def _begin(self, batch: Batch, row: int, time: int, checksum: int) -> Neighbour:
+    def _begin(self, batch: Batch, row: int, time: int, checksum: int) -> RecentPacket:
         """Begin with a first packet, or again after the clock was set.
 
         After the clock was set the index leaves out one number.
@@ -248,7 +248,9 @@ class ClockOrder:
             self._offset = before.order + 2 * MAX_STEP_NS - time
             index = before.index + 2
             batch.breaks[row] = True
-        self._newest = Neighbour(time, time + self._offset, index, 0, checksum, self._angle_at(row))
+        self._newest = RecentPacket(
+            time, time + self._offset, index, 0, checksum, self._angle_at(row)
+        )
         if before is None:
             self._leap = None
         else:
@@ -256,7 +258,9 @@ class ClockOrder:
         self._neighbours = [self._newest]
         return self._newest
 
-    def _insert(self, position: int, row: int, time: int, pace: float, checksum: int) -> Neighbour:
+    def _insert(
+        self, position: int, row: int, time: int, pace: float, checksum: int
+    ) -> RecentPacket:
         """Insert a late packet before a neighbour.
 
         The missing packets on both sides of it are counted again.
@@ -279,7 +283,7 @@ class ClockOrder:
         self._stats.lost += missing + missing_after - after.missing
         after.missing = missing_after
         after.masked = masked_after
-        placed = Neighbour(time, order, index, missing, checksum, self._angle_at(row), masked)
+        placed = RecentPacket(time, order, index, missing, checksum, self._angle_at(row), masked)
         self._neighbours.insert(position, placed)
         return placed
 

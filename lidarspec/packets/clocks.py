@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.expressions.columns import Batch, Fields
 from lidarspec.expressions.graph import header_function
-from lidarspec.frames.arrays import alike, repeat
+from lidarspec.frames.arrays import broadcast_value, repeat
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
 from lidarspec.spec.fields import factor
@@ -48,7 +48,7 @@ class Unwrapper:
         half = self._turn // 2
         steps = _steps(ns, raw)
         over = np.flatnonzero((steps < -half) | (steps >= self._turn - half))
-        if not len(over) and alike(host) == 0:
+        if not len(over) and broadcast_value(host) == 0:
             times = ns if time == raw else ns + (time - raw)
             self._last = (ns.item(-1), times.item(-1), 0)
             return times
@@ -72,23 +72,23 @@ class Unwrapper:
 
 @dataclass(frozen=True)
 class ClockReference:
-    """The turn of a clock as a frame told it (`Clock.told`).
+    """The turn of a clock as a frame told it (`Clock.reference`).
 
     It is found before the packets that it applies to.
 
     Attributes:
         reading_ns: what the clock read in the frame.
-        told_s: the seconds since 1970 that the frame told.
+        reported_s: the seconds since 1970 that the frame told.
         host_ns: when it arrived, ns since 1970; 0 if unknown.
     """
 
     reading_ns: int
-    told_s: float
+    reported_s: float
     host_ns: int
 
 
-class Epoch:
-    """The turn of a clock, by what other frames tell, see `Clock.told`.
+class ClockEpoch:
+    """The turn of a clock, by what other frames tell, see `Clock.reference`.
 
     Args:
         sensor: with the clock of the packets.
@@ -103,9 +103,9 @@ class Epoch:
     def __init__(
         self, sensor: SensorDescription, clock: Clock, reference: ClockReference | None = None
     ) -> None:
-        assert clock.told is not None
+        assert clock.reference is not None
         assert clock.wraps_at is not None
-        self.frame = clock.told[0]
+        self.frame = clock.reference[0]
         self.ns: int | None = None
         self._sensor = sensor
         self._clock = clock
@@ -137,12 +137,12 @@ class Epoch:
         if table is None or not len(rows):
             return repeat(0, len(times))
         frames = table.take(rows)
-        told = told_seconds(self._clock, frames)
+        told = reported_seconds(self._clock, frames)
         if not np.isfinite(told).any():
             return repeat(0, len(times))
         row = int(np.isfinite(told).argmax())
         first = int(np.searchsorted(which, rows[row]))
-        reading = readings_of(self._sensor, frames).item(row)
+        reading = reference_readings(self._sensor, frames).item(row)
         complete = self._complete(reading, told.item(row))
         self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
         if whole or not first:
@@ -156,7 +156,7 @@ class Epoch:
         passed = self._short(reference.reading_ns - reading)
         if host and reference.host_ns:
             passed += round((reference.host_ns - host - passed) / self._turn) * self._turn
-        return self._complete(reference.reading_ns, reference.told_s) - time - passed
+        return self._complete(reference.reading_ns, reference.reported_s) - time - passed
 
     def _complete(self, reading: int, told: float) -> int:
         """Return the reading in the turn that is nearest to the seconds told."""
@@ -167,15 +167,15 @@ class Epoch:
         return (step + self._turn // 2) % self._turn - self._turn // 2
 
 
-def told_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
+def reported_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
     """Return the seconds since 1970 that frames tell, (n,); nan where they tell none."""
-    assert clock.told is not None
+    assert clock.reference is not None
     frames = Batch(table, np.zeros(len(table), np.bool_))
-    seconds = np.asarray(clock.told[1](Fields(frames)), np.float64)
+    seconds = np.asarray(clock.reference[1](Fields(frames)), np.float64)
     return np.broadcast_to(seconds.reshape(-1), (len(table),))
 
 
-def readings_of(sensor: SensorDescription, table: Table) -> Times:
+def reference_readings(sensor: SensorDescription, table: Table) -> Times:
     """Return what the clock reads in frames that tell its turn, (n,) ns."""
     return clock_ns(sensor, Batch(table, np.zeros(len(table), np.bool_)))
 
@@ -189,7 +189,7 @@ def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
     which, readings = read_clock(sensor, batch)
     if which is None:
         return readings
-    return hold(which, readings, np.zeros(len(batch), np.int64))
+    return hold_values(which, readings, np.zeros(len(batch), np.int64))
 
 
 def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
@@ -211,7 +211,7 @@ def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp
     return None, _sum_fields(fields, batch.table, sensor.id)
 
 
-def hold(which: NDArray[np.intp], times: Times, before: Times) -> Times:
+def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     """Return the times of some packets, each held until the next of them, (n,).
 
     Packets before the first of them have the times `before`, (n,).

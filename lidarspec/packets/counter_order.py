@@ -47,7 +47,7 @@ MAX_STEP_NS = 3600 * 10**9
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
+class CounterReadings:
     """The counter and the clock in the packets of a batch.
 
     Attributes:
@@ -99,7 +99,7 @@ class CountedLoss:
 
 
 @dataclass(frozen=True)
-class Jump:
+class CounterJump:
     """A jump of the counter, which one damaged number may have caused.
 
     Attributes:
@@ -135,7 +135,7 @@ class CounterOrder:
         self._first = 0  # index of the first packet since the sensor started
         self._missing = dict[int, CountedLoss]()  # by index
         self._suspect: tuple[int, int] | None = None  # number and time of a damaged packet, perhaps
-        self._jump: Jump | None = None  # before the newest packet
+        self._jump: CounterJump | None = None  # before the newest packet
 
     def push(self, batch: Batch, times: Times | None) -> tuple[Index, NDArray[np.bool_]]:
         """Return the index of each packet, (n,), and whether there is a break before it, (n,).
@@ -179,7 +179,7 @@ class CounterOrder:
         self._arrived = None
         self._gaps.forget()
 
-    def _read(self, batch: Batch, times: Times | None) -> Readings:
+    def _read(self, batch: Batch, times: Times | None) -> CounterReadings:
         """Return the counter and the clock of a batch."""
         info = batch.table.schema.fields.get(self._rule.field)
         if info is None or info.axes:
@@ -191,7 +191,7 @@ class CounterOrder:
         has_counter = batch.table.present(self._rule.field)
         if self._clock is None or times is None:
             unknown = np.broadcast_to(np.nan, (len(batch),))
-            return Readings(numbers, periods, has_counter, None, None, unknown)
+            return CounterReadings(numbers, periods, has_counter, None, None, unknown)
         if self._arrived is None:
             first_step = 1
         else:
@@ -201,7 +201,7 @@ class CounterOrder:
         steps[0] = first_step
         np.subtract(times[1:], times[:-1], out=steps[1:])
         paces = read_paces(self._clock, batch)
-        return Readings(numbers, periods, has_counter, times, steps, paces)
+        return CounterReadings(numbers, periods, has_counter, times, steps, paces)
 
     def _last(self, batch: Batch, largest: int) -> int | NDArray[np.int64]:
         """Return the highest number of the counter, for each packet or for all."""
@@ -215,7 +215,7 @@ class CounterOrder:
             return largest
         return int(last)
 
-    def _find_odd(self, readings: Readings) -> list[int]:
+    def _find_odd(self, readings: CounterReadings) -> list[int]:
         """Return the packets that do not follow the previous one.
 
         The first packet is left out.
@@ -242,7 +242,9 @@ class CounterOrder:
                 is_odd |= (np.abs(readings.steps) > readings.paces * each / 2)[1:]
         return (np.flatnonzero(is_odd) + 1).tolist()
 
-    def _count_places_ahead(self, readings: Readings, row: int) -> tuple[int | None, int | None]:
+    def _count_places_ahead(
+        self, readings: CounterReadings, row: int
+    ) -> tuple[int | None, int | None]:
         """Return how many places a packet is ahead of the newest one, and its corrected number.
 
         Places are None if the sensor has started again.
@@ -311,7 +313,7 @@ class CounterOrder:
         return ahead, self._number + ahead
 
     def _place(
-        self, readings: Readings, row: int, ahead: int | None, number: int | None
+        self, readings: CounterReadings, row: int, ahead: int | None, number: int | None
     ) -> tuple[int, bool]:
         """Return the index of a packet that does not follow the newest one.
 
@@ -343,9 +345,9 @@ class CounterOrder:
     def _note_jump(self, loss: CountedLoss | None) -> None:
         """Remember that the counter jumps here, unless a clock tells damage from losses."""
         if self._clock is None and self._number is not None:
-            self._jump = Jump(self._number, loss)
+            self._jump = CounterJump(self._number, loss)
 
-    def _returns(self, jump: Jump, number: int | None) -> bool:
+    def _returns(self, jump: CounterJump, number: int | None) -> bool:
         """Return whether a number goes on from before a jump, which was damage then."""
         if number is None:
             return False

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import plugin_errors
-from lidarspec.expressions.columns import Batch, Fields, of_points, padding_mask
+from lidarspec.expressions.columns import Batch, Fields, align_points, padding_mask
 from lidarspec.points.conventions import vendor_turn
 from lidarspec.points.reference_evaluator import flat
 from lidarspec.spec.results import Imu
@@ -78,7 +78,7 @@ def join_samples(parts: Sequence[ImuSamples]) -> ImuSamples:
     return ImuSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def samples(
+def read_samples(
     sensor: SensorDescription, frame: str, batch: Batch, time_ns: NDArray[np.int64]
 ) -> ImuSamples:
     """The samples of packets.
@@ -105,7 +105,7 @@ def samples(
                 strict=True,
             )
         )
-        arrays, axes, _, shape = of_points(values, batch)
+        arrays, axes, _, shape = align_points(values, batch)
         mask = padding_mask(axes, shape, batch)
         after = np.rint(np.nan_to_num(np.asarray(arrays.pop(), np.float64)) * 1e9).astype(np.int64)
         time = flat(time_ns.reshape(-1, *(1,) * len(axes)) + after, shape, mask, len(batch))
@@ -120,7 +120,7 @@ def samples(
     return found.turn(turn)
 
 
-class Waiting:
+class WaitingSamples:
     """Samples that wait for the scan that they belong to.
 
     A scan has the samples from its first point to that of the next one. Earlier samples are kept as
@@ -135,12 +135,12 @@ class Waiting:
         if len(more):
             self._parts.append(more)
 
-    def keep(self, most: int) -> None:
+    def keep_newest(self, most: int) -> None:
         """Let go of all but the newest ones, where no scan ends and asks for them."""
         if sum(map(len, self._parts)) > 2 * most:
             self._parts = [join_samples(self._parts)[-most:]]
 
-    def until(self, ns: int | None) -> ImuSamples:
+    def take_until(self, ns: int | None) -> ImuSamples:
         """Hand out what was felt before a time, in the order of time; of None all there is."""
         found = join_samples(self._parts)
         found = found[np.argsort(found.time_ns, kind="stable")]

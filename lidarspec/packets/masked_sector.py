@@ -175,7 +175,7 @@ class SectorFinder:
         self._seen = np.zeros(BINS, np.bool_)
         self._gaps = list[Sector]()
 
-    def see(self, angles: Angles) -> None:
+    def add_angles(self, angles: Angles) -> None:
         """Note that packets came from some angles."""
         if self.sector is None:
             self._seen[(angles * BINS).astype(np.intp) % BINS] = True
@@ -227,7 +227,7 @@ class SectorFinder:
         return not self._seen[(angles * BINS).astype(np.intp) % BINS].any()
 
 
-class Loss(Protocol):
+class GapLoss(Protocol):
     """A gap that counts as a loss so far.
 
     Attributes:
@@ -256,7 +256,7 @@ class MaskedGaps:
         self._angles: Angles | None = None  # of the packets at hand
         self._first_unnoted = 0  # row of the first one that `_finder` has not seen
         self._finder: SectorFinder | None = None
-        self._losses = list[Loss]()  # at the gaps that `_finder` remembers
+        self._losses = list[GapLoss]()  # at the gaps that `_finder` remembers
         self.masked = 0  # packets that the masked sector leaves out
 
     def read(self, table: Table) -> None:
@@ -275,7 +275,7 @@ class MaskedGaps:
     def _note_until(self, row: int) -> None:
         """Note that the packets at hand before a row are not masked."""
         if self._finder is not None and self._angles is not None:
-            self._finder.see(self._angles[self._first_unnoted : row])
+            self._finder.add_angles(self._angles[self._first_unnoted : row])
         self._first_unnoted = row
 
     def forget(self) -> None:
@@ -307,7 +307,7 @@ class MaskedGaps:
             return missing
         return min(self.masked, missing)
 
-    def find_unlost(self, row: int, start: float, stop: float, loss: Loss) -> int:
+    def find_unlost(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
         """Compare a loss between two angles with earlier ones; if it recurs, both are masked.
 
         Args:

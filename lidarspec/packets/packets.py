@@ -14,9 +14,9 @@ from lidarspec.expressions.columns import AROUND, Batch, physical
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.results import Counters, Numbers, array_of
-from lidarspec.notebook_display import drawn
+from lidarspec.notebook_display import make_display_method
 from lidarspec.packets.clocks import part_times
-from lidarspec.packets.imu import ImuSamples, samples
+from lidarspec.packets.imu import ImuSamples, read_samples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.evaluate import evaluate
 from lidarspec.spec.sensor import SensorDescription
@@ -113,7 +113,7 @@ class Packets:
             span = ""
         return f"Packets({len(self)} {self.frame} frames of {self.sensor.id}{span})"
 
-    _repr_html_ = drawn("packets")
+    _repr_html_ = make_display_method("packets")
 
     def __getitem__(self, path: str) -> NDArray[np.float64]:
         """Return a field in its unit, float64, shape (n, *lengths of its arrays).
@@ -191,7 +191,7 @@ class Packets:
         """
         path = self.sensor.parts_with("imu", self.frame)
         own = self.parts(path) if path else self
-        return samples(self.sensor, own.frame, own.batch(), own.time_ns)
+        return read_samples(self.sensor, own.frame, own.batch(), own.time_ns)
 
     def take(self, which: Any) -> Packets:
         """The packets that indices, a mask or a slice pick, with their times, offsets and state."""

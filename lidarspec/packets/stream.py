@@ -18,21 +18,21 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.expressions.columns import Batch
-from lidarspec.frames.arrays import alike, repeat
+from lidarspec.frames.arrays import broadcast_value, repeat
 from lidarspec.frames.frame_table import Table
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Counters, Frames, Numbers, array_of
 from lidarspec.packets.arrival_order import ArrivalOrder
 from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.clocks import (
+    ClockEpoch,
     ClockReference,
-    Epoch,
     Unwrapper,
-    hold,
+    hold_values,
     read_clock,
 )
 from lidarspec.packets.counter_order import CounterOrder
-from lidarspec.packets.imu import ImuSamples, Waiting, join_samples
+from lidarspec.packets.imu import ImuSamples, WaitingSamples, join_samples
 from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.packet_type import find_clock, packet_type
 from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
@@ -81,9 +81,9 @@ class PacketStream:
         self._clock = Unwrapper(clock.wraps_at) if clock else None
         self._time: int | None = None  # of the last packet with parts that have the clock
         self._turn = repeat(0, 0)  # completes the times of the packets at hand
-        self._epoch: Epoch | None = None
-        if clock is not None and clock.told is not None and sensor.frames[frame].data:
-            self._epoch = Epoch(self._type.timed_sensor, clock, reference)
+        self._epoch: ClockEpoch | None = None
+        if clock is not None and clock.reference is not None and sensor.frames[frame].data:
+            self._epoch = ClockEpoch(self._type.timed_sensor, clock, reference)
 
         self._counter_order: CounterOrder | None = None
         self._clock_order: ClockOrder | None = None
@@ -111,7 +111,7 @@ class PacketStream:
             state = self._states(parts, len(table), whole=whole)
         host = _host_times(columns.at)
         breaks = np.zeros(len(table), np.bool_)
-        if alike(columns.skipped) != 0:
+        if broadcast_value(columns.skipped) != 0:
             breaks = columns.skipped > 0
         time = None
         index: Index = range(0)
@@ -190,7 +190,7 @@ class PacketStream:
             before = repeat(self._time, len(host))
         if len(times):
             self._time = times.item(-1)
-        return hold(which, times, before)
+        return hold_values(which, times, before)
 
     def _complete(self, times: Integers) -> Integers:
         """Return times with the turn of the clock that other frames have told, if they have."""
@@ -210,7 +210,7 @@ class PacketStream:
         gaps = part.piece.gaps
         rows = part.rows
         number = len(part.frames)
-        if alike(gaps) == 0 and not self._skipped:
+        if broadcast_value(gaps) == 0 and not self._skipped:
             return repeat(0, number)
         if isinstance(rows, slice) and number:
             skipped = gaps[rows].copy()
@@ -260,7 +260,7 @@ class PacketStream:
                     name = part.piece.names[kind]
                     if name in self._type.others:
                         which = kinds == kind
-                        frames = part.piece.only(others[which])
+                        frames = part.piece.select(others[which])
                         seen.setdefault(name, []).append((frames, before[which]))
             number += len(part.frames)
         return seen
@@ -309,7 +309,7 @@ class ImuStream:
         self._make_stream = partial(PacketStream, sensor, stats=stats, backend=backend, state=state)
         names = (*self._names, *sensor.data_frames)
         has_clock = {find_clock(sensor, name) is not None for name in names}
-        self.waiting = Waiting() if sensor.imu_frames and len(has_clock) == 1 else None
+        self.waiting = WaitingSamples() if sensor.imu_frames and len(has_clock) == 1 else None
 
     def add(
         self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False
@@ -373,7 +373,7 @@ class OwnFrames:
         own_kind = -1
         if name in piece.names:
             own_kind = piece.names.index(name)
-        kind = alike(piece.kinds)
+        kind = broadcast_value(piece.kinds)
         if kind is not None and kind == own_kind:
             return cls(piece, piece, slice(0, len(piece)))
         indices = np.flatnonzero(piece.kinds == own_kind)
@@ -382,7 +382,7 @@ class OwnFrames:
             rows = slice(0, 0)
         elif indices.item(-1) - indices.item(0) == len(indices) - 1:
             rows = slice(indices.item(0), indices.item(-1) + 1)
-        return cls(piece.only(rows), piece, rows)
+        return cls(piece.select(rows), piece, rows)
 
     @property
     def has_others(self) -> bool:
@@ -451,7 +451,7 @@ def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
 
 def _join_values(parts: Sequence[Integers]) -> Integers:
     """Return arrays joined; as one `repeat` value, if all of them are of it."""
-    values = {alike(part) for part in parts}
+    values = {broadcast_value(part) for part in parts}
     if len(values) == 1:
         only = values.pop()
         if only is not None:
@@ -461,7 +461,7 @@ def _join_values(parts: Sequence[Integers]) -> Integers:
 
 def _host_times(at: Integers) -> Integers:
     """Return arrival times, 0 if unknown."""
-    only = alike(at)
+    only = broadcast_value(at)
     if only is not None:
         return repeat(max(only, 0), len(at))
     if len(at) and int(at.min()) < 0:

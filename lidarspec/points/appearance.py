@@ -41,7 +41,7 @@ WORTH = 0.93
 
 
 @dataclass(frozen=True)
-class Look:
+class CloudAppearance:
     """The look of a drawn cloud.
 
     Attributes:
@@ -69,12 +69,14 @@ class Look:
         return f"{self.low:g}", f"{self.full:g} {unit}".rstrip()
 
 
-def ramps(cloud: PointCloud) -> list[str]:
+def list_ramps(cloud: PointCloud) -> list[str]:
     """Return the values that colours can show of a cloud."""
     return ["range", *["intensity"] * (cloud.intensity is not None), *cloud.extra]
 
 
-def look(points: PointCloud, *, ramp: str = "range", reach: float | None = None) -> Look:
+def choose_appearance(
+    points: PointCloud, *, ramp: str = "range", reach: float | None = None
+) -> CloudAppearance:
     """Return how to draw a cloud so that all of it is visible.
 
     Intensity is shown only if the cloud has any.
@@ -83,21 +85,21 @@ def look(points: PointCloud, *, ramp: str = "range", reach: float | None = None)
         UnknownName: for a column that the cloud does not have.
     """
     cloud = points[points.valid]
-    found = reach or reach_of(cloud)
-    if ramp not in (known := ramps(cloud)):
+    found = reach or find_reach(cloud)
+    if ramp not in (known := list_ramps(cloud)):
         if ramp != "intensity":
             raise UnknownName(ramp, known, place="colours")
         ramp = "range"
     if ramp == "range":
-        return Look("range", found, found, flat=is_flat(cloud))
+        return CloudAppearance("range", found, found, flat=is_flat(cloud))
     values = _shown(cloud, ramp)
     values = values[np.isfinite(values)]
     weak, strong = np.percentile(values, (100 - WITHIN, WITHIN)) if len(values) else (0.0, 0.0)
-    low = -rounded_up(-float(weak)) if weak < 0 else 0.0
-    return Look(
+    low = -round_up(-float(weak)) if weak < 0 else 0.0
+    return CloudAppearance(
         ramp,
         found,
-        rounded_up(max(float(strong), 1e-3)),
+        round_up(max(float(strong), 1e-3)),
         flat=is_flat(cloud),
         low=low,
         unit=cloud.units.get(ramp, ""),
@@ -109,7 +111,7 @@ def is_flat(cloud: PointCloud) -> bool:
     return not len(cloud) or float(np.nanmax(np.abs(cloud.elevation))) < FLAT
 
 
-def reach_of(cloud: PointCloud) -> float:
+def find_reach(cloud: PointCloud) -> float:
     """Return the range to draw for a cloud of valid points, rounded up.
 
     It is that of the farthest point, or of most points if a few are far beyond.
@@ -119,15 +121,15 @@ def reach_of(cloud: PointCloud) -> float:
     distance = np.hypot(cloud.x, cloud.y)
     farthest = float(distance.max())
     most = float(np.percentile(distance, MOST))
-    return rounded_up(max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3))
+    return round_up(max(farthest if farthest <= FAR_BEYOND * most else most, 1e-3))
 
 
-def fit(points: PointCloud, look: Look) -> Look:
+def fit_to_points(points: PointCloud, look: CloudAppearance) -> CloudAppearance:
     """Return the look whose view from above the central 98 % of the points fill.
 
     The sensor is shown as well if the points are not much smaller for it.
     """
-    low, high = bounds(points[points.valid])
+    low, high = find_bounds(points[points.valid])
     with_sensor = np.minimum(low, 0.0), np.maximum(high, 0.0)
     if _half_extent(low, high) >= WORTH * _half_extent(*with_sensor):
         low, high = with_sensor
@@ -135,7 +137,7 @@ def fit(points: PointCloud, look: Look) -> Look:
     return replace(look, middle=(forward, left), reach=MARGIN * max(_half_extent(low, high), 1e-3))
 
 
-def bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def find_bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lowest and the highest x, y and z of the central points.
 
     Args:
@@ -160,7 +162,7 @@ def _half_extent(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
     return float((high - low)[:2].max()) / 2
 
 
-def rounded_up(value: float, rounds: Sequence[float] = ROUND) -> float:
+def round_up(value: float, rounds: Sequence[float] = ROUND) -> float:
     """The next of a few round numbers, by default such as 1.2, 1.5, 2, 2.5, 3, 4 ... 10, 12."""
     power = 10.0 ** math.floor(math.log10(value))
     return next((one * power for one in rounds if one * power >= value * 0.999), 10 * power)
@@ -168,22 +170,22 @@ def rounded_up(value: float, rounds: Sequence[float] = ROUND) -> float:
 
 def ring_step(reach: float) -> float:
     """Metres from ring to ring: 1, 2 or 5 times a power of ten, at most four rings."""
-    return rounded_up(reach / RINGS, (1, 2, 5, 10))
+    return round_up(reach / RINGS, (1, 2, 5, 10))
 
 
-def shade(cloud: PointCloud, look: Look) -> NDArray[np.float64]:
+def ramp_positions(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.float64]:
     """Return the position of each point along the ramp, (n,), from 0."""
     if look.ramp == "range":
         return np.hypot(cloud.x, cloud.y).astype(np.float64) / look.full
     return np.nan_to_num((_shown(cloud, look.ramp) - look.low) / (look.full - look.low))
 
 
-def steps(cloud: PointCloud, look: Look) -> NDArray[np.intp]:
+def ramp_indices(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.intp]:
     """Return the index of each point's colour in the ramp, (n,).
 
     Points without a return have the first colour.
     """
-    return np.clip(np.nan_to_num(shade(cloud, look)) * STEPS, 0, STEPS - 1).astype(np.intp)
+    return np.clip(np.nan_to_num(ramp_positions(cloud, look)) * STEPS, 0, STEPS - 1).astype(np.intp)
 
 
 def _shown(cloud: PointCloud, ramp: str) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from weakref import WeakKeyDictionary
 
 from lidarspec.points import numpy_plan
-from lidarspec.points.plan import Maker, Plan, PointsFunction
+from lidarspec.points.plan import ColumnMaker, Plan, PointsFunction
 
 #: points after which a kernel compiled before pays, and one that has to be compiled.
 MIN_WARM_KERNEL_POINTS = 1 << 26
@@ -21,7 +21,7 @@ _NEVER = -(1 << 62)
 _POINT_COUNTS: WeakKeyDictionary[PointsFunction, dict[tuple[str, ...], int]] = WeakKeyDictionary()
 
 
-def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) -> Maker:
+def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) -> ColumnMaker:
     """Return an object that computes columns of a plan.
 
     Args:
@@ -42,7 +42,7 @@ def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) 
     return numpy_plan.compile(plan, names)
 
 
-def _paying_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> Maker | None:
+def _paying_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
     """Return a compiled kernel if it pays after the points of these frames, else None."""
     counts = _POINT_COUNTS.setdefault(plan.function, {})
     counts[names] = counts.get(names, 0) + frames * plan.width

@@ -3,7 +3,7 @@
 `BatchColumns.columns` decides for which points columns are computed: for the whole batch, for a
 large scan alone, or for a block of points that small scans share. `_compute` decides which columns
 are computed together. A program of `points.numpy_plan` or a kernel of `points.numba_kernels` fills
-them for each `Share` of the batch.
+them for each `GroupPoints` of the batch.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.expressions.graph import Node
-from lidarspec.frames.arrays import deep
+from lidarspec.frames.arrays import add_axes
 from lidarspec.points.backends import choose_maker
 from lidarspec.points.column_sources import ColumnSource
 from lidarspec.points.conventions import (
@@ -29,7 +29,7 @@ from lidarspec.points.conventions import (
     turned_azimuth,
     vendor_turn,
 )
-from lidarspec.points.layout_groups import Share
+from lidarspec.points.layout_groups import GroupPoints
 from lidarspec.points.reference_evaluator import PacketBatch
 
 #: columns that one program or kernel computes.
@@ -62,7 +62,7 @@ class BatchColumns(ColumnSource):
     def __init__(
         self,
         packets: PacketBatch,
-        shares: Sequence[Share],
+        shares: Sequence[GroupPoints],
         size: int,
         base: int,
         *,
@@ -229,11 +229,13 @@ class BatchColumns(ColumnSource):
             spread_out(part, share.first, share.plan.width, column)
         return column
 
-    def _times(self, share: Share, first: int, last: int | None) -> NDArray[np.float64]:
+    def _times(self, share: GroupPoints, first: int, last: int | None) -> NDArray[np.float64]:
         """Return the times of all points of some packets, (packets, *shape), s since `base`."""
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)
-        return np.asarray(share.plain("time", first, last) + deep(offsets, len(share.plan.shape)))
+        return np.asarray(
+            share.plain("time", first, last) + add_axes(offsets, len(share.plan.shape))
+        )
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
         if not self._is_regular or "time" in self._computed:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from lidarspec.errors import UnknownName, UsageError
-from lidarspec.notebook_display import drawn
+from lidarspec.notebook_display import make_display_method
 from lidarspec.optional_libraries import import_library
-from lidarspec.points.column_sources import ColumnSource, LazyColumns, Stretch, Stretches
+from lidarspec.points.column_sources import ColumnSource, JoinedColumns, LazyColumns, SourcePart
 from lidarspec.points.conventions import TYPES, UNITS, ExtraType, Floats, Grid, Grids, whole_columns
 from lidarspec.points.table_types import STRUCTURED, arrow_schema, structured_type
 
@@ -94,7 +94,7 @@ class PointCloud:
             f" valid{span}{', nominal calibration' if self.nominal else ''})"
         )
 
-    _repr_svg_ = drawn("cloud")
+    _repr_svg_ = make_display_method("cloud")
 
     @property
     def columns(self) -> Mapping[str, NDArray[Any]]:
@@ -446,8 +446,8 @@ class LazyCloud(PointCloud):
         if not isinstance(which, slice) or which.step not in (None, 1):
             return super().__getitem__(which)
         start, stop, _ = which.indices(len(self))
-        part = Stretch(CloudColumns(self), start, max(start, stop))
-        cloud = LazyCloud.of(Stretches([part]), self.stamp_ns)
+        part = SourcePart(CloudColumns(self), start, max(start, stop))
+        cloud = LazyCloud.of(JoinedColumns([part]), self.stamp_ns)
         cloud.__dict__["chosen"] = self.chosen
         return cloud
 

@@ -3,8 +3,8 @@
 A cloud or a scan takes its columns from a `ColumnSource` when they are first read. A source has one
 method that computes columns for a range of points. The points of a batch of packets are a source
 (`batch_columns.BatchColumns`), those of a cloud that has its columns (`cloud.CloudColumns`), and
-stretches of other sources one after another (`Stretches`), as slices and scans are. So scans are
-cut out of batches without computing a column.
+stretches of other sources one after another (`JoinedColumns`), as slices and scans are. So scans
+are cut out of batches without computing a column.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def level_z(x: NDArray[Any]) -> NDArray[Any]:
     return z
 
 
-class Stretch(NamedTuple):
+class SourcePart(NamedTuple):
     """Consecutive points of a source."""
 
     source: ColumnSource
@@ -125,14 +125,14 @@ class Stretch(NamedTuple):
         return self.stop - self.start
 
 
-class Stretches(ColumnSource):
+class JoinedColumns(ColumnSource):
     """Stretches of sources, one after another, at least one.
 
     Args:
         from_first: times count from the first point; else from the base of the first source.
     """
 
-    def __init__(self, parts: Sequence[Stretch], *, from_first: bool = False) -> None:
+    def __init__(self, parts: Sequence[SourcePart], *, from_first: bool = False) -> None:
         self._parts = parts
         self._from_first = from_first
         self.size = sum(part.size for part in parts)
@@ -159,7 +159,7 @@ class Stretches(ColumnSource):
             columns["time"] = columns["time"] - columns["time"][0]
         return {name: column[start:stop] for name, column in columns.items()}
 
-    def _piece(self, part: Stretch, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    def _piece(self, part: SourcePart, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         """Return columns of one stretch, with times since the base of the first source."""
         piece = part.source.columns(names, part.start, part.stop)
         if "time" in piece:

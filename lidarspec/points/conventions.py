@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.expressions.columns import Column
-from lidarspec.expressions.graph import Traced
+from lidarspec.expressions.graph import TracedColumn
 from lidarspec.spec.results import Extra
 from lidarspec.spec.sensor import DIRECTIONS, SensorDescription
 
@@ -62,14 +62,14 @@ def returned_range(measured: Any) -> Any:
 
     A traced value gets a single step that compilers know.
     """
-    if isinstance(measured, Traced):
+    if isinstance(measured, TracedColumn):
         return measured.apply_function(returned_range, measured)
     return np.where((measured > 0) & (measured < np.inf), measured, np.nan)
 
 
 def mark(measured: Any, invalid: Any) -> Any:
     """Ranges, nan where the sensor marks a point as wrong."""
-    if isinstance(invalid, Traced) or np.any(invalid):
+    if isinstance(invalid, TracedColumn) or np.any(invalid):
         return np.where(invalid, np.nan, measured)
     return measured
 
@@ -110,7 +110,7 @@ def place_points(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
     """
     away = sum(abs(place) for place in coordinates if not is_zero(place))
     lost = np.logical_not((away > 0) & (away <= FARTHEST))
-    if isinstance(invalid, Traced) or np.any(invalid):
+    if isinstance(invalid, TracedColumn) or np.any(invalid):
         lost = lost | invalid
     return [np.where(lost, np.nan, place) for place in coordinates]
 
@@ -122,7 +122,7 @@ def direction_of(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
 
 
 def _product(first: Any, second: Any) -> Any:
-    if not isinstance(second, Traced) and np.size(second) == 1 and np.all(second == 1):
+    if not isinstance(second, TracedColumn) and np.size(second) == 1 and np.all(second == 1):
         return first
     return first * second
 
@@ -132,12 +132,12 @@ def _is_row(value: Any) -> bool:
 
     Computations with such rows are done once, for the table.
     """
-    return isinstance(value, Traced) and value.node.kind == "rows"
+    return isinstance(value, TracedColumn) and value.node.kind == "rows"
 
 
 def is_zero(value: Any) -> bool:
     """Whether a number or an array, which no data decides, is 0."""
-    return not isinstance(value, Traced) and bool(np.all(np.asarray(value) == 0))
+    return not isinstance(value, TracedColumn) and bool(np.all(np.asarray(value) == 0))
 
 
 def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:

@@ -18,12 +18,17 @@ from lidarspec.errors import PluginError, SpecError
 from lidarspec.expressions.columns import Batch, Carry, Column
 from lidarspec.expressions.graph import Node
 from lidarspec.frames.arrays import repeat
-from lidarspec.frames.frame_table import Group, Rows
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.conventions import Grids, grid_of
-from lidarspec.points.layout_groups import PlainValues, Share
+from lidarspec.points.layout_groups import GroupPoints, PlainValues
 from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
-from lidarspec.points.reference_evaluator import Evaluated, PacketBatch, evaluate_plainly, stamp_of
+from lidarspec.points.reference_evaluator import (
+    EvaluatedPoints,
+    PacketBatch,
+    evaluate_plainly,
+    stamp_of,
+)
 
 #: numbers that are checked together, so that they stay in the cache.
 CHECKED_AT_ONCE = 1 << 15
@@ -35,7 +40,7 @@ def evaluate(
     *,
     final: bool = True,
     epoch: int | None = None,
-) -> Evaluated:
+) -> EvaluatedPoints:
     """Return the points of a batch by the fastest applicable evaluation.
 
     The columns equal those of `evaluate_plainly` within a few units in the last place.
@@ -58,10 +63,10 @@ def evaluate(
 
 def _evaluate_by_plans(
     packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: int | None
-) -> Evaluated | None:
+) -> EvaluatedPoints | None:
     """Return the points of a batch by plans, None if there are none for these packets."""
     table = packets.table
-    if not isinstance(table, Rows) or not table.groups:
+    if not isinstance(table, CompiledTable) or not table.groups:
         return None
     batch = packets.batch(carry)
     function = packets.sensor.points_of(packets.frame)
@@ -93,20 +98,24 @@ def _evaluate_by_plans(
         ready = min((column.ready for column in remembered.values()), default=ready)
     source = _source_of(packets, shares, batch, ready, stamp_of(packets, epoch))
     counts = _counts(shares, len(packets))[:ready]
-    return Evaluated(source, ready, counts, plans[0].axes, batch)
+    return EvaluatedPoints(source, ready, counts, plans[0].axes, batch)
 
 
 def _share(
-    plan: Plan, batch: Batch, group: Group, whole: PlainValues, remembered: Mapping[int, Column]
-) -> Share:
+    plan: Plan,
+    batch: Batch,
+    group: LayoutRows,
+    whole: PlainValues,
+    remembered: Mapping[int, Column],
+) -> GroupPoints:
     """Return the share of a group; values that use other packets are those of the whole batch."""
     is_whole = len(group.where) == len(batch) and group.is_in_order
     if is_whole:
-        return Share(plan, group, whole, batch)
-    return Share.part(plan, batch, group, remembered)
+        return GroupPoints(plan, group, whole, batch)
+    return GroupPoints.part(plan, batch, group, remembered)
 
 
-def _is_valid(share: Share) -> bool:
+def _is_valid(share: GroupPoints) -> bool:
     """Return whether a plan is valid for its packets.
 
     Their counts, and the values of factors and floating-point fields, are checked.
@@ -122,7 +131,7 @@ def _is_valid(share: Share) -> bool:
     return all(_is_moderate(share, node) for node in share.plan.floats)
 
 
-def _is_moderate(share: Share, node: Node) -> bool:
+def _is_moderate(share: GroupPoints, node: Node) -> bool:
     """Return whether all numbers of a floating-point field are of moderate size.
 
     They are finite, and neither too small nor too large for float32.
@@ -150,7 +159,7 @@ def _are_moderate(values: NDArray[Any]) -> bool:
 
 
 def _source_of(
-    packets: PacketBatch, shares: list[Share], batch: Batch, ready: int, stamp_ns: int
+    packets: PacketBatch, shares: list[GroupPoints], batch: Batch, ready: int, stamp_ns: int
 ) -> BatchColumns:
     """Return the columns of the points of the first `ready` packets."""
     plan = shares[0].plan
@@ -172,7 +181,7 @@ def _source_of(
     return BatchColumns(packets, shares, size, stamp_ns, grids=grids, nominal=nominal)
 
 
-def _counts(shares: list[Share], number: int) -> NDArray[Any]:
+def _counts(shares: list[GroupPoints], number: int) -> NDArray[Any]:
     """Return 1 for each point, with the axes of the arrays, and 0 in their padding."""
     if len(shares) == 1 or len({share.plan.shape for share in shares}) == 1:
         return repeat(1, number, *shares[0].plan.shape)
@@ -188,7 +197,7 @@ def _counts(shares: list[Share], number: int) -> NDArray[Any]:
 
 def evaluate_guarded(
     packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int
-) -> Evaluated | None:
+) -> EvaluatedPoints | None:
     """Return the points of a batch of a stream, None if the plugin fails.
 
     Failures are counted in the `Counters` of the packets.

@@ -1,7 +1,7 @@
 """The packets of one layout in a batch, with their plan and plain results.
 
-A batch has a `Share` for each layout. `PlainValues` evaluates nodes of the plan plainly for its
-packets, each node once.
+A batch has a `GroupPoints` for each layout. `PlainValues` evaluates nodes of the plan plainly for
+its packets, each node once.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from lidarspec.expressions.columns import Batch, Column, Fields, field_array
 from lidarspec.expressions.graph import Node, compute
-from lidarspec.frames.arrays import deep
-from lidarspec.frames.frame_table import Group
-from lidarspec.points.plan import REMEMBERING, Maker, Plan
+from lidarspec.frames.arrays import add_axes
+from lidarspec.frames.frame_table import LayoutRows
+from lidarspec.points.plan import REMEMBERING, ColumnMaker, Plan
 
 #: bytes of an integer that float64 holds exactly.
 MAX_EXACT_BYTES = 4
@@ -98,14 +98,14 @@ class PlainValues:
 
 
 @dataclass(eq=False)
-class Share:
+class GroupPoints:
     """The packets of one layout in a batch, with their plan and plain results.
 
     `first` is the index of the first point of each packet, -1 for none.
     """
 
     plan: Plan
-    group: Group
+    group: LayoutRows
     plain_values: PlainValues
     batch: Batch
     first: NDArray[np.intp] | None = None
@@ -113,7 +113,7 @@ class Share:
     def __len__(self) -> int:
         return len(self.group.where)
 
-    def fill(self, maker: Maker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
+    def fill(self, maker: ColumnMaker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
         """Return columns of the packets from `first` to `stop` (None: all)."""
         rows = self.group.rows[first:stop]
         columns = maker.columns(len(rows))
@@ -152,13 +152,13 @@ class Share:
             if isinstance(part, Node) and len(array) > 1:
                 array = array[first:stop]
         return np.broadcast_to(
-            deep(array, len(shape) - 1) if isinstance(part, Node) else array, shape
+            add_axes(array, len(shape) - 1) if isinstance(part, Node) else array, shape
         )
 
     @classmethod
     def part(
-        cls, plan: Plan, batch: Batch, group: Group, remembered: Mapping[int, Column]
-    ) -> Share:
+        cls, plan: Plan, batch: Batch, group: LayoutRows, remembered: Mapping[int, Column]
+    ) -> GroupPoints:
         """Return the share of some packets of a batch.
 
         Args:
@@ -176,16 +176,16 @@ class Share:
             share.plain_values.know(node, Column(array[corner], node.sample.axes, own))
         return share
 
-    def some(self, which: NDArray[np.intp]) -> Share:
+    def some(self, which: NDArray[np.intp]) -> GroupPoints:
         """The share of some of the packets, by index, with what is known of them plainly."""
         remembered = {
             node.number: self.plain_values.column(node)
             for node in self.plan.eager
             if node.kind in REMEMBERING
         }
-        return Share.part(
+        return GroupPoints.part(
             self.plan,
             self.batch,
-            Group(self.group.layout, which, self.group.rows[which]),
+            LayoutRows(self.group.layout, which, self.group.rows[which]),
             remembered,
         )

@@ -68,7 +68,7 @@ def window(leaf: Leaf) -> FieldWindow | None:
         return None
     if len(leaf.shape) > len(leaf.strides):
         return None
-    start, stop = leaf.held
+    start, stop = leaf.byte_span
     if stop - start <= 2:
         return FieldWindow(start, stop - start)
     return None

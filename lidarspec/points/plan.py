@@ -2,8 +2,8 @@
 
 `Plan` knows how points become coordinates (by `points.conventions`, as the plain evaluation does),
 and which values have to be known of a batch before they are computed. It computes nothing: a
-`Maker` does, which a back end compiles from it (`points.numpy_plan`, `points.numba_kernels`). Plans
-are kept with the layout that they are for, so a stream of packets traces nothing again.
+`ColumnMaker` does, which a back end compiles from it (`points.numpy_plan`, `points.numba_kernels`).
+Plans are kept with the layout that they are for, so a stream of packets traces nothing again.
 
 Points by coordinates are three expressions and a mask (`conventions.place_points`), their range and
 angles further ones. They are exact: computed in float64 as they are written, whatever
@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.expressions import graph
-from lidarspec.expressions.columns import Batch, of_points
-from lidarspec.expressions.graph import Node, Traced, UntraceableError, is_full, only_field
-from lidarspec.frames.frame_table import Group
+from lidarspec.expressions.columns import Batch, align_points
+from lidarspec.expressions.graph import Node, TracedColumn, UntraceableError, is_full, only_field
+from lidarspec.frames.frame_table import LayoutRows
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf
 from lidarspec.points.conventions import (
     coordinates,
@@ -41,7 +41,7 @@ from lidarspec.points.conventions import (
 from lidarspec.points.lookup_tables import is_number
 from lidarspec.points.reference_evaluator import kinds_of, parts_of
 from lidarspec.spec.results import Cartesian, Polar
-from lidarspec.spec.vocabulary import Along, row_numbers
+from lidarspec.spec.vocabulary import AlongAxis, row_numbers
 
 PointsFunction = Callable[[Any], Any]
 
@@ -56,7 +56,7 @@ REMEMBERING = ("shift", "latest", "state")
 MODERATE = 2.0**-60, 2.0**60
 
 
-class Maker(Protocol):
+class ColumnMaker(Protocol):
     """Makes some columns of the points of frames of one layout."""
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
@@ -107,21 +107,21 @@ class Plan:
         self.nominal = result.nominal
         given = parts_of(result)
         samples = {
-            name: part.node.sample if isinstance(part, Traced) else part
+            name: part.node.sample if isinstance(part, TracedColumn) else part
             for name, part in given.items()
         }
-        arrays, self.axes, _, shape = of_points(samples, sample)
+        arrays, self.axes, _, shape = align_points(samples, sample)
         self.extra = kinds_of(result, samples)
         given = {
-            name: part if isinstance(part, Traced) else array
+            name: part if isinstance(part, TracedColumn) else array
             for (name, part), array in zip(given.items(), arrays, strict=True)
         }
         self.parts = {name: graph.node_of(part) for name, part in given.items()}
         self.shape = shape[1:]
         self.varying = {name for name, count in schema.arrays.items() if not isinstance(count, int)}
         self.tables = _TABLES.setdefault(function, {})
-        self.programs: dict[tuple[str, ...], Maker] = {}
-        self.kernels: dict[tuple[str, ...], Maker] = {}
+        self.programs: dict[tuple[str, ...], ColumnMaker] = {}
+        self.kernels: dict[tuple[str, ...], ColumnMaker] = {}
         if 0 in self.shape:
             raise UntraceableError("packets without points")
         self.exact = isinstance(result, Cartesian)
@@ -132,7 +132,9 @@ class Plan:
                 f"not every point has {'coordinates' if self.exact else 'a range'} of its own"
             )
         self.positive = list[Node]()
-        named = {name: part for name, part in parts_of(result).items() if isinstance(part, Along)}
+        named = {
+            name: part for name, part in parts_of(result).items() if isinstance(part, AlongAxis)
+        }
         if self.exact:
             expressions = self._by_coordinates(given)
         else:
@@ -214,7 +216,7 @@ class Plan:
         ]
 
     def _may_be_nan(self, value: Any) -> bool:
-        return isinstance(value, Traced) and (
+        return isinstance(value, TracedColumn) and (
             bool(self._floats_of(value)) or not is_number(value.node, self.layout.leaves)
         )
 
@@ -228,7 +230,9 @@ class Plan:
         wanted += [node for node, _ in self.tape.steps] + self.positive
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
-    def _by_direction(self, given: Mapping[str, Any], named: Mapping[str, Along]) -> dict[str, Any]:
+    def _by_direction(
+        self, given: Mapping[str, Any], named: Mapping[str, AlongAxis]
+    ) -> dict[str, Any]:
         """Return the columns that back ends make from the parts of `Polar`.
 
         Args:
@@ -256,7 +260,7 @@ class Plan:
         }
         return dict(zip("xyz", place_points(places, given["invalid"]), strict=True)) | columns
 
-    def _distance(self, measured: Traced) -> Any:
+    def _distance(self, measured: TracedColumn) -> Any:
         """Return the distance of a return, nan without a return.
 
         If a low value only scales the distance, that value has to be positive.
@@ -271,7 +275,9 @@ class Plan:
                     and not is_full(low, self.width)
                 ):
                     self.positive.append(low)
-                    return returned_range(Traced(full, self.tape)) * Traced(low, self.tape)
+                    return returned_range(TracedColumn(full, self.tape)) * TracedColumn(
+                        low, self.tape
+                    )
         return returned_range(measured)
 
     def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
@@ -306,7 +312,7 @@ class Plan:
 
     @cached_property
     def _directions(self) -> list[graph.Term]:
-        return [term for node in self.directed for term in graph.terms(node, self.width)]
+        return [term for node in self.directed for term in graph.split_sum(node, self.width)]
 
     @property
     def directed(self) -> list[Node]:
@@ -337,7 +343,7 @@ class Plan:
 _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDictionary()
 
 
-def plan_for(function: PointsFunction, batch: Batch, group: Group) -> Plan | UntraceableError:
+def plan_for(function: PointsFunction, batch: Batch, group: LayoutRows) -> Plan | UntraceableError:
     """Return the plan for frames of a group's layout, or the reason why there is none.
 
     The layout keeps it.
@@ -345,7 +351,7 @@ def plan_for(function: PointsFunction, batch: Batch, group: Group) -> Plan | Unt
     notes = group.layout.notes
     if function not in notes:
         try:
-            notes[function] = Plan(function, graph.sample_of(batch, group), group.layout)
+            notes[function] = Plan(function, graph.make_sample(batch, group), group.layout)
         except UntraceableError as reason:
             notes[function] = reason
     plan: Plan | UntraceableError = notes[function]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import plugin_errors
-from lidarspec.expressions.columns import Batch, Carry, Fields, of_points, padding_mask
+from lidarspec.expressions.columns import Batch, Carry, Fields, align_points, padding_mask
 from lidarspec.frames.frame_table import Table
 from lidarspec.framing.results import Counters
 from lidarspec.points import conventions
@@ -61,7 +61,7 @@ class PacketBatch(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluated:
+class EvaluatedPoints:
     """The points of the first `ready` packets of a batch.
 
     Attributes:
@@ -101,7 +101,7 @@ def evaluate_plainly(
     *,
     final: bool = True,
     epoch: int | None = None,
-) -> Evaluated:
+) -> EvaluatedPoints:
     """The points of a batch.
 
     Args:
@@ -158,9 +158,9 @@ def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
 
 def _flatten(
     packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool
-) -> Evaluated:
+) -> EvaluatedPoints:
     parts = parts_of(result)
-    arrays, axes, ready, shape = of_points(parts, batch)
+    arrays, axes, ready, shape = align_points(parts, batch)
     ready = len(packets) if final else ready
     mask = padding_mask(axes, shape, batch)
     every = {
@@ -184,7 +184,7 @@ def _flatten(
     if mask is not None:
         grids = _grids(inside, axes)
     counts = inside[:ready].astype(np.intp)
-    return Evaluated(CloudColumns(cloud, grids), ready, counts, axes, batch)
+    return EvaluatedPoints(CloudColumns(cloud, grids), ready, counts, axes, batch)
 
 
 def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:

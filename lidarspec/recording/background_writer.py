@@ -162,7 +162,7 @@ class TrafficLog(Protocol):
         """
 
 
-class Appender:
+class BackgroundWriter:
     """Base of recorders: collects records from any thread for a file.
 
     It is a context manager. Errors of the file are not raised while records are added, so that the
@@ -186,7 +186,7 @@ class Appender:
         self.error: SourceError | None = None
         self._changed = threading.Condition()
         self._waiting = bytearray()
-        self._untold = 0
+        self._unreported_drops = 0
         self._raised = False
         self._closing = False
         self._taken = 0
@@ -219,9 +219,9 @@ class Appender:
                 raise SourceTimeout(
                     f"{self.path}: the disk has not taken the recording within {PATIENCE:.0f} s"
                 )
-        self._complain()
+        self._raise_failure()
 
-    def keep_up(self) -> None:
+    def wait_for_room(self) -> None:
         """Wait until there is room for more records; for sources that can wait.
 
         Raises:
@@ -237,7 +237,7 @@ class Appender:
             SourceError: if the file could not be written, unless `sync` has raised it already.
         """
         self._finish()
-        self._complain()
+        self._raise_failure()
 
     def discard(self) -> bool:
         """Remove a closed file without records.
@@ -261,7 +261,7 @@ class Appender:
     ) -> None:
         self._finish()
         if error is None:
-            self._complain()
+            self._raise_failure()
 
     def __repr__(self) -> str:
         return (
@@ -278,12 +278,12 @@ class Appender:
         with self._changed:
             if self.error or self._closing or len(self._waiting) + len(record) > BACKLOG:
                 self.dropped += 1
-                self._untold += 1
+                self._unreported_drops += 1
                 return
             is_first = not self._waiting
-            if self._untold:
-                self._waiting += self._make_drop_record(self._untold)
-                self._untold = 0
+            if self._unreported_drops:
+                self._waiting += self._make_drop_record(self._unreported_drops)
+                self._unreported_drops = 0
             self._waiting += record
             self._taken += 1
             if size is not None:
@@ -296,7 +296,7 @@ class Appender:
         """Return the record of an event of dropped records, if the format has one."""
         return b""
 
-    def _complain(self) -> None:
+    def _raise_failure(self) -> None:
         if self.error and not self._raised:
             self._raised = True
             raise self.error

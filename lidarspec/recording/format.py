@@ -47,10 +47,10 @@ from typing import Any, BinaryIO, Literal
 
 from lidarspec.errors import SourceError, UsageError, WireError, suggest, system_errors
 from lidarspec.plugins import sensor as named_sensor
-from lidarspec.remote_files import file_of
+from lidarspec.remote_files import open_stored
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.options import Learned
-from lidarspec.transports.protocol import Closing
+from lidarspec.transports.protocol import ClosingContext
 
 VERSION = 1
 _ID = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
@@ -240,7 +240,7 @@ def size_at(buffer: bytes | bytearray | memoryview, start: int = 0) -> int:
     return int(_HEAD.size + addresses + size + _CRC.size)
 
 
-class Recording(Closing):
+class Recording(ClosingContext):
     """A recording, read in order; a context manager.
 
     It is an iterable of `Record`s, which continues after the last one read. Memory is limited to a
@@ -277,7 +277,7 @@ class Recording(Closing):
         self.is_cut = False
         self.offset = len(MAGIC)
         with system_errors(path):
-            self._file = file or (sys.stdin.buffer if self.path == "-" else file_of(self.path))
+            self._file = file or (sys.stdin.buffer if self.path == "-" else open_stored(self.path))
         try:
             self._records = self._begin()
         except BaseException:
@@ -316,7 +316,7 @@ class Recording(Closing):
                     high = middle
                 else:
                     low = found[1]
-            self._go(low)
+            self._move(low)
         return low > here
 
     def _find_received(self, start: int, stop: int) -> tuple[int, int] | None:
@@ -324,9 +324,9 @@ class Recording(Closing):
 
         Records without a time are ignored.
         """
-        self._go(start)
+        self._move(start)
         while self.offset < stop and self._holds(1):
-            size = self._good()
+            size = self._find_valid_length()
             place = self._place
             if size > 0:
                 kind, record = _unpack_record(self._window[place : place + size])
@@ -337,7 +337,7 @@ class Recording(Closing):
                 self._next_mark()
         return None
 
-    def _go(self, offset: int) -> None:
+    def _move(self, offset: int) -> None:
         self._file.seek(offset)
         self._window = b""
         self._place = 0
@@ -362,23 +362,23 @@ class Recording(Closing):
                     f"{self.path}: written in format {self.header.version}, and this lidarspec"
                     f" knows {VERSION}"
                 )
-            return self._known(pairs)
+            return self._keep_known(pairs)
         if not self.salvage:
             damage = WireError(f"{self.path}: the header of the recording is damaged or cut off")
             raise suggest(
                 damage, f"lidarspec record {quote(str(self.path))} --salvage -o mended.lsr"
             )
         self.header = Header()
-        return self._known(itertools.chain([] if first is None else [first], pairs))
+        return self._keep_known(itertools.chain([] if first is None else [first], pairs))
 
-    def _known(self, pairs: Iterator[tuple[int, Record]]) -> Iterator[Record]:
+    def _keep_known(self, pairs: Iterator[tuple[int, Record]]) -> Iterator[Record]:
         with system_errors(self.path):
             yield from (record for kind, record in pairs if kind in DIRECTIONS)
 
     def _pairs(self) -> Iterator[tuple[int, Record]]:
         """Yield kind and content of every valid record."""
         while self._holds(1):
-            if (size := self._good()) > 0:
+            if (size := self._find_valid_length()) > 0:
                 kind, record = _unpack_record(self._window[self._place : self._place + size])
                 self._skip(size)
                 self.records += 1
@@ -390,7 +390,7 @@ class Recording(Closing):
                 return
             self.leftover += self._next_mark()
 
-    def _good(self) -> int:
+    def _find_valid_length(self) -> int:
         """Return the length of the current record, 0 if it is damaged or incomplete."""
         self._holds(_HEAD.size)
         size = size_at(self._window, self._place)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lidarspec.errors import LidarSpecError, SourceError
-from lidarspec.recording.background_writer import Appender, TrafficLog
+from lidarspec.recording.background_writer import BackgroundWriter, TrafficLog
 from lidarspec.recording.recorders import recorder
 from lidarspec.transports.protocol import Chunk, Transport
 
@@ -33,7 +33,7 @@ class RecordingSwitch:
         self._folder = folder
         self._changing = threading.Lock()
         self._opened: Transport | None = None
-        self._recorder: Appender | None = None
+        self._recorder: BackgroundWriter | None = None
         self.sensor_id = ""
         self.trouble = ""
         self.written: list[tuple[str, int]] = []

@@ -22,7 +22,7 @@ from lidarspec.errors import UnknownFormat, UsageError
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Found
 from lidarspec.plugins import registry, sensor as named_sensor
-from lidarspec.recording.background_writer import Appender, TrafficLog
+from lidarspec.recording.background_writer import BackgroundWriter, TrafficLog
 from lidarspec.recording.format import (
     DATAGRAM,
     EVENT,
@@ -47,7 +47,7 @@ LARGEST_GAP = 1 << 16
 
 
 @dataclass(frozen=True)
-class MadeFor:
+class RecorderFactory:
     """A factory of a recorder, called with the open transport and the sensor.
 
     The sensor is configured with the options that it reported.
@@ -57,10 +57,10 @@ class MadeFor:
 
 
 #: a file, a recorder, or a factory that is called when the source is open.
-RecordTo = str | Path | Appender | Callable[[Transport], TrafficLog] | MadeFor
+RecordTo = str | Path | BackgroundWriter | Callable[[Transport], TrafficLog] | RecorderFactory
 
 
-class Recorder(Appender):
+class Recorder(BackgroundWriter):
     """Writes an .lsr recording, from any thread; a context manager.
 
     `write` does not raise errors of the file, so that the capture continues. The error is kept in
@@ -136,7 +136,7 @@ class Recorder(Appender):
         return _event("dropped", time.time_ns(), {"records": dropped})
 
 
-class PcapRecorder(Appender):
+class PcapRecorder(BackgroundWriter):
     """Writes received datagrams as a capture that Wireshark opens.
 
     Args:
@@ -166,7 +166,7 @@ class PcapRecorder(Appender):
             self._put(self._writing.record(datagram_frame(datagram), datagram.at), len(chunk.data))
 
 
-class FrameRecorder(Appender):
+class FrameRecorder(BackgroundWriter):
     """Writes a byte stream as a capture with one packet for each frame, link type USER0.
 
     Bytes outside of frames become packets too, so that the file has all received bytes in order.
@@ -221,7 +221,7 @@ class FrameRecorder(Appender):
         super()._finish()
 
 
-class RawRecorder(Appender):
+class RawRecorder(BackgroundWriter):
     """Writes the received bytes, and nothing else."""
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -259,7 +259,7 @@ def recorder(
     datagrams: bool,
     baud: int | None = None,
     overwrite: bool = False,
-) -> Appender:
+) -> BackgroundWriter:
     """Open the recorder for a file, by its suffix: .lsr, .pcap, .pcapng or .bin.
 
     Args:
@@ -309,9 +309,11 @@ def recorder_for(
     """
     if isinstance(target, str | Path):
         return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True
-    if isinstance(target, Appender):
+    if isinstance(target, BackgroundWriter):
         return target, False
-    return target.make(opened, sensor) if isinstance(target, MadeFor) else target(opened), True
+    return target.make(opened, sensor) if isinstance(target, RecorderFactory) else target(
+        opened
+    ), True
 
 
 def _header(

@@ -9,7 +9,7 @@ In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules i
 * `beams`: planar scans of one sensor, all on one grid of angles.
 * `provenance`: the frame that a point of a scan came from.
 * `stream`: `ScanStream`, which makes scans of batches of packets as they arrive.
-* `cutter`: `Cutter`, which decides where a scan ends and whether it is complete.
+* `cutter`: `ScanCutter`, which decides where a scan ends and whether it is complete.
 * `scan_ends`: the ends of scans by the sensor's rule.
 * `rotation`: the rows at which a turning angle passes a given angle.
 * `limits`: the longest and the largest scan.

@@ -27,7 +27,7 @@ MIN_TURN_SHARE = 0.98
 Field = tuple[float, float]
 
 
-class Planes:
+class PlanarScans:
     """Makes planar scans of the scans of one sensor.
 
     Args:
@@ -54,7 +54,7 @@ class Planes:
         self._is_flat: bool | None = None
         self._grid: tuple[int, Field] | None = None
 
-    def scan(self, scan: Scan) -> LaserScan | None:
+    def project(self, scan: Scan) -> LaserScan | None:
         """Return the scan on the grid; None if the sensor has several planes, and none is chosen.
 
         Raises:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.arrays import alike, repeat
+from lidarspec.frames.arrays import broadcast_value, repeat
 from lidarspec.packets.packets import Packets
 
 Integers = NDArray[np.int64]
@@ -158,7 +158,7 @@ class OpenScan(NamedTuple):
 
 
 def _sum(values: Integers) -> int:
-    each = alike(values)
+    each = broadcast_value(values)
     if each is None:
         return int(values.sum())
     return each * len(values)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from lidarspec.packets.masked_sector import Sector
 from lidarspec.packets.packets import Packets
-from lidarspec.points.reference_evaluator import Evaluated
+from lidarspec.points.reference_evaluator import EvaluatedPoints
 from lidarspec.scans.completeness import OpenScan, PacketCounts
 from lidarspec.scans.limits import ScanLimits
-from lidarspec.scans.scan_ends import End, EndFinder, first_points
+from lidarspec.scans.scan_ends import EndFinder, ScanEnd, first_points
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 
@@ -26,7 +26,7 @@ from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 SEARCHED_PACKETS = 1024
 
 
-class Cut(NamedTuple):
+class ScanCut(NamedTuple):
     """The end of one scan and the start of the next.
 
     `point` is the first point of the next scan. The flags describe the scan that ends (see `Scan`).
@@ -37,7 +37,7 @@ class Cut(NamedTuple):
     complete: bool
 
 
-class Cutter:
+class ScanCutter:
     """Cuts the points of one stream into scans.
 
     Args:
@@ -72,7 +72,7 @@ class Cutter:
         """
         self._ends.use_sector(sector, angle)
 
-    def cut(self, packets: Packets, points: Evaluated) -> list[Cut]:
+    def cut(self, packets: Packets, points: EvaluatedPoints) -> list[ScanCut]:
         """Return the cuts in a batch, in order."""
         ends = self._ends.find(packets, points)
         number = points.ready
@@ -85,7 +85,7 @@ class Cutter:
         if self._limits.has_point_limit:
             sizes = np.diff(first, append=points.source.size)
         counts = PacketCounts.of(packets, number, sizes, self._last_index)
-        cuts = list[Cut]()
+        cuts = list[ScanCut]()
         start = 0
         for end in ends:
             row = _find_packet(end, first)
@@ -114,7 +114,9 @@ class Cutter:
         frames, rows = packets.frames
         return int(frames.raw(field)[rows][row]) == first
 
-    def _end_scan(self, counts: PacketCounts, row: int, end: End, *, is_gap_shared: bool) -> Cut:
+    def _end_scan(
+        self, counts: PacketCounts, row: int, end: ScanEnd, *, is_gap_shared: bool
+    ) -> ScanCut:
         """End the scan at an end that the rule has found, and begin the next one.
 
         Args:
@@ -130,11 +132,11 @@ class Cutter:
         if is_gap_shared:
             self._scan = self._scan.add_gap(counts.part(row, row + 1))
         counts.share(row)
-        return Cut(end.point, is_whole, is_whole and not scan.has_gap)
+        return ScanCut(end.point, is_whole, is_whole and not scan.has_gap)
 
     def _add(
-        self, packets: Packets, counts: PacketCounts, start: int, stop: int, points: Evaluated
-    ) -> list[Cut]:
+        self, packets: Packets, counts: PacketCounts, start: int, stop: int, points: EvaluatedPoints
+    ) -> list[ScanCut]:
         """Add packets in which no end was found; return the cuts at the limits."""
         if start >= stop:
             return []
@@ -144,7 +146,7 @@ class Cutter:
             self._scan = scan
             return []
         rows = self._cut_at_limits(packets, counts, start, stop)
-        return [Cut(point, False, False) for point in first_points(points)[rows].tolist()]
+        return [ScanCut(point, False, False) for point in first_points(points)[rows].tolist()]
 
     def _cut_at_limits(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int
@@ -177,7 +179,7 @@ class Cutter:
         return counts.times.item(0) - self._last_ns
 
 
-def _find_packet(end: End, first: NDArray[np.intp]) -> int:
+def _find_packet(end: ScanEnd, first: NDArray[np.intp]) -> int:
     """Return the packet in which a scan ends.
 
     Args:

@@ -143,7 +143,7 @@ class Masking:
         before = angles[0] if self._angle is None else self._angle
         seen = 0
         for row in sorted({*leaps.tolist(), *turns.tolist()}):
-            self._finder.see(angles[seen:row])
+            self._finder.add_angles(angles[seen:row])
             seen = row
             step = min(float(step_before[row]), MIN_WIDTH)
             if steps[row] > limits[row]:
@@ -153,7 +153,7 @@ class Masking:
             if self._finder.sector is not None or is_turn_without_leap or turned[row] > MAX_TURNS:
                 self._is_settled = True
                 break
-        self._finder.see(angles[seen:])
+        self._finder.add_angles(angles[seen:])
         self._smallest_step = min(self._smallest_step, float(smallest[-1]))
         self._turned = float(turned[-1])
         self._angle = float(angles[-1])

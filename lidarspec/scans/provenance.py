@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from lidarspec.packets.packets import Packets
-from lidarspec.points.reference_evaluator import Evaluated
+from lidarspec.points.reference_evaluator import EvaluatedPoints
 from lidarspec.scans.scan_ends import first_points
 
 
@@ -42,7 +42,7 @@ class PointRun(NamedTuple):
     """
 
     packets: Packets
-    points: Evaluated
+    points: EvaluatedPoints
     start: int
     stop: int
     parts_before: int

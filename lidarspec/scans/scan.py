@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
-from lidarspec.notebook_display import drawn
+from lidarspec.notebook_display import make_display_method
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.conventions import axes_of
@@ -88,7 +88,7 @@ class Scan:
             state = "partial"
         return f"Scan({len(self)} points, {rate}{span}, {state}{nominal})"
 
-    _repr_svg_ = drawn("scan")
+    _repr_svg_ = make_display_method("scan")
 
     @property
     def facts(self) -> dict[str, str]:
@@ -139,8 +139,8 @@ class Scan:
         Args:
             beams: the number of angles; by default that of `beams`.
             field: the first and the last angle, radians; by default they cover the whole turn from
-                -pi on. The times of the beams are right if no scan begins within it: `Planes` finds
-                such a field.
+                -pi on. The times of the beams are right if no scan begins within it: `PlanarScans`
+                finds such a field.
 
         Raises:
             UsageError: if `beams` is not a positive whole number.

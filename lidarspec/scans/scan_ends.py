@@ -20,7 +20,7 @@ from lidarspec.packets.masked_sector import FULL_TURNS, AngleReader, Sector
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import COLUMNS
 from lidarspec.points.column_sources import LazyColumns
-from lidarspec.points.reference_evaluator import Evaluated
+from lidarspec.points.reference_evaluator import EvaluatedPoints
 from lidarspec.scans.rotation import (
     MIN_TURNS_AWAY,
     Floats,
@@ -34,7 +34,7 @@ from lidarspec.spec.timing import Every, OnChange, OnFlag, OnJump, OnRewind, OnW
 Indices = NDArray[np.intp]
 
 
-class End(NamedTuple):
+class ScanEnd(NamedTuple):
     """A place at which a scan ends by the rule.
 
     Attributes:
@@ -84,7 +84,7 @@ class EndFinder:
             self._passes = PassDetector(at, sector.direction)
         self._passes.restart(at, sector.direction, angle)
 
-    def find(self, packets: Packets, points: Evaluated) -> list[End]:
+    def find(self, packets: Packets, points: EvaluatedPoints) -> list[ScanEnd]:
         """Return the ends in a batch, ascending."""
         rule = self._rule
         if self._passes is not None:
@@ -102,7 +102,7 @@ class EndFinder:
             return _make_ends(starts[rows], rows)
         return _make_ends(starts[rows])
 
-    def _find_wraps(self, rule: OnWrap, packets: Packets, points: Evaluated) -> list[End]:
+    def _find_wraps(self, rule: OnWrap, packets: Packets, points: EvaluatedPoints) -> list[ScanEnd]:
         """Return the ends at which a column or a field passes an angle."""
         rows: Indices | None = None
         if rule.name in COLUMNS:
@@ -131,7 +131,9 @@ class EndFinder:
         self._last_leap = step
         return last > 0 and step > max(MIN_TURNS_AWAY, 2 * last)
 
-    def _find_passes(self, passes: PassDetector, packets: Packets, points: Evaluated) -> list[End]:
+    def _find_passes(
+        self, passes: PassDetector, packets: Packets, points: EvaluatedPoints
+    ) -> list[ScanEnd]:
         """Return the ends at which the angle of packets or rows passes an angle."""
         if isinstance(self._rule, OnWrap):
             path = _own_path(packets, self._rule.name)
@@ -175,7 +177,7 @@ class EndFinder:
             steps = np.mod(steps + full / 2, full) - full / 2
         return np.flatnonzero(np.abs(steps) > rule.by)
 
-    def _find_periods(self, rule: Every, packets: Packets, points: Evaluated) -> Indices:
+    def _find_periods(self, rule: Every, packets: Packets, points: EvaluatedPoints) -> Indices:
         """Return the packets with which a period begins."""
         times = packets.time_ns[: points.ready]
         if not len(times):
@@ -190,13 +192,13 @@ class EndFinder:
 
 def _make_ends(
     points: Indices, packets: Indices | None = None, leaps: Iterable[bool] | None = None
-) -> list[End]:
+) -> list[ScanEnd]:
     rows: Iterable[int | None] = itertools.repeat(None)
     if packets is not None:
         rows = packets.tolist()
     if leaps is None:
         leaps = itertools.repeat(False)
-    return list(map(End, points.tolist(), rows, leaps))
+    return list(map(ScanEnd, points.tolist(), rows, leaps))
 
 
 def _full_turn(packets: Packets, path: str) -> float | None:
@@ -218,7 +220,7 @@ def _own_path(packets: Packets, path: str) -> str:
     return f"frame.{path}"
 
 
-def _read_field(points: Evaluated, path: str) -> Column:
+def _read_field(points: EvaluatedPoints, path: str) -> Column:
     column: Any = points.fields
     for name in path.split("."):
         try:
@@ -235,7 +237,7 @@ def _is_per_packet(column: Column) -> bool:
     return all(name is None for name in column.axes)
 
 
-def _read_rows(column: Column, points: Evaluated) -> tuple[Floats, Indices]:
+def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices]:
     """Return the values of a field row by row, and the index of the first point of each row.
 
     Rows are in stream order.
@@ -264,7 +266,7 @@ def _read_rows(column: Column, points: Evaluated) -> tuple[Floats, Indices]:
     return values, starts
 
 
-def first_points(points: Evaluated) -> Indices:
+def first_points(points: EvaluatedPoints) -> Indices:
     """Return the index of the first point of each packet, (ready,)."""
     points_per_packet = _sum_axes(points.counts, 1)
     return np.cumsum(points_per_packet) - points_per_packet

@@ -1,6 +1,6 @@
 """Select scans of a source by time or number, and parts of each scan.
 
-A `Selection` is a value. A `Sieve` applies it to the scans of one stream as they arrive, and
+A `Selection` is a value. A `ScanSelector` applies it to the scans of one stream as they arrive, and
 reports when no further scan is selected. `iter_received` selects bytes by their arrival.
 
 If a source can seek, the data before a slice is skipped without reading it. Reading starts early
@@ -119,7 +119,7 @@ def _check_order(low: Any, high: Any) -> None:
 EVERYTHING = Selection()
 
 
-class Slice:
+class TimeSlice:
     """The selected times of one stream.
 
     Attributes:
@@ -174,7 +174,7 @@ class Slice:
         return suggest(UsageError(text), f"lidarspec info {quote(str(source))}")
 
     @property
-    def ahead(self) -> int:
+    def time_until_start(self) -> int:
         """The time from the first time to the start of the slice, ns."""
         if self._times[0] is None:
             return 0
@@ -206,7 +206,7 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
     if times == (None, None):
         yield from source.chunks()
         return
-    wanted = Slice(times)
+    wanted = TimeSlice(times)
     any_came = False
     for chunk in source.chunks():
         if chunk.at is None:
@@ -215,15 +215,15 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
         if wanted.holds(np.array([chunk.at]))[0]:
             any_came = True
             yield chunk
-        elif is_first and wanted.ahead > MIN_SKIP_S * 1e9:
-            source.skip(chunk.at + wanted.ahead)
+        elif is_first and wanted.time_until_start > MIN_SKIP_S * 1e9:
+            source.skip(chunk.at + wanted.time_until_start)
         if wanted.ended:
             break
     if wanted.first is not None and not any_came:
         raise wanted.missed_error(name)
 
 
-class Sieve:
+class ScanSelector:
     """Applies a selection to the scans of one stream.
 
     Args:
@@ -249,9 +249,9 @@ class Sieve:
         self._selected = 0  # by time and number, whatever `every` is
         self._has_skipped = False
         self.ended = False
-        self.slice = Slice(selection.times)
+        self.slice = TimeSlice(selection.times)
 
-    def of(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
+    def iter_selected(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
         """Yield the selected scans, with their selected parts; None is passed on.
 
         Raises:
@@ -260,7 +260,7 @@ class Sieve:
         for scan in scans:
             selected = None
             if scan is not None:
-                selected = self.take(scan)
+                selected = self.select(scan)
             if scan is None or selected is not None:
                 del scan  # only the caller may keep it alive
                 yield selected
@@ -270,7 +270,7 @@ class Sieve:
         if self.is_empty:
             raise self.missing()
 
-    def take(self, scan: Scan) -> Scan | None:
+    def select(self, scan: Scan) -> Scan | None:
         """Return the selected parts of the next scan, None if it is not selected.
 
         Raises:
@@ -333,7 +333,7 @@ class Sieve:
         clock = scan.sensor.clock
         if clock is not None and clock.wraps_at and clock.wraps_at < 1:
             return  # its wraps cannot be counted over a gap
-        distance_s = self.slice.ahead * 1e-9
+        distance_s = self.slice.time_until_start * 1e-9
         skipped_s = distance_s - LEAD_S - MAX_CLOCK_DRIFT * distance_s
         if skipped_s > MIN_SKIP_S:
             self._has_skipped = self._skip(scan.host_ns + round(skipped_s * 1e9))

@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarspec.expressions.columns import Carry
-from lidarspec.packets.imu import ImuSamples, Waiting
+from lidarspec.packets.imu import ImuSamples, WaitingSamples
 from lidarspec.packets.masked_sector import AngleReader
 from lidarspec.packets.packets import Packets, join_packets
 from lidarspec.packets.reorder import Reorder
 from lidarspec.points.cloud import LazyCloud, PointCloud
-from lidarspec.points.column_sources import Stretch, Stretches
+from lidarspec.points.column_sources import JoinedColumns, SourcePart
 from lidarspec.points.evaluate import evaluate_guarded
 from lidarspec.points.mount import Mount
-from lidarspec.points.reference_evaluator import Evaluated
-from lidarspec.scans.cutter import Cutter
+from lidarspec.points.reference_evaluator import EvaluatedPoints
+from lidarspec.scans.cutter import ScanCutter
 from lidarspec.scans.masking import Masking, describe
 from lidarspec.scans.provenance import PointRun, Provenance, find_part
 from lidarspec.scans.scan import Scan
@@ -52,7 +52,10 @@ class ScanStream:
     """
 
     def __init__(
-        self, sensor: SensorDescription, mount: Mount | None = None, imu: Waiting | None = None
+        self,
+        sensor: SensorDescription,
+        mount: Mount | None = None,
+        imu: WaitingSamples | None = None,
     ) -> None:
         self._sensor = sensor
         self._mount = mount
@@ -64,7 +67,7 @@ class ScanStream:
         if AngleReader(sensor).is_available:
             self._masking = Masking(sensor)
         self._uses_sector = False
-        self._cutter = Cutter(sensor)
+        self._cutter = ScanCutter(sensor)
         self._waiting: Packets | None = None  # whose points depend on the next packets
         self._waiting_parts = 0  # parts of their first frame that were ready
         self._carry: Carry = {}
@@ -172,7 +175,7 @@ class ScanStream:
             self._waiting_parts = find_part(packets, points.ready, parts_before)
         return self._cut(packets, points, parts_before)
 
-    def _cut(self, packets: Packets, points: Evaluated, parts_before: int) -> list[Scan]:
+    def _cut(self, packets: Packets, points: EvaluatedPoints, parts_before: int) -> list[Scan]:
         """Return the scans that points complete, and keep the points after them."""
         cuts = self._cutter.cut(packets, points)
         indices = [cut.point for cut in cuts]
@@ -212,15 +215,17 @@ class ScanStream:
         if following is not None:
             end_ns = following.time_ns
         if is_foreign and self._imu is not None:
-            self._imu.until(end_ns)  # those samples belong to the scan that another stream makes
+            self._imu.take_until(
+                end_ns
+            )  # those samples belong to the scan that another stream makes
         if is_foreign or not runs:
             return []
         assert start is not None  # since there are points
-        parts = [Stretch(run.points.source, run.start, run.stop) for run in runs]
-        cloud: PointCloud = LazyCloud.of(Stretches(parts, from_first=True), start.time_ns)
+        parts = [SourcePart(run.points.source, run.start, run.stop) for run in runs]
+        cloud: PointCloud = LazyCloud.of(JoinedColumns(parts, from_first=True), start.time_ns)
         samples: ImuSamples | None = None
         if self._imu is not None:
-            samples = self._imu.until(end_ns)
+            samples = self._imu.take_until(end_ns)
         if self._mount is not None:
             cloud = self._mount.apply(cloud)
             if samples is not None:
@@ -243,7 +248,7 @@ class ScanStream:
 
 
 def _read_starts(
-    packets: Packets, points: Evaluated, indices: Sequence[int]
+    packets: Packets, points: EvaluatedPoints, indices: Sequence[int]
 ) -> list[ScanStart | None]:
     """Return the starts of scans at some points, in order; None for indices past the end."""
     source = points.source
@@ -258,8 +263,8 @@ def _read_starts(
     return starts
 
 
-def scans_of(
-    sensor: SensorDescription, batches: Iterable[Packets], imu: Waiting | None = None
+def iter_scans(
+    sensor: SensorDescription, batches: Iterable[Packets], imu: WaitingSamples | None = None
 ) -> Iterator[Scan]:
     """Yield every scan of the batches of one stream.
 
@@ -268,11 +273,11 @@ def scans_of(
     """
     stream = ScanStream(sensor, imu=imu)
     for batch in batches:
-        yield from handed_out(stream.add(batch))
+        yield from release_yielded(stream.add(batch))
     yield from stream.finish()
 
 
-def handed_out(scans: list[Scan]) -> Iterator[Scan]:
+def release_yielded(scans: list[Scan]) -> Iterator[Scan]:
     """Yield scans one by one, and release each with its columns."""
     scans.reverse()
     while scans:

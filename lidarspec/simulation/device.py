@@ -1,7 +1,7 @@
 """A simulated sensor as a device, sans-IO: bytes in, bytes out.
 
 It follows the spec and knows no sensor. Time runs as in reality or faster: data frames are sent at
-the pace of the sensor's clock, commands get the documented replies (`Answering`), start and stop
+the pace of the sensor's clock, commands get the documented replies (`ReplyMaker`), start and stop
 are obeyed, other frames are sent at their own rate. A sensor that no command of `on_open` starts
 sends from power-on. All times are the caller's, in ns of one monotonic clock.
 """
@@ -26,7 +26,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.faults import Faults, FaultyLink
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Scene, make_room
-from lidarspec.simulation.simulator import FrameSimulation, Rest, simulation
+from lidarspec.simulation.simulator import FrameSimulation, RestingImu, frame_simulation
 from lidarspec.spec.description import Answer, Command, Frame
 from lidarspec.spec.links import is_datagram
 from lidarspec.spec.sensor import with_frames
@@ -51,7 +51,7 @@ PATIENCE = 50_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Request:
+class ReceivedCommand:
     """A received command with the raw values of the fields of its frame, by path."""
 
     name: str
@@ -59,7 +59,7 @@ class Request:
     values: Mapping[str, Any]
 
 
-class Answered(NamedTuple):
+class ReplyPart(NamedTuple):
     """A part of a reply: the name of a frame and its bytes, or a pause in seconds.
 
     The name is empty for bytes that are no frame.
@@ -70,7 +70,7 @@ class Answered(NamedTuple):
     pause: float = 0.0
 
 
-class Answering:
+class ReplyMaker:
     """The replies of one sensor.
 
     Args:
@@ -80,27 +80,27 @@ class Answering:
     def __init__(self, sensor: Sensor, shake: float = 0.0) -> None:
         self._sensor = sensor
         self._shake = shake
-        self._rests: dict[str, Rest] = {}
-        self._heard: dict[str, int] = {}
+        self._rests: dict[str, RestingImu] = {}
+        self._received: dict[str, int] = {}
         links = {command.link for command in sensor.commands.values() if command.frame}
-        self._decoders = {link: _listening(sensor, link) for link in links}
+        self._decoders = {link: _command_decoder(sensor, link) for link in links}
         self._makers: dict[str, FrameMaker] = {}
         self._unasked: dict[
             str, tuple[int, list[bytes]]
         ] = {}  # frame type: number of the first frame of a batch, and the batch
 
-    def requests(self, data: bytes, now: int, link: str) -> list[Request]:
+    def find_requests(self, data: bytes, now: int, link: str) -> list[ReceivedCommand]:
         """Return the commands that these bytes complete; other bytes are ignored."""
         decoder = self._decoders.get(link)
         if decoder is None:
             return []
-        if now - self._heard.get(link, now) > PATIENCE:
+        if now - self._received.get(link, now) > PATIENCE:
             decoder.idle()
-        self._heard[link] = now
+        self._received[link] = now
         requests = (self._request(item.frame, item.data, link) for item in decoder.feed(data))
         return [request for request in requests if request is not None]
 
-    def answers(self, request: Request) -> list[Answered]:
+    def make_replies(self, request: ReceivedCommand) -> list[ReplyPart]:
         """Return everything that is sent for a command before any data."""
         declared = self._sensor.simulation.answers.get(request.name)
         chosen: Iterable[Answer] = request.command.replies[:1]
@@ -109,7 +109,7 @@ class Answering:
                 chosen = declared(request.values)
             else:
                 chosen = declared
-        return [self._answer(answer, request) for answer in chosen]
+        return [self._make_reply(answer, request) for answer in chosen]
 
     def frame(self, name: str, values: Mapping[str, Any]) -> bytes:
         """Return a frame of a type other than data.
@@ -138,19 +138,19 @@ class Answering:
         given = [{**state, **(sweep(number) if sweep else {}), **values} for number in numbers]
         table = self._makers[name].table(given)
         if declared.imu is not None:
-            rest = self._rests.setdefault(name, Rest(self._sensor, name, given[0]))
+            rest = self._rests.setdefault(name, RestingImu(self._sensor, name, given[0]))
             rest.fill(table, self._shake, [numbers.start])
         return self._makers[name].seal(table)
 
-    def _answer(self, answer: Answer, request: Request) -> Answered:
+    def _make_reply(self, answer: Answer, request: ReceivedCommand) -> ReplyPart:
         if isinstance(answer, bytes):
-            return Answered(data=answer)
+            return ReplyPart(data=answer)
         if isinstance(answer, int | float):
-            return Answered(pause=float(answer))
+            return ReplyPart(pause=float(answer))
         name, values = (answer, {}) if isinstance(answer, str) else answer
-        return Answered(name, self.frame(name, {**self._matching_values(name, request), **values}))
+        return ReplyPart(name, self.frame(name, {**self._matching_values(name, request), **values}))
 
-    def _matching_values(self, name: str, request: Request) -> dict[str, Any]:
+    def _matching_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
         """Return the physical values that match a reply to its request."""
         fields = codec(self._sensor.frames[name]).schema.fields
         raw = {
@@ -160,7 +160,7 @@ class Answering:
             path: _physical(fields[path], value) for path, value in raw.items() if path in fields
         }
 
-    def _request(self, frame: str, data: bytes, link: str) -> Request | None:
+    def _request(self, frame: str, data: bytes, link: str) -> ReceivedCommand | None:
         """Return the command of a frame, the most specific of several that match."""
         values = dict(_flat(parse(self._sensor, data, frame=frame)))
         sent = [
@@ -174,11 +174,11 @@ class Answering:
             if all(values.get(path) == value for path, value in one[1].fixed.items())
         ]
         if fitting:
-            return Request(*max(fitting, key=lambda one: len(one[1].fixed)), values)
+            return ReceivedCommand(*max(fitting, key=lambda one: len(one[1].fixed)), values)
         return None
 
 
-def _listening(sensor: Sensor, link: str) -> Decoder:
+def _command_decoder(sensor: Sensor, link: str) -> Decoder:
     """Return a decoder for the frames that are sent to the sensor."""
     frames = {
         name: _as_incoming(frame)
@@ -288,7 +288,7 @@ class SimulatedDevice:
 
     Attributes:
         present: whether it is plugged in.
-        heard: the names of the commands that it received.
+        commands_received: the names of the commands that it received.
         sent: number of sent frames by type, before any faults.
         lines: link -> its faults.
 
@@ -310,12 +310,12 @@ class SimulatedDevice:
         self.rate = rate
         self.faults = faults or Faults()
         self.present = True
-        self.heard = list[str]()
+        self.commands_received = list[str]()
         self.sent = Counter[str]()
         self.lines = {name: self._line(name, seed) for name in sensor.links}
         self._scene = scene or make_room(seed)
         self._source = random.Random(f"device {seed}")
-        self._answering = Answering(sensor, self.faults.shake)
+        self._replies = ReplyMaker(sensor, self.faults.shake)
         self._plan: list[_Due] = []
         self._planned = 0
         self._stream: _Stream | None = None
@@ -347,7 +347,7 @@ class SimulatedDevice:
             self._plug = None
         for name, frame in self.sensor.incoming.items():
             if frame.simulation.rate and not frame.data:
-                self._put(0.0, "data", name, self._answering.unasked_frame(name, 0))
+                self._put(0.0, "data", name, self._replies.unasked_frame(name, 0))
         if not self._waits_for_a_command():
             self._begin(0.0, self.sensor.data_frame)
 
@@ -369,17 +369,17 @@ class SimulatedDevice:
         """Receive bytes or a datagram."""
         self._switch_plug(now)
         if self.present:
-            for request in self._answering.requests(data, now, link):
-                self._obey(request, self._clock(now))
+            for request in self._replies.find_requests(data, now, link):
+                self._reply(request, self._clock(now))
 
     def outgoing(self, now: int) -> list[tuple[str, bytes]]:
         """Return the data sent until now, in order, as (link, bytes).
 
         A byte stream gives one entry for each link, other links one for each datagram.
         """
-        return [(link, data) for link, _, data in self.sendings(now)]
+        return [(link, data) for link, _, data in self.outgoing_with_types(now)]
 
-    def sendings(self, now: int) -> list[tuple[str, str, bytes]]:
+    def outgoing_with_types(self, now: int) -> list[tuple[str, str, bytes]]:
         """Return the data sent until now with its type, as (link, type, bytes).
 
         A byte stream gives one entry for each link, without a type.
@@ -394,7 +394,7 @@ class SimulatedDevice:
         out: list[tuple[str, str, bytes]] = []
         for link, link_packets in packets.items():
             self.sent.update(frame for frame, _ in link_packets if frame)
-            arrived = self.lines[link].carry(link_packets)
+            arrived = self.lines[link].transmit(link_packets)
             if is_datagram(self.sensor.links[link]):
                 out += [(link, frame, data) for frame, data in arrived]
             elif arrived:
@@ -428,7 +428,7 @@ class SimulatedDevice:
         while self._plan and self._plan[0].at <= upto:
             due = heapq.heappop(self._plan)
             sendings.append((due.at, due.link, due.frame, due.data))
-            self._again(due)
+            self._plan_next(due)
         planned = len(sendings)
         if self._stream is not None:
             sendings += [
@@ -438,7 +438,7 @@ class SimulatedDevice:
             sendings.sort(key=lambda item: item[0])
         return [item[1:] for item in sendings]
 
-    def _again(self, due: _Due) -> None:
+    def _plan_next(self, due: _Due) -> None:
         """Plan the next frame of a type that is sent unasked."""
         if due.frame:
             rate = self.sensor.frames[due.frame].simulation.rate
@@ -450,15 +450,15 @@ class SimulatedDevice:
                 due.at + SECOND / rate,
                 due.link,
                 due.frame,
-                self._answering.unasked_frame(due.frame, number),
+                self._replies.unasked_frame(due.frame, number),
             )
 
-    def _obey(self, request: Request, now: float) -> None:
+    def _reply(self, request: ReceivedCommand, now: float) -> None:
         """Reply to a command, unless it has to wait until the data stops.
 
         If the command starts the sensor, data follows the reply.
         """
-        self.heard.append(request.name)
+        self.commands_received.append(request.name)
         command = request.command
         time_ns = now
         mode = None
@@ -473,7 +473,7 @@ class SimulatedDevice:
             ]
             heapq.heapify(self._plan)
         announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
-        for answer in self._answering.answers(request):
+        for answer in self._replies.make_replies(request):
             if answer.pause:
                 time_ns = self._settle(time_ns, answer.pause, command.link)
             else:
@@ -504,7 +504,7 @@ class SimulatedDevice:
         self._stream = _Stream(self._simulation(frame), frame, self._scene, at, self.faults.shake)
 
     def _simulation(self, frame: str) -> FrameSimulation:
-        made = simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
+        made = frame_simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
         if not made.interval:
             raise SpecError(
                 "nothing says how often it is sent: declare its `rate`",

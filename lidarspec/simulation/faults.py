@@ -101,7 +101,7 @@ class FaultyLink:
         stream: whether the link is a byte stream; otherwise it carries datagrams.
 
     Attributes:
-        sent: number of packets passed to `carry`.
+        sent: number of packets passed to `transmit`.
         intact: number of packets that arrive without a fault inside them.
         lost: number of packets that are dropped.
 
@@ -120,7 +120,7 @@ class FaultyLink:
         self._late: list[tuple[int, int, str, bytes]] = []
         self.sent = self.intact = self.lost = 0
 
-    def carry(self, packets: Sequence[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+    def transmit(self, packets: Sequence[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
         """Return the packets that arrive, as (frame name, bytes).
 
         A later call returns delayed packets. Packets still delayed at the end are never returned.

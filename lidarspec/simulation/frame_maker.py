@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
-from lidarspec.frames.encode import fill_in, kind_of
-from lidarspec.frames.frame_table import Group, Rows
+from lidarspec.frames.encode import fill_in, find_kind
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout
-from lidarspec.frames.layout_tree import TooLong, Unknown, layout_of
+from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, layout_of
 from lidarspec.frames.schema import schema, without_indices
 from lidarspec.frames.wire_coder import Coder, frame_coder
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.sensor_operations import Sensor
-from lidarspec.spec.syntax import member
+from lidarspec.spec.syntax import get_member
 from lidarspec.spec.tree import Formula, Kind, Node, refs
 
 Values = Mapping[str, Any]
@@ -85,10 +85,10 @@ class FrameMaker:
             if paths and paths[0] in self.schema.fields
         }
         self._layouts: dict[tuple[int, ...], Layout] = {}
-        self._asked: list[str] = []
+        self._layout_fields: list[str] = []
         self._makers: dict[tuple[Any, ...], FrameMaker] = {}
 
-    def table(self, frames: Sequence[Values]) -> Rows:
+    def table(self, frames: Sequence[Values]) -> CompiledTable:
         """Return one frame for each mapping of field paths to physical values.
 
         Arrays may also be given as bytes, and parts as such mappings.
@@ -106,16 +106,18 @@ class FrameMaker:
             layout = self._layout(values)
             members.setdefault(id(layout), (layout, []))[1].append(index)
         groups = [
-            Group(layout, np.array(which, np.intp), self._rows(layout, [filled[i] for i in which]))
+            LayoutRows(
+                layout, np.array(which, np.intp), self._rows(layout, [filled[i] for i in which])
+            )
             for layout, which in members.values()
         ]
-        return Rows(self.schema, groups)
+        return CompiledTable(self.schema, groups)
 
     def frame(self, values: Values) -> bytes:
         """Return one frame with its checksum."""
         return self.seal(self.table([values]))[0]
 
-    def seal(self, table: Rows) -> list[bytes]:
+    def seal(self, table: CompiledTable) -> list[bytes]:
         """Return the frames of a table as they are sent.
 
         Raises:
@@ -157,7 +159,7 @@ class FrameMaker:
         made = dict[str, bytes]()
         for axis, node in self.schema.parts.items():
             parts = [dict(part) for part in given.pop(axis, ())]
-            kinds = [kind_of(node, part) for part in parts]
+            kinds = [find_kind(node, part) for part in parts]
             around = {ref.path: self._raw(given, ref.path) for ref in node.outer}
             makers = [self._maker(kind, around) for kind in kinds]
             sizes = [
@@ -199,29 +201,33 @@ class FrameMaker:
             for path in paths[1:]:
                 set_nested(raw, path, self._raw(values, path))
             fill_in(formula, raw, number, self.schema.fields, axis)
-            values[paths[0]] = self.schema.fields[paths[0]].physical(member(raw, paths[0]))
+            values[paths[0]] = self.schema.fields[paths[0]].physical(get_member(raw, paths[0]))
 
     def _layout(self, values: Values) -> Layout:
         """Return the layout for these values of header fields."""
         while True:
-            header = {path: self._raw(values, path) for path in self._asked}
+            header = {path: self._raw(values, path) for path in self._layout_fields}
             key = tuple(header.values())
             try:
                 if key not in self._layouts:
                     self._layouts[key] = layout_of(self._root, header, self._limit, self._given)
                 return self._layouts[key]
-            except Unknown as unknown:
-                self._asked.append(unknown.leaf.info.path)
+            except UnknownSelectorError as unknown:
+                self._layout_fields.append(unknown.leaf.info.path)
                 self._layouts.clear()
-            except TooLong as error:
+            except TooLongError as error:
                 raise self._too_long(values, str(error)) from None
 
     def _too_long(self, values: Values, path: str) -> SpecError:
         fields = self.schema.fields
         left_out = [
-            path for path in self._asked if path not in values and fields[path].const is None
+            path
+            for path in self._layout_fields
+            if path not in values and fields[path].const is None
         ]
-        given = ", ".join(f"{path} = {values[path]}" for path in self._asked if path in values)
+        given = ", ".join(
+            f"{path} = {values[path]}" for path in self._layout_fields if path in values
+        )
         reason = f"with {given} there is no frame of at most {self._limit} bytes (max_length)"
         if left_out:
             reason = f"sweep has to give {left_out[0]!r}, which the length of the frame depends on"
@@ -276,7 +282,7 @@ def set_nested(values: dict[str, Any], path: str, value: Any) -> None:
     values[name] = value
 
 
-def seal_frames(table: Rows) -> list[bytes]:
+def seal_frames(table: CompiledTable) -> list[bytes]:
     """Return the frames of a table in order, with constants and checksums."""
     frames = [b""] * len(table)
     for group in table.groups:

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError, did_you_mean
-from lidarspec.trusted_files import document
+from lidarspec.trusted_files import read_document
 
 Floats = NDArray[np.float64]
 #: A value that broadcasts against the beams: an array, or one number for all.
@@ -225,7 +225,7 @@ def read_scene(path: str | Path) -> Room:
         SourceError: if it cannot be read.
         UsageError: if it is invalid; the message names the key.
     """
-    return scene_of(document(Path(path)), str(path))
+    return scene_of(read_document(Path(path)), str(path))
 
 
 def scene_of(table: Mapping[str, Any], place: str = "scene") -> Room:

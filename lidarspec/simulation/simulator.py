@@ -14,7 +14,7 @@ serial line, which limits every sensor.
 
 Cartesian points do not give the directions of beams: the spec declares them, and the equations of
 the coordinates, which are linear in the raw values, are solved for the point that a beam hits
-(`Placement`).
+(`PointPlacement`).
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError, UsageError, plugin_errors
-from lidarspec.expressions.columns import AROUND, Batch, Column, Fields, of_points
-from lidarspec.frames.frame_table import Group, Rows, Table
+from lidarspec.expressions.columns import AROUND, Batch, Column, Fields, align_points
+from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
 from lidarspec.framing.example_frames import example
 from lidarspec.framing.frame_engine import codec
 from lidarspec.packets.clocks import clock_ns
@@ -70,7 +70,7 @@ GRAVITY = 9.80665
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class RangeField:
     """A field that ranges come from.
 
     Attributes:
@@ -124,7 +124,9 @@ class Measurement:
             are ranges.
     """
 
-    def __init__(self, sensor: Sensor, frame: str, table: Rows, given: Container[str] = ()) -> None:
+    def __init__(
+        self, sensor: Sensor, frame: str, table: CompiledTable, given: Container[str] = ()
+    ) -> None:
         self._sensor = sensor
         self._frame = frame
         self._points = sensor.points_of(_name(frame, table))
@@ -135,19 +137,25 @@ class Measurement:
         self._given = given
         self._intensity = "" if intensity in given else intensity
         self._targets = () if self._encode else self._trace_targets(table)
-        self._coupled = self._encode is not None or self._turning(table)
+        self._coupled = self._encode is not None or self._directions_depend_on_range(table)
 
     @classmethod
-    def of(cls, sensor: Sensor, frame: str, table: Rows, given: Container[str]) -> Measurement:
+    def of(
+        cls, sensor: Sensor, frame: str, table: CompiledTable, given: Container[str]
+    ) -> Measurement:
         """Return the measurement of a frame's points.
 
-        It is a `Placement` for Cartesian points, else a `Measurement`.
+        It is a `PointPlacement` for Cartesian points, else a `Measurement`.
         """
         return (
-            Placement if _result(sensor, frame, table)[0].__class__ is Cartesian else Measurement
+            PointPlacement
+            if _result(sensor, frame, table)[0].__class__ is Cartesian
+            else Measurement
         )(sensor, frame, table, given)
 
-    def fill(self, table: Rows, numbers: Sequence[int], scene: Scene, times: Floats) -> None:
+    def fill(
+        self, table: CompiledTable, numbers: Sequence[int], scene: Scene, times: Floats
+    ) -> None:
         """Measure a table's ranges in the scene, and write them.
 
         Args:
@@ -170,17 +178,17 @@ class Measurement:
                 break
             written = values
             for path, raw in values.items():
-                store(table, path, raw)
+                write_raw(table, path, raw)
             if not self._coupled or attempt >= ROUNDS - 2:
                 break
         if self._intensity and not self._encode:
-            self._shine(table, written[self._targets[0].path])
+            self._fill_intensity(table, written[self._targets[0].path])
 
-    def _shine(self, table: Rows, ranges: NDArray[Any]) -> None:
+    def _fill_intensity(self, table: CompiledTable, ranges: NDArray[Any]) -> None:
         """Write an intensity for each range."""
-        store(table, self._intensity, np.where(ranges > 0, 40 + np.rint(ranges) % 160, 0))
+        write_raw(table, self._intensity, np.where(ranges > 0, 40 + np.rint(ranges) % 160, 0))
 
-    def beams(self, table: Rows) -> Beams:
+    def beams(self, table: CompiledTable) -> Beams:
         """Return the beams of a table."""
         result, batch = _result(self._sensor, self._frame, table)
         with (
@@ -188,7 +196,7 @@ class Measurement:
             plugin_errors(f"points of {self._frame}", self._sensor.id, self._points),
         ):
             parts = {name: part for name, part in parts_of(result).items() if name in _MEASURED}
-            arrays, axes, _, shape = of_points(parts, batch)
+            arrays, axes, _, shape = align_points(parts, batch)
         depth = len(shape)
         full = {
             name: _as_deep(np.asarray(array, np.float64), depth)
@@ -231,7 +239,7 @@ class Measurement:
         )
 
     def _values(
-        self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]
+        self, table: CompiledTable, beams: Beams, ranges: Floats, steps: list[Any]
     ) -> dict[str, NDArray[Any]]:
         """Return the raw values of the fields for these ranges."""
         if self._encode is not None:
@@ -247,13 +255,13 @@ class Measurement:
             info = table.schema.fields[target.path]
             part = _part(ranges, target.inner)
             with np.errstate(all="ignore"):
-                raw = whole(info, (part - zero) / step)
+                raw = round_raw(info, (part - zero) / step)
             raw_values[target.path] = np.where(
                 (part > 0) & (raw > 0) & (raw <= self._most(table, target.path)), raw, 0
             )
         return raw_values
 
-    def _most(self, table: Rows, path: str) -> float:
+    def _most(self, table: CompiledTable, path: str) -> float:
         """Return the largest raw value that a field and the wire form can hold."""
         most = table.schema.fields[path].limits[1]
         form = self._sensor.frames[self._frame].wire
@@ -264,9 +272,9 @@ class Measurement:
             return most
         return min(most, *(form.largest(leaf.size) for leaf in leaves))
 
-    def _trace_targets(self, table: Rows) -> tuple[Target, ...]:
+    def _trace_targets(self, table: CompiledTable) -> tuple[RangeField, ...]:
         """Return the fields in metres that the ranges of the points depend on."""
-        targets: list[Target] = []
+        targets: list[RangeField] = []
         for path, info in table.schema.fields.items():
             if factor(info.unit, "m") is None or not any(
                 path in group.layout.leaves for group in table.groups
@@ -283,7 +291,7 @@ class Measurement:
                     step = info.scale
                 else:
                     step = None
-                targets += [Target(path, inner, step, info.offset)] if near.size else []
+                targets += [RangeField(path, inner, step, info.offset)] if near.size else []
         targets = targets or self._linear(table)
         if not targets:
             reason = (
@@ -292,7 +300,7 @@ class Measurement:
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(targets)
 
-    def _linear(self, table: Rows) -> list[Target]:
+    def _linear(self, table: CompiledTable) -> list[RangeField]:
         """Return the fields that ranges are linear in with another scale than their own.
 
         These are fields in metres that a correction shifts or stretches, and elements of arrays
@@ -310,22 +318,22 @@ class Measurement:
                 once, twice, thrice = (_part(answer, inner) for answer in answers)
                 even = np.isclose(thrice - twice, twice - once) & (twice > once) & (once > 0)
                 if (even & (metres | np.isclose(twice, 2 * once))).any():
-                    targets.append(Target(path, inner, None))
+                    targets.append(RangeField(path, inner, None))
         return targets
 
-    def _probe(self, table: Rows, paths: Iterable[str], *probes: int) -> list[Beams]:
+    def _probe(self, table: CompiledTable, paths: Iterable[str], *probes: int) -> list[Beams]:
         """Return the beams for each of some values of fields, then restore the table."""
         before = {path: table.raw(path) for path in paths}
         beams = []
         for probe in probes:
             for path in before:
-                store(table, path, np.array(probe))
+                write_raw(table, path, np.array(probe))
             beams.append(self.beams(table))
         for path, raw in before.items():
-            store(table, path, raw)
+            write_raw(table, path, raw)
         return beams
 
-    def _step(self, table: Rows, target: Target) -> tuple[Any, Any]:
+    def _step(self, table: CompiledTable, target: RangeField) -> tuple[Any, Any]:
         """Return metres per raw step, and of raw 0: numbers, or arrays over points."""
         if target.step is not None:
             return target.step, target.zero
@@ -335,14 +343,14 @@ class Measurement:
         )
         return (twice - once) / PROBE, 2 * once - twice
 
-    def _inner(self, table: Rows, answer: Floats) -> list[tuple[int, ...]]:
+    def _inner(self, table: CompiledTable, answer: Floats) -> list[tuple[int, ...]]:
         """Return the indices of the axes that points have in addition to the fields."""
         extra = answer.ndim - 1 - table.schema.depth()
         if extra > 0:
             return list(np.ndindex(*answer.shape[answer.ndim - extra :]))
         return [()]
 
-    def _turning(self, table: Rows) -> bool:
+    def _directions_depend_on_range(self, table: CompiledTable) -> bool:
         """Return whether directions depend on ranges."""
         first, second = self._probe(
             table, [target.path for target in self._targets], PROBE, 2 * PROBE
@@ -354,22 +362,24 @@ class Measurement:
         return not all(same)
 
 
-class Placement(Measurement):
+class PointPlacement(Measurement):
     """Writes Cartesian points: solves for raw values of the point that a beam hits.
 
     Raises:
         SpecError: if no directions are declared, or no field gives a coordinate of a point.
     """
 
-    def fill(self, table: Rows, numbers: Sequence[int], scene: Scene, times: Floats) -> None:
+    def fill(
+        self, table: CompiledTable, numbers: Sequence[int], scene: Scene, times: Floats
+    ) -> None:
         beams = self.beams(table)
         azimuth, elevation = self._directions(numbers, beams.range.shape[1:])
         beams = replace(beams, azimuth=azimuth, elevation=elevation)
         ranges = self._measure(beams, scene, times)
         for path, raw in self._values(table, beams, ranges, []).items():
-            store(table, path, raw)
+            write_raw(table, path, raw)
         if self._intensity and not self._encode:
-            self._shine(table, _part(ranges, self._targets[0].inner) * 1000)
+            self._fill_intensity(table, _part(ranges, self._targets[0].inner) * 1000)
 
     def _directions(self, numbers: Sequence[int], shape: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Return the declared azimuths and elevations of packets, (n, *shape) each.
@@ -404,7 +414,7 @@ class Placement(Measurement):
         return directions[0], directions[1]
 
     def _values(
-        self, table: Rows, beams: Beams, ranges: Floats, steps: list[Any]
+        self, table: CompiledTable, beams: Beams, ranges: Floats, steps: list[Any]
     ) -> dict[str, NDArray[Any]]:
         if self._encode is not None:
             return super()._values(table, beams, ranges, steps)
@@ -416,7 +426,7 @@ class Placement(Measurement):
             zero, *ones = (_part(places, inner) for places in self._move(table, paths))
             slopes = np.stack([(one - zero) / PROBE for one in ones])
             raw = [
-                whole(info, column)
+                round_raw(info, column)
                 for info, column in zip(
                     infos, _solve(slopes, _part(aims, inner) - zero), strict=True
                 )
@@ -433,20 +443,20 @@ class Placement(Measurement):
             }
         return raw_values
 
-    def _move(self, table: Rows, paths: Sequence[str]) -> list[Floats]:
+    def _move(self, table: CompiledTable, paths: Sequence[str]) -> list[Floats]:
         """Return coordinates with all fields at 0, then with each at its probe value.
 
         Each array has the shape (3, n, ...).
         """
         before = {path: table.raw(path) for path in paths}
         for path in paths:
-            store(table, path, np.array(0))
+            write_raw(table, path, np.array(0))
         beams = [self.beams(table), *(self._probe(table, [path], PROBE)[0] for path in paths)]
         for path, raw in before.items():
-            store(table, path, raw)
+            write_raw(table, path, raw)
         return [each.places for each in beams if each.places is not None]
 
-    def _trace_targets(self, table: Rows) -> tuple[Target, ...]:
+    def _trace_targets(self, table: CompiledTable) -> tuple[RangeField, ...]:
         """Return the fields, in metres or without a unit, that coordinates are linear in."""
         targets = []
         for path, info in table.schema.fields.items():
@@ -466,13 +476,13 @@ class Placement(Measurement):
             for inner in self._inner(table, places[0][0]):
                 once, twice, thrice = (_part(place, inner) for place in places)
                 if (twice != once).any() and np.allclose(thrice - twice, twice - once):
-                    targets.append(Target(path, inner, None))
+                    targets.append(RangeField(path, inner, None))
         if not targets:
             reason = "no field of a point makes its coordinates: the sensor has to give `encode`"
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(targets)
 
-    def _turning(self, table: Rows) -> bool:
+    def _directions_depend_on_range(self, table: CompiledTable) -> bool:
         return False
 
 
@@ -490,14 +500,14 @@ def _solve(slopes: Floats, aims: Floats) -> Floats:
     return np.moveaxis((inverse @ wanted[..., None])[..., 0], -1, 0)
 
 
-def _name(frame: str, table: Rows) -> str:
+def _name(frame: str, table: CompiledTable) -> str:
     """Return the name of a table's frame type or parts."""
     if isinstance(table, PartRows):
         return ".".join(filter(None, (frame, *table.place)))
     return frame
 
 
-def _result(sensor: Sensor, frame: str, table: Rows) -> tuple[Points, Batch]:
+def _result(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, Batch]:
     """Return the result of `points` for a table of frames without predecessors."""
     batch = _batch(sensor, table)
     points = sensor.points_of(_name(frame, table))
@@ -513,7 +523,7 @@ def _result(sensor: Sensor, frame: str, table: Rows) -> tuple[Points, Batch]:
     return result, batch
 
 
-def _batch(sensor: Sensor, table: Rows) -> Batch:
+def _batch(sensor: Sensor, table: CompiledTable) -> Batch:
     """Return a batch of frames, or of parts of them, without predecessors."""
     state: dict[str, tuple[Table | None, NDArray[np.intp]]]
     state = {name: (None, np.full(len(table), -1, np.intp)) for name in sensor.state}
@@ -522,14 +532,14 @@ def _batch(sensor: Sensor, table: Rows) -> Batch:
     return Batch(table, np.zeros(len(table), np.bool_), state, sensor.state)
 
 
-def whole(info: FieldInfo, raw: Floats) -> Floats:
+def round_raw(info: FieldInfo, raw: Floats) -> Floats:
     """Return raw values as a field can hold them."""
     if info.kind == "int":
         return np.rint(raw)
     return raw
 
 
-class PartRows(Rows):
+class PartRows(CompiledTable):
     """The parts of frames that have the points, with their frames.
 
     Args:
@@ -537,7 +547,7 @@ class PartRows(Rows):
         path: path of the parts.
     """
 
-    def __init__(self, frames: Rows, path: str) -> None:
+    def __init__(self, frames: CompiledTable, path: str) -> None:
         place = frames.schema.within(path)
         if place is None or place[2]:
             raise SpecError("the frame has no such parts", path=path)
@@ -546,7 +556,7 @@ class PartRows(Rows):
         own, self.which = frames.parts(*self.place)
         super().__init__(
             own.schema,
-            [Group(group.layout, group.where, group.rows.copy()) for group in own.groups],
+            [LayoutRows(group.layout, group.where, group.rows.copy()) for group in own.groups],
         )
 
     def put_back(self) -> None:
@@ -568,7 +578,7 @@ class PartRows(Rows):
             buffer[offset : offset + len(part)] = np.frombuffer(part, np.uint8)
 
 
-def store(table: Rows, path: str, values: NDArray[Any]) -> None:
+def write_raw(table: CompiledTable, path: str, values: NDArray[Any]) -> None:
     """Write raw values, (n, ...) or a single one, into every frame that has the field."""
     for group in table.groups:
         leaf = group.layout.leaves.get(path)
@@ -601,7 +611,7 @@ def _counts(shape: tuple[int, ...], axes: tuple[str | None, ...], batch: Batch) 
     return counts
 
 
-class Rest:
+class RestingImu:
     """Writes the readings of an IMU at rest into the fields that `imu` depends on.
 
     Args:
@@ -618,7 +628,7 @@ class Rest:
         self._path = sensor.parts_with("imu", frame)
         self._targets: list[str] | None = None
 
-    def fill(self, frames: Rows, shake: float, seed: Sequence[int]) -> None:
+    def fill(self, frames: CompiledTable, shake: float, seed: Sequence[int]) -> None:
         """Write the readings into frames.
 
         Args:
@@ -629,10 +639,10 @@ class Rest:
         if not len(table):
             return
         if self._targets is None:
-            self._targets = self._answering(table)
+            self._targets = self._find_linear_fields(table)
         before = {path: table.raw(path) for path in self._targets}
         for path in self._targets:
-            store(table, path, np.array(0))
+            write_raw(table, path, np.array(0))
         zero = self._read_motion(table)
         slopes = np.stack([self._probe(table, path) - zero for path in self._targets]) / PROBE
         if shake:
@@ -642,11 +652,11 @@ class Rest:
         aims[5] += GRAVITY
         for path, raw in zip(self._targets, _solve(slopes, aims - zero), strict=True):
             info = table.schema.fields[path]
-            store(
+            write_raw(
                 table,
                 path,
                 (
-                    np.clip(whole(info, raw), *info.limits).reshape(before[path].shape)
+                    np.clip(round_raw(info, raw), *info.limits).reshape(before[path].shape)
                     if info.kind == "int"
                     else raw
                 ),
@@ -654,7 +664,7 @@ class Rest:
         if isinstance(table, PartRows):
             table.put_back()
 
-    def _answering(self, table: Rows) -> list[str]:
+    def _find_linear_fields(self, table: CompiledTable) -> list[str]:
         """Return the fields that the readings are linear in."""
         zero = self._read_motion(table)
         paths = list[str]()
@@ -664,9 +674,9 @@ class Rest:
             before = table.raw(path)
             answers = []
             for probe in (0, PROBE, 2 * PROBE):
-                store(table, path, np.array(probe))
+                write_raw(table, path, np.array(probe))
                 answers.append(self._read_motion(table))
-            store(table, path, before)
+            write_raw(table, path, before)
             none, once, twice = answers
             if (once != none).any() and np.allclose(twice - once, once - none):
                 paths.append(path)
@@ -678,14 +688,14 @@ class Rest:
             )
         return paths
 
-    def _probe(self, table: Rows, path: str) -> Floats:
+    def _probe(self, table: CompiledTable, path: str) -> Floats:
         """Return the readings with one field at its probe value, and the others at 0."""
-        store(table, path, np.array(PROBE))
+        write_raw(table, path, np.array(PROBE))
         readings = self._read_motion(table)
-        store(table, path, np.array(0))
+        write_raw(table, path, np.array(0))
         return readings
 
-    def _read_motion(self, table: Rows) -> Floats:
+    def _read_motion(self, table: CompiledTable) -> Floats:
         """Return angular velocities, then accelerations, (6, n, ...)."""
         batch = _batch(self._sensor, table)
         function = self._sensor.imu_of(_name(self._frame, table))
@@ -695,7 +705,7 @@ class Rest:
         ):
             result = function(Fields(batch))
             parts = dict(enumerate((*result.angular_velocity, *result.linear_acceleration)))
-            arrays, _, _, shape = of_points(
+            arrays, _, _, shape = align_points(
                 {str(number): part for number, part in parts.items()}, batch
             )
         return np.stack(
@@ -706,7 +716,7 @@ class Rest:
         )
 
 
-class Pace:
+class PacketTimes:
     """The times of a sensor's packets, batch by batch.
 
     Args:
@@ -716,7 +726,7 @@ class Pace:
         interval: mean ns from one packet to the next; 0 if the spec has no times.
     """
 
-    def __init__(self, sensor: Sensor, frame: str, table: Rows, beams: Beams) -> None:
+    def __init__(self, sensor: Sensor, frame: str, table: CompiledTable, beams: Beams) -> None:
         self._sensor = sensor
         self._rate = sensor.simulation_of(frame).rate
         self._point = _seconds_per_point(beams)
@@ -726,7 +736,7 @@ class Pace:
         times = self.times(table, lambda: beams)
         self.interval = float(times[-1]) / (len(times) - 1)
 
-    def times(self, table: Rows, beams: Callable[[], Beams]) -> Times:
+    def times(self, table: CompiledTable, beams: Callable[[], Beams]) -> Times:
         """Return the times of the packets of a batch after its first, (n,) ns.
 
         Args:
@@ -745,7 +755,7 @@ class Pace:
                 steps = np.zeros(len(table))
         return np.asarray(np.rint(np.concatenate([[0], np.cumsum(steps[:-1])])), np.int64)
 
-    def _by_clock(self, table: Rows) -> Times:
+    def _by_clock(self, table: CompiledTable) -> Times:
         assert self._sensor.clock is not None
         steps = np.diff(clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_))))
         if self._sensor.clock.wraps_at:
@@ -767,7 +777,7 @@ def _seconds_per_point(beams: Beams) -> float:
     return 0.0
 
 
-def _sizes(table: Rows) -> NDArray[np.intp]:
+def _sizes(table: CompiledTable) -> NDArray[np.intp]:
     sizes = np.zeros(len(table), np.intp)
     for group in table.groups:
         sizes[group.where] = group.layout.size
@@ -822,9 +832,9 @@ class FrameSimulation:
         self._measurement = Measurement.of(
             sensor, frame, self._with_points(table), {path for values in given for path in values}
         )
-        self._pace = Pace(sensor, frame, table, self._beams(table))
+        self._pace = PacketTimes(sensor, frame, table, self._beams(table))
         self._rest = (
-            Rest(sensor, frame, {path for values in swept for path in values})
+            RestingImu(sensor, frame, {path for values in swept for path in values})
             if sensor.frames[frame].imu
             else None
         )
@@ -858,13 +868,13 @@ class FrameSimulation:
             self._rest.fill(table, shake, [start])
         return PacketBlock(self._maker.seal(table)[:count], times[: count + 1])
 
-    def _with_points(self, table: Rows) -> Rows:
+    def _with_points(self, table: CompiledTable) -> CompiledTable:
         """Return the rows that have points: frames, or the parts in them."""
         if self._parts:
             return PartRows(table, self._parts)
         return table
 
-    def _beams(self, table: Rows) -> Beams:
+    def _beams(self, table: CompiledTable) -> Beams:
         """Return the beams of frames, with those of their parts joined."""
         measured = self._with_points(table)
         beams = self._measurement.beams(measured)
@@ -891,7 +901,7 @@ class FrameSimulation:
 
 
 @functools.lru_cache(maxsize=64)
-def simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> FrameSimulation:
+def frame_simulation(sensor: Sensor, frame: str, *, blocked: bool = False) -> FrameSimulation:
     """Return the simulation of a data frame type; cached, as its analysis is slow."""
     return FrameSimulation(sensor, frame, blocked=blocked)
 
@@ -910,11 +920,11 @@ def simulate(
         UsageError: if the sensor declares no `sweep`.
         SpecError: if its ranges cannot be traced back to fields.
     """
-    made = simulation(sensor, sensor.data_frame)
+    made = frame_simulation(sensor, sensor.data_frame)
     return made.block(start, packets, scene or Room(), start * made.interval / 1e9).frames
 
 
-def opening(sensor: Sensor) -> bytes:
+def make_opening_frame(sensor: Sensor) -> bytes:
     """Return the frame that has to precede the data frames, empty if there is none."""
     after = sensor.frames[sensor.data_frame].after
     if after is None:

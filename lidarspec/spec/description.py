@@ -300,12 +300,12 @@ class Relative:
     """A related model, installed or not, with packets of the same form.
 
     Args:
-        told_by: the difference, in words.
+        difference: the difference, in words.
         sends: a function of the data frame's `Fields` that is True for packets that only the
             related model sends.
     """
 
-    told_by: str
+    difference: str
     sends: Callable[[Any], Any]
 
 

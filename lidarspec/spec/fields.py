@@ -131,7 +131,7 @@ def share(text: str) -> float:
     return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
 
 
-class Scaled(layer.Describing):
+class Scaled(layer.DescribedField):
     """A number with a unit: ``physical = raw * scale + offset``.
 
     It parses and builds the raw number. Scale and unit are applied only if physical values are
@@ -171,7 +171,7 @@ class Scaled(layer.Describing):
         return replace(info, scale=self.scale, offset=self.offset, unit=self.unit, measured=True)
 
 
-class SizeOf(layer.Sizing):
+class SizeOf(layer.SizeField):
     """The size of another part of the frame, in bytes.
 
     `build` fills it in and ignores a given value. A parsed frame is invalid if the part has another
@@ -197,7 +197,7 @@ class SizeOf(layer.Sizing):
         super().__init__(subcon, tuple(filter(None, part.split("."))), plus)
 
 
-class Checksummed(layer.Sealing):
+class Checksummed(layer.SealedStruct):
     """A struct with a checksum in one of its own fields, at any position in it.
 
     It can be nested, also directly around another `Checksummed`, each with its own field.
@@ -244,7 +244,7 @@ class Checksummed(layer.Sealing):
         start = stream.tell()
         obj = self._marked._parsereport(stream, context, path)
         end = stream.tell()
-        if not layer.verifying(context):
+        if not layer.is_verifying(context):
             return obj
         stream.seek(start)
         data = stream.read(end - start)
@@ -254,7 +254,7 @@ class Checksummed(layer.Sealing):
             width = (sum(layer.bit_width(self._field(name)) for name in self.fields) + 3) // 4
             expected, got = (f"0x{value:0{width}x}" for value in (computed, stored))
             reason = "checksum"
-            raise layer.Mismatch(
+            raise layer.MismatchError(
                 f"{path} -> {name.replace('.', ' -> ')}",
                 self._span(obj, name)[0],
                 expected,
@@ -264,7 +264,7 @@ class Checksummed(layer.Sealing):
         return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
-        given = [layer.member(obj, name, None) for name in self.fields]
+        given = [layer.get_member(obj, name, None) for name in self.fields]
         blank = obj
         for name, value in zip(self.fields, given, strict=True):
             blank = _replace(blank, name, self._zero(name) if value is None else value)
@@ -317,7 +317,7 @@ class Checksummed(layer.Sealing):
 
     def _compute(self, data: bytes, obj: Any, base: int) -> int:
         if self.algorithm is None:
-            raise layer.Mismatch(
+            raise layer.MismatchError(
                 "",
                 0,
                 "a checksum algorithm",
@@ -331,7 +331,7 @@ class Checksummed(layer.Sealing):
     def _load_stored(self, obj: Any) -> int:
         value = shift = 0
         for name in self.fields:
-            part = layer.member(obj, name)
+            part = layer.get_member(obj, name)
             if isinstance(part, bytes):
                 part = int.from_bytes(part, self.algorithm.order if self.algorithm else "little")
             value |= int(part) << shift
@@ -430,7 +430,7 @@ class Parts(layer.Partition):
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
-        found = layer.Pieces()
+        found = layer.ParsedParts()
         goes_on = self._rule(context, path)
         while (announced := goes_on(found)) != 0:
             place = f"{path}[{len(found)}]"
@@ -444,8 +444,8 @@ class Parts(layer.Partition):
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, list | tuple):
-            raise layer.Mismatch(path, 0, "a list of its parts", repr(obj), "value")
-        built = layer.Pieces()
+            raise layer.MismatchError(path, 0, "a list of its parts", repr(obj), "value")
+        built = layer.ParsedParts()
         goes_on = self._rule(context, path)
         for index, part in enumerate(obj):
             announced = goes_on(built)
@@ -464,7 +464,7 @@ class Parts(layer.Partition):
     def _sizeof(self, context: Any, path: str) -> int:
         raise SizeofError("the size of parts is theirs", path=path)
 
-    def _rule(self, context: Any, path: str) -> Callable[[layer.Pieces], int]:
+    def _rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
         """Return a function from the parts so far to the bytes of the next one.
 
         It returns 0 if there is no further part, and -1 if the struct of the part determines its
@@ -479,7 +479,7 @@ class Parts(layer.Partition):
         )
         count, size, within = bounds
 
-        def goes_on(found: layer.Pieces) -> int:
+        def goes_on(found: layer.ParsedParts) -> int:
             if count is not None:
                 if len(found) < count:
                     return -1
@@ -502,7 +502,12 @@ class Parts(layer.Partition):
 
     @staticmethod
     def _take(
-        found: layer.Pieces, kind: str, part: Any, span: tuple[int, int], announced: int, place: str
+        found: layer.ParsedParts,
+        kind: str,
+        part: Any,
+        span: tuple[int, int],
+        announced: int,
+        place: str,
     ) -> None:
         size = span[1] - span[0]
         if announced == 0 or size == 0 or announced not in (-1, size):
@@ -530,7 +535,7 @@ class Parts(layer.Partition):
         for name in names if len(names) > 1 else ():
             try:
                 self.cases[name]._parsereport(stream, trial, path)
-            except (layer.Mismatch, ConstError) as fault:
+            except (layer.MismatchError, ConstError) as fault:
                 if getattr(fault, "reason", "constant") == "constant":
                     continue
             # an expression may raise any exception: the part is of this kind, and fails again when
@@ -540,8 +545,8 @@ class Parts(layer.Partition):
             finally:
                 stream.seek(start)
             return name
-        if len(names) > 1 and layer.verifying(context):
-            raise layer.Mismatch(
+        if len(names) > 1 and layer.is_verifying(context):
+            raise layer.MismatchError(
                 path, start, f"one of {', '.join(names)}", "none of these", "constant"
             )
         return names[-1]

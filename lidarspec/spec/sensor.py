@@ -43,7 +43,7 @@ from lidarspec.spec.links import Link, is_datagram
 from lidarspec.spec.options import Learned, OptionType, option_types
 from lidarspec.spec.results import Imu, Points
 from lidarspec.spec.timing import Clock, OnChange, OnWrap, Sequence, Split
-from lidarspec.trusted_files import beside
+from lidarspec.trusted_files import resolve_beside
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -253,8 +253,8 @@ def with_frames(sensor: _Sensor, frames: Mapping[str, Frame]) -> _Sensor:
     It has no commands, no state, and no fields with information about the device.
     """
     clock = sensor.clock
-    if clock is not None and clock.told is not None and clock.told[0] not in frames:
-        clock = replace(clock, told=None)
+    if clock is not None and clock.reference is not None and clock.reference[0] not in frames:
+        clock = replace(clock, reference=None)
     return replace(
         sensor, frames=frames, clock=clock, commands={}, state={}, info={}, on_open=(), on_close=()
     )
@@ -346,15 +346,15 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
 
 
 def _check_clock(sensor: SensorDescription) -> None:
-    """Raise SpecError if `told` of the clock cannot complete it."""
+    """Raise SpecError if `reference` of the clock cannot complete it."""
     clock = sensor.clock
-    if clock is None or clock.told is None:
+    if clock is None or clock.reference is None:
         return
-    _check_names(sensor, "clock.told", clock.told[:1], sensor.frames)
+    _check_names(sensor, "clock.reference", clock.reference[:1], sensor.frames)
     if clock.wraps_at is None or callable(clock.source):
         raise SpecError(
-            "told completes a clock made of fields that starts again at `wraps_at`",
-            path="clock.told",
+            "reference completes a clock made of fields that starts again at `wraps_at`",
+            path="clock.reference",
             sensor=sensor.id,
         )
 
@@ -433,7 +433,7 @@ class Configure:
                 checked[name] = Learned.of_dict(value)
             elif name in self.files and value is not None:
                 try:
-                    checked[name] = beside(folder, value)
+                    checked[name] = resolve_beside(folder, value)
                 except UsageError as error:
                     raise UsageError(f"{name}: {error}") from None
             elif not isinstance(value, bool | int | float | None) and not is_word:

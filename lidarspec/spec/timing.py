@@ -112,7 +112,7 @@ class Clock:
             short counter has wrapped in a gap, and whether a number that jumps is corrupt; then it
             has to be right in every mode. A clock without it counts no loss. It distinguishes
             related models; if it is left out, the pace of a simulation does.
-        told: another frame type that completes a clock that starts again: it has the clock's
+        reference: another frame type that completes a clock that starts again: it has the clock's
             field too. With it a function of its `Fields` that returns seconds since 1970, nan if
             the frame has no date. The first frame with a date decides: from the start of a file,
             and for live packets from that frame on.
@@ -124,7 +124,7 @@ class Clock:
     source: Source
     wraps_at: float | None = None
     pace: Callable[[Any], Any] | None = None
-    told: tuple[str, Callable[[Any], Any]] | None = None
+    reference: tuple[str, Callable[[Any], Any]] | None = None
 
     def __post_init__(self) -> None:
         if self.wraps_at is None:

@@ -958,7 +958,7 @@ class Scope:
         raise UntraceableExpressionError("an expression asks for the length of an array")
 
 
-class Outside(Scope):
+class OuterScope(Scope):
     """The context of the outer frame for expressions in a part.
 
     It has the symbols of that frame, with "_." before their paths.
@@ -971,7 +971,7 @@ class Outside(Scope):
     def __getitem__(self, name: str) -> Any:
         found = self._scope[name]
         if isinstance(found, Scope):
-            return Outside(found, self.asked)
+            return OuterScope(found, self.asked)
         if isinstance(found, Symbol) and isinstance(found.formula, Ref):
             self.asked.append(Ref(f"_.{found.formula.path}", found.formula.info))
             return Symbol(self.asked[-1])

@@ -25,7 +25,7 @@ STEP_TOLERANCE = 1.25
 ELEMENTWISE = {np.where, np.clip, np.nan_to_num, np.round, np.isclose, np.real_if_close}
 
 
-class Along(NDArrayOperatorsMixin):
+class AlongAxis(NDArrayOperatorsMixin):
     """Numbers that all packets share, along arrays of the frame.
 
     NumPy's ufuncs combine them with each other and with columns.
@@ -66,7 +66,8 @@ class Along(NDArrayOperatorsMixin):
                 (lambda *arrays: function(*arrays, **kwargs)) if kwargs else function, *args
             )
         return function(
-            *(np.asarray(value) if isinstance(value, Along) else value for value in args), **kwargs
+            *(np.asarray(value) if isinstance(value, AlongAxis) else value for value in args),
+            **kwargs,
         )
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Any:
@@ -75,13 +76,15 @@ class Along(NDArrayOperatorsMixin):
         If a column is among the values, the column applies the function.
         """
         for value in values:
-            if hasattr(value, "apply_function") and not isinstance(value, Along):
+            if hasattr(value, "apply_function") and not isinstance(value, AlongAxis):
                 return value.apply_function(function, *values)
         axes: dict[str, str] = {}
-        for name in (name for value in values if isinstance(value, Along) for name in value.axes):
+        for name in (
+            name for value in values if isinstance(value, AlongAxis) for name in value.axes
+        ):
             axes.setdefault(name.rpartition(".")[2], name)
         arrays = [
-            value.lined_up(tuple(axes)) if isinstance(value, Along) else np.asarray(value)
+            value.lined_up(tuple(axes)) if isinstance(value, AlongAxis) else np.asarray(value)
             for value in values
         ]
         array = np.asarray(function(*arrays))
@@ -90,7 +93,7 @@ class Along(NDArrayOperatorsMixin):
                 f"an array of shape {array.shape} beside numbers along {', '.join(axes)}: say what"
                 " it is along with along(...)"
             )
-        return Along(tuple(axes.values()), array)
+        return AlongAxis(tuple(axes.values()), array)
 
     def lined_up(self, names: tuple[str, ...]) -> NDArray[Any]:
         """Return the numbers with an axis for each name; axes of other arrays have length 1.
@@ -124,7 +127,7 @@ def along(axis: str | tuple[str, ...], values: Array) -> Any:
             f"along({axis!r}, ...) takes an array with an axis for each name, not one of shape"
             f" {array.shape}"
         )
-    return Along(axes, array)
+    return AlongAxis(axes, array)
 
 
 def spread(start: Array, end: Array, count: Array, *, full: float) -> Array:
@@ -291,7 +294,7 @@ def take(table: Array, index: Array) -> Array:
     """
     entries = np.asarray(table, np.float64)
     if entries.ndim == 1:
-        return _apply(LookUp(entries), index)
+        return _apply(TableLookup(entries), index)
     rows = np.concatenate([entries, np.full((1, entries.shape[1]), np.nan)])
     if hasattr(index, "gather"):
         return index.gather(rows)
@@ -306,7 +309,7 @@ def row_numbers(index: NDArray[Any], rows: int) -> NDArray[np.intp]:
     return np.where((index >= 0) & (index < rows - 1), index, rows - 1).astype(np.intp)
 
 
-class LookUp:
+class TableLookup:
     """Function of an index that returns the entries of a table, (m,); nan if there is none."""
 
     def __init__(self, entries: Any) -> None:

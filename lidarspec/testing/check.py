@@ -26,11 +26,11 @@ from lidarspec.errors import SourceError, SpecError, UnknownSensor
 from lidarspec.plugins import Registry, file_and_id, file_module, registry
 from lidarspec.sensor_operations import Sensor
 from lidarspec.testing.declaration import check_declaration
-from lidarspec.testing.findings import Finding, left_over
+from lidarspec.testing.findings import Finding, unacknowledged
 from lidarspec.testing.properties import PROPERTIES
-from lidarspec.testing.sensor_under_test import EXAMPLES, Subject
+from lidarspec.testing.sensor_under_test import EXAMPLES, SensorUnderTest
 from lidarspec.testing.vectors import lacking
-from lidarspec.trusted_files import document
+from lidarspec.trusted_files import read_document
 
 #: Name of a file of golden vectors.
 VECTORS = "vectors.json"
@@ -128,7 +128,7 @@ def _file(file: Path, wanted: str) -> CheckTarget:
 def _folder(folder: Path) -> CheckTarget:
     """Return the target of the distribution with its source in a folder."""
     file = folder / "pyproject.toml"
-    project = document(file).get("project")
+    project = read_document(file).get("project")
     if isinstance(project, dict):
         name = project.get("name")
     else:
@@ -615,7 +615,7 @@ def reports(
     total = len(PROPERTIES) * len(target.sensors)
     for index, sensor in enumerate(target.sensors):
         family = () if vectors and single else target.family
-        subject = Subject(
+        subject = SensorUnderTest(
             sensor, examples, strategies or {}, vectors or target.vectors, family, tested
         )
         before = len(PROPERTIES) * index
@@ -632,7 +632,7 @@ def _watch_sensor(watch: Watch, before: int, total: int, text: str, done: int) -
     watch(text, before + done, total)
 
 
-def _beside(subject: Subject) -> Iterator[tuple[str, str]]:
+def _beside(subject: SensorUnderTest) -> Iterator[tuple[str, str]]:
     """Yield facts to compare with the measured values of a sensor."""
     sensor = subject.sensor
     missing = lacking(subject)
@@ -651,7 +651,7 @@ def _watch_case(watch: Callable[[str, int], None], sensor_id: str, done: int, ca
 
 
 def _report(
-    subject: Subject,
+    subject: SensorUnderTest,
     places: SourceTexts,
     mistakes: list[Finding],
     watch: Callable[[str, int], None],
@@ -665,7 +665,7 @@ def _report(
     report.findings += check_declaration(subject)
     for done, one in enumerate(PROPERTIES):
         known = sorted(
-            {finding.code for finding in left_over(report.findings, sensor, whole=False)}
+            {finding.code for finding in unacknowledged(report.findings, sensor, whole=False)}
             & set(one.unless)
         )
         reason = one.lacks(subject) or (f"{', '.join(known)} is found already" if known else "")
@@ -681,7 +681,7 @@ def _report(
     distinct = list(
         {(finding.code, finding.path): finding for finding in reversed(report.findings)}.values()
     )[::-1]
-    left = left_over(distinct, sensor, whole=ELSE not in report.skipped and not subject.tested)
+    left = unacknowledged(distinct, sensor, whole=ELSE not in report.skipped and not subject.tested)
     report.findings = [places.locate(finding, sensor) for finding in left]
     report.measured = subject.measured
     report.picture = subject.picture and {

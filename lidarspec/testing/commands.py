@@ -6,7 +6,7 @@ import math
 from ipaddress import ip_address
 from typing import Any
 
-from lidarspec.device.session import Reply, Session, found_at, learn_options
+from lidarspec.device.session import Reply, Session, get_nested, learn_options
 from lidarspec.errors import CommandError, LidarSpecError, SpecError, UsageError
 from lidarspec.explaining.formatting import format_argument_type
 from lidarspec.frames.commands import argument_slot, raw_argument
@@ -16,14 +16,14 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.spec.arguments import Address, Range, Text
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing.findings import Violation, require
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.findings import ViolationError, require
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Nanoseconds of one step of a simulated exchange.
 STEP = 20_000_000
 
 
-def arguments(subject: Subject, name: str, share: float) -> dict[str, Any]:
+def arguments(subject: SensorUnderTest, name: str, share: float) -> dict[str, Any]:
     """Return a value for each argument of a command.
 
     Args:
@@ -48,7 +48,7 @@ def _value(sensor: Sensor, name: str, key: str, share: float) -> Any:
     return bytes(range(slot.room or round(share * 16)))
 
 
-def a_command_parses_back(subject: Subject, name: str) -> None:
+def a_command_parses_back(subject: SensorUnderTest, name: str) -> None:
     """Check that a command's frame has its fixed values and its arguments.
 
     The arguments are read back within half a step, and the frame is built again.
@@ -57,7 +57,7 @@ def a_command_parses_back(subject: Subject, name: str) -> None:
         try:
             _parses_back(subject.sensor, name, arguments(subject, name, share))
         except LidarSpecError as error:
-            raise Violation("LS601", str(error), f"commands.{name}") from error
+            raise ViolationError("LS601", str(error), f"commands.{name}") from error
 
 
 def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
@@ -70,13 +70,13 @@ def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
     parsed = sensor.parse(data, frame=command.frame)
     assert sensor.build(command.frame, parsed) == data, "it builds as other bytes"
     for path, value in command.fixed.items():
-        assert found_at(parsed, path) == value, (
-            f"{path} is {found_at(parsed, path)}, and {value} is meant"
+        assert get_nested(parsed, path) == value, (
+            f"{path} is {get_nested(parsed, path)}, and {value} is meant"
         )
     for argument, value in given.items():
         slot = argument_slot(sensor, name, argument)
         declared = command.arguments[argument]
-        read = found_at(parsed, declared.path)
+        read = get_nested(parsed, declared.path)
         raw = raw_argument(slot, declared.kind, value, argument, name)
         if isinstance(declared.kind, Range):
             read = slot.info.physical(read)
@@ -87,7 +87,7 @@ def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
             assert read == raw, f"{argument} is {read!r}, and {value!r} is given"
 
 
-def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
+def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> None:
     """Check that arguments outside their ranges are refused."""
     for key, declared in subject.sensor.commands[name].arguments.items():
         kind = declared.kind
@@ -103,7 +103,7 @@ def arguments_are_held_to_their_ranges(subject: Subject, name: str) -> None:
                 subject.sensor.command(name, **{**arguments(subject, name, 0.0), key: outside})
             except UsageError:
                 continue
-            raise Violation(
+            raise ViolationError(
                 "LS602",
                 f"{key} = {outside} is sent, and {format_argument_type(kind)} is declared",
                 f"commands.{name}.args.{key}",
@@ -137,10 +137,10 @@ def an_exchange_holds(
         session.tick(math.ceil(1e9 * (1 + command.timeout) * (2 + command.retries)))
         pending.result()
     except LidarSpecError as error:
-        raise Violation("LS605", str(error), place) from error
+        raise ViolationError("LS605", str(error), place) from error
 
 
-def replies_can_match(subject: Subject, name: str) -> None:
+def replies_can_match(subject: SensorUnderTest, name: str) -> None:
     """Check that every field that identifies a reply is a field of one of the replies."""
     command = subject.sensor.commands[name]
     answers = [subject.fields(reply) for reply in command.replies]
@@ -153,7 +153,7 @@ def replies_can_match(subject: Subject, name: str) -> None:
         )
 
 
-def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
+def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
     """Check that the simulated sensor sends the documented reply in time.
 
     Three sets of arguments are tried; one reply is enough. A missing reply is accepted if `answers`
@@ -173,16 +173,16 @@ def the_simulated_sensor_answers(subject: Subject, name: str) -> None:
             if name in subject.sensor.simulation.answers:
                 raise
             what = f"its reply cannot be made up without answers= of the Simulation: {error.reason}"
-            raise Violation("LS604", what, f"commands.{name}") from error
+            raise ViolationError("LS604", what, f"commands.{name}") from error
         require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
         _learn(subject, name, reply)
         return
     decides = callable(subject.sensor.simulation.answers.get(name))
     if not (command.args and decides):
-        raise Violation("LS604", refused, f"commands.{name}")
+        raise ViolationError("LS604", refused, f"commands.{name}")
 
 
-def _learn(subject: Subject, name: str, reply: Reply) -> None:
+def _learn(subject: SensorUnderTest, name: str, reply: Reply) -> None:
     """Configure the sensor with the values that it learns from a simulated reply."""
     sensor = subject.sensor
     try:
@@ -194,10 +194,10 @@ def _learn(subject: Subject, name: str, reply: Reply) -> None:
         else:
             which = "its reply, which is made up without"
         what = f"{which} answers= of the Simulation, cannot be learned from: {error}"
-        raise Violation("LS604", what, f"commands.{name}") from error
+        raise ViolationError("LS604", what, f"commands.{name}") from error
 
 
-def _ask(subject: Subject, name: str, given: dict[str, float]) -> Reply:
+def _ask(subject: SensorUnderTest, name: str, given: dict[str, float]) -> Reply:
     """Return the reply of a simulated sensor to a command.
 
     Raises:

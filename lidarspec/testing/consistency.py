@@ -21,7 +21,7 @@ from lidarspec.spec import Clock
 from lidarspec.spec.tree import exact
 from lidarspec.testing.findings import require
 from lidarspec.testing.geometry import BACK, SMALL, make_sweep, read
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Numbers of the packets for the check of the clock: far along the sweep, so that the clock has
 #: wrapped.
@@ -34,7 +34,7 @@ MOST_STEPS = 30
 TURNS = 24
 
 
-def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
+def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
     """Check that far along the sweep the clock stays below `wraps_at`."""
     clock = subject.sensor.clock
     sweep = subject.sensor.simulation_of(name).sweep
@@ -54,7 +54,7 @@ def the_clock_stays_below_its_wrap(subject: Subject, name: str) -> None:
     require(most <= exact(clock.wraps_at) * 10**9, "LS512", message, "clock")
 
 
-def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
+def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
     """Check that the times of a packet's points spread over few clock steps."""
     frames = make_sweep(subject, name, TIMED_PACKETS)
     if subject.sensor.clock is None or len(frames) < 3:
@@ -77,7 +77,7 @@ def times_of_points_fit_the_clock(subject: Subject, name: str) -> None:
     )
 
 
-def turned_angles_turn_the_points(subject: Subject, name: str) -> None:
+def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
     """Check that points turn with the angles of their packet."""
     sweep = subject.sensor.simulation_of(name).sweep
     if sweep is None:
@@ -138,7 +138,7 @@ def _turn_angles(
 
 
 def _read_azimuths(
-    subject: Subject, name: str, values: Mapping[str, Any]
+    subject: SensorUnderTest, name: str, values: Mapping[str, Any]
 ) -> NDArray[np.float64] | None:
     """Return the azimuths of a packet with these values; None if it is not valid."""
     try:

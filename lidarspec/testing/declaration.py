@@ -17,21 +17,21 @@ import numpy as np
 
 from lidarspec.errors import LidarSpecError, SpecError, did_you_mean
 from lidarspec.expressions.columns import Batch, Fields
-from lidarspec.expressions.graph import Traced, UntraceableError
+from lidarspec.expressions.graph import TracedColumn, UntraceableError
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.schema import without_indices
-from lidarspec.framing.example_frames import draw_always, header, random_frame
+from lidarspec.framing.example_frames import make_random_header, random_frame, return_raw
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.points.conventions import TYPES
 from lidarspec.simulation.scenes import Room
-from lidarspec.simulation.simulator import simulation
+from lidarspec.simulation.simulator import frame_simulation
 from lidarspec.spec import Clock, Frame, OnWrap, Sensor
 from lidarspec.spec.fields import factor, is_unit
 from lidarspec.spec.syntax import is_expression
 from lidarspec.spec.tree import Sealed, Struct, infos, nodes
 from lidarspec.testing.findings import Finding
 from lidarspec.testing.geometry import field_of, find_fields, trace_points
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Names of fields that hold a measured value.
 MEASURES = frozenset(
@@ -78,7 +78,7 @@ PLACEHOLDER = re.compile(r"\s*(\?*|-*|todo.*|tbd.*|n/?a|none|unknown)\s*", re.IG
 Findings = Iterator[tuple[str, str, str]]
 
 
-def check_declaration(subject: Subject) -> list[Finding]:
+def check_declaration(subject: SensorUnderTest) -> list[Finding]:
     """Return the findings of a declaration."""
     sensor = subject.sensor
     checks: list[Findings] = [
@@ -117,7 +117,7 @@ def _sensor(sensor: Sensor) -> Findings:
 def _check_required_fields(sensor: Sensor) -> Findings:
     """Yield the missing fields of scans, clock and counter."""
     known = {
-        path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.named
+        path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.scan_names
     }
     if isinstance(sensor.scan, OnWrap):
         cut_by = known | set(TYPES)
@@ -154,7 +154,7 @@ def _clock(sensor: Sensor) -> Findings:
         or not sensor.frames
     ):
         return
-    named = codec(sensor.frames[sensor.data_frame]).schema.named
+    named = codec(sensor.frames[sensor.data_frame]).schema.scan_names
     paths = (clock.source,) if isinstance(clock.source, str) else clock.source
     infos = [named.get(without_indices(path)[0]) for path in paths]
     spans = [
@@ -217,7 +217,7 @@ def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
     return accepted > 1
 
 
-def _frame(subject: Subject, name: str, frame: Frame) -> Findings:
+def _frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     engine = codec(frame)
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
@@ -252,7 +252,7 @@ def _is_reply(sensor: Sensor, name: str) -> bool:
     return any(name in command.replies for command in sensor.commands.values())
 
 
-def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
+def _longest(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     """Yield a finding if `max_length` is far above the lengths of random frames.
 
     The decoder waits much longer than needed for a frame with a corrupt length.
@@ -275,19 +275,19 @@ def _longest(subject: Subject, name: str, frame: Frame) -> Findings:
     )
 
 
-def _sizes(subject: Subject, name: str) -> Iterator[int]:
+def _sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
     """Yield the lengths of examples and of a simulated frame.
 
     The simulated frame comes late, because it takes long and is seldom needed.
     """
     yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS))
     if name in subject.sensor.data_frames and subject.sensor.simulation_of(name).sweep is not None:
-        yield len(simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0])
+        yield len(frame_simulation(subject.sensor, name).block(0, 1, Room(), 0.0).frames[0])
     yield from (len(subject.example(name, seed=seed)) for seed in range(FIRST_LENGTHS, LENGTHS))
     yield from _raised_sizes(subject, name)
 
 
-def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
+def _raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
     """Yield the lengths of valid frames with one large value in a header field.
 
     The value is the largest that `max_length` allows. Random headers seldom have large counts, and
@@ -298,12 +298,12 @@ def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
     if not isinstance(engine, CompiledCodec) or engine.schema.parts:
         return
     source = subject.source(f"lengths of {name}")
-    for path in header(engine, source)[1]:
+    for path in make_random_header(engine, source)[1]:
         info = engine.schema.fields[path]
         for shift in range(info.bits if info.const is None else 0):
-            raised = {path: partial(draw_always, info.limits[1] >> shift)}
+            raised = {path: partial(return_raw, info.limits[1] >> shift)}
             try:
-                size = header(engine, source, raised)[0].size
+                size = make_random_header(engine, source, raised)[0].size
                 if FAR * size < frame.max_length:
                     break
                 yield len(
@@ -313,7 +313,7 @@ def _raised_sizes(subject: Subject, name: str) -> Iterator[int]:
                 continue
 
 
-def _names(subject: Subject, name: str, frame: Frame) -> Findings:
+def _names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     """Yield fields without a unit with names of measured values.
 
     `Scaled(..., "")` declares a pure number.
@@ -334,7 +334,7 @@ def _names(subject: Subject, name: str, frame: Frame) -> Findings:
             )
 
 
-def _find_multiplied(subject: Subject, name: str) -> set[str]:
+def _find_multiplied(subject: SensorUnderTest, name: str) -> set[str]:
     """Return the fields that are multiplied with a field in metres to give ranges."""
     try:
         infos = [
@@ -365,7 +365,7 @@ def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
     }
 
 
-def _plausible(subject: Subject, name: str, frame: Frame) -> Findings:
+def _plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     try:
         table = codec(frame).table([subject.example(name)])
     except LidarSpecError:
@@ -421,7 +421,7 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
                 )
 
 
-def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> Findings:
+def _sync(subject: SensorUnderTest, name: str, frame: Frame, engine: CompiledCodec) -> Findings:
     """Yield a finding if the constant bytes at the start are common in payloads."""
     if subject.sensor.datagrams or frame.confirm > 1:
         return
@@ -448,7 +448,7 @@ def _sync(subject: Subject, name: str, frame: Frame, engine: CompiledCodec) -> F
         yield "LS204", f"its constants stand at {share:.1%} of the places in payloads", name
 
 
-def _strength(subject: Subject, name: str, frame: Frame, layouts: list[Layout]) -> Findings:
+def _strength(subject: SensorUnderTest, name: str, frame: Frame, layouts: list[Layout]) -> Findings:
     """Yield a finding if constants and checksums are too few to reject random bytes."""
     if frame.plausible is not None or frame.confirm > 1 or not layouts:
         return
@@ -477,7 +477,7 @@ def _weak_bits(sensor: Sensor, frame: Frame) -> int:
     return WEAK_BITS_WITHOUT_POINTS
 
 
-def _points(subject: Subject, name: str) -> Findings:
+def _points(subject: SensorUnderTest, name: str) -> Findings:
     """Yield the findings of `points`: whether it can be traced, and its source fields."""
     try:
         result = trace_points(subject, name)
@@ -492,7 +492,7 @@ def _points(subject: Subject, name: str) -> Findings:
     yield from _intensity(subject, name, result)
 
 
-def _intensity(subject: Subject, name: str, result: Any) -> Findings:
+def _intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
     """Yield a finding if the intensity comes from a field with another name.
 
     Applies if no column uses the field that is named intensity.
@@ -526,7 +526,7 @@ def _intensity(subject: Subject, name: str, result: Any) -> Findings:
             return
 
 
-def _reach(subject: Subject) -> Findings:
+def _reach(subject: SensorUnderTest) -> Findings:
     """Yield a finding if a range limit exceeds the largest value of the range field."""
     reach: list[tuple[float, str]] = []
     for name in subject.sensor.data_frames:
@@ -535,7 +535,7 @@ def _reach(subject: Subject) -> Findings:
         except Exception:  # another check reports it
             return
         value = getattr(result, "range", None)
-        if isinstance(value, Traced) and value.node.kind == "field":
+        if isinstance(value, TracedColumn) and value.node.kind == "field":
             info = field_of(subject, name, value.node)
         else:
             info = None
@@ -561,7 +561,7 @@ def _reach(subject: Subject) -> Findings:
 
 
 def _column(
-    subject: Subject, name: str, value: Any, column: str, units: tuple[str, ...]
+    subject: SensorUnderTest, name: str, value: Any, column: str, units: tuple[str, ...]
 ) -> Findings:
     """Yield a finding if no source field of a column has a unit of its kind."""
     infos = [field_of(subject, name, node) for node in find_fields(value, looked_up=False)]

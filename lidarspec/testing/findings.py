@@ -1,8 +1,8 @@
 """The findings of `lidarspec check` and the test kit, and their rules.
 
-The rules are a table, which a test compares with the reference page. A property raises `Violation`
+The rules are a table, which a test compares with the reference page. A property raises `ViolationError`
 (through `require`) if it does not hold, which becomes a `Finding`; findings that a declaration
-acknowledges with a reason are removed at the end, by `left_over`.
+acknowledges with a reason are removed at the end, by `unacknowledged`.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ class Finding:
         )
 
 
-class Violation(AssertionError):
+class ViolationError(AssertionError):
     """The exception of a property that does not hold."""
 
     def __init__(self, code: str, what: str, path: str = "") -> None:
@@ -217,16 +217,16 @@ class Violation(AssertionError):
 
 
 def require(holds: object, code: str, what: str, path: str = "") -> None:
-    """Raise a `Violation` unless `holds`.
+    """Raise a `ViolationError` unless `holds`.
 
     Raises:
         Violation: with this code, text and path.
     """
     if not holds:
-        raise Violation(code, what, path)
+        raise ViolationError(code, what, path)
 
 
-def left_over(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[Finding]:
+def unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[Finding]:
     """Return the findings that a declaration does not acknowledge with a reason.
 
     Args:

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 
 from lidarspec.errors import SpecError, UsageError, WireError
-from lidarspec.explaining.damage_search import changes
-from lidarspec.explaining.explanation import fits
+from lidarspec.explaining.damage_search import find_changes
+from lidarspec.explaining.explanation import is_valid_frame
 from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.findings import Violation, require
-from lidarspec.testing.sensor_under_test import MANY, Subject
+from lidarspec.testing.findings import ViolationError, require
+from lidarspec.testing.sensor_under_test import MANY, SensorUnderTest
 
 #: Number of examples, read by plain construct, in which bytes are changed.
 CHANGED_EXAMPLES = 3
@@ -50,7 +50,7 @@ LEAST_SAMPLES = 2
 FLIPPED_BYTES = 1 << 23
 
 
-def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
+def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
     """Check that examples of a frame type can be built, parse, repeat and differ.
 
     None may be longer than declared.
@@ -65,7 +65,7 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
             path = f"{name}.{error.path}"
         else:
             path = name
-        raise Violation(error.rule or "LS301", error.reason, path) from error
+        raise ViolationError(error.rule or "LS301", error.reason, path) from error
     if not subject.drawers(name):
         again = [subject.sensor.example(name, seed=seed) for seed in range(min(3, len(examples)))]
     else:
@@ -92,7 +92,7 @@ def examples_are_valid_and_repeat(subject: Subject, name: str) -> None:
     )
 
 
-def bytes_survive_parsing_and_building(subject: Subject, name: str) -> None:
+def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> None:
     """Check build(parse(bytes)) == bytes for every example, reserved bits included."""
     sensor = subject.sensor
     for seed in subject.seeds(name):
@@ -107,7 +107,7 @@ def bytes_survive_parsing_and_building(subject: Subject, name: str) -> None:
             )
 
 
-def every_raw_value_survives(subject: Subject, name: str) -> None:
+def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
     """Check that changed bytes survive parsing and building, apart from checksums.
 
     Applies to frames that plain construct reads: they may contain functions of the author's own,
@@ -129,7 +129,7 @@ def every_raw_value_survives(subject: Subject, name: str) -> None:
         _require_same_values(parsed, again, sealed | follows, name)
 
 
-def _changed_examples(subject: Subject, name: str) -> Iterator[bytes]:
+def _changed_examples(subject: SensorUnderTest, name: str) -> Iterator[bytes]:
     """Yield copies of examples with one changed byte each."""
     source = subject.source(f"raw {name}")
     changes = subject.limit_to_bytes(name, subject.scale_rounds(CHANGES), CHANGED_BYTES)
@@ -138,7 +138,7 @@ def _changed_examples(subject: Subject, name: str) -> Iterator[bytes]:
     )
     for seed in range(subject.limit_to_bytes(name, CHANGED_EXAMPLES)):
         example = subject.example(name, seed=seed)
-        for offset in material.places(len(example), source, offset_count):
+        for offset in material.pick_offsets(len(example), source, offset_count):
             for _ in range(changes):
                 data = bytearray(example)
                 data[offset] = source.randrange(256)
@@ -149,14 +149,14 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
     for (path, before), (other, after) in zip(leaves(parsed), leaves(again), strict=False):
         is_number = isinstance(before, int | float) and re.sub(r"\[\d+\]", "", path) not in sealed
         if path == other and is_number and not same(before, after):
-            raise Violation(
+            raise ViolationError(
                 "LS303" if is_cut(before, after) else "LS302",
                 f"{before!r} comes back as {after!r}",
                 f"{name}.{path}",
             )
 
 
-def what_follows_is_held(subject: Subject, name: str) -> None:
+def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
     """Check that a frame is refused if a field differs from its `Rebuild`.
 
     Such a frame would be built as a different one.
@@ -203,7 +203,7 @@ def is_cut(before: Any, after: Any) -> bool:
     return before - after < 0.1 * abs(before) + 1
 
 
-def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:
+def values_in_units_build_the_same_bytes(subject: SensorUnderTest, name: str) -> None:
     """Check that a frame built from its physical values has the original bytes."""
     for seed in subject.seeds(name):
         data = subject.example(name, seed=seed)
@@ -216,10 +216,12 @@ def values_in_units_build_the_same_bytes(subject: Subject, name: str) -> None:
             _lost(subject, name, data, built, "LS304")
 
 
-def parse_finds_out_the_type(subject: Subject, name: str) -> None:
+def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
     """Check that parsing without a type equals parsing as one of the matching types."""
     data = subject.example(name, seed=1)
-    fitting = [other for other in subject.sensor.frames if fits(subject.sensor, data, other)]
+    fitting = [
+        other for other in subject.sensor.frames if is_valid_frame(subject.sensor, data, other)
+    ]
     require(name in fitting, "LS306", "its own example is not parsed as such a frame", name)
     read = [subject.sensor.parse(data, frame=other) for other in fitting]
     require(
@@ -241,7 +243,7 @@ def same(one: Any, other: Any) -> bool:
     )
 
 
-def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> None:
+def _lost(subject: SensorUnderTest, name: str, data: bytes, built: bytes, code: str) -> None:
     """Raise the violation for bytes that changed, with the field in which they differ."""
     offset = next(
         (index for index, pair in enumerate(zip(data, built, strict=False)) if pair[0] != pair[1]),
@@ -258,11 +260,11 @@ def _lost(subject: Subject, name: str, data: bytes, built: bytes, code: str) -> 
     )
     if difference is None:
         was, became = (part[offset : offset + 1].hex() for part in (data, built))
-        raise Violation(
+        raise ViolationError(
             code, f"byte {offset} of {len(data)} is {was} and comes back as {became}", name
         )
     path, before, after = difference
-    raise Violation(
+    raise ViolationError(
         "LS303" if is_cut(before, after) else code,
         f"{before!r} comes back as {after!r}",
         f"{name}.{path}",
@@ -281,7 +283,7 @@ def leaves(parsed: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, parsed
 
 
-def acceptable(subject: Subject, name: str, values: Any) -> bytes | None:
+def acceptable(subject: SensorUnderTest, name: str, values: Any) -> bytes | None:
     """Return the frame with these values; None if they contradict each other."""
     try:
         return subject.sensor.build(name, values)
@@ -289,7 +291,7 @@ def acceptable(subject: Subject, name: str, values: Any) -> bytes | None:
         return None
 
 
-def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
+def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> None:
     """Check that drawn values of fields are read back as they were written."""
     from hypothesis import HealthCheck, given, seed, settings, strategies as st
 
@@ -333,11 +335,13 @@ def values_survive_building_and_parsing(subject: Subject, name: str) -> None:
 
     try:
         check_edited()
-    except Violation as found:
-        raise Violation(found.code, found.what, found.path) from None
+    except ViolationError as found:
+        raise ViolationError(found.code, found.what, found.path) from None
 
 
-def _check(subject: Subject, name: str, parsed: Any, spots: list[Any], edits: list[int]) -> None:
+def _check(
+    subject: SensorUnderTest, name: str, parsed: Any, spots: list[Any], edits: list[int]
+) -> None:
     """Check that the edited integers of a frame are read back."""
     built = acceptable(subject, name, parsed)
     if built is None:
@@ -390,13 +394,13 @@ def free(info: FieldInfo | None) -> bool:
     )
 
 
-def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
+def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> None:
     """Check that a frame that is cut short raises `WireError` with its offset."""
     data = subject.example(name, seed=2)
     offset_count = subject.limit_to_bytes(
         name, subject.scale_rounds(material.SPOTS, LEAST_SPOTS), CUT_BYTES
     )
-    for end in material.places(len(data), subject.source("cut"), offset_count):
+    for end in material.pick_offsets(len(data), subject.source("cut"), offset_count):
         try:
             subject.sensor.parse(data[:end], frame=name)
         except WireError as error:
@@ -409,10 +413,10 @@ def a_truncated_frame_is_a_wire_error(subject: Subject, name: str) -> None:
         except Exception as error:
             raise _undocumented_error(error, f"cut at byte {end} of {len(data)}", name) from error
         else:
-            raise Violation("LS307", f"cut at byte {end} of {len(data)}, and it passes", name)
+            raise ViolationError("LS307", f"cut at byte {end} of {len(data)}, and it passes", name)
 
 
-def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> None:
+def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str) -> None:
     """Check that a mutated frame parses or raises `WireError`.
 
     Parsing without verification may raise nothing else, either.
@@ -431,7 +435,7 @@ def a_damaged_frame_is_at_worst_a_wire_error(subject: Subject, name: str) -> Non
                 raise _undocumented_error(error, f"parsing {data.hex(' ')[:200]}", name) from error
 
 
-def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
+def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
     """Check that every flipped bit under a checksum makes the frame invalid.
 
     The share of other flipped bits that pass is measured.
@@ -451,7 +455,7 @@ def every_single_bit_error_is_seen(subject: Subject, name: str) -> None:
             continue
         sealed = bool(layout.seals)
         offsets = _flipped_offsets(layout, len(data), source)
-        passing = changes(subject.sensor.frames[name], data, ["flipped bit"], offsets=offsets)
+        passing = find_changes(subject.sensor.frames[name], data, ["flipped bit"], offsets=offsets)
         tried += 8 * len(offsets)
         passed += len(passing)
         covered = {
@@ -492,9 +496,9 @@ def _flipped_offsets(layout: Layout, length: int, source: random.Random) -> Sequ
     return sorted({*chosen, *source.sample(range(length), number - len(chosen))})
 
 
-def _undocumented_error(error: Exception, what: str, name: str) -> Violation:
+def _undocumented_error(error: Exception, what: str, name: str) -> ViolationError:
     code = "LS115" if isinstance(error, SpecError) else "LS308"
-    return Violation(
+    return ViolationError(
         code,
         f"{what}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}",
         name,

@@ -5,8 +5,8 @@ source fields of each column. Packets along the sensor's `sweep`: directions are
 one sense from beam to beam, cross the full circle without a jump, and exist for a single point;
 clock and counter increase. Frames with an angle that is changed by a few steps: the sense in which
 the points turn agrees with the vendor's axes. Packets simulated in a room: the decoded points lie
-on its walls, by a geometry of this module's own (`off`), not the simulator's. Measured values are
-reported (`Subject.picture`), to be compared with the manual.
+on its walls, by a geometry of this module's own (`distance_outside`), not the simulator's. Measured
+values are reported (`SensorUnderTest.picture`), to be compared with the manual.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.expressions.columns import Fields, align, padding_mask
-from lidarspec.expressions.graph import Node, sample_of, trace, traverse
-from lidarspec.frames.frame_table import Rows
-from lidarspec.framing.example_frames import header, random_frame
+from lidarspec.expressions.graph import Node, make_sample, trace, traverse
+from lidarspec.frames.frame_table import CompiledTable
+from lidarspec.framing.example_frames import make_random_header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.packets.packets import Packets
@@ -34,16 +34,16 @@ from lidarspec.points.conventions import axis_matrix
 from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Room, make_room
-from lidarspec.simulation.simulator import simulation
+from lidarspec.simulation.simulator import frame_simulation
 from lidarspec.spec import OnWrap, Polar
 from lidarspec.spec.fields import factor
 from lidarspec.spec.tree import FieldInfo
-from lidarspec.spec.vocabulary import LookUp
+from lidarspec.spec.vocabulary import TableLookup
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.cloud_assertions import assert_well_formed
-from lidarspec.testing.findings import Violation, require
+from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.frames import acceptable
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Number of packets along the sweep for the check of directions.
 PACKETS = 400
@@ -82,7 +82,9 @@ EXACT = 2e-6
 UNTOLD = 0.004
 
 
-def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYTES) -> list[bytes]:
+def make_sweep(
+    subject: SensorUnderTest, name: str, packets: int, total: int = SWEEP_BYTES
+) -> list[bytes]:
     """Return the first packets along the sensor's `sweep`.
 
     Returns an empty list if there is no `sweep` or the frame type is not compiled.
@@ -107,7 +109,9 @@ def make_sweep(subject: Subject, name: str, packets: int, total: int = SWEEP_BYT
     return made[:packets]
 
 
-def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = True) -> Packets:
+def read(
+    subject: SensorUnderTest, name: str, frames: list[bytes], *, by_clock: bool = True
+) -> Packets:
     """Decode frames of one data type, with or without the sensor's clock.
 
     If several frame types have points, the mode of this type is selected.
@@ -121,7 +125,7 @@ def read(subject: Subject, name: str, frames: list[bytes], *, by_clock: bool = T
     return sensor.decode(frames if sensor.datagrams else b"".join(frames), name)
 
 
-def trace_points(subject: Subject, name: str) -> Any:
+def trace_points(subject: SensorUnderTest, name: str) -> Any:
     """Return the result of `points` for traced columns of one example.
 
     Returns None if the frame is not compiled.
@@ -134,16 +138,17 @@ def trace_points(subject: Subject, name: str) -> Any:
     return subject.traced[name]
 
 
-def _trace_points(subject: Subject, name: str) -> Any:
+def _trace_points(subject: SensorUnderTest, name: str) -> Any:
     few = [
         subject.example(name, seed=seed)
         for seed in (range(8) if subject.sensor.parts_with("points", name) else (0,))
     ]
     packets = read(subject, name, few * subject.sensor.frames[name].confirm).with_points
-    if not isinstance(packets.table, Rows) or not packets.table.groups:
+    if not isinstance(packets.table, CompiledTable) or not packets.table.groups:
         return None
     return trace(
-        subject.sensor.points_of(packets.frame), sample_of(packets.batch(), packets.table.groups[0])
+        subject.sensor.points_of(packets.frame),
+        make_sample(packets.batch(), packets.table.groups[0]),
     )[0]
 
 
@@ -153,11 +158,13 @@ def find_fields(*values: Any, looked_up: bool = True) -> list[Node]:
     Args:
         looked_up: include fields that are only used as an index of a table.
     """
-    nodes = traverse(*values, into=lambda node: looked_up or not isinstance(node.function, LookUp))
+    nodes = traverse(
+        *values, into=lambda node: looked_up or not isinstance(node.function, TableLookup)
+    )
     return [node for node in nodes if node.kind in ("field", "state")]
 
 
-def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
+def field_of(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | None:
     """Return the field of a node, in this frame type or in the state."""
     if node.path.startswith("frame.") and node.kind == "state":
         return subject.fields(name).get(node.path.removeprefix("frame."))
@@ -165,12 +172,14 @@ def field_of(subject: Subject, name: str, node: Node) -> FieldInfo | None:
         _, frame, path = node.path.split(".", 2)
         return subject.fields(frame).get(path)
     parts = subject.sensor.parts_with("points", name)
-    return codec(subject.sensor.frames[name]).schema.named.get(
+    return codec(subject.sensor.frames[name]).schema.scan_names.get(
         f"{parts}.{node.path}" if parts else node.path
     )
 
 
-def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np.float64]] | None:
+def directions(
+    subject: SensorUnderTest, name: str, packets: Packets
+) -> list[NDArray[np.float64]] | None:
     """Return azimuths and elevations from `points` before folding, without padding.
 
     For Cartesian points these are the directions that are declared for the simulation; None if
@@ -198,7 +207,7 @@ def directions(subject: Subject, name: str, packets: Packets) -> list[NDArray[np
     return [angles[mask] for angles in whole]
 
 
-def _declared_directions(subject: Subject, name: str) -> list[NDArray[np.float64]] | None:
+def _declared_directions(subject: SensorUnderTest, name: str) -> list[NDArray[np.float64]] | None:
     """Return the simulated directions of the first frames, None if there are none."""
     declared = subject.sensor.simulation_of(name).directions
     if declared is None:
@@ -210,7 +219,7 @@ def _declared_directions(subject: Subject, name: str) -> list[NDArray[np.float64
     ]
 
 
-def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
+def clouds_keep_the_conventions(subject: SensorUnderTest, name: str) -> None:
     """Check that clouds keep the conventions, and that `points` does not fail.
 
     The conventions are float32 metres and radians, azimuth in [-pi, pi), and no coordinates without
@@ -221,17 +230,17 @@ def clouds_keep_the_conventions(subject: Subject, name: str) -> None:
         packets = read(subject, name, frames)
         cloud = packets.points()
     except SpecError as error:
-        raise Violation(error.rule or "LS414", error.reason, f"{name}.points") from error
+        raise ViolationError(error.rule or "LS414", error.reason, f"{name}.points") from error
     require(not packets.stats.plugin_errors, "LS414", str(packets.stats.failure("")), name)
     try:
         assert_well_formed(cloud)
     except AssertionError as error:
-        raise Violation(
+        raise ViolationError(
             "LS501", str(error).splitlines()[0] or "the cloud is not well formed", f"{name}.points"
         ) from error
 
 
-def directions_are_radians(subject: Subject, name: str) -> None:
+def directions_are_radians(subject: SensorUnderTest, name: str) -> None:
     """Check that no direction is so large that it must be in degrees."""
     along = make_sweep(subject, name, 64)
     if not along and any(info.kind == "float" for info in subject.fields(name).values()):
@@ -253,7 +262,7 @@ def directions_are_radians(subject: Subject, name: str) -> None:
     )
 
 
-def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
+def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
     """Check that frames with one point have a valid direction.
 
     Applies if the number of points is in the header.
@@ -263,7 +272,9 @@ def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
     if not isinstance(engine, CompiledCodec) or engine.schema.parts:
         return
     counts = [
-        path for path in header(engine, source)[1] if engine.schema.fields[path].const is None
+        path
+        for path in make_random_header(engine, source)[1]
+        if engine.schema.fields[path].const is None
     ]
     for path in counts:
         try:
@@ -277,7 +288,7 @@ def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
                 subject, name, [single] * max(3, subject.sensor.frames[name].confirm)
             ).points()
         except SpecError as error:
-            raise Violation(
+            raise ViolationError(
                 "LS503", f"with {path} = 1: {error.reason}", f"{name}.{path}"
             ) from error
         if not len(cloud) or not np.isnan(cloud.azimuth).all():
@@ -293,7 +304,7 @@ def a_single_point_has_a_direction(subject: Subject, name: str) -> None:
         )
 
 
-def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
+def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> None:
     """Check that an angle of exactly 360 degrees gives the same points as 0.
 
     Applies if such a frame is plausible.
@@ -306,7 +317,7 @@ def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
             # the full circle comes first, since few frames can carry it
             clouds = _with_values(subject, name, path, (full[1], full[0], full[0] + SMALL))
         except SpecError as error:
-            raise Violation(
+            raise ViolationError(
                 "LS505",
                 f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit}: {error.reason}",
                 f"{name}.{path}",
@@ -326,7 +337,7 @@ def the_full_circle_is_the_same_as_none(subject: Subject, name: str) -> None:
         )
 
 
-def the_points_turn_as_the_axes_do(subject: Subject, name: str) -> None:
+def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
     """Check that points turn with the angle as the vendor's axes declare.
 
     Golden vectors with points in two quadrants prove the sense better. It is reported in any case.
@@ -372,7 +383,7 @@ def _sense_of(axes: tuple[str, str, str], zero: float) -> int:
     return -turning
 
 
-def angles_are_in_order(subject: Subject, name: str) -> None:
+def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
     """Check that along the sweep the azimuths of each ring have one direction.
 
     This includes the crossing of the full circle. Applies to sensors that rotate.
@@ -421,14 +432,14 @@ def angles_are_in_order(subject: Subject, name: str) -> None:
                 f"from {before:.1f} to {after:.1f} degrees in packet {number[index + 1]} of the"
                 " sweep"
             )
-            raise Violation(
+            raise ViolationError(
                 "LS504" if number[index] == number[index + 1] else "LS506",
                 message,
                 f"{name}.points",
             )
 
 
-def counters_run_on(subject: Subject, name: str) -> None:
+def counters_run_on(subject: SensorUnderTest, name: str) -> None:
     """Check that along the sweep no packet is lost, late or doubled, or back in time."""
     if name != subject.sensor.data_frame:
         return
@@ -482,7 +493,7 @@ def _zero(info: FieldInfo) -> int | None:
     return None
 
 
-def _angles_of_points(subject: Subject, name: str) -> dict[str, FieldInfo]:
+def _angles_of_points(subject: SensorUnderTest, name: str) -> dict[str, FieldInfo]:
     """Return the angles of a frame type that may turn its points, by path.
 
     These are the ones that `points` uses, and optional ones, which the traced example may lack;
@@ -519,7 +530,7 @@ def _full_circle(info: FieldInfo) -> tuple[int, int] | None:
 
 
 def _with_values(
-    subject: Subject, name: str, path: str, values: tuple[int, ...]
+    subject: SensorUnderTest, name: str, path: str, values: tuple[int, ...]
 ) -> list[PointCloud]:
     """Return the points of an example with each of these values in a field.
 
@@ -567,7 +578,7 @@ def _turn(info: FieldInfo, nought: PointCloud, turned: PointCloud) -> int:
     return 0
 
 
-def _with(subject: Subject, name: str, path: str, value: int, parsed: Any) -> bytes:
+def _with(subject: SensorUnderTest, name: str, path: str, value: int, parsed: Any) -> bytes:
     """Return the frame with every element of one field set; changes `parsed`.
 
     Returns no bytes if no frame can hold the value.
@@ -582,7 +593,7 @@ def _with(subject: Subject, name: str, path: str, value: int, parsed: Any) -> by
     return b""
 
 
-def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+def distance_outside(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distances in metres, (n,), of points, (n, 3), to surfaces of a room.
 
     Does not use the simulator's geometry.
@@ -598,7 +609,7 @@ def off(room: Room, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     return distances
 
 
-def half_step(subject: Subject, name: str) -> float:
+def half_step(subject: SensorUnderTest, name: str) -> float:
     """Return half a step of the coarsest range field in metres, at least `UNTOLD`."""
     fields = subject.fields(name).values()
     metres = [
@@ -611,13 +622,13 @@ def half_step(subject: Subject, name: str) -> float:
     return UNTOLD
 
 
-def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
+def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
     """Check that packets simulated in a room decode to points on its walls."""
     room = make_room(len(subject.sensor.id))
     room = Room(room.walls, room.boxes)
     is_long = subject.sensor.frames[name].max_length > LONG_FRAME_BYTES
     try:
-        made = simulation(subject.sensor, name)
+        made = frame_simulation(subject.sensor, name)
         length = len(made.block(0, 1, room).frames[0])
         packets = min(
             LONG_SCENE_PACKETS if is_long else SCENE_PACKETS,
@@ -627,7 +638,7 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     except UsageError:
         return
     except LidarSpecError as error:
-        raise Violation("LS508", str(error), f"{name}.sweep") from error
+        raise ViolationError("LS508", str(error), f"{name}.sweep") from error
     cloud = read(subject, name, block.frames).points()
     seconds = float(block.times[-1]) / 1e9
     if seconds:
@@ -642,7 +653,7 @@ def a_simulated_scene_comes_back(subject: Subject, name: str) -> None:
     require(
         share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points"
     )
-    apart = off(room, cloud.xyz[:count][valid].astype(np.float64))
+    apart = distance_outside(room, cloud.xyz[:count][valid].astype(np.float64))
     worst = float(apart.max(initial=0))
     if subject.sensor.simulation_of(name).directions:
         each = np.sqrt(3)

@@ -1,7 +1,7 @@
 """The table of properties that every sensor must have, for `lidarspec check` and for pytest.
 
-A property is a function of a `Subject` that raises an exception if it does not hold. It proves the
-declaration, not the engine, which has tests of its own.
+A property is a function of a `SensorUnderTest` that raises an exception if it does not hold. It
+proves the declaration, not the engine, which has tests of its own.
 
 This module imports neither pytest nor hypothesis, so that it can be imported without the extra
 `testing`; `conformance` makes a test for pytest of it.
@@ -17,11 +17,11 @@ from pathlib import Path
 from lidarspec.errors import SpecError
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import commands, consistency, frames, geometry, streams, vectors
-from lidarspec.testing.findings import Finding, Violation
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.findings import Finding, ViolationError
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 
-def _no_sweep(subject: Subject) -> str:
+def _no_sweep(subject: SensorUnderTest) -> str:
     names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
         return "it declares no `sweep`, and cannot be simulated"
@@ -31,13 +31,13 @@ def _no_sweep(subject: Subject) -> str:
     return ""
 
 
-def _no_commands(subject: Subject) -> str:
+def _no_commands(subject: SensorUnderTest) -> str:
     if subject.sensor.commands:
         return ""
     return "it has no commands"
 
 
-def _no_device(subject: Subject) -> str:
+def _no_device(subject: SensorUnderTest) -> str:
     has_replies = any(command.replies for command in subject.sensor.commands.values())
     if has_replies:
         return _no_sweep(subject)
@@ -64,7 +64,7 @@ class Property:
     function: Callable[..., None]
     each: str
     rule: str
-    lacks: Callable[[Subject], str] = lambda subject: ""
+    lacks: Callable[[SensorUnderTest], str] = lambda subject: ""
     unless: tuple[str, ...] = ()
     depends_on: tuple[str, ...] = ()
 
@@ -73,7 +73,7 @@ class Property:
         """The name of its function."""
         return self.function.__name__
 
-    def cases(self, subject: Subject) -> Iterable[tuple[str, ...]]:
+    def cases(self, subject: SensorUnderTest) -> Iterable[tuple[str, ...]]:
         """Return the arguments of each call, apart from the subject."""
         if self._is_tested_elsewhere(subject):
             return []
@@ -88,7 +88,7 @@ class Property:
         }
         return [(name,) for name in names[self.each]]
 
-    def _is_tested_elsewhere(self, subject: Subject) -> bool:
+    def _is_tested_elsewhere(self, subject: SensorUnderTest) -> bool:
         """Return whether a related model that is tested too gives the same result."""
         if not self.depends_on:
             return False
@@ -99,7 +99,7 @@ class Property:
         )
 
     def findings(
-        self, subject: Subject, watch: Callable[[str], None] = lambda text: None
+        self, subject: SensorUnderTest, watch: Callable[[str], None] = lambda text: None
     ) -> list[Finding]:
         """Return the findings of every case that fails.
 
@@ -111,7 +111,7 @@ class Property:
             watch(" ".join((self.name, *case)))
             try:
                 self.function(subject, *case)
-            except Violation as error:
+            except ViolationError as error:
                 file = str(subject.vectors) if error.code == "LS702" else ""  # a fault of that file
                 found.append(Finding(error.code, error.what, error.path, subject.sensor.id, file))
             except AssertionError as error:
@@ -265,7 +265,7 @@ def _rule_of(error: SpecError) -> str:
     return "LS414"
 
 
-def _unexpected_error(error: Exception, path: str, subject: Subject) -> Finding:
+def _unexpected_error(error: Exception, path: str, subject: SensorUnderTest) -> Finding:
     """Return the finding for an undocumented exception.
 
     Its location is the plugin's own line if the exception was raised there.

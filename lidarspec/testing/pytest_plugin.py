@@ -74,7 +74,7 @@ def bare_registry() -> Iterator[Registry]:
 
     No installed plugin is visible; `add` adds one.
     """
-    from lidarspec.plugins import Registry, standing_in
+    from lidarspec.plugins import Registry, use_registry
 
-    with standing_in(Registry()) as registry:
+    with use_registry(Registry()) as registry:
         yield registry

@@ -1,7 +1,7 @@
 """A sensor under test, with its examples, their edits and truncated copies.
 
-A `Subject` has the sensor, its examples (drawn by the author's own strategies if there are any)
-and measured values. All random values are seeded, so that a failure can be repeated.
+A `SensorUnderTest` has the sensor, its examples (drawn by the author's own strategies if there are
+any) and measured values. All random values are seeded, so that a failure can be repeated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SHORT = 300
 SPOTS = 50
 
 
-def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
+def make_input(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
     """Return frames as the data link delivers them: datagrams, or one run of bytes."""
     parts = [data for _, data in frames]
     if sensor.datagrams:
@@ -32,7 +32,7 @@ def delivery(sensor: Sensor, frames: list[tuple[str, bytes]]) -> Any:
     return b"".join(parts)
 
 
-def places(length: int, source: random.Random, spots: int = SPOTS) -> list[int]:
+def pick_offsets(length: int, source: random.Random, spots: int = SPOTS) -> list[int]:
     """Return offsets at which to cut: all of few, else both ends and random ones."""
     if length <= SHORT * spots // SPOTS:
         return list(range(length))
@@ -45,7 +45,7 @@ CHUNKS = (0, 1, 1, 2, 3, 7, 20, 100, 1000)
 MEAN_CHUNK = sum(CHUNKS) / len(CHUNKS)
 
 
-def pieces(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes]:
+def cut_randomly(data: bytes, source: random.Random, scale: int = 1) -> Iterator[bytes]:
     """Yield the bytes in chunks of random sizes, including empty ones.
 
     Args:
@@ -177,7 +177,7 @@ POOL = 60
 
 
 @dataclass(eq=False)
-class Subject:
+class SensorUnderTest:
     """A sensor under test.
 
     Attributes:

@@ -12,12 +12,12 @@ from lidarspec.framing.results import Found, pack_found
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.stream import scans_of
+from lidarspec.scans.stream import iter_scans
 from lidarspec.sensor_operations import Sensor
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.cloud_assertions import assert_same_places, assert_well_formed
-from lidarspec.testing.findings import Violation, require
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.findings import ViolationError, require
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Rounds of a conversation if a shorter one has no scan, since few random frames of a sensor have
 #: points.
@@ -26,10 +26,10 @@ MORE_ROUNDS = 12
 BATCH_SIZES = (1, 3)
 
 
-def a_clean_input_loses_nothing(subject: Subject) -> None:
+def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
     """Check that frames back to back are found unchanged, with every byte."""
     sent = subject.conversation()
-    data = material.delivery(subject.sensor, sent)
+    data = material.make_input(subject.sensor, sent)
     found = [(item.frame, item.data) for item in subject.sensor.split(data)]
     if found != sent:
         raise _loss(sent, found)
@@ -42,7 +42,7 @@ def a_clean_input_loses_nothing(subject: Subject) -> None:
     )
 
 
-def _loss(sent: list[tuple[str, bytes]], found: list[tuple[str, bytes]]) -> Violation:
+def _loss(sent: list[tuple[str, bytes]], found: list[tuple[str, bytes]]) -> ViolationError:
     """Return the violation for the first frame that is not found as it was sent."""
     equal = 0
     for one, other in zip(sent, found, strict=False):
@@ -52,16 +52,16 @@ def _loss(sent: list[tuple[str, bytes]], found: list[tuple[str, bytes]]) -> Viol
     name = sent[min(equal, len(sent) - 1)][0]
     text = f"of {len(sent)} frames, number {equal} is not found"
     if equal < len(found) and found[equal][0] != name:
-        return Violation("LS306", f"{text}; a {found[equal][0]!r} frame is found there", name)
-    return Violation("LS401", text, name)
+        return ViolationError("LS306", f"{text}; a {found[equal][0]!r} frame is found there", name)
+    return ViolationError("LS401", text, name)
 
 
-def the_same_bytes_give_the_same_points(subject: Subject) -> None:
+def the_same_bytes_give_the_same_points(subject: SensorUnderTest) -> None:
     """Check that decoding the same bytes twice gives the same points.
 
     `points` is called for each run: the plan of a traced function would not call it again.
     """
-    data = material.delivery(subject.sensor, subject.conversation(rounds=1))
+    data = material.make_input(subject.sensor, subject.conversation(rounds=1))
     one = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
     other = evaluate_plainly(subject.sensor.decode(data).with_points).cloud
     require(len(one) == len(other), "LS415", "two runs give different numbers of points")
@@ -74,10 +74,10 @@ def the_same_bytes_give_the_same_points(subject: Subject) -> None:
         )
 
 
-def scans_do_not_depend_on_batches(subject: Subject) -> None:
+def scans_do_not_depend_on_batches(subject: SensorUnderTest) -> None:
     """Check that scans do not depend on the number of packets that arrive at a time."""
     for rounds in (None, MORE_ROUNDS):
-        data = material.delivery(subject.sensor, subject.conversation(rounds=rounds))
+        data = material.make_input(subject.sensor, subject.conversation(rounds=rounds))
         frames = subject.sensor.split(data)
         whole = _scans_in_batches(subject.sensor, frames, len(frames))
         if whole:
@@ -101,7 +101,7 @@ def _scans_in_batches(sensor: Sensor, found: list[Found], size: int) -> list[Sca
     stream = PacketStream(sensor, sensor.data_frame, stats)
     starts = range(0, len(found), size)
     batches = [stream.add([pack_found(found[start : start + size])]) for start in starts]
-    scans = list(scans_of(sensor, batches))
+    scans = list(iter_scans(sensor, batches))
     require(not stats.plugin_errors, "LS414", str(stats.failure("")))
     return scans
 

@@ -27,18 +27,18 @@ from typing import Any, cast
 import numpy as np
 
 from lidarspec.drafting.checksum_search import search
-from lidarspec.drafting.samples import Match, Place
+from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 from lidarspec.testing.commands import an_exchange_holds
-from lidarspec.testing.findings import Violation, require
+from lidarspec.testing.findings import ViolationError, require
 from lidarspec.testing.frames import leaves
 from lidarspec.testing.geometry import read
-from lidarspec.testing.sensor_under_test import SHORT, Subject, seals
+from lidarspec.testing.sensor_under_test import SHORT, SensorUnderTest, seals
 from lidarspec.transports.hex_text import parse_hex
-from lidarspec.trusted_files import document
+from lidarspec.trusted_files import read_document
 
 #: Tolerance of points in metres and radians, as manuals print them.
 NEAR = 2e-4
@@ -98,7 +98,7 @@ KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
 }
 
 
-def vectors_hold(subject: Subject, only: str = "") -> None:
+def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
     """Check that each golden vector has its values, its points, and is built again.
 
     Args:
@@ -107,7 +107,7 @@ def vectors_hold(subject: Subject, only: str = "") -> None:
     read_entries = _read_entries(subject)
     chosen = {only: read_entries[only]} if only else read_entries
     for place, vector in chosen.items():
-        if isinstance(vector, Violation):
+        if isinstance(vector, ViolationError):
             raise vector
         require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
         data = parse_hex(vector["hex"])
@@ -137,7 +137,7 @@ def vectors_hold(subject: Subject, only: str = "") -> None:
             _points(subject, name, data, vector["points"], place)
 
 
-def lacking(subject: Subject) -> str:
+def lacking(subject: SensorUnderTest) -> str:
     """Return the reason why there are no vectors of this sensor.
 
     Returns "" if there are any, or if `vectors_hold` reports their faults.
@@ -148,22 +148,22 @@ def lacking(subject: Subject) -> str:
         if _read_entries(subject):
             return ""
         return f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
-    except Violation:
+    except ViolationError:
         return ""
 
 
-def places(subject: Subject) -> list[str]:
+def places(subject: SensorUnderTest) -> list[str]:
     """Return the keys of the sensor's vectors in their file.
 
     Returns a single "" if the file cannot be read.
     """
     try:
         return list(_read_entries(subject))
-    except Violation:
+    except ViolationError:
         return [""]
 
 
-def the_status_is_proven(subject: Subject) -> None:
+def the_status_is_proven(subject: SensorUnderTest) -> None:
     """Check that a sensor with the status "vectors" has some.
 
     A capture may be too large, or not ours to publish: the `source` of the sensor names it.
@@ -173,7 +173,7 @@ def the_status_is_proven(subject: Subject) -> None:
     require(status != "vectors" or not missing, "LS710", f"status is {status!r}, and {missing}")
 
 
-def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
+def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None:
     """Check that each field of a data frame with vectors has a nonzero value in one."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     if not vectors:
@@ -199,7 +199,7 @@ def every_data_field_is_pinned_down(subject: Subject, name: str) -> None:
     require(not message, "LS711", message, name)
 
 
-def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
+def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     """Check that the vectors place points in two quadrants and within the range."""
     vectors = [vector for vector in entries(subject).values() if vector["frame"] == name]
     placed = [
@@ -238,7 +238,7 @@ def points_stand_in_two_quadrants(subject: Subject, name: str) -> None:
         subject.placed.add(name)
 
 
-def every_checksum_is_checked(subject: Subject, name: str) -> None:
+def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     """Check that no field outside a `Checksummed` is a checksum.
 
     A checksum is recognised by its name, or by a search over the vectors. A field may have a remark
@@ -258,7 +258,7 @@ def every_checksum_is_checked(subject: Subject, name: str) -> None:
             for vector in entries(subject).values()
             if vector["frame"] == name
         ]
-    except Violation:  # reported by `vectors_hold`
+    except ViolationError:  # reported by `vectors_hold`
         frames = []
     is_told = isinstance(
         codec(subject.sensor.frames[name]), CompiledCodec
@@ -267,7 +267,7 @@ def every_checksum_is_checked(subject: Subject, name: str) -> None:
         path = _standing(subject, name, match, frames[0])
         if path in (named or free) and (named or match.doubt >= PROVEN):
             fits = f"{_in_words(match, len(frames[0]))} fits every vector"
-            raise Violation(
+            raise ViolationError(
                 "LS212", f"{fits}, and no Checksummed holds a frame to it", f"{name}.{path}"
             )
     unsaid = [path for path in named if not fields[path].docs.startswith(NOT_CHECKED)]
@@ -279,7 +279,7 @@ def every_checksum_is_checked(subject: Subject, name: str) -> None:
     )
 
 
-def _sealing_fields(subject: Subject, name: str) -> set[str]:
+def _sealing_fields(subject: SensorUnderTest, name: str) -> set[str]:
     """Return the fields that hold a checksum in any of several examples.
 
     A header may remove a part together with its checksum.
@@ -295,8 +295,8 @@ def _sealing_fields(subject: Subject, name: str) -> set[str]:
 
 
 def _fitting(
-    subject: Subject, name: str, path: str, frames: list[bytes], frame: bytes
-) -> list[Match]:
+    subject: SensorUnderTest, name: str, path: str, frames: list[bytes], frame: bytes
+) -> list[ChecksumMatch]:
     """Return the checksums that match frames and lie in the field at `path`.
 
     If some are of the library, those that need a class of their own are left out: they match only
@@ -312,7 +312,7 @@ def _fitting(
     else:
         leaf = None
 
-    def stands(place: Place) -> bool:
+    def stands(place: ChecksumPlace) -> bool:
         return leaf is None or (place.start(len(frame)), 8 * place.size) == (
             leaf.offset,
             leaf.info.bits,
@@ -322,11 +322,11 @@ def _fitting(
     return [match for match in matches if not _needs_class(match)] or matches
 
 
-def _needs_class(match: Match) -> bool:
+def _needs_class(match: ChecksumMatch) -> bool:
     return match.paste.startswith("class ")
 
 
-def _in_words(match: Match, length: int) -> str:
+def _in_words(match: ChecksumMatch, length: int) -> str:
     """Describe a checksum, its coverage, and the byte order of its field."""
     if match.place.size > 1:
         order = f", in a field that is {match.order}-endian,"
@@ -339,7 +339,7 @@ def _in_words(match: Match, length: int) -> str:
     return f"{algorithm} over {match.span.describe(match.place, length)}{order}"
 
 
-def _common(frames: list[bytes]) -> list[Match]:
+def _common(frames: list[bytes]) -> list[ChecksumMatch]:
     """Return the checksums that match all frames.
 
     Long frames are searched one by one, at the usual offsets only.
@@ -357,7 +357,7 @@ def _common(frames: list[bytes]) -> list[Match]:
     ]
 
 
-def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
+def _standing(subject: SensorUnderTest, name: str, match: ChecksumMatch, frame: bytes) -> str:
     """Return the field that holds a checksum; "" if it cannot be determined."""
     engine = codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
@@ -376,7 +376,7 @@ def _standing(subject: Subject, name: str, match: Match, frame: bytes) -> str:
     )
 
 
-def entries(subject: Subject) -> dict[str, Any]:
+def entries(subject: SensorUnderTest) -> dict[str, Any]:
     """Return the valid vectors of the sensor by their keys.
 
     Raises:
@@ -385,35 +385,35 @@ def entries(subject: Subject) -> dict[str, Any]:
     return {
         place: vector
         for place, vector in _read_entries(subject).items()
-        if not isinstance(vector, Violation)
+        if not isinstance(vector, ViolationError)
     }
 
 
-def _read_entries(subject: Subject) -> dict[str, Any]:
+def _read_entries(subject: SensorUnderTest) -> dict[str, Any]:
     """Return the vectors of the sensor by their keys.
 
-    An invalid entry is represented by its `Violation`.
+    An invalid entry is represented by its `ViolationError`.
     """
     if subject.vectors is None:
         return {}
     try:
-        found = document(Path(subject.vectors), "JSON")
+        found = read_document(Path(subject.vectors), "JSON")
     except LidarSpecError as error:
-        raise Violation("LS702", str(error), str(subject.vectors)) from None
+        raise ViolationError("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(found, list):
-        raise Violation("LS702", "the file is no list of vectors", str(subject.vectors))
+        raise ViolationError("LS702", "the file is no list of vectors", str(subject.vectors))
     own_entries: dict[str, Any] = {}
     for index, vector in enumerate(found):
         place = f"vectors[{index}]"
         try:
             if _check_entry(subject, vector, place):
                 own_entries[place] = vector
-        except Violation as error:
+        except ViolationError as error:
             own_entries[place] = error
     return own_entries
 
 
-def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
+def _check_entry(subject: SensorUnderTest, vector: Any, place: str) -> bool:
     """Return whether an entry belongs to the sensor; set the frame of a command.
 
     Raises:
@@ -442,11 +442,11 @@ def _check_entry(subject: Subject, vector: Any, place: str) -> bool:
         parse_hex(vector.get("hex", "-"))
         parse_hex(vector.get("reply", ""))
     except ValueError:
-        raise Violation("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
+        raise ViolationError("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
     return True
 
 
-def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
+def _is_of(subject: SensorUnderTest, vector: Mapping[str, Any], place: str) -> bool:
     """Return whether an entry belongs to the sensor.
 
     Raises:
@@ -470,26 +470,33 @@ def _is_of(subject: Subject, vector: Mapping[str, Any], place: str) -> bool:
     return not ids or subject.sensor.id in ids
 
 
-def _parse_vector(subject: Subject, name: str, data: bytes, place: str) -> Any:
+def _parse_vector(subject: SensorUnderTest, name: str, data: bytes, place: str) -> Any:
     """Return the parsed vector; a wrong checksum is reported with those that match."""
     try:
         return subject.sensor.parse(data, frame=name)
     except WireError as error:
         if ": checksum " not in error.reason:
-            raise Violation("LS707", error.reason, f"{place} {name}.{error.path}") from error
+            raise ViolationError("LS707", error.reason, f"{place} {name}.{error.path}") from error
         same = [parse_hex(one["hex"]) for one in entries(subject).values() if one["frame"] == name]
         fitting = [
             _in_words(match, len(data))
             for match in _fitting(subject, name, error.path, same, data)[:2]
         ]
         fits = f"; {' or '.join(fitting)} fits" if fitting else ""
-        raise Violation("LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}") from error
+        raise ViolationError(
+            "LS703", f"{error.reason}{fits}", f"{place} {name}.{error.path}"
+        ) from error
     except LidarSpecError as error:
-        raise Violation("LS707", str(error), f"{place} {name}") from error
+        raise ViolationError("LS707", str(error), f"{place} {name}") from error
 
 
 def _values(
-    subject: Subject, name: str, data: bytes, parsed: Any, vector: Mapping[str, Any], place: str
+    subject: SensorUnderTest,
+    name: str,
+    data: bytes,
+    parsed: Any,
+    vector: Mapping[str, Any],
+    place: str,
 ) -> None:
     """Compare the fields of a vector with its raw and physical values."""
     fields = subject.fields(name)
@@ -523,7 +530,7 @@ def _values(
             expected = info.raw(value)
         else:
             expected = value
-        raise Violation(
+        raise ViolationError(
             _reading(info, raw, expected),
             f"{plain} is read, and {value} is printed",
             f"{place} {name}.{path}",
@@ -545,7 +552,11 @@ def _reading(info: FieldInfo | None, raw: Any, wanted: Any) -> str:
 
 
 def _points(
-    subject: Subject, name: str, data: bytes, wanted: Mapping[str, Mapping[str, float]], place: str
+    subject: SensorUnderTest,
+    name: str,
+    data: bytes,
+    wanted: Mapping[str, Mapping[str, float]],
+    place: str,
 ) -> None:
     """Compare single points of a vector's frame with their expected columns."""
     cloud = read(subject, name, [data] * subject.sensor.frames[name].confirm).points()

@@ -10,7 +10,7 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.transports.addresses import SourceAddress
-from lidarspec.transports.outlets import LOCALHOST, Line, Outlet, PtyLine, TcpLine, UdpLine
+from lidarspec.transports.outlets import LOCALHOST, Outlet, OutletLine, PtyLine, TcpLine, UdpLine
 
 
 def simulated_outlet(sensor: Sensor, place: str, link: str | Path | None = None) -> Outlet:
@@ -73,7 +73,7 @@ def _make_udp_replay_line(place: str, *, datagrams: bool, port: int) -> UdpLine:
     return UdpLine.to(host, ports, default_port=port)
 
 
-def _make_data_line(sensor: Sensor, place: str, link: str | Path | None) -> Line:
+def _make_data_line(sensor: Sensor, place: str, link: str | Path | None) -> OutletLine:
     if place == "pty":
         if sensor.datagrams:
             raise UsageError(
@@ -116,7 +116,7 @@ def _make_udp_data_line(sensor: Sensor, place: str) -> UdpLine:
     return UdpLine.to(host, ports)
 
 
-def _make_control_lines(sensor: Sensor) -> dict[str, Line]:
+def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:
     """Return a line on this computer for each link that takes commands, except the data link."""
     lines = {}
     for name in {command.link for command in sensor.commands.values()} - {"data"}:
@@ -126,7 +126,7 @@ def _make_control_lines(sensor: Sensor) -> dict[str, Line]:
     return lines
 
 
-def _make_control_line(link: Link) -> Line | None:
+def _make_control_line(link: Link) -> OutletLine | None:
     """Return a line at the declared port, or at a free one if that is taken.
 
     None for a link of a kind that only a plugin knows.

@@ -19,17 +19,24 @@ from shlex import quote
 from typing import BinaryIO
 
 from lidarspec.captures.bulk import CaptureBatches, CapturedDatagrams, StreamBatches
-from lidarspec.captures.containers import HEAD, damage, head, open_capture, refuse_container, unpack
+from lidarspec.captures.containers import (
+    HEAD,
+    find_damage,
+    open_capture,
+    peek_head,
+    refuse_container,
+    unpack,
+)
 from lidarspec.captures.pcap import CaptureStats, is_stream_capture
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
-from lidarspec.remote_files import file_of, is_stored
+from lidarspec.remote_files import is_stored, open_stored
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import parse_origin
 from lidarspec.transports.hex_text import hex_chunks, is_hexadecimal
 from lidarspec.transports.protocol import Chunk, Transport
-from lidarspec.transports.robotics_logs import BagTransport, log_of
+from lidarspec.transports.robotics_logs import BagTransport, find_log_kind
 
 #: Events that interrupt the stream: an incomplete frame does not continue after them.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
@@ -187,7 +194,7 @@ def _check_end(transport: FileTransport | RecordingTransport, file: BinaryIO) ->
 
     If not, add a warning and the number of unread bytes to the transport.
     """
-    fault = damage(file)
+    fault = find_damage(file)
     if fault is not None:
         transport.warnings.append(fault.text)
         transport.unread += fault.unread
@@ -366,17 +373,17 @@ def open_file(
         SourceError: if the file cannot be opened, or its format is not supported.
         UsageError: if a required library is missing, or an archive contains several captures.
     """
-    if (log := log_of(path)) is not None:
+    if (log := find_log_kind(path)) is not None:
         return BagTransport(path, log, sender=sender)
     name = "standard input" if path == "-" else path
     with system_errors(path), contextlib.ExitStack() as undo:
         if path == "-":
             plain = sys.stdin.buffer
         else:
-            plain = undo.enter_context(contextlib.closing(file_of(path)))
+            plain = undo.enter_context(contextlib.closing(open_stored(path)))
         file = unpack(name, plain, member)
-        start = head(file)
-        log = log_of(path, start)
+        start = peek_head(file)
+        log = find_log_kind(path, start)
         if log is not None and (file is not plain or path == "-"):
             raise SourceError(
                 f"{name} is {log.what}{' in a compressed file' * (file is not plain)}, and is not"

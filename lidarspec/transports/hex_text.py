@@ -336,7 +336,7 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
             if len(block) < BLOCK or block.endswith(b"\n"):
                 end = len(text)
             else:
-                end = between(text)
+                end = find_cut(text)
             yield reader.line((goes_on + text[:end]).removesuffix("\n"))
             if block.endswith(b"\n"):
                 goes_on = ""
@@ -352,7 +352,7 @@ def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
         raise WireError(f"{name}, line {number}: not hexadecimal: {error}") from None
 
 
-def between(text: str) -> int:
+def find_cut(text: str) -> int:
     """Return an index at which hexadecimal text can be cut.
 
     It is next to the last separator, else between two bytes.
@@ -390,7 +390,7 @@ def is_hexadecimal(head: bytes, *, whole: bool) -> bool:
         return any(
             chunk.data
             for chunk in reader(
-                (text if whole else text[: text.rfind("\n") + 1 or between(text)]).splitlines()
+                (text if whole else text[: text.rfind("\n") + 1 or find_cut(text)]).splitlines()
             )
         )
     except ValueError:

@@ -17,7 +17,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from lidarspec.spec.fields import HttpReply, HttpRequest
-from lidarspec.transports.outlets import Line
+from lidarspec.transports.outlets import OutletLine
 from lidarspec.transports.protocol import Chunk
 
 _MAX_BODY_BYTES = 1 << 20
@@ -29,7 +29,7 @@ _SHUTDOWN_POLL_S = 0.05
 _ReplyQueue = queue.SimpleQueue[bytes]
 
 
-class HttpLine(Line):
+class HttpLine(OutletLine):
     """The web server of a simulated sensor.
 
     Args:

@@ -1,8 +1,8 @@
 """Send bytes as a sensor does, over pseudo-terminals, UDP, TCP and HTTP.
 
-Simulated sensors and replays use the same mechanism. A `Line` is the sensor's end of one link: it
-sends without waiting and returns the commands that have arrived. An `Outlet` holds the line of the
-data and the lines of the sensor's other links, and waits for all of them in one loop.
+Simulated sensors and replays use the same mechanism. An `OutletLine` is the sensor's end of one
+link: it sends without waiting and returns the commands that have arrived. An `Outlet` holds the
+line of the data and the lines of the sensor's other links, and waits for all of them in one loop.
 
 Like a real sensor, an outlet sends without a listener too, and counts the bytes that were not read.
 With `patient=True` it waits for a slow reader instead. A replay requires that, because it has to
@@ -57,7 +57,7 @@ _EMPTY_CHECKS = 3
 _DISCARD_PORT = 9
 
 
-class Line:
+class OutletLine:
     """The sensor's end of one link.
 
     Attributes:
@@ -165,7 +165,7 @@ class _SendBuffer:
                 del self._waiting[: self._write(self._waiting)]
 
 
-class UdpLine(Line):
+class UdpLine(OutletLine):
     """UDP datagrams to one host, or to the sender of the last command.
 
     `UdpLine.to` and `UdpLine.replying` make one.
@@ -327,7 +327,7 @@ class UdpLine(Line):
         return False
 
 
-class TcpLine(Line):
+class TcpLine(OutletLine):
     """TCP connections to one address; each receives the bytes that are sent from then on.
 
     Args:
@@ -447,7 +447,7 @@ class TcpLine(Line):
         client.close()
 
 
-class PtyLine(Line):
+class PtyLine(OutletLine):
     """A pseudo-terminal that programs open by its path, POSIX only.
 
     Bytes that are sent while no program has it open are lost, as on a serial cable.
@@ -627,7 +627,7 @@ class Outlet:
             replies.
     """
 
-    def __init__(self, data: Line, controls: Mapping[str, Line] | None = None) -> None:
+    def __init__(self, data: OutletLine, controls: Mapping[str, OutletLine] | None = None) -> None:
         self.data = data
         self.controls = dict(controls or {})
         self._lines = {"data": data, **self.controls}
@@ -667,7 +667,7 @@ class Outlet:
         return [(name, data) for name, line in self._lines.items() for data in line.receive()]
 
     def send(self, link: str, chunks: Sequence[Chunk], *, patient: bool = False) -> None:
-        """Send chunks over a link; see `Line.send`."""
+        """Send chunks over a link; see `OutletLine.send`."""
         self._lines[link].send(chunks, patient=patient)
 
     def deliver(self, chunk: Chunk) -> None:
@@ -677,7 +677,7 @@ class Outlet:
 
         Raises:
             Disconnected: if there is no listener any more.
-            SourceError, UsageError: as `Line.send`.
+            SourceError, UsageError: as `OutletLine.send`.
         """
         self.data.receive()
         if self.data.has_listener:
@@ -709,7 +709,7 @@ class Outlet:
             line.close()
 
 
-def wait_for(lines: Collection[Line], timeout: float) -> None:
+def wait_for(lines: Collection[OutletLine], timeout: float) -> None:
     """Wait until one of the lines has something to receive or can write bytes that wait.
 
     Args:

@@ -36,11 +36,11 @@ class SerialPort:
     description: str
     lasting: str
     allowed: bool
-    users: tuple[User, ...]
+    users: tuple[PortUser, ...]
 
 
 @dataclass(frozen=True)
-class User:
+class PortUser:
     """A program that has a port open."""
 
     pid: int
@@ -50,7 +50,7 @@ class User:
         return f"{self.name} (process {self.pid})"
 
 
-def serial_ports() -> list[SerialPort]:
+def list_serial_ports() -> list[SerialPort]:
     """Return the serial ports of this computer, sorted by name."""
     ports = []
     for port in sorted(list_ports.comports(), key=lambda port: str(port.device)):
@@ -65,13 +65,17 @@ def serial_ports() -> list[SerialPort]:
         path = port.device
         ports.append(
             SerialPort(
-                path, f"{description}{maker}".strip(), lasting(path), is_allowed(path), users(path)
+                path,
+                f"{description}{maker}".strip(),
+                find_lasting_path(path),
+                is_allowed(path),
+                find_users(path),
             )
         )
     return ports
 
 
-def lasting(port: str) -> str:
+def find_lasting_path(port: str) -> str:
     """Return the name under /dev/serial/by-id of a port, "" if there is none."""
     links = sorted(Path("/dev/serial/by-id").glob("*"))
     return next(
@@ -85,7 +89,7 @@ def is_allowed(port: str) -> bool:
     return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK, effective_ids=effective)
 
 
-def group(port: str) -> str:
+def find_group(port: str) -> str:
     """Return the group that may open a port; "" if only root may, or it is unknown."""
     with contextlib.suppress(OSError, KeyError):
         status = os.stat(port)
@@ -94,7 +98,7 @@ def group(port: str) -> str:
     return ""
 
 
-def users(port: str) -> tuple[User, ...]:
+def find_users(port: str) -> tuple[PortUser, ...]:
     """Return the other programs that have a port open.
 
     Without root's rights, only this user's programs are visible.
@@ -102,12 +106,12 @@ def users(port: str) -> tuple[User, ...]:
     path = os.path.realpath(port)
     if os.path.exists(path):
         return tuple(
-            sorted(set(_holding(lambda target: target == path)), key=lambda user: user.pid)
+            sorted(set(_find_holders(lambda target: target == path)), key=lambda user: user.pid)
         )
     return ()
 
 
-def udp_users(port: int) -> tuple[User, ...] | None:
+def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
     """Return the other programs that have a UDP port open, None if it is free.
 
     Returns:
@@ -121,23 +125,23 @@ def udp_users(port: int) -> tuple[User, ...] | None:
                 if int(columns[1].rpartition(":")[2], 16) == port:
                     inodes.add(f"socket:[{columns[9]}]")
     if inodes:
-        return tuple(sorted(set(_holding(inodes.__contains__)), key=lambda user: user.pid))
+        return tuple(sorted(set(_find_holders(inodes.__contains__)), key=lambda user: user.pid))
     return None
 
 
-def _holding(wanted: Callable[[str], bool]) -> Iterator[User]:
+def _find_holders(wanted: Callable[[str], bool]) -> Iterator[PortUser]:
     """Yield the programs with an open file that `wanted` accepts."""
     for process in _PROCESSES.glob("[0-9]*") if _PROCESSES.is_dir() else ():
         if int(process.name) == os.getpid():
             continue
         with contextlib.suppress(OSError):
-            if any(wanted(target) for target in _targets(process / "fd")):
-                yield User(
+            if any(wanted(target) for target in _read_links(process / "fd")):
+                yield PortUser(
                     int(process.name), (process / "comm").read_text(encoding="utf-8").strip()
                 )
 
 
-def _targets(folder: Path) -> Iterator[str]:
+def _read_links(folder: Path) -> Iterator[str]:
     """Yield the targets of a process's open files."""
     for name in os.listdir(folder):
         with contextlib.suppress(OSError):

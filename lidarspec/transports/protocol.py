@@ -133,7 +133,7 @@ class Chunk:
     quiet: bool = False
 
 
-class Closing:
+class ClosingContext:
     """A context manager with a `close` method."""
 
     def close(self) -> None:
@@ -241,13 +241,13 @@ class LiveTransport(Transport):
             waits for its reader.
         silence: seconds without a byte after which an incomplete frame is discarded.
         addressed: whether `write` has a destination.
-        stranger: the sender of the last `foreign` datagram.
+        other_sender: the sender of the last `foreign` datagram.
     """
 
     label: str = ""
     closed: bool = False
     silence: float = 0.1
-    stranger: Sender | None = None
+    other_sender: Sender | None = None
     overflow: str = "drop_oldest"
 
     @property

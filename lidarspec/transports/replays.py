@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 
 from lidarspec.errors import UsageError, WireError
-from lidarspec.recording.background_writer import Appender
+from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.scans.selection import Times, iter_received
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import Outlet
@@ -106,7 +106,7 @@ class Replay:
     def __init__(
         self,
         file: str,
-        destination: Outlet | Appender,
+        destination: Outlet | BackgroundWriter,
         *,
         speed: float | None = 1.0,
         needs_times: bool = False,
@@ -179,7 +179,7 @@ class Replay:
         if isinstance(self._destination, Outlet):
             self._destination.deliver(chunk)
         else:
-            self._destination.keep_up()
+            self._destination.wait_for_room()
             self._destination.write(chunk)
 
     def _check_times(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:

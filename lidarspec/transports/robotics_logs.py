@@ -79,7 +79,7 @@ LOGS = {
 FOLDER = LogKind("a ROS 2 bag", "rosbags.rosbag2", "Reader")
 
 
-def log_of(path: str, head: bytes = b"") -> LogKind | None:
+def find_log_kind(path: str, head: bytes = b"") -> LogKind | None:
     """Return the kind of a log by its first bytes or its folder, None for other files."""
     if os.path.isdir(path):
         if os.path.isfile(os.path.join(path, "metadata.yaml")):

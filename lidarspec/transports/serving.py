@@ -18,7 +18,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
 from lidarspec.transports.outlets import LOCALHOST, Outlet
-from lidarspec.transports.protocol import POLL, Chunk, Closing, Sender
+from lidarspec.transports.protocol import POLL, Chunk, ClosingContext, Sender
 
 #: The shortest time between two passes, so that a fast sensor gathers some frames.
 _MIN_PAUSE_S = 0.001
@@ -154,7 +154,7 @@ def due_chunks(
     """
     sensor = device.sensor
     chunks: dict[str, list[Chunk]] = {}
-    for link, frame, data in device.sendings(now):
+    for link, frame, data in device.outgoing_with_types(now):
         endpoint = None
         if sensor.datagrams and link == "data":
             endpoint = _find_endpoint(sensor, frame)
@@ -175,7 +175,7 @@ def _find_endpoint(sensor: Sensor, frame: str) -> Sender:
     return LOCALHOST, ports[0] if is_data else ports[-1]
 
 
-class Served(Closing):
+class Served(ClosingContext):
     """A simulated sensor at an outlet, in a thread of its own; a context manager.
 
     Args:

@@ -58,7 +58,7 @@ def write_file(
     ) as log:
         for chunk, direction in itertools.chain(until_first_data, transfers):
             log.write(chunk, direction)
-            log.keep_up()
+            log.wait_for_room()
             if direction == "in":
                 sent_bytes += len(chunk.data)
     return sent_bytes
@@ -112,8 +112,8 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
             f"nothing was written: the simulated {sensor.id} sends nothing in the first {seconds:g}"
             f" s; {due}"
         )
-    recognized = ", ".join(device.heard) or "no command"
-    missed = [name for name in _commands_on_open(sensor) if name not in device.heard]
+    recognized = ", ".join(device.commands_received) or "no command"
+    missed = [name for name in _commands_on_open(sensor) if name not in device.commands_received]
     cause = f"nothing starts its data after {recognized}"
     if missed:
         cause = f"{missed[0]!r} was sent to it, and it recognized {recognized}"

@@ -9,8 +9,8 @@ before it. A short pause after each read, in which datagrams accumulate, therefo
 accuracy. The receive buffer bridges the time in which the program does not read. The kernel may
 grant a smaller buffer than requested, so its size is read back.
 
-`Slots` fetches many datagrams in one system call, recvmmsg, through ctypes, since Python has no
-function for it. Each socket call in Python releases the interpreter lock. Taking it back needs
+`ReceiveSlots` fetches many datagrams in one system call, recvmmsg, through ctypes, since Python has
+no function for it. Each socket call in Python releases the interpreter lock. Taking it back needs
 milliseconds if another thread computes, and one call per datagram is then too slow for a fast
 sensor.
 """
@@ -105,7 +105,7 @@ _CONTROL_SIZE_INDEX = _MessageHeader.control_size.offset // ctypes.sizeof(ctypes
 _CONTROL_SIZE_STEP = ctypes.sizeof(_ReceivedDatagram) // ctypes.sizeof(ctypes.c_size_t)
 
 
-class Slots:
+class ReceiveSlots:
     """Buffers for many datagrams, which each call of `fill` reuses.
 
     Raises:
@@ -278,9 +278,9 @@ class UdpTransport(LiveTransport):
         self._selector = selectors.DefaultSelector()
         self._sockets: list[_Socket] = []
         self._next_read = 0.0
-        slots: Slots | None = None
+        slots: ReceiveSlots | None = None
         with contextlib.suppress(OSError):
-            slots = Slots() if sys.platform == "linux" else None
+            slots = ReceiveSlots() if sys.platform == "linux" else None
         try:
             for port in ports:
                 self._sockets.append(_Socket(self._open_socket(host, port, group), slots))
@@ -294,7 +294,7 @@ class UdpTransport(LiveTransport):
             raise
         self.ports = tuple(one.address[1] for one in self._sockets)
         smallest = min((one.buffer for one in self._sockets), default=BUFFER)
-        self.warnings = shortfall(BUFFER, smallest)
+        self.warnings = warn_of_small_buffer(BUFFER, smallest)
 
     def read(self, timeout: float) -> list[Chunk]:
         sleep_until(self._next_read)
@@ -356,7 +356,7 @@ class UdpTransport(LiveTransport):
             for data, sender, at in one.datagrams(*self.clock.now_and_wall()):
                 if own is not None and sender not in own:
                     self.foreign = self.foreign + 1
-                    self.stranger = sender
+                    self.other_sender = sender
                     continue
                 found.append(Chunk(data, at, sender, one.address))
         except ConnectionRefusedError:
@@ -421,7 +421,7 @@ class _Socket:
         drops: number of datagrams that the kernel dropped because the buffer was full.
     """
 
-    def __init__(self, found: socket.socket, slots: Slots | None) -> None:
+    def __init__(self, found: socket.socket, slots: ReceiveSlots | None) -> None:
         self.socket = found
         self._slots = slots
         self.drops = 0
@@ -552,7 +552,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
     )
 
 
-def shortfall(asked: int, granted: int) -> list[str]:
+def warn_of_small_buffer(asked: int, granted: int) -> list[str]:
     """Return a warning with a fix if the kernel granted a smaller buffer than requested."""
     if granted >= asked:
         return []

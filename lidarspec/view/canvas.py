@@ -51,7 +51,7 @@ _BY_DOTS = " ..::oo##"
 
 
 @dataclass(frozen=True)
-class Ink:
+class TextStyle:
     """A colour and weight.
 
     Attributes:
@@ -67,20 +67,20 @@ class Ink:
 
 
 _FIXED = (
-    Ink(),
-    Ink(bold=True),
-    Ink((98, 100, 112), 90, faint=True),
-    Ink((150, 154, 168), 37),
-    Ink((96, 216, 110), 92, bold=True),
-    Ink((255, 92, 87), 91, bold=True),
+    TextStyle(),
+    TextStyle(bold=True),
+    TextStyle((98, 100, 112), 90, faint=True),
+    TextStyle((150, 154, 168), 37),
+    TextStyle((96, 216, 110), 92, bold=True),
+    TextStyle((255, 92, 87), 91, bold=True),
 )
 #: the first ink of the ramp, for its lowest values.
 FIRST_STEP = len(_FIXED)
 _SCALE = tuple(
-    Ink(rgb, _STANDARD[step * len(_STANDARD) // STEPS])
+    TextStyle(rgb, _STANDARD[step * len(_STANDARD) // STEPS])
     for step, rgb in enumerate(make_ramp("dark", STEPS))
 )
-INKS: tuple[Ink, ...] = (*_FIXED, *_SCALE)
+INKS: tuple[TextStyle, ...] = (*_FIXED, *_SCALE)
 
 
 @functools.cache
@@ -117,7 +117,7 @@ def style(ink: int) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class CellGrid:
     """A picture as characters and inks.
 
     Attributes:
@@ -129,7 +129,7 @@ class Cells:
     inks: NDArray[np.int16]
 
     @classmethod
-    def blank(cls, width: int, height: int) -> Cells:
+    def blank(cls, width: int, height: int) -> CellGrid:
         """Return a picture of spaces."""
         return cls(np.full((height, width), _SPACE, np.int32), np.zeros((height, width), np.int16))
 
@@ -149,7 +149,7 @@ class Cells:
         self.codes[row, column : column + len(text)] = [ord(character) for character in text]
         self.inks[row, column : column + len(text)] = ink
 
-    def paste(self, row: int, column: int, other: Cells) -> None:
+    def paste(self, row: int, column: int, other: CellGrid) -> None:
         """Copy a picture, with its upper left corner in a cell; it is cut off at the edge."""
         width = min(other.size[0], self.size[0] - column)
         height = min(other.size[1], self.size[1] - row)
@@ -174,7 +174,7 @@ class Cells:
                 found.append("\n")
         return found
 
-    def ascii(self) -> Cells:
+    def ascii(self) -> CellGrid:
         """Return the picture in ASCII, for terminals without Unicode."""
         codes = self.codes.copy()
         for character in set(np.unique(codes).tolist()):
@@ -185,7 +185,7 @@ class Cells:
                     if BLANK <= character < BLANK + 256
                     else ASCII.get(chr(character), "?")
                 )
-        return Cells(codes, self.inks)
+        return CellGrid(codes, self.inks)
 
 
 class Canvas:
@@ -246,7 +246,7 @@ class Canvas:
         self.labels |= {cell: (character, ink) for cell, character in zip(cells, text, strict=True)}
         return True
 
-    def cells(self) -> Cells:
+    def cells(self) -> CellGrid:
         """Return the picture."""
         points = _braille(self.dots)
         lines = _braille(self.lines)
@@ -258,7 +258,7 @@ class Canvas:
         ).astype(np.int16)
         for cell, (character, ink) in self.labels.items():
             codes[cell], inks[cell] = ord(character), ink
-        return Cells(codes, inks)
+        return CellGrid(codes, inks)
 
     def _places(
         self, column: NDArray[Any], row: NDArray[Any]

@@ -1,8 +1,8 @@
 """The scans of an open device, between two pictures or two lines of figures.
 
-`pump` reads arrived data, counts it in a `Meter` and keeps the newest scan. A file can be played:
-then each scan is shown as long after the one before as their times say, and little of the file is
-read ahead, so that figures and bytes belong to the scan that is shown.
+`read` reads arrived data, counts it in a `RateMeter` and keeps the newest scan. A file can be
+played: then each scan is shown as long after the one before as their times say, and little of the
+file is read ahead, so that figures and bytes belong to the scan that is shown.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from lidarspec.device.device import Device
 from lidarspec.device.device_input import BATCH_BYTES
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import Selection, Sieve, Slice
+from lidarspec.scans.selection import ScanSelector, Selection, TimeSlice
 from lidarspec.scans.stream import ScanStream
-from lidarspec.view.rate_meter import Meter
+from lidarspec.view.rate_meter import RateMeter
 
 #: seconds that one read of a live source waits for data.
 LOOK_S = 0.04
@@ -30,7 +30,7 @@ READ_AHEAD_S = 0.1
 MIN_PORTION_BYTES = 1 << 12
 
 
-class Feed:
+class LiveScans:
     """Takes the scans of an open device.
 
     Args:
@@ -44,7 +44,7 @@ class Feed:
     Attributes:
         speed: may be changed while a file is played.
         packets: the batch that was read last, None if nothing came.
-        scans: the scans, and pieces of scans, of the last `pump` or `step`.
+        scans: the scans, and pieces of scans, of the last `read` or `step`.
         scan: the newest whole scan; before there is one, the newest piece.
         number: how often `scan` has changed.
         meter: counts packets and scans.
@@ -67,20 +67,20 @@ class Feed:
         self.number = 0
         self.meter = self._make_meter()
         self._select = select or Selection()
-        self._sieve = Sieve(self._select, device.source, device.skip)
-        self._times = Slice(self._select.times)
+        self._sieve = ScanSelector(self._select, device.source, device.skip)
+        self._times = TimeSlice(self._select.times)
         self._batches = device.packets(wait=LOOK_S)
         self._stream = ScanStream(device.sensor, device.mount)
         self._disconnects = 0
         self._has_counted = False
         self._is_read_out = False
-        self._is_played = played and not device.is_live
+        self._plays_in_real_time = played and not device.is_live
         self._waiting = deque[Scan]()  # scans of a file, until they are due
         self._due: float | None = None  # when the last scan was, by `time.monotonic`
         self._last_stamp_ns = 0
-        self._ahead = ahead if self._is_played else None
+        self._read_ahead_s = ahead if self._plays_in_real_time else None
         self._portion = MIN_PORTION_BYTES
-        if self._ahead is not None:
+        if self._read_ahead_s is not None:
             device.read_ahead(self._portion)
 
     @property
@@ -88,7 +88,7 @@ class Feed:
         """Whether the input has ended and every scan was shown."""
         return self._is_read_out and not self._waiting
 
-    def pump(self, until: float) -> None:
+    def read(self, until: float) -> None:
         """Read until a time of `time.monotonic`, or the end; at least once.
 
         Raises:
@@ -118,9 +118,9 @@ class Feed:
                 self._show_next()
             else:
                 self._read()
-        self.rest()
+        self.read_rest()
 
-    def rest(self) -> None:
+    def read_rest(self) -> None:
         """Stop the clock of a file that is played; call it while the picture does not change."""
         self._due = None
 
@@ -141,7 +141,7 @@ class Feed:
             return
         if self.device.stats.disconnects != self._disconnects:
             self._disconnects = self.device.stats.disconnects
-            self._keep(self._stream.finish())
+            self._store_scans(self._stream.finish())
             self._stream = ScanStream(self.device.sensor, self.device.mount)
         if not len(packets):
             return
@@ -151,14 +151,14 @@ class Feed:
             self.meter = meter
             self.meter.packets(selected)
             self._has_counted = True
-        self._keep(self._stream.add(packets))
-        if self._ahead is not None:
-            self._adjust_portion(packets, self._ahead)
+        self._store_scans(self._stream.add(packets))
+        if self._read_ahead_s is not None:
+            self._adjust_portion(packets, self._read_ahead_s)
 
     def _finish(self) -> None:
         self._is_read_out = True
         if not self._sieve.ended:
-            self._keep(self._stream.finish())
+            self._store_scans(self._stream.finish())
         if self._sieve.is_empty:
             raise self._sieve.missing()
 
@@ -174,9 +174,9 @@ class Feed:
             self._portion = portion
             self.device.read_ahead(portion)
 
-    def _make_meter(self) -> Meter:
+    def _make_meter(self) -> RateMeter:
         """Return a meter that counts from now on."""
-        return Meter(self.device.stats, counts_losses=self.device.sensor.counts_losses)
+        return RateMeter(self.device.stats, counts_losses=self.device.sensor.counts_losses)
 
     def _select_packets(self, packets: Packets) -> Packets:
         """Return the packets at the selected times."""
@@ -191,15 +191,15 @@ class Feed:
             return packets
         return packets.take(is_selected)
 
-    def _keep(self, scans: list[Scan]) -> None:
+    def _store_scans(self, scans: list[Scan]) -> None:
         """Show the selected ones of some scans, or keep them until they are due."""
         for scan in scans:
             if self._sieve.ended:
                 return
-            selected = self._sieve.take(scan)
+            selected = self._sieve.select(scan)
             if selected is None:
                 continue
-            if self._is_played:
+            if self._plays_in_real_time:
                 self._waiting.append(selected)
             else:
                 self._show(selected)

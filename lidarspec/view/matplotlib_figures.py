@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
 from lidarspec.optional_libraries import import_library
-from lidarspec.points.appearance import Look, bounds
+from lidarspec.points.appearance import CloudAppearance, find_bounds
 from lidarspec.points.colours import make_ramp, to_hex
 from lidarspec.scans.scan import Scan
-from lidarspec.view.live_scans import Feed
+from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.rate_meter import totals
 
 #: supported suffixes of `save`.
@@ -79,7 +79,7 @@ def save(figure: Any, target: Any, suffix: str) -> None:
 
 
 @_with_style
-def of_scan(scan: Scan, look: Look, title: str) -> Any:
+def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
     """Draw a scan from above, forward up, to scale.
 
     Unless it is flat, it is also drawn from its right side.
@@ -93,7 +93,7 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
     else:
         column = cloud.extra[look.ramp]
     unit = "m" if look.ramp == "range" else look.unit
-    lowest, highest = bounds(cloud)
+    lowest, highest = find_bounds(cloud)
     low = min(float(lowest[2]), 0.0)
     high = max(float(highest[2]), 0.0)
     if look.flat:
@@ -134,7 +134,7 @@ def of_scan(scan: Scan, look: Look, title: str) -> Any:
 
 
 @_with_style
-def of_intensities(scans: Iterable[Scan], title: str) -> Any:
+def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
     """Draw the histogram of the intensities.
 
     Raises:
@@ -170,7 +170,7 @@ def of_intensities(scans: Iterable[Scan], title: str) -> Any:
 
 
 @_with_style
-def of_ranges(scans: Iterable[Scan], title: str) -> Any:
+def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
     """Draw the number of returns by range over time, and the median.
 
     If there are many scans, an even selection is shown.
@@ -225,7 +225,7 @@ def of_ranges(scans: Iterable[Scan], title: str) -> Any:
 
 
 @_with_style
-def of_rates(rates: Rates, title: str) -> Any:
+def draw_rates(rates: RateSeries, title: str) -> Any:
     """Draw packets and scans per second, and the lost and invalid shares, over time.
 
     Raises:
@@ -256,7 +256,7 @@ def of_rates(rates: Rates, title: str) -> Any:
     return figure
 
 
-class Rates:
+class RateSeries:
     """Counts of packets, losses and invalid frames in even steps of time.
 
     The time is that of arrival, else that of the sensor's clock.
@@ -272,7 +272,7 @@ class Rates:
         scans: seconds from the first packet, and rate, of each whole scan.
     """
 
-    def __init__(self, feed: Feed, until: float) -> None:
+    def __init__(self, feed: LiveScans, until: float) -> None:
         self._feed = feed
         self._first = 0
         self._before = totals(feed.device.stats)
@@ -281,7 +281,7 @@ class Rates:
         self._last = 0.0
         self.scans = list[tuple[float, float]]()
         while not feed.ended and time.monotonic() < until:
-            feed.pump(0.0)
+            feed.read(0.0)
             self._take()
             self.scans += [
                 (self._seconds(scan.host_ns or scan.stamp_ns), scan.rate_hz)

@@ -21,7 +21,7 @@ from lidarspec.explaining.listing import parents
 from lidarspec.exports import select_frame
 from lidarspec.exports.diagram import svg as diagram
 from lidarspec.packets.packets import Packets
-from lidarspec.points.appearance import fit, look
+from lidarspec.points.appearance import choose_appearance, fit_to_points
 from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.scan import Scan
 from lidarspec.sensor_operations import Sensor
@@ -152,7 +152,9 @@ def _diagram(sensor: Sensor, name: str) -> str:
 
 
 def _picture(points: PointCloud, title: str) -> str:
-    return svg(points, fit(points, look(points)), title, side=SIDE, most=DOTS)
+    return svg(
+        points, fit_to_points(points, choose_appearance(points)), title, side=SIDE, most=DOTS
+    )
 
 
 def _ends(number: int) -> NDArray[np.intp]:

@@ -10,9 +10,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.points.appearance import MOST, Look, ring_step, shade
+from lidarspec.points.appearance import MOST, CloudAppearance, ramp_positions, ring_step
 from lidarspec.points.cloud import PointCloud
-from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, Cells
+from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, CellGrid
 
 #: dots between two dots of a ring.
 RING_GAP = 4
@@ -23,7 +23,7 @@ HEIGHTS = (1, 2, 5, 10)
 FILLED = 0.9
 
 
-def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells:
+def picture(points: PointCloud, *, width: int, height: int, look: CloudAppearance) -> CellGrid:
     """Return the cloud in `width` by `height` cells, from above.
 
     Unless the look is flat, the view from its right side is below.
@@ -32,7 +32,7 @@ def picture(points: PointCloud, *, width: int, height: int, look: Look) -> Cells
     if look.flat:
         return _from_above(cloud, width, height, look)
     above = max(round((height - 1) * ABOVE), 1)
-    whole = Cells.blank(width, height)
+    whole = CellGrid.blank(width, height)
     whole.paste(0, 0, _from_above(cloud, width, above, look))
     side, scale = _from_side(
         cloud, width, max(height - 1 - above, 1), look, _scale(width, above, look.reach)
@@ -49,13 +49,13 @@ def _scale(width: int, height: int, reach: float) -> float:
     return (min(width * ACROSS, height * DOWN) - 1) / 2 / reach
 
 
-def _from_above(cloud: PointCloud, width: int, height: int, look: Look) -> Cells:
+def _from_above(cloud: PointCloud, width: int, height: int, look: CloudAppearance) -> CellGrid:
     canvas = Canvas(width, height, look.ramp)
     scale = _scale(width, height, look.reach)
     middle = _middle(canvas)
     across = middle[0] + look.middle[1] * scale
     down = middle[1] + look.middle[0] * scale
-    canvas.plot(across - cloud.y * scale, down - cloud.x * scale, shade(cloud, look))
+    canvas.plot(across - cloud.y * scale, down - cloud.x * scale, ramp_positions(cloud, look))
     step = ring_step(look.reach)
     radii = [
         step * number
@@ -99,8 +99,8 @@ def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: flo
 
 
 def _from_side(
-    cloud: PointCloud, width: int, height: int, look: Look, scale: float
-) -> tuple[Cells, int]:
+    cloud: PointCloud, width: int, height: int, look: CloudAppearance, scale: float
+) -> tuple[CellGrid, int]:
     """Return the view from the right side, and the exaggeration of heights.
 
     Forward is right. The heights are centred on the points.
@@ -114,7 +114,9 @@ def _from_side(
     middle = _middle(canvas)
     across = middle[0] - look.middle[0] * scale
     level = middle[1] + (low + high) / 2 * scale * larger
-    canvas.plot(across + cloud.x * scale, level - cloud.z * scale * larger, shade(cloud, look))
+    canvas.plot(
+        across + cloud.x * scale, level - cloud.z * scale * larger, ramp_positions(cloud, look)
+    )
     step = ring_step(canvas.dots.shape[0] / scale / larger)
     half = canvas.dots.shape[0] / scale / larger / 2
     first, last = (math.ceil(((low + high) / 2 + end * half) / step) for end in (-1, 1))

@@ -1,6 +1,6 @@
 """Measure a running sensor: speed, rates, losses and jitter.
 
-A `Meter` counts packets and scans, both since its last reading and from the beginning.
+A `RateMeter` counts packets and scans, both since its last reading and from the beginning.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ NOTHING = MeterReading(
 )
 
 
-class Tally:
+class RateTally:
     """Counts packets and scans from some moment on.
 
     Args:
@@ -169,7 +169,7 @@ class Tally:
         return math.sqrt(max(self._gap_square_sum / self._gap_count - mean * mean, 0.0))
 
 
-class Meter:
+class RateMeter:
     """Counts packets and scans.
 
     Args:
@@ -180,8 +180,8 @@ class Meter:
     def __init__(self, counters: Counters, *, counts_losses: bool) -> None:
         self._counts_losses = counts_losses
         self._last_ns: int | None = None
-        self._recent = Tally(counters)
-        self._all = Tally(counters)
+        self._recent = RateTally(counters)
+        self._all = RateTally(counters)
 
     def packets(self, packets: Packets) -> None:
         """Count a batch."""
@@ -206,7 +206,7 @@ class Meter:
     def reading(self, counters: Counters, seconds: float | None = None) -> MeterReading:
         """Return the figures since the last reading, and begin the next one."""
         reading = self._recent.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
-        self._recent = Tally(counters)
+        self._recent = RateTally(counters)
         return reading
 
     def summary(self, counters: Counters, seconds: float | None = None) -> MeterReading:

@@ -8,7 +8,7 @@ import time
 
 from lidarspec.errors import UsageError, suggest, system_errors
 from lidarspec.formats.rerun import RerunRecording
-from lidarspec.view.live_scans import LOOK_S, Feed
+from lidarspec.view.live_scans import LOOK_S, LiveScans
 
 #: seconds between two readings of the statistics, by the time of the scans.
 FIGURES = 1.0
@@ -18,7 +18,7 @@ FIGURED = ("packet_rate_hz", "error_rate", "skipped_rate", "loss_rate", "jitter_
 SCHEMES = ("rerun://", "rerun+http://", "rerun+https://")
 
 
-def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
+def show(feed: LiveScans, target: str, *, ramp: str = "range", until: float) -> None:
     """Log scans and statistics as they arrive, until the feed ends or a time.
 
     Args:
@@ -36,7 +36,7 @@ def show(feed: Feed, target: str, *, ramp: str = "range", until: float) -> None:
         read_at = time.monotonic()
         last = None
         while not feed.ended and time.monotonic() < until:
-            feed.pump(time.monotonic() + LOOK_S)
+            feed.read(time.monotonic() + LOOK_S)
             for scan in feed.scans:
                 log.scan(scan)
                 if last is None or not 0 <= scan.stamp_ns - last < FIGURES * 1e9:

@@ -13,7 +13,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.points.appearance import STEPS, Look, bounds, ring_step, steps
+from lidarspec.points.appearance import STEPS, CloudAppearance, find_bounds, ramp_indices, ring_step
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp, to_hex
 
@@ -39,7 +39,12 @@ _PARTS = ("ground", "line", "text", "head")
 
 
 def svg(
-    points: PointCloud, look: Look, title: str, *, side: int = SIDE, most: int | None = None
+    points: PointCloud,
+    look: CloudAppearance,
+    title: str,
+    *,
+    side: int = SIDE,
+    most: int | None = None,
 ) -> str:
     """Return a cloud as an SVG document, from above and from its right side.
 
@@ -50,7 +55,7 @@ def svg(
         most: maximum number of dots of a view: one dot may stand for several returns.
     """
     cloud = points[points.valid]
-    views = _Views(cloud, look, side, most, steps(cloud, look))
+    views = _ViewDrawer(cloud, look, side, most, ramp_indices(cloud, look))
     if look.flat:
         shown = [views.above()]
     else:
@@ -59,7 +64,7 @@ def svg(
     top = HEAD
     body: list[str] = []
     for view in shown:
-        body.append(f'<text x="{MARGIN}" y="{top + 12}" {_as("text")}>{view.told}</text>')
+        body.append(f'<text x="{MARGIN}" y="{top + 12}" {_style_of("text")}>{view.title}</text>')
         box = f'viewBox="0 {view.top:.0f} {side} {view.height:.0f}"'
         body += [
             f'<svg x="{MARGIN}" y="{top + LINE}" width="{side}" height="{view.height:.0f}" {box}>',
@@ -74,9 +79,10 @@ def svg(
             f' height="{top}" font-family="system-ui, sans-serif" font-size="12">'
         ),
         f"<style>{_style()}</style>",
-        f'<rect width="100%" height="100%" {_as("ground")}/>',
-        f'<text x="{MARGIN}" y="26" font-size="14" {_as("head")}>{escape(title)}</text>',
-        f'<text x="{MARGIN}" y="48" {_as("text")}>{len(cloud):,} returns as {drawn} dots</text>',
+        f'<rect width="100%" height="100%" {_style_of("ground")}/>',
+        f'<text x="{MARGIN}" y="26" font-size="14" {_style_of("head")}>{escape(title)}</text>',
+        f'<text x="{MARGIN}" y="48" {_style_of("text")}>'
+        f"{len(cloud):,} returns as {drawn} dots</text>",
         *_legend(look, width - MARGIN),
     ]
     return "\n".join([*head, *body, "</svg>"]) + "\n"
@@ -87,13 +93,13 @@ class _View:
     """A view.
 
     Attributes:
-        told: its title.
+        title: its title.
         parts: its SVG elements.
         top, height: its vertical range in pixels.
         dots: the number of dots.
     """
 
-    told: str
+    title: str
     parts: list[str]
     top: float
     height: float
@@ -101,7 +107,7 @@ class _View:
 
 
 @dataclass(frozen=True)
-class _Views:
+class _ViewDrawer:
     """The views of a cloud of valid points, in pixels.
 
     Attributes:
@@ -109,7 +115,7 @@ class _Views:
     """
 
     cloud: PointCloud
-    look: Look
+    look: CloudAppearance
     side: int
     most: int | None
     colours: NDArray[np.intp]
@@ -157,10 +163,10 @@ class _Views:
             labels.write(text, [right, leftward, ahead, behind, towards_middle])
         axes = f'<path d="M{across:.1f} 0V{side}M0 {down:.1f}H{side}"/>'
         parts = [
-            f'<g fill="none" {_as("line", "stroke")}>{axes}{circles}</g>',
+            f'<g fill="none" {_style_of("line", "stroke")}>{axes}{circles}</g>',
             *paths,
-            f"<g {_as('text')}>{''.join(labels.parts)}</g>",
-            f'<path d="M{across:.1f} {down - 9:.1f}l6 15h-12z" {_as("head")}/>',
+            f"<g {_style_of('text')}>{''.join(labels.parts)}</g>",
+            f'<path d="M{across:.1f} {down - 9:.1f}l6 15h-12z" {_style_of("head")}/>',
         ]
         return _View("from above, forward is up", parts, top, bottom - top, dots)
 
@@ -168,7 +174,7 @@ class _Views:
         """Return heights with their labels, and points; forward is right."""
         scale = self._scale
         side = self.side
-        lowest, highest = bounds(self.cloud)
+        lowest, highest = find_bounds(self.cloud)
         low = min(float(lowest[2]), 0.0)
         high = max(float(highest[2]), 0.0)
         span = max(high - low, 1e-3)
@@ -192,10 +198,10 @@ class _Views:
             across + self.cloud.x * scale, level - self.cloud.z * steep, height
         )
         parts = [
-            f'<path d="{lines}" {_as("line", "stroke")}/>',
+            f'<path d="{lines}" {_style_of("line", "stroke")}/>',
             *paths,
-            f"<g {_as('text')}>{''.join(labels.parts)}</g>",
-            f'<path d="M{across + 9:.1f} {level:.1f}l-15 6v-12z" {_as("head")}/>',
+            f"<g {_style_of('text')}>{''.join(labels.parts)}</g>",
+            f'<path d="M{across + 9:.1f} {level:.1f}l-15 6v-12z" {_style_of("head")}/>',
         ]
         return _View(told, parts, 0, height, dots)
 
@@ -275,12 +281,12 @@ def _path(places: NDArray[np.int64]) -> str:
     return "".join(f"m{across} {down}h0" for down, across in steps.tolist())
 
 
-def _legend(look: Look, right: int) -> Iterator[str]:
+def _legend(look: CloudAppearance, right: int) -> Iterator[str]:
     """Yield a bar of the ramp with its column and values, which ends at `right`."""
     low, high = (escape(text) for text in look.ends)
     left = right - 7 * len(high) - 12 - STEPS * 6
     yield (
-        f'<g {_as("text")}><text x="{left - 8}" y="48" text-anchor="end">{escape(look.ramp)},'
+        f'<g {_style_of("text")}><text x="{left - 8}" y="48" text-anchor="end">{escape(look.ramp)},'
         f" {low}</text>"
     )
     yield f'<text x="{right}" y="48" text-anchor="end">{high}</text></g>'
@@ -291,7 +297,7 @@ def _legend(look: Look, right: int) -> Iterator[str]:
         )
 
 
-def _as(part: str, attribute: str = "fill") -> str:
+def _style_of(part: str, attribute: str = "fill") -> str:
     """Return the attributes of a part of the picture.
 
     They are its colour on light pages, and the class for its colour on dark ones.

@@ -20,7 +20,7 @@ import numpy as np
 from rich.console import Console
 
 from lidarspec.transports.base import wait_readable
-from lidarspec.view.canvas import Cells, Depth, sgr
+from lidarspec.view.canvas import CellGrid, Depth, sgr
 
 #: codes of cursor keys: on POSIX after escape, on Windows after a prefix byte.
 _POSIX = {
@@ -49,7 +49,7 @@ END = "\x1b[?2026l"
 BRIDGED = 4
 
 
-class Keys:
+class KeyReader:
     """A keyboard, as a context manager that restores the terminal.
 
     This base class has no keys, but waits like one.
@@ -89,7 +89,7 @@ def decode_keys(text: str) -> list[str]:
 if sys.platform == "win32":
     import msvcrt
 
-    class Keyboard(Keys):
+    class Keyboard(KeyReader):
         """The console's keyboard."""
 
         def read(self, timeout: float) -> list[str]:
@@ -105,17 +105,17 @@ if sys.platform == "win32":
                 raise KeyboardInterrupt
             return [key for key in keys if key]
 
-    def keyboard(*, taken: bool = False) -> Keys:
+    def keyboard(*, taken: bool = False) -> KeyReader:
         """Return the keyboard of the console, or one without keys."""
         if sys.stdin.isatty() and not taken:
             return Keyboard()
-        return Keys()
+        return KeyReader()
 
 else:
     import termios
     import tty
 
-    class Keyboard(Keys):
+    class Keyboard(KeyReader):
         """A terminal that returns single keys unechoed; Ctrl-C and Ctrl-Z stay signals."""
 
         def __init__(self, descriptor: int) -> None:
@@ -144,7 +144,7 @@ else:
             with contextlib.suppress(termios.error):
                 termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
-    def keyboard(*, taken: bool = False) -> Keys:
+    def keyboard(*, taken: bool = False) -> KeyReader:
         """Return the keyboard of the terminal, or one without keys.
 
         Args:
@@ -155,10 +155,10 @@ else:
                 return Keyboard(sys.stdin.fileno())
             return Keyboard(os.open("/dev/tty", os.O_RDONLY))
         except (OSError, ValueError, termios.error):
-            return Keys()
+            return KeyReader()
 
 
-class Terminated(BaseException):
+class TerminatedError(BaseException):
     """Raised when a signal ends the process, so that resources are closed.
 
     Attributes:
@@ -170,7 +170,7 @@ class Terminated(BaseException):
         self.code = 128 + number
 
 
-def depth(stream: TextIO) -> Depth:
+def find_colour_depth(stream: TextIO) -> Depth:
     """Return the colour depth of a terminal, by NO_COLOR, COLORTERM and TERM."""
     console = Console(file=stream)
     system = console.color_system
@@ -183,7 +183,7 @@ def depth(stream: TextIO) -> Depth:
     return "standard"
 
 
-def encodable(stream: TextIO) -> bool:
+def find_plain_characters(stream: TextIO) -> bool:
     """Return whether a stream supports braille characters."""
     try:
         "⣿▲│".encode(stream.encoding or "ascii")
@@ -198,12 +198,12 @@ class Screen:
     This includes the end of the process by SIGTERM or SIGHUP, and its suspension by SIGTSTP.
     """
 
-    def __init__(self, stream: TextIO, keys: Keys) -> None:
+    def __init__(self, stream: TextIO, keys: KeyReader) -> None:
         self._stream = stream
         self.keys = keys
-        self._depth = depth(stream)
-        self._plain = not encodable(stream)
-        self._shown: Cells | None = None
+        self._depth = find_colour_depth(stream)
+        self._plain = not find_plain_characters(stream)
+        self._shown: CellGrid | None = None
         # number of times the terminal was taken over: this discards the shown picture, also during
         # `show`
         self._taken = 0
@@ -214,7 +214,7 @@ class Screen:
         window = os.get_terminal_size(self._stream.fileno())
         return max(window.columns, 1), max(window.lines, 1)
 
-    def show(self, cells: Cells) -> None:
+    def show(self, cells: CellGrid) -> None:
         """Show a picture on the screen."""
         if self._plain:
             cells = cells.ascii()
@@ -223,7 +223,7 @@ class Screen:
             before = self._shown
         else:
             before = None
-        text = changes(before, cells, self._depth)
+        text = encode_changes(before, cells, self._depth)
         if text:
             self._write(BEGIN + ("" if before is not None else "\x1b[0m\x1b[2J") + text + END)
         self._shown = cells if taken == self._taken else None
@@ -278,7 +278,7 @@ class Screen:
         self._taken += 1
 
 
-def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
+def encode_changes(before: CellGrid | None, after: CellGrid, depth: Depth) -> str:
     """Return the text that changes a terminal from one picture to another.
 
     Args:
@@ -288,7 +288,7 @@ def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
     if before is not None:
         old = before
     else:
-        old = Cells.blank(*after.size)
+        old = CellGrid.blank(*after.size)
     changed = (old.codes != after.codes) | (old.inks != after.inks)
     parts: list[str] = []
     ink = -1
@@ -312,9 +312,9 @@ def changes(before: Cells | None, after: Cells, depth: Depth) -> str:
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    raise Terminated(number)
+    raise TerminatedError(number)
 
 
-def interactive() -> bool:
+def is_interactive() -> bool:
     """Return whether there is a screen to take over."""
     return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"

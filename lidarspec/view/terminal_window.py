@@ -1,6 +1,6 @@
 """The terminal window of a running sensor, drawn at most twelve times a second.
 
-`Window.run` waits for keys and data in turn. `Choice` is the state that the keys change, and
+`Window.run` waits for keys and data in turn. `ViewSettings` is the state that the keys change, and
 `Window.cells` draws the window anew from it, the newest scan and the figures; `Screen` writes the
 cells that changed.
 """
@@ -12,16 +12,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lidarspec.points.appearance import Look, look, ramps
+from lidarspec.points.appearance import CloudAppearance, choose_appearance, list_ramps
 from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.scans.scan import Scan
-from lidarspec.view.canvas import ALARM, GOOD, PLAIN, STRONG, Cells
-from lidarspec.view.live_scans import Feed
+from lidarspec.view.canvas import ALARM, GOOD, PLAIN, STRONG, CellGrid
+from lidarspec.view.live_scans import LiveScans
 from lidarspec.view.polar import picture
 from lidarspec.view.rate_meter import NOTHING, MeterReading, format_figure
 from lidarspec.view.terminal_screen import Screen
 from lidarspec.view.terminal_window_parts import (
-    Figure,
+    WindowFigure,
     draw_keys,
     draw_message,
     write_last_line,
@@ -54,7 +54,7 @@ DEFAULT_RAMPS = ("range", "intensity")
 
 
 @dataclass(frozen=True)
-class Choice:
+class ViewSettings:
     """The choices that keys have made.
 
     Attributes:
@@ -73,7 +73,9 @@ class Choice:
     helped: bool = False
     done: bool = False
 
-    def after(self, key: str, reach: float, ramps: Sequence[str] = DEFAULT_RAMPS) -> Choice:
+    def after_key(
+        self, key: str, reach: float, ramps: Sequence[str] = DEFAULT_RAMPS
+    ) -> ViewSettings:
         """Return the choice after a key press.
 
         Args:
@@ -123,7 +125,7 @@ class Window:
 
     def __init__(
         self,
-        feed: Feed,
+        feed: LiveScans,
         source: str,
         *,
         ramp: str = "range",
@@ -134,9 +136,9 @@ class Window:
         self._device = feed.device
         self._source = source
         self._record = record
-        self.choice = Choice(ramp)
+        self.choice = ViewSettings(ramp)
         self._scan: Scan | None = None
-        self._look: Look | None = None
+        self._look: CloudAppearance | None = None
         self._reading: MeterReading | None = None
         self._read_at = time.monotonic()
         if duration is None:
@@ -170,12 +172,12 @@ class Window:
     def _wait(self, screen: Screen) -> list[str]:
         """Read data until the next picture is due, and return the keys that were pressed."""
         if self._feed.ended or (self.choice.paused and not self._device.is_live):
-            self._feed.rest()
+            self._feed.read_rest()
             return screen.keys.read(FRAME_PERIOD_S)
-        self._feed.pump(time.monotonic() + FRAME_PERIOD_S)
+        self._feed.read(time.monotonic() + FRAME_PERIOD_S)
         return screen.keys.read(0)
 
-    def cells(self, columns: int, lines: int) -> Cells:
+    def cells(self, columns: int, lines: int) -> CellGrid:
         """Return the window as it is now.
 
         The figures are beside the picture, or in the last line if the window is narrow.
@@ -186,7 +188,7 @@ class Window:
         width = columns - SIDE_COLUMNS - 1 if is_wide else columns
         height = max(lines - (1 if is_wide else 2), 1)
         current_look = self._current_look()
-        window = Cells.blank(columns, lines)
+        window = CellGrid.blank(columns, lines)
         window.paste(1, 0, self._picture(width, height, current_look))
         write_title(window, self._device.sensor.id, self._source, *self._state())
         if is_wide:
@@ -197,10 +199,10 @@ class Window:
             _paste_in_middle(window, draw_keys(columns, lines))
         return window
 
-    def _picture(self, width: int, height: int, current_look: Look) -> Cells:
+    def _picture(self, width: int, height: int, current_look: CloudAppearance) -> CellGrid:
         """Return the picture of the scan, with what is wrong in its middle."""
         if self._scan is None:
-            drawn = Cells.blank(width, height)
+            drawn = CellGrid.blank(width, height)
         else:
             drawn = picture(self._scan.points, width=width, height=height, look=current_look)
         warning = self._warning()
@@ -209,8 +211,8 @@ class Window:
         return drawn
 
     def _press(self, key: str) -> None:
-        known = DEFAULT_RAMPS if self._scan is None else ramps(self._scan.points)
-        self.choice = self.choice.after(key, self._current_look().reach, known)
+        known = DEFAULT_RAMPS if self._scan is None else list_ramps(self._scan.points)
+        self.choice = self.choice.after_key(key, self._current_look().reach, known)
         if key in ("r", "R") and self._record is not None:
             self._record.toggle()
 
@@ -232,7 +234,7 @@ class Window:
         if self.choice.paused and self._scan is not None:
             return
         self._scan = newest
-        new = look(newest.points, ramp=self.choice.ramp)
+        new = choose_appearance(newest.points, ramp=self.choice.ramp)
         old = self._look
         if old is not None and _fits(new.reach, old.reach):
             new = replace(new, reach=old.reach)
@@ -240,12 +242,12 @@ class Window:
             new = replace(new, full=old.full, low=min(old.low, new.low))
         self._look = new
 
-    def _current_look(self) -> Look:
+    def _current_look(self) -> CloudAppearance:
         """Return the scale of the picture, as the keys have changed it."""
         if self._look is None:
-            return Look("range", 1.0, 1.0)
+            return CloudAppearance("range", 1.0, 1.0)
         if self._scan is not None and self._look.ramp != self.choice.ramp:
-            new = look(self._scan.points, ramp=self.choice.ramp)
+            new = choose_appearance(self._scan.points, ramp=self.choice.ramp)
             self._look = replace(new, reach=self._look.reach)
             self.choice = replace(self.choice, ramp=new.ramp)
         reach = self._look.reach / self.choice.zoom
@@ -270,27 +272,31 @@ class Window:
             return ("end", STRONG)
         return ("▶ playing", GOOD)
 
-    def _figures(self) -> list[Figure]:
+    def _figures(self) -> list[WindowFigure]:
         """Return the figures of the last second and of the scan that is shown."""
         reading = self._reading or NOTHING
         figures = [
-            Figure("speed", format_figure(reading.speed_hz, "{:.1f} Hz"), STRONG),
-            Figure("packets", format_figure(reading.packet_rate_hz, "{:.0f} /s")),
-            Figure("input", format_figure(reading.bytes_per_s, "{:.1f} kB/s", 1e-3)),
+            WindowFigure("speed", format_figure(reading.speed_hz, "{:.1f} Hz"), STRONG),
+            WindowFigure("packets", format_figure(reading.packet_rate_hz, "{:.0f} /s")),
+            WindowFigure("input", format_figure(reading.bytes_per_s, "{:.1f} kB/s", 1e-3)),
             *self._scan_figures(),
             _rate_figure("errors", reading.error_rate if self._reading else None),
             _rate_figure("skipped", reading.skipped_rate if self._reading else None),
             self._lost_figure(reading),
-            Figure("jitter", format_figure(reading.jitter_s, "{:.2f} ms", 1e3)),
+            WindowFigure("jitter", format_figure(reading.jitter_s, "{:.2f} ms", 1e3)),
         ]
         if self._device.queued is not None:
-            figures.append(Figure("queue", str(self._device.queued)))
+            figures.append(WindowFigure("queue", str(self._device.queued)))
         return figures
 
-    def _scan_figures(self) -> list[Figure]:
+    def _scan_figures(self) -> list[WindowFigure]:
         """Return the figures of the scan that is shown."""
         if self._scan is None:
-            return [Figure("points", "0"), Figure("valid", "-"), Figure("nearest", "-")]
+            return [
+                WindowFigure("points", "0"),
+                WindowFigure("valid", "-"),
+                WindowFigure("nearest", "-"),
+            ]
         points = self._scan.points
         ranges = points.range[points.valid]
         if len(points):
@@ -299,19 +305,19 @@ class Window:
             valid_share = None
         nearest = float(ranges.min()) if len(ranges) else None
         figures = [
-            Figure("points", str(len(points))),
-            Figure("valid", format_figure(valid_share, "{:.1f} %", 100)),
-            Figure("nearest", format_figure(nearest, "{:.2f} m")),
+            WindowFigure("points", str(len(points))),
+            WindowFigure("valid", format_figure(valid_share, "{:.1f} %", 100)),
+            WindowFigure("nearest", format_figure(nearest, "{:.2f} m")),
         ]
         if points.nominal:
-            figures.insert(0, Figure("calibration", "nominal", ALARM))
+            figures.insert(0, WindowFigure("calibration", "nominal", ALARM))
         return figures
 
-    def _lost_figure(self, reading: MeterReading) -> Figure:
+    def _lost_figure(self, reading: MeterReading) -> WindowFigure:
         lost = self._device.stats.lost
         if lost:
-            return Figure("lost", str(lost), ALARM)
-        return Figure("lost", "-" if reading.loss_rate is None else "0")
+            return WindowFigure("lost", str(lost), ALARM)
+        return WindowFigure("lost", "-" if reading.loss_rate is None else "0")
 
     def _warning(self) -> str:
         """Return the message for the middle of the picture, "" if nothing is wrong."""
@@ -334,12 +340,12 @@ class Window:
         return ""
 
 
-def _rate_figure(name: str, rate: float | None) -> Figure:
+def _rate_figure(name: str, rate: float | None) -> WindowFigure:
     is_alarm = rate is not None and rate >= ALARM_RATE
-    return Figure(name, format_figure(rate, "{:.2f} %", 100), ALARM if is_alarm else PLAIN)
+    return WindowFigure(name, format_figure(rate, "{:.2f} %", 100), ALARM if is_alarm else PLAIN)
 
 
-def _paste_in_middle(target: Cells, box: Cells) -> None:
+def _paste_in_middle(target: CellGrid, box: CellGrid) -> None:
     row = (target.size[1] - box.size[1]) // 2
     column = (target.size[0] - box.size[0]) // 2
     target.paste(max(row, 0), max(column, 0), box)

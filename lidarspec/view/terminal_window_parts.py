@@ -6,8 +6,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from lidarspec.points.appearance import STEPS, Look
-from lidarspec.view.canvas import ALARM, FAINT, FIRST_STEP, LABEL, PLAIN, STRONG, Cells
+from lidarspec.points.appearance import STEPS, CloudAppearance
+from lidarspec.view.canvas import ALARM, FAINT, FIRST_STEP, LABEL, PLAIN, STRONG, CellGrid
 
 KEYS = (
     ("space", "pause and go on"),
@@ -27,7 +27,7 @@ KEY_COLUMNS = 14
 MIN_SOURCE_COLUMNS = 8
 
 
-class Figure(NamedTuple):
+class WindowFigure(NamedTuple):
     """A figure of the window: its name, its value as text, and the ink of the value."""
 
     name: str
@@ -35,7 +35,7 @@ class Figure(NamedTuple):
     ink: int = PLAIN
 
 
-def write_title(window: Cells, sensor: str, source: str, state: str, ink: int) -> None:
+def write_title(window: CellGrid, sensor: str, source: str, state: str, ink: int) -> None:
     """Write sensor, source and state into the first line."""
     columns = window.size[0]
     room = columns - len(sensor) - len(state) - 6
@@ -53,7 +53,9 @@ def shorten_source(source: str, room: int) -> str:
     return "..." + source[len(source) - room + 3 :]
 
 
-def write_side(window: Cells, left: int, figures: Sequence[Figure], look: Look) -> None:
+def write_side(
+    window: CellGrid, left: int, figures: Sequence[WindowFigure], look: CloudAppearance
+) -> None:
     """Write figures, colours and keys beside the picture, as far as there is room.
 
     Args:
@@ -77,7 +79,7 @@ def write_side(window: Cells, left: int, figures: Sequence[Figure], look: Look) 
             window.write(row, left + 2, f"{first:<{HINT_COLUMNS}}{second}", FAINT)
 
 
-def write_last_line(window: Cells, figures: Sequence[Figure]) -> None:
+def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:
     """Write the figures that are known into the last line, as far as there is room."""
     columns, lines = window.size
     row = lines - 1
@@ -93,7 +95,7 @@ def write_last_line(window: Cells, figures: Sequence[Figure]) -> None:
         column += width + 2
 
 
-def _write_ramp(window: Cells, row: int, column: int, look: Look) -> None:
+def _write_ramp(window: CellGrid, row: int, column: int, look: CloudAppearance) -> None:
     """Write a bar of the colours, and below it the values at its ends."""
     for step in range(STEPS):
         window.write(row, column + step, "━", FIRST_STEP + step)
@@ -103,10 +105,10 @@ def _write_ramp(window: Cells, row: int, column: int, look: Look) -> None:
     window.write(row + 1, column + STEPS - len(high), high, LABEL)
 
 
-def draw_keys(columns: int, lines: int) -> Cells:
+def draw_keys(columns: int, lines: int) -> CellGrid:
     """Return the page of keys, which fits into a window of this size."""
     width = min(max(len(text) for _, text in KEYS) + KEY_COLUMNS, columns)
-    page = Cells.blank(width, min(len(KEYS) + 4, lines))
+    page = CellGrid.blank(width, min(len(KEYS) + 4, lines))
     page.write(0, 0, "─" * width, FAINT)
     page.write(0, 2, " keys ", LABEL)
     for row, (key, text) in enumerate(KEYS, start=2):
@@ -116,11 +118,11 @@ def draw_keys(columns: int, lines: int) -> Cells:
     return page
 
 
-def draw_message(columns: int, text: str) -> Cells:
+def draw_message(columns: int, text: str) -> CellGrid:
     """Return a message for the middle of a picture."""
     lines = textwrap.wrap(text, max(columns - 4, 1))
     width = min(max(map(len, lines)) + 4, columns)
-    box = Cells.blank(width, len(lines) + 2)
+    box = CellGrid.blank(width, len(lines) + 2)
     for row, line in enumerate(lines, start=1):
         box.write(row, 2, line, ALARM)
     return box

@@ -173,7 +173,7 @@ def test_a_packed_capture_is_read_from_its_beginning(tmp_path: Path) -> None:
 def test_the_duration_of_a_long_capture_is_known_without_reading_it(tmp_path: Path) -> None:
     path = written(tmp_path / "long.pcap")
     assert path.stat().st_size > contents.LOOKED_AT
-    assert contents.duration(path) == pytest.approx((NUMBER - 1) * STEP * 1e-9)
+    assert contents.measure_duration(path) == pytest.approx((NUMBER - 1) * STEP * 1e-9)
 
 
 #: datagrams of the simulated sensor a second.

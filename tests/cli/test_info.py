@@ -64,7 +64,7 @@ def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) 
     number, data = looking.LOOKED_AT // 60_000 * 3, bytes(60_000)
     with Recorder(path, "ldrobot-stl27l", "/dev/ttyUSB0") as recorder:
         for place in range(number):
-            recorder.keep_up()
+            recorder.wait_for_room()
             recorder.write(Chunk(data, START + place * 10**8))
     told = printed("info", path)
     assert told["kind"] == "a recording"

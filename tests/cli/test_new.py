@@ -15,7 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import spec
-from lidarspec.drafting.draft import Names
+from lidarspec.drafting.draft import DistributionNames
 from lidarspec.exports import EXPORTS, export
 from lidarspec.simulation.simulator import simulate
 from tests.architecture import Module, private_imports
@@ -237,7 +237,7 @@ def test_what_is_there_is_not_overwritten(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["3d-360", "acme-data", "acme-x-1b", "a-1"])
 def test_odd_ids_make_working_modules(tmp_path: Path, name: str) -> None:
     ran("new", name, "--into", tmp_path)
-    names = Names(name)
+    names = DistributionNames(name)
     assert ls.sensor(tmp_path / names.distribution / names.module / "__init__.py").id == name
     assert names.constant.isidentifier()
 

@@ -20,7 +20,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.detect.identification import Verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
@@ -37,7 +37,7 @@ class TestSend:
             assert "firmware  3 " in text
             assert "reserved  00 00 00 00 00 00" in text
             time.sleep(0.2)
-            assert made.device.heard == ["start"]  # and not stopped again
+            assert made.device.commands_received == ["start"]  # and not stopped again
             told = printed("send", made.path, "stop", "-s", "cspc-m1c1-mini")
         assert (told["confirmed"], told["frame"], told["fields"]["mode"]) == (True, "ack", 0x55)
         assert told["hex"] == "a5 5a 55 07 00 00 00 00 00 00 00 ad"
@@ -182,14 +182,14 @@ class TestDetect:
 
         def listened(source: str, duration: float, *, start: bool) -> list[Verdict]:
             both.wait(TIMEOUT_S)
-            return [Verdict(Heard(source))]
+            return [Verdict(SampleBytes(source))]
 
-        monkeypatch.setattr("lidarspec.cli.finding._one", listened)
+        monkeypatch.setattr("lidarspec.cli.finding._detect_source", listened)
         monkeypatch.setattr(
-            "lidarspec.cli.finding.serial_ports",
+            "lidarspec.cli.finding.list_serial_ports",
             lambda: [SerialPort("/dev/ttyUSB0", "", "", True, ())],
         )
-        monkeypatch.setattr("lidarspec.cli.finding.udp_ports", lambda: [2368])
+        monkeypatch.setattr("lidarspec.cli.finding.list_udp_ports", lambda: [2368])
         told = json.loads(ran("detect", "--json", code=5).stdout)
         assert [one["source"] for one in told["sources"]] == ["/dev/ttyUSB0", "udp://:2368"]
 
@@ -393,8 +393,9 @@ def test_bytes_sent_by_hand_are_answered_and_the_answer_is_explained() -> None:
 def test_detect_exits_with_5_if_live_sources_are_silent(
     source: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lidarspec.cli.finding._everywhere", lambda duration, start: iter([]))
+    monkeypatch.setattr("lidarspec.cli.finding._detect_all_ports", lambda duration, start: iter([]))
     monkeypatch.setattr(
-        "lidarspec.cli.finding._one", lambda source, duration, start, tell: [Verdict(Heard(source))]
+        "lidarspec.cli.finding._detect_source",
+        lambda source, duration, start, tell: [Verdict(SampleBytes(source))],
     )
     assert ran("detect", *source, code=5).stderr.startswith("no data received\n")

@@ -18,11 +18,24 @@ import pytest
 import lidarspec as ls
 from lidarspec import CommandError, SourceError, UsageError, WireError, simulate
 from lidarspec.detect import identification, listen
-from lidarspec.detect.identification import detect, fitting, scores, verdict, verdicts
-from lidarspec.detect.listen import Heard, bauds, hear, probe, started_first, udp_ports
-from lidarspec.drafting.crc_search import DIVISION_WORK, QUICK_WORK, crc_matches, remainder
-from lidarspec.drafting.periods import structure
-from lidarspec.drafting.samples import Samples
+from lidarspec.detect.identification import (
+    detect,
+    find_fitting_sensors,
+    identify_sample,
+    identify_senders,
+    rate_sensors,
+)
+from lidarspec.detect.listen import (
+    SampleBytes,
+    list_bauds,
+    list_start_required,
+    list_udp_ports,
+    probe,
+    read_samples,
+)
+from lidarspec.drafting.crc_search import DIVISION_WORK, QUICK_WORK, crc_matches, divide_remainder
+from lidarspec.drafting.periods import find_structure
+from lidarspec.drafting.samples import SampleFrames
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from tests.evidence import capture
@@ -84,7 +97,7 @@ def few_installed(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen until enough has come, however slow the machine is."""
-    monkeypatch.setitem(identification.verdicts.__kwdefaults__, "seconds", TIMEOUT_S)
+    monkeypatch.setitem(identification.identify_senders.__kwdefaults__, "seconds", TIMEOUT_S)
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -125,10 +138,10 @@ def test_captures_of_others_are_nobodys(name: str, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("name", ALIKE)
 def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str) -> None:
     for found in (
-        one for one in verdicts(capture(name)) if one.scores
+        one for one in identify_senders(capture(name)) if one.scores
     ):  # an IMU sends on a port of its own
         assert found.sensor is None
-        assert {score.sensor.id for score in found.alike} == ALIKE[name]
+        assert {score.sensor.id for score in found.candidates} == ALIKE[name]
     with pytest.raises(UsageError, match="send the same frames"):
         detect(capture(name))
 
@@ -140,9 +153,9 @@ def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str)
 def test_clocks_tell_twins_apart(name: str) -> None:
     sensor = ls.sensor(name)
     data = simulate(sensor, 60, start=7)
-    found = verdict(Heard("", tuple(data), datagrams=sensor.datagrams))
+    found = identify_sample(SampleBytes("", tuple(data), datagrams=sensor.datagrams))
     assert found.sensor is sensor
-    assert "its clock advances by" in found.alike[0].why
+    assert "its clock advances by" in found.candidates[0].why
 
 
 def old_firmware(
@@ -177,8 +190,8 @@ def swapped(data: list[bytes]) -> list[bytes]:
 def test_a_network_does_not_change_what_the_clock_says(
     as_it_comes: Callable[[list[bytes]], list[bytes]],
 ) -> None:
-    found = verdict(Heard("", tuple(as_it_comes(old_firmware(200))), datagrams=True))
-    assert (found.sensor and found.sensor.id, found.alike[0].why) == (
+    found = identify_sample(SampleBytes("", tuple(as_it_comes(old_firmware(200))), datagrams=True))
+    assert (found.sensor and found.sensor.id, found.candidates[0].why) == (
         "velodyne-vlp16",
         "its clock advances by 1.33 ms a packet",
     )
@@ -187,14 +200,16 @@ def test_a_network_does_not_change_what_the_clock_says(
 @pytest.mark.usefixtures("few_installed")
 def test_the_pace_of_a_clock_is_that_of_the_mode_that_the_packets_name() -> None:
     dual = old_firmware(60, period=6 * 110.592e-6, mode=0x39)
-    assert (found := verdict(Heard("", tuple(dual), datagrams=True)).sensor) is not None
+    assert (
+        found := identify_sample(SampleBytes("", tuple(dual), datagrams=True)).sensor
+    ) is not None
     assert found.id == "velodyne-vlp16"
 
 
 @pytest.mark.slow
 def test_a_name_that_is_not_to_be_trusted_tells_nothing() -> None:
-    found = verdict(Heard("", tuple(old_firmware(2)), datagrams=True))
-    assert (found.sensor, {score.sensor.id for score in found.alike}) == (
+    found = identify_sample(SampleBytes("", tuple(old_firmware(2)), datagrams=True))
+    assert (found.sensor, {score.sensor.id for score in found.candidates}) == (
         None,
         {"velodyne-hdl32e", "velodyne-vlp16"},
     )
@@ -207,10 +222,12 @@ def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None
         xt32.build("data", xt32.parse(packet), block_count=6, blocks=xt32.parse(packet).blocks[:6])
         for packet in simulate(xt32, 5)
     ]
-    assert verdict(Heard("", tuple(xt32m), datagrams=True)).sensor is ls.sensor("hesai-xt32m")
+    assert identify_sample(SampleBytes("", tuple(xt32m), datagrams=True)).sensor is ls.sensor(
+        "hesai-xt32m"
+    )
     data, name = old_firmware(60, period=6 * 110.592e-6, product=0x23), "velodyne-vlp32a"
-    found = verdict(Heard("", tuple(data), datagrams=True))
-    assert (found.alike, [*found.others]) == ((), [name])
+    found = identify_sample(SampleBytes("", tuple(data), datagrams=True))
+    assert (found.candidates, [*found.others]) == ((), [name])
     (tmp_path / "one.bin").write_bytes(data[0])
     with pytest.raises(
         WireError, match=f"these are frames of {name} .*, which no installed plugin supports"
@@ -222,8 +239,8 @@ def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None
 def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
     sensor = ls.sensor("cspc-coin-d4")
     data = b"".join(simulate(sensor, 60))
-    at_its_baud_rate = verdict(Heard("", (data,), baud=230_400))
-    left = {score.sensor.id for score in at_its_baud_rate.alike}
+    at_its_baud_rate = identify_sample(SampleBytes("", (data,), baud=230_400))
+    left = {score.sensor.id for score in at_its_baud_rate.candidates}
     assert left == {"cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6", "ydlidar-g2", *TMINIS}
     named = sensor.build(
         "info",
@@ -234,24 +251,26 @@ def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
         reserved=bytes(3),
         revision=1,
     )
-    assert verdict(Heard("", (named + data,))).sensor is sensor
+    assert identify_sample(SampleBytes("", (named + data,))).sensor is sensor
 
 
 @pytest.mark.slow
 def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
     sensor = ls.sensor("slamtec-rplidar-s2")
     data = (sensor.build("scan_descriptor"), *simulate(sensor, 300))
-    assert {score.sensor.id for score in verdict(Heard("", data)).alike} == RPLIDARS
-    found = verdict(Heard("", data, baud=1_000_000))
-    assert {score.sensor.id for score in found.alike} == {
+    assert {
+        score.sensor.id for score in identify_sample(SampleBytes("", data)).candidates
+    } == RPLIDARS
+    found = identify_sample(SampleBytes("", data, baud=1_000_000))
+    assert {score.sensor.id for score in found.candidates} == {
         f"slamtec-rplidar-{name}" for name in ("s2", "s2l", "s3")
     }
-    assert found.alike[0].why == "it runs at 1000000 baud"
+    assert found.candidates[0].why == "it runs at 1000000 baud"
     named = sensor.build(
         "info", model=0x81, firmware_minor=1, firmware_major=1, hardware=1, serial=bytes(16)
     )
-    found = verdict(Heard("", (named, *data), baud=1_000_000))
-    assert (found.sensor and found.sensor.id, found.alike[0].why) == (
+    found = identify_sample(SampleBytes("", (named, *data), baud=1_000_000))
+    assert (found.sensor and found.sensor.id, found.candidates[0].why) == (
         "slamtec-rplidar-s3",
         "info.model is RPLIDAR S3",
     )
@@ -261,26 +280,27 @@ def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
 def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     assert "slamtec-rplidar-a1" in {
-        score.sensor.id for score in scores([b"".join(simulate(sensor, 300))], datagrams=False)
+        score.sensor.id
+        for score in rate_sensors([b"".join(simulate(sensor, 300))], datagrams=False)
     }
 
 
 @pytest.mark.slow
 def test_the_middle_of_a_scan_is_read_with_the_answer_that_began_it() -> None:
     data = b"".join(simulate(ls.sensor("slamtec-rplidar-a1"), 300))
-    found = verdict(Heard("", (data,)))
-    assert {(score.sensor.id, score.sensor.options["answer"]) for score in found.alike} == {
+    found = identify_sample(SampleBytes("", (data,)))
+    assert {(score.sensor.id, score.sensor.options["answer"]) for score in found.candidates} == {
         (name, "node") for name in RPLIDARS
     }
-    assert len(found.alike[0].sensor.decode(data)) == 300
+    assert len(found.candidates[0].sensor.decode(data)) == 300
 
 
 @pytest.mark.usefixtures("few_installed")
 def test_what_is_no_fit_for_one_question_is_none_for_another() -> None:
     packed = gzip.compress(b"".join(b"%d\n" % number for number in range(40_000)))
-    assert scores([packed], datagrams=False)
-    assert verdict(Heard("", (packed,))).scores == ()
-    assert fitting([packed], datagrams=False) == []
+    assert rate_sensors([packed], datagrams=False)
+    assert identify_sample(SampleBytes("", (packed,))).scores == ()
+    assert find_fitting_sensors([packed], datagrams=False) == []
 
 
 def firmware_bug(number: int) -> list[bytes]:
@@ -296,7 +316,7 @@ def firmware_bug(number: int) -> list[bytes]:
 @pytest.mark.usefixtures("few_installed")
 def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path: Path) -> None:
     data, path = b"".join(firmware_bug(60)), tmp_path / "bug.bin"
-    found = verdict(Heard("", (data,)))
+    found = identify_sample(SampleBytes("", (data,)))
     assert (found.scores, found.sensor) == ((), None)
     alike = " or ".join(
         f"ldrobot-{name}" for name in ("ld06", "ld14", "ld14p", "ld20", "stl06p", "stl27l")
@@ -316,22 +336,22 @@ def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path:
     sealed_by_chance = [frame[:46] + noise.randbytes(1) for frame in firmware_bug(60)]
     assert (
         "no other checksum was found"
-        in verdict(Heard("", (b"".join(sealed_by_chance[:12]),))).fault
+        in identify_sample(SampleBytes("", (b"".join(sealed_by_chance[:12]),))).fault
     )
 
 
 @pytest.mark.usefixtures("few_installed")
 def test_a_wrong_checksum_now_and_then_is_damage_and_no_bug() -> None:
     good, bad = simulate(ls.sensor("ldrobot-stl27l"), 60), firmware_bug(60)
-    assert verdict(Heard("", (b"".join(bad[:58] + good[58:]),))).fault == ""
+    assert identify_sample(SampleBytes("", (b"".join(bad[:58] + good[58:]),))).fault == ""
 
 
 @pytest.mark.usefixtures("few_installed")
 def test_chance_frames_in_much_noise_are_no_fit() -> None:
     noise = random.Random(4).randbytes(40_000)
     data = noise[:20_000] + simulate(ls.sensor("ldrobot-stl27l"), 1)[0] + noise[20_000:]
-    assert scores([data], datagrams=False)
-    assert verdict(Heard("", (data,))).scores == ()
+    assert rate_sensors([data], datagrams=False)
+    assert identify_sample(SampleBytes("", (data,))).scores == ()
 
 
 @pytest.mark.usefixtures("few_installed")
@@ -339,7 +359,7 @@ def test_damage_does_not_hide_a_sensor() -> None:
     source, data = random.Random(5), bytearray(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 300)))
     for _ in range(len(data) // 100):
         data[source.randrange(len(data))] ^= 0xFF
-    found = verdict(Heard("", (bytes(data),)))
+    found = identify_sample(SampleBytes("", (bytes(data),)))
     assert found.sensor is not None
     assert found.sensor.id == "ldrobot-stl27l"
     assert 0.4 < found.scores[0].share < 0.8
@@ -358,19 +378,21 @@ def test_a_simulated_port_is_its_sensors(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_installed")
 def test_a_sensor_that_has_to_be_started_first() -> None:
-    assert {"cspc-m1c1-mini", "slamtec-rplidar-a1"} <= {sensor.id for sensor in started_first()}
+    assert {"cspc-m1c1-mini", "slamtec-rplidar-a1"} <= {
+        sensor.id for sensor in list_start_required()
+    }
     with virtual_port("cspc-m1c1-mini") as made:
         with pytest.raises(CommandError, match="nothing comes") as error:
             detect(made.path)
         assert error.value.__notes__ == [f"next: lidarspec doctor {made.path}"]
-        assert made.device.heard == []
+        assert made.device.commands_received == []
         heard = next(heard for heard in probe(made.path) if heard.size)
-        found = verdict(heard)
-        assert (found.sensor and found.sensor.id, found.alike[0].why) == (
+        found = identify_sample(heard)
+        assert (found.sensor and found.sensor.id, found.candidates[0].why) == (
             "cspc-m1c1-mini",
             "info.model is M1C1_Mini",
         )
-        until(lambda: made.device.heard[-1] == "stop")
+        until(lambda: made.device.commands_received[-1] == "stop")
 
 
 @pytest.mark.usefixtures("few_installed", "patient")
@@ -395,8 +417,8 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
 
         with working(send):
             found = {
-                one.heard.sender: one.sensor and one.sensor.id
-                for one in verdicts(f"udp://127.0.0.1:{target}")
+                one.sample.sender: one.sensor and one.sensor.id
+                for one in identify_senders(f"udp://127.0.0.1:{target}")
             }
             with pytest.raises(UsageError, match="several sensors send"):
                 detect(f"udp://127.0.0.1:{target}")
@@ -431,13 +453,13 @@ def test_what_cannot_be_opened_is_the_systems_fault(tmp_path: Path) -> None:
 
 
 def test_what_is_listened_to() -> None:
-    assert {115_200, 150_000, 230_400, 921_600} <= set(bauds())
-    assert {2368, 6699, 7788} <= set(udp_ports())
+    assert {115_200, 150_000, 230_400, 921_600} <= set(list_bauds())
+    assert {2368, 6699, 7788} <= set(list_udp_ports())
 
 
 def test_a_pseudo_terminal_is_listened_to_once() -> None:
     with virtual_port("ldrobot-stl27l") as made:
-        (heard,) = hear(made.path, seconds=0.3)
+        (heard,) = read_samples(made.path, seconds=0.3)
     assert heard.baud is None
     assert heard.size > 47
 
@@ -447,11 +469,11 @@ def test_without_sensors_the_rate_or_port_has_to_be_named(
 ) -> None:
     monkeypatch.setattr(listen, "sensors", dict)
     with port(tmp_path) as made:
-        assert list(hear(made.name, seconds=0.1))
+        assert list(read_samples(made.name, seconds=0.1))
     with pytest.raises(SourceError, match=r"serial:///dev/ttyUSB0\?baud="):
-        next(hear("serial:///dev/ttyUSB0"))
+        next(read_samples("serial:///dev/ttyUSB0"))
     with pytest.raises(SourceError, match=r"udp://\?port="):
-        next(hear("udp://"))
+        next(read_samples("udp://"))
 
 
 def test_of_sensors_with_the_same_frames_those_of_the_vendor_with_most_of_them_come_first(
@@ -459,8 +481,8 @@ def test_of_sensors_with_the_same_frames_those_of_the_vendor_with_most_of_them_c
 ) -> None:
     few = {name: ls.sensor(name) for name in ("cspc-coin-d4", "ydlidar-s4b", "ydlidar-tmini")}
     monkeypatch.setattr(identification, "sensors", lambda: few)
-    found = verdict(Heard("", tuple(simulate(few["cspc-coin-d4"], 30))))
-    assert [score.sensor.id for score in found.alike] == [
+    found = identify_sample(SampleBytes("", tuple(simulate(few["cspc-coin-d4"], 30))))
+    assert [score.sensor.id for score in found.candidates] == [
         "ydlidar-s4b",
         "ydlidar-tmini",
         "cspc-coin-d4",
@@ -479,12 +501,12 @@ def test_a_line_that_is_silent_at_three_rates_is_not_listened_to_at_others(
         port(tmp_path) as made,
         working(lambda stop: _noise(made, random.Random(4), stop) if sends else None) as stop,
     ):
-        heard = list(hear(made.name, seconds=0.1, tell=told.append))
+        heard = list(read_samples(made.name, seconds=0.1, tell=told.append))
         stop.set()
         made.discard()
-    assert len(heard) == len(told) == (listened or len(bauds()))
-    assert {one.baud for one in heard} >= {bauds()[0], min(bauds()), max(bauds())}
-    assert told[0] == f"{made.name} at {bauds()[0]} baud"
+    assert len(heard) == len(told) == (listened or len(list_bauds()))
+    assert {one.baud for one in heard} >= {list_bauds()[0], min(list_bauds()), max(list_bauds())}
+    assert told[0] == f"{made.name} at {list_bauds()[0]} baud"
 
 
 def make_bodies(size: int, number: int) -> list[bytes]:
@@ -497,11 +519,11 @@ class TestStructure:
     """What unknown bytes are made of."""
 
     def test_bytes_that_are_alike_by_chance_are_no_frames(self) -> None:
-        assert structure([random.Random(1).randbytes(10_000)], datagrams=False) is None
+        assert find_structure([random.Random(1).randbytes(10_000)], datagrams=False) is None
         few = b"".join(
             b"\xde\xad\xbe\xef" + random.Random(seed).randbytes(996) for seed in range(3)
         )
-        found = structure([few], datagrams=False)
+        found = find_structure([few], datagrams=False)
         assert found is not None
         assert (found.sync, found.period) == (b"\xde\xad\xbe\xef", 1000)
 
@@ -514,11 +536,11 @@ class TestStructure:
         def count_and_divide(a: int, b: int) -> int:
             nonlocal divided
             divided += max(a.bit_length() - b.bit_length() + 1, 0) // 8
-            return remainder(a, b)
+            return divide_remainder(a, b)
 
-        monkeypatch.setattr("lidarspec.drafting.crc_search.remainder", count_and_divide)
+        monkeypatch.setattr("lidarspec.drafting.crc_search.divide_remainder", count_and_divide)
         monkeypatch.setattr("lidarspec.drafting.crc_search.QUICK_WORK", QUICK_WORK // 64)
-        samples = Samples(make_bodies(size, number))
+        samples = SampleFrames(make_bodies(size, number))
         assert list(crc_matches(samples, quick=True)) == []
         assert (
             0 < divided <= 2 * QUICK_WORK // 64 // DIVISION_WORK
@@ -529,7 +551,7 @@ class TestStructure:
 
     @pytest.mark.parametrize(("size", "number"), [(60, 40), (600, 8)])
     def test_a_quick_search_finds_a_usual_crc(self, size: int, number: int) -> None:
-        sealed = Samples(
+        sealed = SampleFrames(
             body + zlib.crc32(body).to_bytes(4, "little") for body in make_bodies(size, number)
         )
         assert next(crc_matches(sealed, quick=True)).name == "CRC-32"
@@ -537,7 +559,7 @@ class TestStructure:
     @pytest.mark.slow
     def test_frames_of_one_length(self) -> None:
         data = b"".join(simulate(ls.sensor("ldrobot-stl27l"), 60))[13:]
-        found = structure([data[:1000], data[1000:]], datagrams=False)
+        found = find_structure([data[:1000], data[1000:]], datagrams=False)
         assert found is not None
         assert (found.sync[:2], found.period, len(found.frames)) == (b"\x54\x2c", 47, 59)
         assert (found.checksums[0].paste, found.checksums[0].right) == (
@@ -546,7 +568,7 @@ class TestStructure:
         )
 
     def test_frames_that_say_how_long_they_are(self) -> None:
-        found = structure(
+        found = find_structure(
             [b"\xfe" + b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 60))], datagrams=False
         )
         assert found is not None
@@ -559,12 +581,12 @@ class TestStructure:
 
     @pytest.mark.slow
     def test_long_frames_with_shorter_ones_in_them(self) -> None:
-        found = structure([b"".join(simulate(ls.sensor("robosense-m1"), 60))], datagrams=False)
+        found = find_structure([b"".join(simulate(ls.sensor("robosense-m1"), 60))], datagrams=False)
         assert found is not None
         assert (found.sync[:4].hex(), found.period) == ("55aa5aa5", 1210)
 
     def test_datagrams(self) -> None:
-        found = structure(simulate(ls.sensor("robosense-m1"), 20), datagrams=True)
+        found = find_structure(simulate(ls.sensor("robosense-m1"), 20), datagrams=True)
         assert found is not None
         assert (found.sync[:4].hex(), found.period, found.share) == ("55aa5aa5", 1210, 1.0)
 
@@ -573,5 +595,5 @@ class TestStructure:
         [b"", b"\x00" * 5000, random.Random(7).randbytes(20_000), b"a line of some text\n" * 3],
     )
     def test_nothing_is_seen_where_nothing_is(self, data: bytes) -> None:
-        assert structure([data], datagrams=False) is None
-        assert structure([data] if data else [], datagrams=True) is None
+        assert find_structure([data], datagrams=False) is None
+        assert find_structure([data] if data else [], datagrams=True) is None

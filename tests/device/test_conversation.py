@@ -21,7 +21,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import CommandError, ReplyTimeout, SpecError, UsageError
-from lidarspec.plugins import Registry, standing_in
+from lidarspec.plugins import Registry, use_registry
 from lidarspec.recording.format import Header
 from lidarspec.spec import (
     Chunk,
@@ -106,7 +106,7 @@ def test_a_simulated_sensor_answers_over_a_link_of_its_own(kind: type[Udp | Tcp]
             "code": 2,
         }
         assert device.send("hello").values.head.number == 9
-        assert port.device.heard == ["call", "send_to", "hello"]
+        assert port.device.commands_received == ["call", "send_to", "hello"]
         assert device.latest(TIMEOUT_S).complete
 
 
@@ -138,7 +138,7 @@ def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: 
             assert (dict(device.learned), angles(device)) == ({}, [0.0, 1.0, 2.0, 3.0])
     registry = Registry()
     registry.add(SimpleNamespace(lidarspec_sensors=hookimpl(lambda: [sensor])), name="shapes")
-    with standing_in(registry):
+    with use_registry(registry):
         with ls.open(path) as replay:
             assert repr(replay.sensor.options["table"]) == "Learned(11 bytes)"
             again = [
@@ -250,18 +250,20 @@ def test_a_sensor_that_no_longer_answers_its_heartbeat_is_started_again() -> Non
         ls.open(port.path, sensor) as device,
     ):
         device.latest(TIMEOUT_S)
-        read_until(device, lambda: port.device.heard.count("beat") > 2)
+        read_until(device, lambda: port.device.commands_received.count("beat") > 2)
         assert not silent(device)
         port.unplug()
         read_until(device, lambda: silent(device))
-        heard = len(port.device.heard)
+        heard = len(port.device.commands_received)
         port.plug()
-        read_until(device, lambda: "hello" in port.device.heard[heard:] and not silent(device))
+        read_until(
+            device, lambda: "hello" in port.device.commands_received[heard:] and not silent(device)
+        )
         assert device.latest(TIMEOUT_S).complete
-        begun = port.device.heard.count("hello")
-        beats = port.device.heard.count("beat")
-        read_until(device, lambda: port.device.heard.count("beat") > beats + 3)
-        assert port.device.heard.count("hello") == begun, "once is enough"
+        begun = port.device.commands_received.count("hello")
+        beats = port.device.commands_received.count("beat")
+        read_until(device, lambda: port.device.commands_received.count("beat") > beats + 3)
+        assert port.device.commands_received.count("hello") == begun, "once is enough"
 
 
 class Loop(Link):
@@ -302,7 +304,7 @@ class Plugin:
 def test_a_plugin_opens_a_link_of_its_own_kind() -> None:
     sensor, plugin = linked(Loop()), Plugin()
     source, plugins = f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", Registry()
-    with standing_in(plugins):
+    with use_registry(plugins):
         for opened, error, said in [
             (None, UsageError, "no plugin .* opens a Loop link, which control is"),
             (3, SpecError, "and is a int"),
@@ -350,7 +352,7 @@ def test_a_sensor_is_found_by_a_broadcast_and_told_our_address() -> None:
     ):
         assert device.send("hello", timeout=TIMEOUT_S).confirmed
         assert device.send("call", name="anna").confirmed
-        assert port.device.heard == ["hello", "call"]
+        assert port.device.commands_received == ["hello", "call"]
 
 
 @pytest.mark.skipif(
@@ -422,7 +424,7 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
         assert (reply.values.status, reply.values.body) == (200, body)
         assert device.send("set_mode", mode="fast").values.status == 200
         assert device.send("set_mode", mode="slow").values.status == 400
-        assert port.device.heard == ["status", "set_mode", "set_mode"]
+        assert port.device.commands_received == ["status", "set_mode", "set_mode"]
         asked = http.client.HTTPConnection(
             "127.0.0.1", port.outlet.controls["web"].port, timeout=TIMEOUT_S
         )

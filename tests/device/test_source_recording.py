@@ -16,7 +16,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
-from lidarspec.device.capture_thread import BoundedQueue, Capture
+from lidarspec.device.capture_thread import BoundedQueue, CaptureThread
 from lidarspec.device.source_recording import SourceRecording
 from lidarspec.recording.format import Recording
 from lidarspec.recording.recorders import Recorder
@@ -131,7 +131,7 @@ def test_a_clock_that_is_set_changes_no_time_and_is_recorded(tmp_path: Path) -> 
     with udp() as sender, Recorder(path, sensor) as kept:
         clock = HostClock(wall=lambda: time.time_ns() + wall[0])
         with contextlib.closing(
-            Capture(live(f"udp://:{number}", sensor), queue, log=kept, clock=clock)
+            CaptureThread(live(f"udp://:{number}", sensor), queue, log=kept, clock=clock)
         ) as capture:
             for index, step in enumerate((0, 20_000_000, 3_000_000_000, 3_000_000_000)):
                 wall[0] = step

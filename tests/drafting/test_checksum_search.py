@@ -13,16 +13,16 @@ import pytest
 
 import lidarspec
 import lidarspec.spec
-from lidarspec.drafting.checksum_search import Changed, WordSum, search
+from lidarspec.drafting.checksum_search import MaskedChecksum, WordSum, search
 from lidarspec.drafting.crc_search import (
     common_divisor,
     crc_matches,
+    divide_remainder,
     divisors,
     quotient,
-    remainder,
     solve,
 )
-from lidarspec.drafting.samples import Match, Place, Samples, best_first
+from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace, SampleFrames, sort_matches
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksum, Crc, Fold15, Sum, WordXor, Xor
 from lidarspec.spec.checksums import CRCS, name_of
@@ -49,23 +49,25 @@ def sealed(
     ]  # type: ignore[arg-type]
 
 
-def found(frames: list[bytes]) -> Match:
+def found(frames: list[bytes]) -> ChecksumMatch:
     return search(frames)[0]
 
 
-def found_among_crcs(frames: list[bytes]) -> Match:
+def found_among_crcs(frames: list[bytes]) -> ChecksumMatch:
     """The same, where plain checksums are not tried before."""
-    samples = Samples(frames)
-    return best_first(list(crc_matches(samples)) or list(crc_matches(samples, mixed=True)))[0]
+    samples = SampleFrames(frames)
+    return sort_matches(list(crc_matches(samples)) or list(crc_matches(samples, mixed=True)))[0]
 
 
-def assert_found_by_name(find: Callable[[list[bytes]], Match], name: str, length: int) -> None:
+def assert_found_by_name(
+    find: Callable[[list[bytes]], ChecksumMatch], name: str, length: int
+) -> None:
     crc = CRCS[name]
     match = find(sealed(crc, length=length, order="big" if len(name) % 2 else "little", vary=3))
     assert (match.algorithm, match.name, match.place) == (
         crc,
         name,
-        Place(-crc.width // 8, crc.width // 8),
+        ChecksumPlace(-crc.width // 8, crc.width // 8),
     )
     assert (match.right, match.total) == (12, 12)
     assert match.order == ("big" if len(name) % 2 and crc.width > 8 else "little")
@@ -163,7 +165,7 @@ def test_what_the_checksum_leaves_out_in_front() -> None:
         pytest.param(WordXor(), marks=pytest.mark.slow),
         WordSum("little"),
         WordSum("big", carry=True),
-        pytest.param(Changed(Sum(8), 0xFF, negative=True), marks=pytest.mark.slow),
+        pytest.param(MaskedChecksum(Sum(8), 0xFF, negative=True), marks=pytest.mark.slow),
     ],
     ids=lambda checksum: checksum.describe(),
 )
@@ -181,9 +183,9 @@ def test_plain_checksums(checksum: Checksum) -> None:
         *(
             pytest.param(checksum, marks=pytest.mark.slow)
             for checksum in (
-                Changed(Sum(8), 0x5A),
-                Changed(Sum(16), 0, negative=True),
-                Changed(Sum(16), 0x1234),
+                MaskedChecksum(Sum(8), 0x5A),
+                MaskedChecksum(Sum(16), 0, negative=True),
+                MaskedChecksum(Sum(16), 0x1234),
             )
         ),
     ],
@@ -208,23 +210,23 @@ def test_what_is_pasted_computes_the_same(checksum: Checksum) -> None:
 @pytest.mark.parametrize("number", [5, pytest.param(40, marks=pytest.mark.slow)])
 def test_words_in_groups_around_a_field_in_the_middle(number: int) -> None:
     match = found(simulate(lidarspec.sensor("cspc-m1c1-mini"), 40)[-number:])
-    assert (match.algorithm, match.place) == (WordXor(head=8, groups=(1, 2)), Place(8, 2))
+    assert (match.algorithm, match.place) == (WordXor(head=8, groups=(1, 2)), ChecksumPlace(8, 2))
     assert match.paste == "WordXor(head=8, groups=(1, 2))"
 
 
 @pytest.mark.slow
 def test_an_xor_with_a_constant_is_found_and_its_place_a_guess() -> None:
-    frames = sealed(Changed(Xor(), 0x33), 40, 27)
+    frames = sealed(MaskedChecksum(Xor(), 0x33), 40, 27)
     matches = search(frames)
-    assert {match.algorithm for match in matches} == {Changed(Xor(), 0x33)}
-    assert Place(-1, 1) in [match.place for match in matches]
+    assert {match.algorithm for match in matches} == {MaskedChecksum(Xor(), 0x33)}
+    assert ChecksumPlace(-1, 1) in [match.place for match in matches]
     assert all("at other places" in match.remarks[-1] for match in matches if match.span.head == 0)
 
 
 @pytest.mark.slow
 def test_an_xor_in_two_nibbles() -> None:
     match = found(simulate(lidarspec.sensor("slamtec-rplidar-a1").configure(answer="express"), 20))
-    assert (match.algorithm, match.place) == (Xor(), Place(0, 2))
+    assert (match.algorithm, match.place) == (Xor(), ChecksumPlace(0, 2))
     assert "low nibbles" in match.remarks[0]
 
 
@@ -256,7 +258,7 @@ def test_division() -> None:
     source = random.Random(1)
     for _ in range(50):
         a, b = source.getrandbits(60), source.getrandbits(20) | 1
-        q, r, product = quotient(a, b), remainder(a, b), 0
+        q, r, product = quotient(a, b), divide_remainder(a, b), 0
         for bit in range(q.bit_length()):
             product ^= (b << bit) * (q >> bit & 1)
         assert product ^ r == a
@@ -293,8 +295,8 @@ def test_batches_of_the_checksums_without_a_name() -> None:
     for checksum in (
         WordSum("big"),
         WordSum("little", carry=True),
-        Changed(Sum(8), 7, negative=True),
-        Changed(Xor(), 9),
+        MaskedChecksum(Sum(8), 7, negative=True),
+        MaskedChecksum(Xor(), 9),
     ):
         assert checksum.batch(rows).tolist() == [checksum(row.tobytes()) for row in rows]
         assert checksum.describe()

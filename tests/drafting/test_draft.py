@@ -14,10 +14,15 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import UsageError, WireError
-from lidarspec.drafting.checksum_search import Changed
-from lidarspec.drafting.draft import Draft, Names, draft, make_template_values as text_of
-from lidarspec.drafting.periods import candidates
-from lidarspec.drafting.samples import Place
+from lidarspec.drafting.checksum_search import MaskedChecksum
+from lidarspec.drafting.draft import (
+    DistributionNames,
+    Draft,
+    draft,
+    make_template_values as text_of,
+)
+from lidarspec.drafting.periods import find_rising_fields
+from lidarspec.drafting.samples import ChecksumPlace
 from lidarspec.expressions.columns import align
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksum, Crc, Fold15, Sequence, Sum, WordXor, Xor
@@ -57,7 +62,10 @@ def module(tmp_path: Path, source: Path, *more: str) -> ls.Sensor:
     """The sensor that `new --from-capture` writes."""
     ran("new", "acme-x9", "--into", tmp_path, "--from-capture", source, *more)
     return ls.sensor(
-        tmp_path / Names("acme-x9").distribution / Names("acme-x9").module / "__init__.py"
+        tmp_path
+        / DistributionNames("acme-x9").distribution
+        / DistributionNames("acme-x9").module
+        / "__init__.py"
     )
 
 
@@ -77,7 +85,7 @@ def test_three_frames_of_one_length_and_a_crc() -> None:
     assert found.seal is not None
     assert (found.seal.algorithm, found.seal.place, found.seal.right) == (
         Crc(8, 0x4D),
-        Place(-1, 1),
+        ChecksumPlace(-1, 1),
         3,
     )
     assert rising(found) == {"rising_4": (2, "little", 0), "rising_42": (2, "little", 0)}
@@ -93,7 +101,10 @@ def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
         4,
     )
     assert found.seal is not None
-    assert (found.seal.algorithm, found.seal.place) == (WordXor(head=8, groups=(1, 2)), Place(8, 2))
+    assert (found.seal.algorithm, found.seal.place) == (
+        WordXor(head=8, groups=(1, 2)),
+        ChecksumPlace(8, 2),
+    )
     assert rising(found) == {"rising_4": (2, "little", 0), "rising_6": (2, "little", 0)}
 
 
@@ -204,7 +215,7 @@ def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> N
     sources = {
         "blocks": b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)),
         "count": b"".join(simulate(ls.sensor("cspc-coin-d4"), 60)),
-        "class": made(b"\x5a\xc3", Changed(Sum(8), 0x55), skip=1),
+        "class": made(b"\x5a\xc3", MaskedChecksum(Sum(8), 0x55), skip=1),
         "over": made(b"\x5a\xc3", Crc(16, 0x1021), skip=3),
         "angles": b"".join(simulate(ls.sensor("ldrobot-ld06"), 300)),
     }
@@ -260,7 +271,7 @@ SEALED = [
     (Sum(16), 0, "big"),
     (Crc(16, 0x1021), 2, "big"),
     (Crc(32, 0x04C11DB7, 0xFFFFFFFF, True, True, 0xFFFFFFFF), 1, "little"),
-    (Changed(Sum(8), 0xFF, negative=True), 3, "little"),
+    (MaskedChecksum(Sum(8), 0xFF, negative=True), 3, "little"),
 ]
 
 
@@ -319,7 +330,7 @@ def test_turns_of_an_index_are_not_taken_for_one_frame(tmp_path: Path) -> None:
     found = draft([data[9:]], datagrams=False)
     assert (found.sync[:1], found.size, len(found.frames)) == (b"\xfa", 22, 899)
     assert found.seal is not None
-    assert (found.seal.algorithm, found.seal.place) == (Fold15(), Place(-2, 2))
+    assert (found.seal.algorithm, found.seal.place) == (Fold15(), ChecksumPlace(-2, 2))
     assert [
         (one.name, one.first, one.circle) for one in found.candidates if one.kind == "counter"
     ] == [("counter_1", 0xA0, 0xFA)]
@@ -358,7 +369,7 @@ def test_a_length_in_bytes_with_short_frames_of_another_kind_between(tmp_path: P
     assert found.seal is not None
     assert (found.seal.algorithm, found.seal.place, found.seal.order) == (
         Sum(16),
-        Place(-2, 2),
+        ChecksumPlace(-2, 2),
         "big",
     )
     assert rising(found) == {"angle_11": (2, "big", 36_000)}
@@ -374,7 +385,7 @@ def test_angles_are_told_by_what_they_wrap_at(circle: int, order: str) -> None:
         source.randbytes(5) + int(value).to_bytes(2, order) + source.randbytes(6)
         for value in turned
     ]  # type: ignore[arg-type]
-    (one,) = candidates(np.frombuffer(b"".join(rows), np.uint8).reshape(300, 13))
+    (one,) = find_rising_fields(np.frombuffer(b"".join(rows), np.uint8).reshape(300, 13))
     assert (one.name, one.size, one.order, one.circle, one.kind) == (
         "angle_5",
         2,
@@ -386,7 +397,7 @@ def test_angles_are_told_by_what_they_wrap_at(circle: int, order: str) -> None:
 
 def test_noise_has_no_candidates() -> None:
     rows = np.random.default_rng(1).integers(0, 256, (400, 60), np.uint8)
-    assert not candidates(rows)
+    assert not find_rising_fields(rows)
 
 
 @pytest.mark.parametrize(
@@ -418,7 +429,7 @@ def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_names_are_refused_before_a_capture_is_read() -> None:
     with pytest.raises(UsageError):
-        Names("X9")
+        DistributionNames("X9")
 
 
 def test_points_may_depend_on_no_field() -> None:

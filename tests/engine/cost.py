@@ -58,4 +58,4 @@ def _find_frames(sensor: Sensor, data: bytes) -> list[Frames]:
     decoder = sensor.decoder()
     if sensor.datagrams:
         return [decoder.datagrams([data])]
-    return [*decoder.frames(data), *decoder.rest()]
+    return [*decoder.frames(data), *decoder.take_pending()]

@@ -13,7 +13,7 @@ from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.spec import Frame
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.frames import acceptable, free
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import assert_backends_agree
 
 DAMAGED_CONVERSATIONS = 2
@@ -35,16 +35,16 @@ def assert_damaged_input_reads_alike(sensor: Sensor, count: int = DAMAGED_CONVER
     """Fail unless a conversation, and `count` with damaged frames in them, give the same on both
     engines.
     """
-    subject = Subject(sensor)
+    subject = SensorUnderTest(sensor)
     source = subject.source("agree")
     frames = subject.conversation(rounds=1)
-    assert_backends_agree(sensor, material.delivery(sensor, frames))
+    assert_backends_agree(sensor, material.make_input(sensor, frames))
     for _ in range(count):
         noisy = [
             (name, material.mutate(data, source) if source.random() < 0.4 else data)
             for name, data in frames
         ]
-        assert_backends_agree(sensor, material.delivery(sensor, noisy))
+        assert_backends_agree(sensor, material.make_input(sensor, noisy))
 
 
 def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) -> None:
@@ -53,7 +53,7 @@ def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) ->
 
     Long frames are left out, since construct takes its time for each field.
     """
-    subject = Subject(sensor)
+    subject = SensorUnderTest(sensor)
     for name in sensor.incoming:
         frame = sensor.frames[name]
         if frame.max_length > material.SHORT or not is_compiled(frame):
@@ -70,4 +70,4 @@ def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) ->
             built = acceptable(subject, name, parsed)
             if built is not None:
                 edged.append((name, built))
-        assert_backends_agree(sensor, material.delivery(sensor, edged))
+        assert_backends_agree(sensor, material.make_input(sensor, edged))

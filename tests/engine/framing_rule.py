@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from lidarspec import Sensor
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import cuts
 from tests.engine.oracle import Cut, Oracle
 from tests.engine.streams import (
@@ -29,7 +29,7 @@ BURST_BYTES = (8, 16, 64)
 QUICK_SPLITS = 16
 
 
-def assert_like_oracle(subject: Subject, data: bytes, description: str) -> None:
+def assert_like_oracle(subject: SensorUnderTest, data: bytes, description: str) -> None:
     """Fail unless the decoder finds the same frames in a stream as the oracle."""
     frames = decoded(subject.sensor, data)
     expected = Oracle(subject.sensor, data).frames()
@@ -38,7 +38,7 @@ def assert_like_oracle(subject: Subject, data: bytes, description: str) -> None:
     assert frames == expected, f"{description}: missed {missed}, extra {extra}"
 
 
-def any_split_gives_the_same(subject: Subject, length: int = LENGTH) -> None:
+def any_split_gives_the_same(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check that 2-way splits, single bytes and random splits give the same frames and counters.
 
     Streams of `streams.LENGTH` are split at every byte, shorter ones at random places.
@@ -47,11 +47,11 @@ def any_split_gives_the_same(subject: Subject, length: int = LENGTH) -> None:
     source = subject.source("splits")
     data = material.mutate(subject.stream(rounds=1), source) + subject.stream(seed=1, rounds=1)
     data = data[: max(length // 2, 2 * _longest_frame(sensor))]
-    offsets = material.places(len(data), source)
+    offsets = material.pick_offsets(len(data), source)
     if length < LENGTH:
         offsets = source.sample(range(len(data)), min(QUICK_SPLITS, len(data)))
     splits = [[data[:offset], data[offset:]] for offset in offsets]
-    splits += [list(material.pieces(data, source)) for _ in range(len(offsets) // 4)]
+    splits += [list(material.cut_randomly(data, source)) for _ in range(len(offsets) // 4)]
     splits.append([data[offset : offset + 1] for offset in range(len(data))])
     _assert_same_in_pieces(sensor, data, splits)
 
@@ -77,7 +77,7 @@ def _assert_same_in_pieces(sensor: Sensor, data: bytes, splits: list[list[bytes]
         )
 
 
-def every_recoverable_frame_is_recovered(subject: Subject, length: int = LENGTH) -> None:
+def every_recoverable_frame_is_recovered(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check the frames against the oracle at every byte error rate, single bytes and bursts."""
     for rate in ERROR_RATES:
         data = damaged(_part(subject, length, f"{rate:g}"), rate, 1)
@@ -87,7 +87,7 @@ def every_recoverable_frame_is_recovered(subject: Subject, length: int = LENGTH)
         assert_like_oracle(subject, data, f"bursts of {burst} bytes")
 
 
-def _part(subject: Subject, length: int, purpose: str) -> bytes:
+def _part(subject: SensorUnderTest, length: int, purpose: str) -> bytes:
     """Return part of a conversation, from a random offset: one round of a sensor with many frame
     types is long.
     """
@@ -96,7 +96,7 @@ def _part(subject: Subject, length: int, purpose: str) -> bytes:
     return data[start : start + length]
 
 
-def a_claimed_length_costs_no_frame(subject: Subject, length: int = LENGTH) -> None:
+def a_claimed_length_costs_no_frame(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check that neither the head of a frame nor a frame with a bad end costs one of the frames
     behind it.
     """
@@ -114,7 +114,7 @@ def a_claimed_length_costs_no_frame(subject: Subject, length: int = LENGTH) -> N
             )
 
 
-def a_header_may_start_at_every_byte(subject: Subject, length: int = LENGTH) -> None:
+def a_header_may_start_at_every_byte(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check that stray bytes and repeated first bytes between frames cost none of them."""
     frames = subject.conversation(rounds=3 if length >= LENGTH else 1)
     first = frames[0][1][:1]
@@ -123,7 +123,7 @@ def a_header_may_start_at_every_byte(subject: Subject, length: int = LENGTH) -> 
         assert_like_oracle(subject, data, f"{stray.hex(' ')} before each frame")
 
 
-def noise_is_cut_by_the_rule(subject: Subject, length: int = LENGTH) -> None:
+def noise_is_cut_by_the_rule(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check constant lines, and noise made of headers, against the oracle."""
     source = subject.source("noise")
     whole = subject.stream(rounds=1)[:length]
@@ -149,7 +149,9 @@ def noise_is_cut_by_the_rule(subject: Subject, length: int = LENGTH) -> None:
     assert_like_oracle(subject, data, "noise made of headers")
 
 
-def announcements_may_change_with_every_frame(subject: Subject, length: int = LENGTH) -> None:
+def announcements_may_change_with_every_frame(
+    subject: SensorUnderTest, length: int = LENGTH
+) -> None:
     """Check announcements in any order, frames behind their own and behind others', whole, cut off
     and damaged.
     """
@@ -168,10 +170,12 @@ def announcements_may_change_with_every_frame(subject: Subject, length: int = LE
             (frame, frame, frame[: source.randint(1, 5)], material.mutate(frame, source))
         )
     assert_like_oracle(subject, data, "announcements in any order")
-    _assert_same_in_pieces(sensor, data, [list(material.pieces(data, source)) for _ in range(10)])
+    _assert_same_in_pieces(
+        sensor, data, [list(material.cut_randomly(data, source)) for _ in range(10)]
+    )
 
 
-def the_longest_frame_is_a_frame(subject: Subject, length: int = LENGTH) -> None:
+def the_longest_frame_is_a_frame(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check that the longest of many examples is found in a stream."""
     for name in subject.sensor.incoming:
         frame = subject.sensor.frames[name]
@@ -180,7 +184,7 @@ def the_longest_frame_is_a_frame(subject: Subject, length: int = LENGTH) -> None
             assert_like_oracle(subject, longest * 2, f"a {name} frame of {len(longest)} bytes")
 
 
-def idle_gives_up_pending_bytes(subject: Subject, length: int = LENGTH) -> None:
+def idle_gives_up_pending_bytes(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check that pending bytes are given up when the line falls silent, and never joined to later
     ones.
     """
@@ -197,7 +201,7 @@ def idle_gives_up_pending_bytes(subject: Subject, length: int = LENGTH) -> None:
         assert last not in later, f"its first {end} bytes came before the line fell silent"
 
 
-def decoders_are_independent(subject: Subject, length: int = LENGTH) -> None:
+def decoders_are_independent(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check that two decoders fed in turn give what each gives alone."""
     inputs = [damaged(clean(subject, seed=seed, length=length // 2), 1e-3, seed) for seed in (3, 4)]
     alone = []

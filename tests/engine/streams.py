@@ -11,10 +11,10 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 
 from lidarspec import Counters, Sensor, SpecError
-from lidarspec.framing.example_frames import header, random_frame
+from lidarspec.framing.example_frames import make_random_header, random_frame
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import cuts
 from tests.by_construct import reader
 from tests.engine.oracle import Cut
@@ -63,7 +63,7 @@ def worst(sensor: Sensor, length: int) -> bytes:
 NOISE_BYTES = (0, 2, 6)
 
 
-def hostile_streams(subject: Subject, length: int) -> Iterator[tuple[str, bytes]]:
+def hostile_streams(subject: SensorUnderTest, length: int) -> Iterator[tuple[str, bytes]]:
     """Generate streams of about this length that cost a decoder much for each byte, each with a
     description.
 
@@ -124,13 +124,13 @@ def _cut(frame: bytes, source: random.Random) -> bytes:
     return frame[: source.randint(1, len(frame))]
 
 
-def clean(subject: Subject, *, seed: int = 0, length: int = LENGTH) -> bytes:
+def clean(subject: SensorUnderTest, *, seed: int = 0, length: int = LENGTH) -> bytes:
     """A conversation of about this length, at least one round."""
     rounds = max(length // max(len(subject.stream(rounds=1)), 1), 1)
     return subject.stream(seed=seed, rounds=rounds)
 
 
-def longest_example(subject: Subject, name: str, headers: int = MANY_HEADERS) -> bytes:
+def longest_example(subject: SensorUnderTest, name: str, headers: int = MANY_HEADERS) -> bytes:
     """Return the longest of many examples, and of the longest header among `headers` drawn ones.
 
     With few headers, headers of frames with parts are not drawn: those have thousands of fields.
@@ -144,7 +144,7 @@ def longest_example(subject: Subject, name: str, headers: int = MANY_HEADERS) ->
     if is_drawn and (headers >= MANY_HEADERS or not engine.schema.parts):
         with contextlib.suppress(SpecError):
             _, longest = max(
-                (header(engine, source, subject.drawers(name)) for _ in range(headers)),
+                (make_random_header(engine, source, subject.drawers(name)) for _ in range(headers)),
                 key=lambda chosen: chosen[0].size,
             )
             drawn = {path: (lambda _, value=value: value) for path, value in longest.items()}
@@ -181,7 +181,7 @@ class Books:
 def decoded(sensor: Sensor, data: bytes) -> list[Cut]:
     """The frames of a stream that comes in chunks of random sizes."""
     books = Books(sensor)
-    for chunk in material.pieces(data, random.Random(len(data))):
+    for chunk in material.cut_randomly(data, random.Random(len(data))):
         books.feed(chunk)
     return books.finish()
 

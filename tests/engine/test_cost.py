@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.engine.cost import (
     MAX_CALLS_PER_BYTE,
     MAX_KEPT_PER_BYTE,
@@ -33,7 +33,7 @@ CASES = [
 @pytest.mark.parametrize("name", CASES)
 def test_no_stream_costs_much_more_than_frames(name: str) -> None:
     sensor = load_sensor(name)
-    for description, data in hostile_streams(Subject(sensor), STREAM_BYTES):
+    for description, data in hostile_streams(SensorUnderTest(sensor), STREAM_BYTES):
         calls = calls_per_byte(sensor, data)
         if calls >= MAX_CALLS_PER_BYTE:  # layouts that the engine remembers are made only once
             calls = calls_per_byte(sensor, data)
@@ -44,7 +44,7 @@ def test_no_stream_costs_much_more_than_frames(name: str) -> None:
 @pytest.mark.parametrize("name", REJECTED_IN_BULK)
 def test_headers_without_a_frame_are_rejected_in_bulk(name: str) -> None:
     sensor = load_sensor(name)
-    for description, data in hostile_streams(Subject(sensor), STREAM_BYTES):
+    for description, data in hostile_streams(SensorUnderTest(sensor), STREAM_BYTES):
         if description.startswith("headers of"):
             sensor.decoder().feed(data)  # layouts that the engine remembers are made only once
             assert calls_per_byte(sensor, data) < MAX_REJECTING_CALLS_PER_BYTE, description

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.engine import framing_rule as rule, mutants
 from tests.engine.streams import LENGTH
 from tests.installed import distinct_sensors_in, sensor_modules
@@ -71,9 +71,9 @@ MUTANTS = {
 
 
 @functools.cache
-def subject_of(name: str) -> Subject:
+def subject_of(name: str) -> SensorUnderTest:
     """Return the subject of a shape: one for all rules, since it keeps its examples."""
-    return Subject(SHAPES[name])
+    return SensorUnderTest(SHAPES[name])
 
 
 each_rule = pytest.mark.parametrize("holds", rule.RULES, ids=lambda holds: holds.__name__)
@@ -123,7 +123,7 @@ def test_every_recoverable_frame_of_a_representative_is_recovered(name: str) -> 
     sensor = load_sensor(name)
     longest = len(sensor.example(sensor.data_frame))
     rule.every_recoverable_frame_is_recovered(
-        Subject(sensor), max(2 * QUICK_LENGTH, 5 * longest // 2)
+        SensorUnderTest(sensor), max(2 * QUICK_LENGTH, 5 * longest // 2)
     )
 
 
@@ -132,7 +132,7 @@ def test_every_recoverable_frame_of_a_representative_is_recovered(name: str) -> 
 def test_every_recoverable_frame_of_every_sensor_is_recovered(module: str) -> None:
     for sensor in distinct_sensors_in(module):
         if not sensor.datagrams:
-            rule.every_recoverable_frame_is_recovered(Subject(sensor), 2 * QUICK_LENGTH)
+            rule.every_recoverable_frame_is_recovered(SensorUnderTest(sensor), 2 * QUICK_LENGTH)
 
 
 def test_representatives_that_send_streams_are_known() -> None:
@@ -141,15 +141,19 @@ def test_representatives_that_send_streams_are_known() -> None:
 
 @pytest.mark.slow
 def test_an_announcement_may_change_with_every_frame_of_a_representative() -> None:
-    rule.announcements_may_change_with_every_frame(Subject(load_sensor("slamtec-rplidar-a1")), 1500)
+    rule.announcements_may_change_with_every_frame(
+        SensorUnderTest(load_sensor("slamtec-rplidar-a1")), 1500
+    )
 
 
 @each_rule
-def test_a_parser_without_a_mistake_keeps_the_rule(holds: Callable[[Subject, int], None]) -> None:
-    holds(Subject(mutants.read_by(mutants.Parser)), QUICK_LENGTH)
+def test_a_parser_without_a_mistake_keeps_the_rule(
+    holds: Callable[[SensorUnderTest, int], None],
+) -> None:
+    holds(SensorUnderTest(mutants.read_by(mutants.Parser)), QUICK_LENGTH)
 
 
 @pytest.mark.parametrize("parser", MUTANTS, ids=lambda parser: parser.__name__)
 def test_a_parser_with_a_mistake_is_caught(parser: type[mutants.Parser]) -> None:
     with pytest.raises(AssertionError):
-        MUTANTS[parser](Subject(mutants.read_by(parser)), LENGTH)
+        MUTANTS[parser](SensorUnderTest(mutants.read_by(parser)), LENGTH)

@@ -13,7 +13,7 @@ import pytest
 
 from lidarspec import WireError
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.representatives import REPRESENTATIVES, each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
 
@@ -28,7 +28,7 @@ SEEDS = 2
 @pytest.mark.parametrize("times", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str, times: int) -> None:
     sensor = load_sensor(name)
-    subject = Subject(sensor)
+    subject = SensorUnderTest(sensor)
     source = subject.source(f"hostile frames {times}")
     examples = [
         (frame, subject.example(frame, seed=seed))
@@ -45,7 +45,7 @@ def test_a_mutated_frame_is_parsed_or_is_a_wire_error(name: str, times: int) -> 
 @each_sensor
 def test_decoding_mutated_frames_raises_nothing(name: str) -> None:
     sensor = load_sensor(name)
-    subject = Subject(sensor)
+    subject = SensorUnderTest(sensor)
     source = subject.source("hostile streams")
     frames = subject.conversation(rounds=1)
     mutated = [
@@ -53,7 +53,7 @@ def test_decoding_mutated_frames_raises_nothing(name: str) -> None:
         for frame, data in source.choices(frames, k=DECODED_FRAMES)
     ]
     mutated += frames
-    packets = sensor.decode(material.delivery(sensor, mutated))
+    packets = sensor.decode(material.make_input(sensor, mutated))
     packets.points()
     assert packets.stats.plugin_errors == 0
     assert packets.stats.bytes_in == sum(len(data) for _, data in mutated)

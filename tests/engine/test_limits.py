@@ -9,7 +9,7 @@ import pytest
 
 from lidarspec import Sensor
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.engine.engines import is_compiled
 from tests.engine.streams import MEGABYTE, peak, worst
 from tests.installed import distinct_sensors_in, sensor_modules
@@ -58,9 +58,13 @@ def pending_bound(sensor: Sensor) -> int:
 )
 def test_a_decoder_holds_less_than_its_longest_frame(name: str) -> None:
     sensor = load_sensor(name)
-    for data in (garbage(2_000), worst(sensor, 2_000), Subject(sensor).stream(rounds=1)[:6_000]):
+    for data in (
+        garbage(2_000),
+        worst(sensor, 2_000),
+        SensorUnderTest(sensor).stream(rounds=1)[:6_000],
+    ):
         decoder = sensor.decoder()
-        for chunk in material.pieces(data, random.Random(1)):
+        for chunk in material.cut_randomly(data, random.Random(1)):
             decoder.feed(chunk)
             assert decoder.stats.pending < pending_bound(sensor)
 
@@ -102,7 +106,7 @@ def test_a_frame_is_out_before_one_longest_frame_more_has_come(name: str) -> Non
     one each frame is out.
     """
     sensor = load_sensor(name)
-    data = b"".join(part for _, part in Subject(sensor).conversation(rounds=1))
+    data = b"".join(part for _, part in SensorUnderTest(sensor).conversation(rounds=1))
     bound = pending_bound(sensor)
     decoder = sensor.decoder()
     step = max(bound // 50, 1)

@@ -8,7 +8,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import explain
-from lidarspec.explaining.damage_search import Change, changes
+from lidarspec.explaining.damage_search import FrameChange, find_changes
 from tests.cli.running import EXAMPLE
 from tests.shapes import SHAPES
 
@@ -22,16 +22,16 @@ SHORT_SHAPES = [
 ]
 
 
-def flipped(offset: int, bit: int) -> Change:
-    return Change("flipped bit", offset, bit)
+def flipped(offset: int, bit: int) -> FrameChange:
+    return FrameChange("flipped bit", offset, bit)
 
 
 def test_the_flipped_bit_of_a_damaged_frame_is_found() -> None:
     data = STL.example("data", seed=4)
     for flip in (flipped(0, 3), flipped(7, 6), flipped(20, 0), flipped(46, 1)):
         damaged = flip.repair(data)
-        assert flip in changes(STL_FRAME, damaged)
-        for change in changes(STL_FRAME, damaged):
+        assert flip in find_changes(STL_FRAME, damaged)
+        for change in find_changes(STL_FRAME, damaged):
             STL.parse(change.repair(damaged))
 
 
@@ -40,12 +40,12 @@ def test_a_lost_and_an_inserted_byte_are_found(offset: int) -> None:
     data = STL.example("data", seed=4)
     lost, more = data[:offset] + data[offset + 1 :], data[:offset] + b"\x9b" + data[offset:]
     for damaged in (lost, more):
-        found = changes(STL_FRAME, damaged)
+        found = find_changes(STL_FRAME, damaged)
         assert data in {change.repair(damaged) for change in found}
         for change in found:
             STL.parse(change.repair(damaged))
-    assert {change.kind for change in changes(STL_FRAME, lost)} == {"lost byte"}
-    assert {change.kind for change in changes(STL_FRAME, more)} == {"inserted byte"}
+    assert {change.kind for change in find_changes(STL_FRAME, lost)} == {"lost byte"}
+    assert {change.kind for change in find_changes(STL_FRAME, more)} == {"inserted byte"}
 
 
 def test_a_lost_and_an_inserted_byte_are_told() -> None:
@@ -70,7 +70,7 @@ def test_what_is_said_to_mend_a_frame_mends_it(name: str) -> None:
     without = data[:middle] + data[middle + 1 :]
     inserted = data[:middle] + b"\x9b" + data[middle:]
     for damaged in (flipped(middle, 2).repair(data), without, inserted):
-        for change in changes(sensor.frames["data"], damaged):
+        for change in find_changes(sensor.frames["data"], damaged):
             sensor.parse(change.repair(damaged), "data")
 
 

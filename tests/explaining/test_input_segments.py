@@ -12,7 +12,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import UnknownFrame
-from lidarspec.explaining.input_segments import NEAREST, explain_piece, pieces
+from lidarspec.explaining.input_segments import NEAREST, explain_piece, iter_pieces
 from lidarspec.spec import Chunk
 from tests.representatives import load_sensor
 
@@ -28,7 +28,7 @@ def told(
     was sent, in order.
     """
     sent = list(sent)
-    found = pieces(sensor, map(Chunk, sent), datagrams=datagrams)
+    found = iter_pieces(sensor, map(Chunk, sent), datagrams=datagrams)
     parts = [part for piece in found for part in explain_piece(sensor, piece)]
     assert b"".join(piece.data for piece, _ in parts) == b"".join(sent)
     assert [piece.offset for piece, _ in parts] == [
@@ -107,20 +107,20 @@ def test_every_byte_of_a_damaged_stream_is_in_one_piece(sensor: str) -> None:
 def test_pieces_come_before_the_input_ends() -> None:
     endless = map(Chunk, itertools.cycle(FRAMES))
     assert [
-        piece.offset for piece in itertools.islice(pieces(STL, endless, datagrams=False), 3)
+        piece.offset for piece in itertools.islice(iter_pieces(STL, endless, datagrams=False), 3)
     ] == [0, 47, 94]
     noise = map(Chunk, itertools.repeat(bytes(1 << 12)))
-    assert next(pieces(STL, noise, datagrams=False)).frame == ""
+    assert next(iter_pieces(STL, noise, datagrams=False)).frame == ""
 
 
 def test_a_frame_type_is_looked_for_in_the_whole_input() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     node = sensor.example("node")
     found = list(
-        pieces(sensor, [Chunk(node * 600)], datagrams=False, frame="node")
+        iter_pieces(sensor, [Chunk(node * 600)], datagrams=False, frame="node")
     )  # no descriptor before it
     assert [piece.frame for piece in found] == ["node"] * 600
-    (short,) = pieces(STL, [Chunk(b"\x00" + FRAMES[0][1:])], datagrams=False, frame="data")
+    (short,) = iter_pieces(STL, [Chunk(b"\x00" + FRAMES[0][1:])], datagrams=False, frame="data")
     assert short.frame == NEAREST
     with pytest.raises(UnknownFrame, match="'data'"):
-        next(pieces(STL, [], datagrams=False, frame="dat"))
+        next(iter_pieces(STL, [], datagrams=False, frame="dat"))

@@ -11,7 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import explain
 from lidarspec.explaining.formatting import TextSpan, bit_picture
-from lidarspec.explaining.listing import fold, list_differences, parents, text
+from lidarspec.explaining.listing import fold, join_text, list_differences, parents
 from tests.cli.running import EXAMPLE, printed, process, ran
 from tests.representatives import load_sensor
 
@@ -38,7 +38,7 @@ def test_parts_are_indented_below_what_holds_them() -> None:
 
 def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> None:
     found = explain(M1C1, ls.sensor("cspc-m1c1-mini"), "data")
-    listed = [text(line) for line in found.lines()]
+    listed = [join_text(line) for line in found.lines()]
     told = {" ".join(line.split()) for line in listed}
     assert (
         "000a .. 001010.. 00001010 distance 0.650 m (byte 2 bits 7-0, byte 1 bits 7-2); 0: no"
@@ -46,7 +46,7 @@ def test_bit_fields_are_drawn_in_the_first_element_and_on_request_in_all() -> No
     )
     assert "000a ......00 .. .. exposure 0; 1 high, 2 low" in told
     assert not any(line.startswith("000d  ..") for line in listed)
-    assert sum(text(line).startswith("000d") for line in found.lines(every=True)) == 4
+    assert sum(join_text(line).startswith("000d") for line in found.lines(every=True)) == 4
 
 
 def test_a_picture_has_dots_for_other_bits() -> None:
@@ -58,13 +58,13 @@ def test_differences_are_told_field_by_field_and_to_the_bit() -> None:
     first, second = explain(EXAMPLE, STL), explain(other, STL)
     found = first.differences(second)
     assert [part.path for part in found] == ["end_angle", "crc"]
-    assert [text(line) for line in list_differences(found, (47, 47))][:3] == [
+    assert [join_text(line) for line in list_differences(found, (47, 47))][:3] == [
         "002a  end_angle  334.70 deg -> 334.71 deg (+0.01 deg)",
         "      - be 82        .......0 ..",
         "      + bf 82        .......1 ..",
     ]
     assert (
-        text(list(list_differences(first.differences(first), (47, 47)))[-1])
+        join_text(list(list_differences(first.differences(first), (47, 47)))[-1])
         == "47 bytes, all identical"
     )
 
@@ -77,7 +77,7 @@ def test_fields_that_one_frame_alone_has_are_told_together() -> None:
         explain(sensor.build("data", **head, samples=samples[:count]), sensor) for count in (1, 3)
     ]
     shown = [
-        text(line)
+        join_text(line)
         for line in list_differences(
             parts[0].differences(parts[1]), (len(parts[0].data), len(parts[1].data))
         )
@@ -138,7 +138,7 @@ def test_long_lines_are_folded_below_their_text() -> None:
         TextSpan("some words that are too many for it"),
     )
     assert (
-        text(fold(line, 44))
+        join_text(fold(line, 44))
         == "0000  aa  name  some words that are too many\n                for it"
     )
     assert fold(line, 20) == line

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from lidarspec import Sensor
-from lidarspec.exports import beginning, export
+from lidarspec.exports import export, make_prefix
 from lidarspec.exports.ksy import identifier
 from tests.exports.trees import number
 
@@ -61,7 +61,7 @@ def _has_packages() -> bool:
 
 def module(sensor: Sensor, folder: Path) -> ModuleType:
     """The compiled module of a sensor."""
-    name = identifier(beginning(sensor))
+    name = identifier(make_prefix(sensor))
     spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -73,7 +73,7 @@ def module(sensor: Sensor, folder: Path) -> ModuleType:
 
 def reader(found: ModuleType, sensor: Sensor, frame: str) -> Any:
     """The class of a frame type."""
-    return getattr(getattr(found, camel(identifier(beginning(sensor)))), camel(identifier(frame)))
+    return getattr(getattr(found, camel(identifier(make_prefix(sensor)))), camel(identifier(frame)))
 
 
 def camel(name: str) -> str:

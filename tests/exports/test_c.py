@@ -19,7 +19,7 @@ import pytest
 
 import lidarspec
 from lidarspec import Sensor, WireError
-from lidarspec.exports import ExportError, beginning, export
+from lidarspec.exports import ExportError, export, make_prefix
 from lidarspec.frames.schema import Schema
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import sensor_under_test as material
@@ -103,7 +103,7 @@ def test_a_header_has_a_function_for_every_field(name: str) -> None:
     sensor = SHAPED[name]
     text = export(sensor, "c")
     for frame in sensor.frames:
-        prefix = f"{_word(beginning(sensor))}_{frame}"
+        prefix = f"{_word(make_prefix(sensor))}_{frame}"
         assert f" {prefix}_is_frame(" in text
         for path in codec(sensor.frames[frame]).schema.fields:
             assert re.search(rf"\b{prefix}_{_word(path)}{'_' * (path in OWN)}\(", text), path
@@ -168,7 +168,7 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     dumps = [_dump(sensor, name) for sensor in subjects().values() for name in sensor.frames]
     calls = [
         f'        if (!strcmp(name, "{sensor.id}:{name}"))'
-        f" dump_{_word(beginning(sensor))}_{name}(p, n);\n"
+        f" dump_{_word(make_prefix(sensor))}_{name}(p, n);\n"
         for sensor in subjects().values()
         for name in sensor.frames
     ]
@@ -258,7 +258,7 @@ def _dump(sensor: Sensor, name: str) -> str:
     comes from the schema of lidarspec.
     """
     table = codec(sensor.frames[name]).schema
-    prefix = f"{_word(beginning(sensor))}_{name}"
+    prefix = f"{_word(make_prefix(sensor))}_{name}"
     text = export_of(sensor.id)
     lines = [
         f'    printf("%d %zu\\n", {prefix}_is_frame(p, n), {prefix}_frame_length(p, n));',

@@ -17,7 +17,7 @@ from lidarspec.captures.pcap import CaptureReader
 from lidarspec.exports import ExportError, export
 from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests import made_captures as made
 from tests.exports.sharks import captured, columns, dissector, judged, tshark, written
 from tests.exports.trees import SHAPED, installed_sensors, is_recoded, recoded, values
@@ -112,7 +112,7 @@ def assert_fields_are_read(sensor: Sensor, tmp_path: Path, rounds: int | None = 
     ]
     frames = [
         (_answer(sensor, name, data), data)
-        for name, data in [*Subject(sensor).conversation(rounds=rounds), *outgoing]
+        for name, data in [*SensorUnderTest(sensor).conversation(rounds=rounds), *outgoing]
     ]
     capture = captured(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
     script = written(sensor, tmp_path)

@@ -15,10 +15,10 @@ from lidarspec.expressions.columns import Batch
 from lidarspec.expressions.graph import (
     Node,
     compute,
-    conjuncts,
+    make_sample,
     node_of,
     only_field,
-    sample_of,
+    split_condition,
     trace,
     traverse,
 )
@@ -32,7 +32,7 @@ PACKETS = STL27L.decode(b"".join(STL27L.example("data", seed=seed) for seed in r
 
 
 def graph_of(function: Any) -> Node:
-    node = node_of(trace(function, sample_of(PACKETS.batch(), PACKETS.table.groups[0]))[0])  # type: ignore[attr-defined]
+    node = node_of(trace(function, make_sample(PACKETS.batch(), PACKETS.table.groups[0]))[0])  # type: ignore[attr-defined]
     assert isinstance(node, Node)
     return node
 
@@ -85,7 +85,7 @@ def test_the_one_field_that_an_expression_is_made_of(function: Any, path: str | 
 
 def test_conditions_that_hold_together_are_told_apart() -> None:
     node = graph_of(lambda f: (f.start_angle < 360) & ((f.end_angle < 360) & (f.speed > 0)))
-    assert [only_field(part).path for part in conjuncts(node)] == [
+    assert [only_field(part).path for part in split_condition(node)] == [
         "start_angle",
         "end_angle",
         "speed",

@@ -22,7 +22,7 @@ import lidarspec as ls
 from lidarspec import PointCloud, Scan, SourceError, simulate
 from lidarspec.errors import LibraryError, ReplyTimeout, UnknownFormat
 from lidarspec.formats import arrays, arrow_tables as tables, format_of, formats, write
-from lidarspec.formats.common import replacing
+from lidarspec.formats.common import replace_file
 from tests.libraries import needs
 from tests.recording.test_recordings import file_size_limit
 from tests.shapes import SHAPES
@@ -350,7 +350,7 @@ def test_part_of_a_killed_process_is_removed_by_the_next_write(tmp_path: Path) -
         path.touch()
     for path in (killed, running, other):
         os.utime(path, (0, 0))
-    with replacing(target) as part:
+    with replace_file(target) as part:
         part.touch()
     assert {path.name for path in tmp_path.iterdir()} == {
         path.name for path in (target, running, recent, other)

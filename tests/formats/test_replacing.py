@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lidarspec import UsageError
-from lidarspec.formats.common import replacing
+from lidarspec.formats.common import replace_file
 
 OWN_FILES = {
     "out.zarr": ["zarr.json", "x/zarr.json", "x/c/0", "x/c/1/2"],
@@ -27,7 +27,7 @@ def fill(folder: Path, names: list[str]) -> None:
 def test_folder_of_the_same_format_is_replaced(tmp_path: Path, output: str) -> None:
     folder = tmp_path / output
     fill(folder, OWN_FILES[output])
-    with replacing(folder) as part:
+    with replace_file(folder) as part:
         part.mkdir()
         (part / "new").write_bytes(b"new")
     assert [path.name for path in folder.iterdir()] == ["new"]
@@ -38,7 +38,7 @@ def test_folder_of_the_same_format_is_replaced(tmp_path: Path, output: str) -> N
 def test_folder_with_another_file_is_left_alone(tmp_path: Path, output: str, stranger: str) -> None:
     folder = tmp_path / output
     fill(folder, [*OWN_FILES[output], stranger])
-    with pytest.raises(UsageError, match=stranger), replacing(folder) as part:
+    with pytest.raises(UsageError, match=stranger), replace_file(folder) as part:
         part.mkdir()
     assert sorted(
         path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
@@ -51,7 +51,7 @@ def test_file_added_while_writing_is_not_deleted(tmp_path: Path) -> None:
     fill(folder, OWN_FILES["out.zarr"])
 
     def write() -> None:
-        with replacing(folder) as part:
+        with replace_file(folder) as part:
             part.mkdir()
             fill(folder, ["late.txt"])
 

@@ -18,7 +18,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.formats import write
-from lidarspec.points.appearance import look, shade
+from lidarspec.points.appearance import choose_appearance, ramp_positions
 from lidarspec.points.mount import Mount
 from tests.cli.running import ran
 from tests.formats.test_formats import scan
@@ -82,7 +82,11 @@ def test_colours_follow_the_range_on_one_scale(tmp_path: Path) -> None:
     write(tmp_path / "a.rrd", scans)
     colours = logged(tmp_path / "a.rrd")["/ldrobot-stl27l/points"]["Points3D:colors"]
     steps = [
-        np.clip(shade(one.points[one.points.valid], look(scans[0].points)) * 20, 0, 19).astype(int)
+        np.clip(
+            ramp_positions(one.points[one.points.valid], choose_appearance(scans[0].points)) * 20,
+            0,
+            19,
+        ).astype(int)
         for one in scans
     ]
     by_step = dict(

@@ -54,7 +54,7 @@ from construct import (
 
 from lidarspec import SpecError, UsageError, WireError, export
 from lidarspec.testing.properties import PROPERTIES
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.by_construct import reader
 from tests.engine.against_construct import BACKENDS, agree, plain, sensor
 from tests.engine.engines import (
@@ -172,7 +172,7 @@ def test_such_a_frame_keeps_every_promise(name: str) -> None:
         "v" / fields,
         "end" / Const(b"\xe1\x77"),
     )
-    subject = Subject(sensor(inner), 6)
+    subject = SensorUnderTest(sensor(inner), 6)
     found = [
         finding
         for one in PROPERTIES

@@ -11,7 +11,7 @@ import pytest
 from construct import Array, BitsInteger, Bitwise, Const, Struct
 
 from lidarspec.frames.layout import Layout, Leaf
-from lidarspec.framing.example_frames import header
+from lidarspec.framing.example_frames import make_random_header
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
 from tests.shapes import SHAPES
@@ -29,12 +29,12 @@ def layouts() -> list[tuple[str, Layout]]:
     """
     packed = codec(PACKED)
     assert isinstance(packed, CompiledCodec)
-    found = [("packed", header(packed, random.Random(1))[0])]
+    found = [("packed", make_random_header(packed, random.Random(1))[0])]
     for sensor in SHAPES.values():
         for name, frame in sensor.frames.items():
             engine = codec(frame)
             if isinstance(engine, CompiledCodec) and not engine.schema.parts:
-                layout, _ = header(engine, random.Random(f"{sensor.id} {name}"))
+                layout, _ = make_random_header(engine, random.Random(f"{sensor.id} {name}"))
                 found.append((f"{sensor.id} {name}", layout))
     return found
 

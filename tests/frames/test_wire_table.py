@@ -11,7 +11,7 @@ from construct import Bytes, BytesInteger, Enum, If, Int8ul, Struct, this
 
 import lidarspec as ls
 from lidarspec.frames.layout import Layout
-from lidarspec.frames.wire_table import INDICES, Extent, WireRow, frame_size, wire_table
+from lidarspec.frames.wire_table import INDICES, SizeFormula, WireRow, frame_size, wire_table
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Frame
 from tests.representatives import each_sensor, each_shape, load_sensor
@@ -146,14 +146,14 @@ def test_text_has_no_size_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("extent", "factor", "text"),
     [
-        (Extent(3), 4, "12"),
-        (Extent(3), "i", "3*i"),
-        (Extent(1), "n", "n"),
-        (Extent(2), "a * b", "2*(a * b)"),
-        (Extent(1, ("n",)), "i", "(1 + n)*i"),
+        (SizeFormula(3), 4, "12"),
+        (SizeFormula(3), "i", "3*i"),
+        (SizeFormula(1), "n", "n"),
+        (SizeFormula(2), "a * b", "2*(a * b)"),
+        (SizeFormula(1, ("n",)), "i", "(1 + n)*i"),
     ],
 )
-def test_extents_multiply(extent: Extent, factor: int | str, text: str) -> None:
+def test_extents_multiply(extent: SizeFormula, factor: int | str, text: str) -> None:
     assert str(extent.times(factor)) == text
 
 

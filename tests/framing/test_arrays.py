@@ -20,7 +20,7 @@ import lidarspec
 from lidarspec import Counters
 from lidarspec.expressions.columns import Batch
 from lidarspec.frames.arrays import repeat
-from lidarspec.frames.frame_table import Rows
+from lidarspec.frames.frame_table import CompiledTable
 from lidarspec.framing.frame_engine import codec
 from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import Unwrapper, clock_ns
@@ -127,7 +127,7 @@ def test_a_large_array_is_not_copied() -> None:
     sensor = lidarspec.sensor("robosense-m1")
     rows = np.tile(np.frombuffer(sensor.example("data"), np.uint8), (15_000, 1))
     table = sensor.decode(rows, frame="data").table
-    assert isinstance(table, Rows)
+    assert isinstance(table, CompiledTable)
     assert len(table) == len(rows)
     assert np.shares_memory(table.groups[0].rows, rows)
     assert (table.groups[0].rows == rows).all()

@@ -15,7 +15,7 @@ from construct import Bytes, Const, Int8ub, Int16ub, Int32ub, Struct, VarInt, th
 
 import lidarspec as ls
 from lidarspec import Sensor, SpecError
-from lidarspec.explaining.input_segments import pieces
+from lidarspec.explaining.input_segments import iter_pieces
 from lidarspec.framing.datagram_assembly import PATIENCE, WAITING
 from lidarspec.spec import Assembled, Chunk, Udp
 from tests.shapes.fragments import FRAGMENT, SENSOR
@@ -188,7 +188,7 @@ def test_exports_and_explain_know_of_messages_in_fragments() -> None:
     with pytest.raises(ls.UsageError, match="several datagrams"):
         ls.export(SENSOR, "wireshark")
     found = list(
-        pieces(
+        iter_pieces(
             SENSOR,
             [Chunk(part, 0) for number in range(3) for part in fragments(number)],
             datagrams=True,

@@ -17,7 +17,7 @@ import lidarspec.spec
 from lidarspec import Sensor, UsageError
 from lidarspec.framing.frame_engine import CompiledCodec, codec
 from lidarspec.spec import Checksummed, Frame, Sum, tree
-from lidarspec.testing.sensor_under_test import Subject, mutate
+from lidarspec.testing.sensor_under_test import SensorUnderTest, mutate
 from tests.agreement import assert_backends_agree
 from tests.by_construct import reader
 from tests.engine import against_construct
@@ -35,8 +35,8 @@ each_stream = pytest.mark.parametrize("sensor", STREAMS.values(), ids=STREAMS)
 
 
 def conversation(sensor: Sensor, *, seed: int = 0, length: int = LENGTH) -> bytes:
-    rounds = max(length // len(Subject(sensor).stream(rounds=1)), 1)
-    return Subject(sensor).stream(seed=seed, rounds=rounds)
+    rounds = max(length // len(SensorUnderTest(sensor).stream(rounds=1)), 1)
+    return SensorUnderTest(sensor).stream(seed=seed, rounds=rounds)
 
 
 @pytest.mark.parametrize("sensor", SHAPES.values(), ids=SHAPES)
@@ -324,7 +324,7 @@ def test_a_frame_that_comes_first_in_the_order_ends_a_run() -> None:
     ["shape-count", "shape-options", "shape-state", "shape-modes", "shape-text", "shape-commands"],
 )
 def test_a_frame_is_out_with_its_last_byte(name: str) -> None:
-    data = Subject(SHAPES[name]).stream()
+    data = SensorUnderTest(SHAPES[name]).stream()
     decoder = SHAPES[name].decoder()
     for spot in range(len(data)):
         for found in decoder.feed(data[spot : spot + 1]):

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from construct import Bytes, Const, Struct
 
-from lidarspec.frames.row_checksums import FEW, SHORT, registers
+from lidarspec.frames.row_checksums import FEW, SHORT, compute_registers
 from lidarspec.framing.regular_rows import SMALL_PIECE_BYTES
 from lidarspec.framing.results import Frames
-from lidarspec.simulation.simulator import opening, simulate
+from lidarspec.simulation.simulator import make_opening_frame, simulate
 from lidarspec.spec import Checksummed, Frame, Xor
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.engine.streams import Books, damaged
 from tests.representatives import load_sensor
 from tests.shapes import SHAPES
@@ -70,7 +70,7 @@ def test_pieces_of_a_few_frames_give_what_the_whole_gives(name: str, rate: float
     sensor = STREAMS[name]
     size = min(frame.max_length for frame in sensor.incoming.values())
     for seed in range(1 if rate == 0 else 2):
-        other = Subject(sensor).stream(seed=seed, rounds=1)
+        other = SensorUnderTest(sensor).stream(seed=seed, rounds=1)
         train = sensor.example(sensor.data_frame, seed=seed) * 12 + other
         train += (
             b"".join(sensor.example(sensor.data_frame, seed=number) for number in range(20)) + other
@@ -95,9 +95,9 @@ def test_clean_frames_are_found_so() -> None:
 
 def test_weak_frames_are_searched_for_in_the_first_bytes_alone() -> None:
     sensor = load_sensor("slamtec-rplidar-a1").configure(answer="node")
-    data = opening(sensor) + b"".join(simulate(sensor, 20_000))
+    data = make_opening_frame(sensor) + b"".join(simulate(sensor, 20_000))
     found = sensor.decoder().frames(data)
-    steady = sum(frames.total for frames in found if is_steady(frames))
+    steady = sum(frames.total_bytes for frames in found if is_steady(frames))
     assert steady > len(data) - 10_000
 
 
@@ -110,13 +110,13 @@ def test_long_pieces_are_taken_up_to_the_first_damage(faults: int) -> None:
         spot = source.randrange(len(data))
         data[spot : spot + source.randrange(2)] = source.randbytes(source.randint(0, 30))
     whole, parts = TWINS.decoder(), TWINS.decoder()
-    found = [*whole.frames(bytes(data)), *whole.rest()]
+    found = [*whole.frames(bytes(data)), *whole.take_pending()]
     pieces = [
         spans
         for start in range(0, len(data), 5000)
         for spans in parts.frames(bytes(data[start : start + 5000]))
     ]
-    pieces += parts.rest()
+    pieces += parts.take_pending()
     for name in ("offsets", "gaps", "kinds"):
         assert (
             np.concatenate([getattr(one, name) for one in found]).tolist()
@@ -183,7 +183,8 @@ def test_few_rows_have_the_registers_that_many_have(width: int, refin: bool) -> 
     for length in (1, 7, 8, 9, 46, SHORT):
         many = source.integers(0, 256, (FEW // length + 1, length + 2), dtype=np.uint8)
         spans = ((0, 1), (2, length + 1)) if length > 1 else ((1, 2),)
-        together = registers(many, spans, start, width, poly, refin)
+        together = compute_registers(many, spans, start, width, poly, refin)
         assert (
-            registers(many[:5], spans, start, width, poly, refin).tolist() == together[:5].tolist()
+            compute_registers(many[:5], spans, start, width, poly, refin).tolist()
+            == together[:5].tolist()
         )

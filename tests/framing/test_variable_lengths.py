@@ -17,7 +17,7 @@ from construct import Array, Const, Int8ul, Int16ul, Struct, this
 from lidarspec import Sensor
 from lidarspec.framing import frame_engine, variable_lengths
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.variable_lengths import Together
+from lidarspec.framing.variable_lengths import JointChecker
 from lidarspec.spec import Checksummed, Crc, Fields, Frame, Simulation, Sum, WordXor
 from lidarspec.spec.checksums import Checksum
 from tests.engine.oracle import Oracle
@@ -109,14 +109,14 @@ def test_the_frames_and_counters_are_those_of_each_layout_by_itself(
 ) -> None:
     sensor = SENSORS[name]
     judged = 0
-    judge = Together.judge
+    judge = JointChecker.judge
 
-    def counting(self: Together, buffer: Any, offsets: Any, forms: Any, sums: Any) -> Any:
+    def counting(self: JointChecker, buffer: Any, offsets: Any, forms: Any, sums: Any) -> Any:
         nonlocal judged
         judged += len(offsets)
         return judge(self, buffer, offsets, forms, sums)
 
-    monkeypatch.setattr(Together, "judge", counting)
+    monkeypatch.setattr(JointChecker, "judge", counting)
     data = false_headers(sensor, 20_000)
     together = [books(sensor, data, piece) for piece in (700, 20_000)]
     assert judged > 300
@@ -148,7 +148,7 @@ def test_what_computes_checksums_is_asked_for_all_lengths() -> None:
 def test_a_checksum_that_zeros_change_is_computed_length_by_length(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Together, "judge", None)
+    monkeypatch.setattr(JointChecker, "judge", None)
     sensor = summed_behind(Crc(16, 0x1021))
     data = false_headers(sensor, 3000)
     assert books(sensor, data, 3000)[0]

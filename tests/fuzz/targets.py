@@ -39,11 +39,11 @@ from lidarspec.recording.format import (
     Recording,
     pack_record,
 )
-from lidarspec.remote_files import digest, stamp
+from lidarspec.remote_files import digest, read_stamp
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.findings import Violation
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.findings import ViolationError
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from lidarspec.testing.vectors import vectors_hold
 from lidarspec.transports.hex_text import parse_hex
 from lidarspec.transports.open_url import is_port, live_address
@@ -194,7 +194,7 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
 
 def _frame(sensor: Sensor, name: str) -> Target:
     """Frames of one type, parsed as such, as any, and explained."""
-    subject = Subject(sensor)
+    subject = SensorUnderTest(sensor)
 
     def run(data: bytes) -> None:
         parse = functools.partial(sensor.parse, data)
@@ -243,11 +243,11 @@ def _stream(sensor: Sensor) -> Target:
     """A stream in pieces of any size, or datagrams, through the decoder and on to scans: nothing of
     it raises.
     """
-    subject = Subject(sensor)
+    subject = SensorUnderTest(sensor)
 
     def run(data: bytes) -> None:
         source = random.Random(zlib.crc32(data))
-        chunks = _datagrams(data) if sensor.datagrams else list(material.pieces(data, source))
+        chunks = _datagrams(data) if sensor.datagrams else list(material.cut_randomly(data, source))
         decoder = sensor.decoder()
         for chunk in chunks:
             decoder.feed(chunk)
@@ -437,7 +437,7 @@ def _manifest(folder: Path) -> Target:
 
     def examples() -> list[bytes]:
         source.write_bytes(b"")
-        made_of = stamp(str(source))
+        made_of = read_stamp(str(source))
         counts = {"first_scan": 0, "scans": 3, "points": 900, "warnings": []}
         done = piece.record(**made_of, digest=digest(str(source)), **counts, output=piece.output)
         failed = replace(piece, number=1).describe_failure(ls.SourceError("gone"))
@@ -633,7 +633,7 @@ def _vectors(folder: Path) -> Target:
         folder / "vectors.json",
         SHAPES["shape-datagrams"],
     )  # without a checksum, which would be searched for
-    subject = Subject(sensor, vectors=path)
+    subject = SensorUnderTest(sensor, vectors=path)
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
@@ -675,7 +675,7 @@ def _vectors(folder: Path) -> Target:
         "vectors",
         run,
         lambda: [json.dumps([vector, {**vector, **more}]).encode()],
-        (Violation,),
+        (ViolationError,),
         lambda: words,
         is_text=True,
     )

@@ -15,7 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SpecError
-from lidarspec.packets.imu import ImuSamples, Waiting, join_samples
+from lidarspec.packets.imu import ImuSamples, WaitingSamples, join_samples
 from lidarspec.points.mount import Mount
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
@@ -174,12 +174,12 @@ def test_an_imu_by_another_clock_than_the_points_is_in_no_scan() -> None:
 
 
 def test_samples_that_no_scan_asks_for_are_let_go() -> None:
-    waiting = Waiting()
+    waiting = WaitingSamples()
     for start in range(0, 100, 10):
         waiting.add(ImuSamples(np.arange(start, start + 10), np.zeros((10, 3)), np.zeros((10, 3))))
-        waiting.keep(20)
-    assert waiting.until(None).time_ns.tolist()[-20:] == list(range(80, 100))
-    assert len(waiting.until(None)) == 0
+        waiting.keep_newest(20)
+    assert waiting.take_until(None).time_ns.tolist()[-20:] == list(range(80, 100))
+    assert len(waiting.take_until(None)) == 0
 
 
 def test_mistakes_are_named() -> None:

@@ -52,7 +52,9 @@ def test_device_information_is_a_field_of_an_incoming_frame(module: str) -> None
         for role, path in sensor.info.items():
             name, _, field = path.partition(".")
             assert name in sensor.incoming, f"{sensor.id} {role}: {path}"
-            assert field in schema(sensor.frames[name].tree).named, f"{sensor.id} {role}: {path}"
+            assert field in schema(sensor.frames[name].tree).scan_names, (
+                f"{sensor.id} {role}: {path}"
+            )
 
 
 @EACH_MODULE
@@ -62,7 +64,7 @@ def test_related_models_name_each_other(module: str) -> None:
         for related, difference in sensor.relatives.items():
             assert related != sensor.id
             assert related not in sensors or sensor.id in sensors[related].relatives
-            assert difference if isinstance(difference, str) else difference.told_by
+            assert difference if isinstance(difference, str) else difference.difference
 
 
 @EACH_MODULE

@@ -12,7 +12,7 @@ from construct import Const, Int8ul, Struct
 import lidarspec
 from lidarspec import Sensor, SpecError
 from lidarspec.plugins import Registry
-from lidarspec.scans.stream import scans_of
+from lidarspec.scans.stream import iter_scans
 from lidarspec.spec import Checksummed, Fields, Frame, OnWrap, Polar, Serial, Sum, Xor, hookimpl
 from tests.by_construct import reader
 from tests.plugins.test_plugins import STRANGER
@@ -123,7 +123,7 @@ def test_a_hook_that_fails_is_a_spec_error_of_its_sensor(registry: Registry) -> 
         packets.points()
     with pytest.warns(UserWarning, match="the site's file is gone"):
         assert list(sensor.scans(sensor.example("data"))) == []
-    assert list(scans_of(sensor, [packets])) == []
+    assert list(iter_scans(sensor, [packets])) == []
     assert packets.stats.plugin_errors == 1
     assert "the site's file is gone" in packets.stats.tracebacks[0]
 

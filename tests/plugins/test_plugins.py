@@ -14,7 +14,7 @@ import lidarspec
 from lidarspec import SourceError, SpecError, UsageError
 from lidarspec.entry_points import GROUP, SENSORS, entry_points
 from lidarspec.errors import UnknownSensor
-from lidarspec.plugins import Registry, file_module, standing_in
+from lidarspec.plugins import Registry, file_module, use_registry
 from lidarspec.testing import SensorConformance
 from tests.plugins.test_installed import distribution
 
@@ -31,7 +31,7 @@ def test_sensor_of_a_foreign_distribution_is_found_and_decodes(
     shutil.copy(STRANGER, tmp_path)
     distribution(tmp_path, "acme_lidars", "3.2.1", "[lidarspec]\nacme = acme_lidars\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with standing_in(Registry(entry_points(GROUP), entry_points(SENSORS))) as registry:
+    with use_registry(Registry(entry_points(GROUP), entry_points(SENSORS))) as registry:
         sensor = lidarspec.sensor("acme-x1")
         assert len(sensor.decode(sensor.example("data"))) == 1
         (plugin,) = [one for one in registry.plugins if one.distribution == "acme_lidars"]

@@ -19,19 +19,19 @@ from construct import Bytes, Int8ub, Struct, this
 
 import lidarspec
 from lidarspec import Packets, Sensor, UsageError, simulate
-from lidarspec.frames.frame_table import Rows
+from lidarspec.frames.frame_table import CompiledTable
 from lidarspec.frames.layout import Seal
-from lidarspec.frames.row_checksums import batch
+from lidarspec.frames.row_checksums import compute_checksums
 from lidarspec.points import backends
 from lidarspec.points.evaluate import evaluate
 from lidarspec.points.numba_kernels import checksums as kernelsums
 from lidarspec.points.numba_kernels.source import write_kernel
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.points.reference_evaluator import evaluate_plainly
-from lidarspec.simulation.simulator import opening
+from lidarspec.simulation.simulator import make_opening_frame
 from lidarspec.spec import Checksum, Checksummed, Crc, Fields, Polar, WordXor, Xor
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import assert_same_points
 from tests.engine import against_construct
 from tests.installed import sensor_modules, sensors_in
@@ -122,7 +122,7 @@ def test_kernels_give_what_the_plain_evaluation_gives(name: str) -> None:
 @pytest.mark.parametrize("name", [*SHAPED, "ldrobot-stl27l", "velodyne-vlp16"])
 def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     sensor = sensor_of(name)
-    packets = sensor.decode(Subject(sensor).stream(), backend="jit").with_points
+    packets = sensor.decode(SensorUnderTest(sensor).stream(), backend="jit").with_points
     if len(packets):
         assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud, ulps=ULPS)
 
@@ -142,7 +142,7 @@ def simulated(sensor: Sensor, answer: str, backend: str, number: int = 2 * MANY)
     frames = simulate(configured, number)
     data: Any = frames
     if not is_datagram(configured.links.get("data")):
-        data = opening(configured) + b"".join(frames)
+        data = make_opening_frame(configured) + b"".join(frames)
     return configured.decode(data, backend=backend)
 
 
@@ -181,7 +181,7 @@ def assert_kernel_gives_the_plain_points(sensor: Sensor, answer: str) -> None:
 
 
 def plan(packets: Packets) -> Plan:
-    assert isinstance(packets.table, Rows)
+    assert isinstance(packets.table, CompiledTable)
     found = plan_for(
         packets.sensor.points_of(packets.frame), packets.batch(), packets.table.groups[0]
     )
@@ -311,7 +311,7 @@ def test_compiled_checksums_are_those_of_the_algorithm(
     found = kernelsums.checksums(seal, rows)
     assert found is not None
     covered = np.concatenate([rows[:, start:stop] for start, stop in spans], axis=1)
-    np.testing.assert_array_equal(found, batch(algorithm, covered), strict=True)
+    np.testing.assert_array_equal(found, compute_checksums(algorithm, covered), strict=True)
 
 
 @pytest.mark.slow

@@ -16,13 +16,13 @@ from construct import Array, Int8ul, Int16ul, Struct, this
 
 import lidarspec
 from lidarspec import Packets, Sensor, simulate
-from lidarspec.frames.frame_table import Rows
+from lidarspec.frames.frame_table import CompiledTable
 from lidarspec.points.evaluate import evaluate
 from lidarspec.points.plan import Plan, plan_for
 from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.spec import Fields, Polar, Scaled, take
 from lidarspec.spec.links import is_datagram
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import assert_same_points
 from tests.broken import sound
 from tests.by_construct import reader
@@ -38,7 +38,7 @@ SHAPED = [name for name, sensor in SHAPES.items() if sensor.frames]
 
 def plan(packets: Packets) -> Any:
     """The plan of the longest packets that have points; why there is none, where there is none."""
-    assert isinstance(packets.table, Rows)
+    assert isinstance(packets.table, CompiledTable)
     made: Any = None
     for group in sorted(packets.table.groups, key=lambda group: -group.layout.size):
         made = plan_for(packets.sensor.points_of(packets.frame), packets.batch(), group)
@@ -111,7 +111,7 @@ LARGE = ("shape-joined", "shape-channels", "shape-segments")
 )
 def test_every_column_of_damaged_and_mixed_streams(name: str) -> None:
     sensor = SHAPES[name]
-    packets = sensor.decode(Subject(sensor).stream()).with_points
+    packets = sensor.decode(SensorUnderTest(sensor).stream()).with_points
     if len(packets):
         assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
@@ -187,7 +187,7 @@ def test_columns_are_made_once_and_slices_share_them() -> None:
     part = cloud[125:250]
     assert part.x.base is cloud.x or part.x.base is cloud.x.base
     assert part.shape == (25, 5)
-    assert isinstance(packets.batch().table, Rows)
+    assert isinstance(packets.batch().table, CompiledTable)
 
 
 def test_a_cloud_is_freed_without_garbage_collection() -> None:

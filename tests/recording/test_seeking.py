@@ -21,7 +21,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "drive.lsr"
     with Recorder(path, datagrams=True) as target:
         for number in range(NUMBER):
-            target.keep_up()
+            target.wait_for_room()
             target.write(
                 Chunk(MARK + number.to_bytes(4, "big") + bytes(292), START + number * STEP)
             )

@@ -14,7 +14,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import LaserScan, Scan, UsageError, simulate
 from lidarspec.points.mount import Mount
-from lidarspec.scans.beams import Planes
+from lidarspec.scans.beams import PlanarScans
 
 
 def simulated(name: str, packets: int = 1000) -> list[Scan]:
@@ -23,8 +23,8 @@ def simulated(name: str, packets: int = 1000) -> list[Scan]:
     return [scan for scan in sensor.scans(simulate(sensor, packets)) if scan.whole]
 
 
-def planar(planes: Planes, scans: Iterable[Scan]) -> list[LaserScan]:
-    found = [planes.scan(scan) for scan in scans]
+def planar(planes: PlanarScans, scans: Iterable[Scan]) -> list[LaserScan]:
+    found = [planes.project(scan) for scan in scans]
     assert None not in found
     return [one for one in found if one is not None]
 
@@ -36,7 +36,7 @@ def beams_of(one: LaserScan, scan: Scan) -> np.ndarray:
 
 
 def test_a_sensor_that_looks_one_way_has_one_beam() -> None:
-    for planes in (Planes(), Planes(beams=360), Planes(field=(-1.0, 1.0))):
+    for planes in (PlanarScans(), PlanarScans(beams=360), PlanarScans(field=(-1.0, 1.0))):
         for scan, one in zip(
             scans := simulated("benewake-tfmini"), planar(planes, scans), strict=True
         ):
@@ -52,7 +52,7 @@ TEXT = [pytest.param(name, marks=pytest.mark.slow) for name in ("hokuyo-utm30lx"
 def test_each_beam_is_as_late_as_its_points(name: str) -> None:
     """Within three beams, and two steps of a clock that counts in ms."""
     scans = simulated(name)
-    found = planar(Planes(), scans)
+    found = planar(PlanarScans(), scans)
     assert len(found) > 2
     assert (
         len({(one.angle_min, one.angle_max, one.angle_increment, len(one.ranges)) for one in found})
@@ -73,13 +73,13 @@ def test_each_beam_is_as_late_as_its_points(name: str) -> None:
 
 def test_a_sensor_that_sees_less_than_a_turn_has_beams_where_it_sees() -> None:
     scan, *_ = simulated("hokuyo-utm30lx")
-    (one,) = planar(Planes(), [scan])
+    (one,) = planar(PlanarScans(), [scan])
     assert (math.degrees(one.angle_min), math.degrees(one.angle_max)) == pytest.approx((-135, 135))
     assert len(one.ranges) == len(scan) == 1081
     np.testing.assert_array_equal(
         one.ranges, np.where(scan.points.valid, scan.points.range, np.inf)
     )
-    (fewer,) = planar(Planes(541), [scan])
+    (fewer,) = planar(PlanarScans(541), [scan])
     assert (fewer.angle_min, fewer.angle_max, len(fewer.ranges)) == (
         one.angle_min,
         one.angle_max,
@@ -90,13 +90,13 @@ def test_a_sensor_that_sees_less_than_a_turn_has_beams_where_it_sees() -> None:
 def test_a_field_that_is_asked_for_has_its_share_of_the_beams() -> None:
     scans = simulated("ldrobot-stl27l")
     (whole, *_), (half, *_) = (
-        planar(Planes(), scans),
-        planar(Planes(field=(-math.pi / 2, math.pi / 2)), scans),
+        planar(PlanarScans(), scans),
+        planar(PlanarScans(field=(-math.pi / 2, math.pi / 2)), scans),
     )
     assert len(half.ranges) == len(whole.ranges) // 2 + 1
     assert half.angle_increment == pytest.approx(whole.angle_increment)
     assert (half.angle_min, half.angle_max) == (-math.pi / 2, math.pi / 2)
-    (few, *_) = planar(Planes(90, (-math.pi / 2, math.pi / 2)), scans)
+    (few, *_) = planar(PlanarScans(90, (-math.pi / 2, math.pi / 2)), scans)
     assert (len(few.ranges), few.angle_max) == (90, math.pi / 2)
 
 
@@ -104,8 +104,8 @@ def test_a_sensor_upside_down_is_planar_and_mirrored() -> None:
     scans = simulated("ldrobot-stl27l")
     over = [replace(scan, points=Mount(inverted=True).apply(scan.points)) for scan in scans]
     (one, *_), (other, *_) = (
-        planar(Planes(360, (-math.pi / 2, math.pi / 2)), scans),
-        planar(Planes(360, (-math.pi / 2, math.pi / 2)), over),
+        planar(PlanarScans(360, (-math.pi / 2, math.pi / 2)), scans),
+        planar(PlanarScans(360, (-math.pi / 2, math.pi / 2)), over),
     )
     assert np.sign(other.time_increment) == -np.sign(one.time_increment)
     assert np.mean(np.isclose(one.ranges, other.ranges[::-1], atol=0.05)) > 0.95
@@ -114,17 +114,17 @@ def test_a_sensor_upside_down_is_planar_and_mirrored() -> None:
 def test_a_ring_or_a_layer_of_a_sensor_of_several_is_planar() -> None:
     scans = [scan for scan in simulated("velodyne-vlp16") if scan.complete]
     scan = scans[0]
-    assert Planes().scan(scan) is None
-    (ring, *_) = planar(Planes(1800, ring=15), scans)
+    assert PlanarScans().project(scan) is None
+    (ring, *_) = planar(PlanarScans(1800, ring=15), scans)
     points = scan.points[scan.points.valid & (scan.points.ring == 15)]
     away = np.hypot(points.x, points.y)
     np.testing.assert_allclose(ring.ranges.min(), away.min(), rtol=1e-6)
     assert (ring.ranges[np.isfinite(ring.ranges)] <= away.max() + 1e-3).all()
     assert np.isfinite(ring.ranges).mean() > 0.9
-    (layer, *_) = planar(Planes(1800, heights=(-0.1, 0.1)), scans)
+    (layer, *_) = planar(PlanarScans(1800, heights=(-0.1, 0.1)), scans)
     inside = scan.points[np.abs(scan.points.z) <= 0.1]
     np.testing.assert_allclose(layer.ranges.min(), np.hypot(inside.x, inside.y).min(), rtol=1e-6)
     with pytest.raises(UsageError, match="ring 16"):
-        Planes(ring=16).scan(scan)
+        PlanarScans(ring=16).project(scan)
     with pytest.raises(UsageError, match="ring 1 "):
-        Planes(ring=1).scan(simulated("ldrobot-stl27l")[0])
+        PlanarScans(ring=1).project(simulated("ldrobot-stl27l")[0])

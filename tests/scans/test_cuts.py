@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from lidarspec import Sensor, simulate
-from lidarspec.scans.stream import scans_of
+from lidarspec.scans.stream import iter_scans
 from lidarspec.spec import OnChange, OnFlag, OnJump, OnRewind, OnWrap
 from tests.shapes import SHAPES
 
@@ -57,7 +57,7 @@ def test_scans_end_where_the_rule_says(case: str, frames_per_batch: int) -> None
     assert len(packets) == len(angles)
     starts = range(0, len(packets), frames_per_batch)
     batches = [packets.take(slice(start, start + frames_per_batch)) for start in starts]
-    scans = list(scans_of(sensor, batches))
+    scans = list(iter_scans(sensor, batches))
     assert [len(scan) // POINTS_PER_FRAME for scan in scans] == sizes
 
 
@@ -72,7 +72,7 @@ def test_a_period_begins_with_its_first_instant(frames_per_batch: int) -> None:
     packets = sensor.decode(b"".join(frames))
     starts = range(0, len(packets), frames_per_batch)
     batches = [packets.take(slice(start, start + frames_per_batch)) for start in starts]
-    assert [len(scan) // POINTS_PER_FRAME for scan in scans_of(sensor, batches)] == [3, 2, 2, 1]
+    assert [len(scan) // POINTS_PER_FRAME for scan in iter_scans(sensor, batches)] == [3, 2, 2, 1]
 
 
 def test_a_rule_may_name_any_column_of_points() -> None:

@@ -23,13 +23,13 @@ from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
 from lidarspec.errors import UsageError
-from lidarspec.frames.frame_table import Rows
+from lidarspec.frames.frame_table import CompiledTable
 from lidarspec.packets.stream import PacketStream
 from lidarspec.points import batch_columns
 from lidarspec.points.cloud import COLUMNS, CloudColumns, LazyCloud
-from lidarspec.points.column_sources import Stretch, Stretches
+from lidarspec.points.column_sources import JoinedColumns, SourcePart
 from lidarspec.points.reference_evaluator import evaluate_plainly
-from lidarspec.scans.stream import ScanStream, scans_of
+from lidarspec.scans.stream import ScanStream, iter_scans
 from lidarspec.spec import OnChange, OnWrap, Udp
 from tests.agreement import assert_same_points
 from tests.broken import points_fail, sound
@@ -95,7 +95,7 @@ def test_scans_are_the_points_of_the_whole_cut(
     monkeypatch.setattr(batch_columns, "MIN_OWN_POINTS", least)
     monkeypatch.setattr(batch_columns, "BLOCK_POINTS", 5000)
     packets = packets_of(name, 700, backend)
-    scans = list(scans_of(packets.sensor, batches(packets, 1, 300, 2, 333)))
+    scans = list(iter_scans(packets.sensor, batches(packets, 1, 300, 2, 333)))
     assert len(scans) > 1
     assert_cut_from(scans, packets.points())
 
@@ -105,13 +105,13 @@ def test_scans_are_the_points_of_the_whole_cut(
 )
 def test_columns_do_not_depend_on_the_order_in_which_they_are_read(order: tuple[str, ...]) -> None:
     packets = packets_of("velodyne-vlp16", 200, "numpy")
-    assert_cut_from(list(scans_of(packets.sensor, batches(packets, 90))), packets.points(), order)
+    assert_cut_from(list(iter_scans(packets.sensor, batches(packets, 90))), packets.points(), order)
 
 
 def test_the_vendors_axes_hold_for_scans_too() -> None:
     sensor = ls.sensor("hesai-xt32").configure(frame="vendor")
     packets = sensor.decode(simulate(sensor, 400))
-    assert_cut_from(list(scans_of(sensor, batches(packets, 123))), packets.points())
+    assert_cut_from(list(iter_scans(sensor, batches(packets, 123))), packets.points())
 
 
 def test_scans_of_batches_that_are_evaluated_in_different_ways_have_all_columns() -> None:
@@ -120,15 +120,18 @@ def test_scans_of_batches_that_are_evaluated_in_different_ways_have_all_columns(
     planned = packets.points()
     plain = evaluate_plainly(packets).cloud
     assert isinstance(planned, LazyCloud)
-    parts = [Stretch(planned.lazy.source, 0, 100), Stretch(CloudColumns(plain), 100, len(plain))]
-    cloud = LazyCloud.of(Stretches(parts), plain.stamp_ns)
+    parts = [
+        SourcePart(planned.lazy.source, 0, 100),
+        SourcePart(CloudColumns(plain), 100, len(plain)),
+    ]
+    cloud = LazyCloud.of(JoinedColumns(parts), plain.stamp_ns)
     np.testing.assert_array_equal(cloud.z, plain.z)
     assert_same_points(cloud, plain, ulps=4)
 
 
 def test_large_scans_are_computed_without_the_rest_of_their_batch() -> None:
     packets = packets_of("robosense-m1", 2000, "numpy")
-    scans = list(scans_of(packets.sensor, [packets]))
+    scans = list(iter_scans(packets.sensor, [packets]))
     middle = scans[1].points
     assert middle.x.base is not None
     assert len(middle.x.base) < len(packets.points()) / 2
@@ -138,7 +141,7 @@ def test_large_scans_are_computed_without_the_rest_of_their_batch() -> None:
 def test_small_scans_share_what_is_computed() -> None:
     sensor = small_scans()
     packets = sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 700))
-    scans = list(scans_of(sensor, [packets]))
+    scans = list(iter_scans(sensor, [packets]))
     bases = {id(scan.points.x.base) for scan in scans}
     assert len(scans) > 300
     assert len(bases) < 20
@@ -151,7 +154,7 @@ def test_small_scans_share_what_is_computed() -> None:
 def test_small_scans_may_be_read_in_any_order(seed: int) -> None:
     sensor = small_scans()
     packets = sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 400))
-    scans = list(scans_of(sensor, batches(packets, 190)))
+    scans = list(iter_scans(sensor, batches(packets, 190)))
     for index in np.random.default_rng(seed).permutation(len(scans))[:100]:
         assert scans[index].points.x is not None
     assert_cut_from(scans, packets.points())
@@ -183,7 +186,7 @@ def test_packets_go_with_the_last_scan_that_is_made_of_them(size: str) -> None:
     gc.collect()
     gc.disable()
     try:
-        for scan in scans_of(sensor, (waiting.pop(0) for _ in range(2))):
+        for scan in iter_scans(sensor, (waiting.pop(0) for _ in range(2))):
             assert len(scan.points.x) == len(scan.points.time) == len(scan)
         del scan
         assert not any(packets() for packets in known)
@@ -205,7 +208,7 @@ def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> 
             )
     given = list[weakref.ref[Scan]]()
     with ls.open(path, sensor) as device:
-        for scan in device.scans() if opened else scans_of(sensor, [sensor.decode(frames)]):
+        for scan in device.scans() if opened else iter_scans(sensor, [sensor.decode(frames)]):
             given.append(weakref.ref(scan))
             assert len(scan.points.x) == len(scan)
             assert sum(known() is not None for known in given) <= 2
@@ -219,10 +222,10 @@ def test_a_sensor_that_turns_back_and_forth_is_cut_alike_in_any_batches() -> Non
     assert isinstance(sensor.scan, OnWrap)
     frames = simulate(ls.sensor("velodyne-vlp16"), 300)
     packets = sensor.decode([*frames, *frames[::-1], *frames])
-    whole = [len(scan) for scan in scans_of(sensor, [packets])]
+    whole = [len(scan) for scan in iter_scans(sensor, [packets])]
     assert len(whole) > 8
     for sizes in ((1, 7, 250), (310, 280), tuple([20] * 44)):
-        assert [len(scan) for scan in scans_of(sensor, batches(packets, *sizes))] == whole
+        assert [len(scan) for scan in iter_scans(sensor, batches(packets, *sizes))] == whole
 
 
 @pytest.mark.parametrize("name", SHAPED)
@@ -259,7 +262,7 @@ def assert_place_of_packets_does_not_matter(sensor: Sensor, backend: str) -> Non
         found.append(stream.add([decoder.decode_placed(buffer, places, sizes, unknown)]))
     together, separate = found
     assert len(together) == len(separate)
-    if isinstance(separate.table, Rows) and len(separate):
+    if isinstance(separate.table, CompiledTable) and len(separate):
         link = sensor.links["data"]
         recoded = sensor.frames[sensor.data_frame].wire is not None
         copied = recoded or (
@@ -360,7 +363,7 @@ def test_the_shape_of_a_scan_is_that_of_its_packets_whatever_they_came_with(
         reader(sensor, backend).decode(frames[start : start + size])
         for start in range(0, len(frames), size)
     ]
-    assert [scan.points.shape for scan in scans_of(sensor, read)] == [
+    assert [scan.points.shape for scan in iter_scans(sensor, read)] == [
         (10, 3),
         (10, 2),
         None,

@@ -17,7 +17,7 @@ from lidarspec.framing.results import Frames
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.stream import ScanStream
 from lidarspec.simulation.scenes import Room
-from lidarspec.simulation.simulator import opening, simulation
+from lidarspec.simulation.simulator import frame_simulation, make_opening_frame
 from tests.shapes import SHAPES
 
 #: a rotor that is blocked, or the start of a scan that does not come: seconds of the longest scan,
@@ -49,7 +49,7 @@ class Reading:
             ScanStream(self.sensor),
         )
         if decoder.stream:
-            decoder.frames(opening(self.sensor))
+            decoder.frames(make_opening_frame(self.sensor))
 
     def scans(self, frames: list[bytes]) -> list[Scan]:
         """The scans that some more frames complete."""
@@ -77,7 +77,7 @@ QUICK = "ldrobot-ld06"
 )
 def test_a_scan_ends_though_the_rotor_is_blocked(name: str) -> None:
     reading = Reading(name)
-    blocked = simulation(reading.sensor, reading.sensor.data_frame, blocked=True)
+    blocked = frame_simulation(reading.sensor, reading.sensor.data_frame, blocked=True)
     longest, sizes = BLOCKED[name], list[int]()
     for part in range(4):
         frames = blocked.block(part * 4000, 4000, Room()).frames
@@ -95,7 +95,7 @@ def test_a_scan_ends_though_the_rotor_is_blocked(name: str) -> None:
 @pytest.mark.slow
 def test_ten_minutes_of_a_blocked_rotor_keep_no_more_than_one_scan() -> None:
     reading, number = Reading("velodyne-vlp16"), 4096
-    frames = simulation(reading.sensor, "data", blocked=True).block(0, number, Room()).frames
+    frames = frame_simulation(reading.sensor, "data", blocked=True).block(0, number, Room()).frames
     rows = np.frombuffer(b"".join(frames), np.uint8).reshape(number, -1)
     starts, sizes, kept = (
         np.arange(number) * rows.shape[1],
@@ -121,7 +121,7 @@ def test_ten_minutes_of_a_blocked_rotor_keep_no_more_than_one_scan() -> None:
 
 def test_what_a_spinning_up_rotor_left_open_is_not_complained_of_once_it_turns() -> None:
     reading = Reading("ldrobot-ld06")
-    still = simulation(reading.sensor, "data", blocked=True).block(0, 375, Room()).frames
+    still = frame_simulation(reading.sensor, "data", blocked=True).block(0, 375, Room()).frames
     assert [scan.complete for scan in reading.scans(still)] == [False, False]
     assert "is the rotor blocked?" in reading.stats.unended
     turning = reading.scans(simulate(reading.sensor, 375, start=375))
@@ -139,7 +139,7 @@ def test_scans_go_on_after_a_pause_and_no_rotor_is_blamed_for_it() -> None:
 
 def test_scans_of_data_without_an_end_are_warned_of() -> None:
     sensor = ls.sensor("ldrobot-ld06")
-    frames = simulation(sensor, "data", blocked=True).block(0, 1000, Room()).frames
+    frames = frame_simulation(sensor, "data", blocked=True).block(0, 1000, Room()).frames
     with pytest.warns(
         UserWarning,
         match=r"ldrobot-ld06: the angle does not pass 0 \(azimuth\): is the rotor blocked\?",
@@ -156,7 +156,11 @@ def scans_without(name: str, lost: Collection[int], number: int = 4000) -> list[
     """The scans of simulated frames some of which are missing."""
     sensor = ls.sensor(name)
     frames = [frame for place, frame in enumerate(simulated(name, number)) if place not in lost]
-    return list(sensor.scans(frames if sensor.datagrams else b"".join([opening(sensor), *frames])))
+    return list(
+        sensor.scans(
+            frames if sensor.datagrams else b"".join([make_opening_frame(sensor), *frames])
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -314,7 +318,7 @@ def test_a_frame_without_parts_that_have_points_leaves_no_gap(size: int) -> None
 def test_false_and_missing_nodes_make_a_scan_incomplete(kind: str) -> None:
     sensor = ls.sensor("slamtec-rplidar-a1").configure(answer=kind)
     sound, draw = (
-        opening(sensor) + b"".join(simulate(sensor, 3000 if kind == "node" else 300)),
+        make_opening_frame(sensor) + b"".join(simulate(sensor, 3000 if kind == "node" else 300)),
         random.Random(5),
     )
     whole = {len(scan) for scan in sensor.scans(sound) if scan.complete}

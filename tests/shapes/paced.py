@@ -79,7 +79,9 @@ SENSOR = Sensor(
     points=partial(points, step_deg=3.0),
     scan=OnFlag("start", value=SCAN_START),
     links={"data": Udp(7010)},
-    clock=Clock(("seconds", "micros"), wraps_at=TURN_S, pace=pace, told=("position", unix_time)),
+    clock=Clock(
+        ("seconds", "micros"), wraps_at=TURN_S, pace=pace, reference=("position", unix_time)
+    ),
     simulation=Simulation(partial(sweep, step_deg=3.0)),
     range_limits=(0.1, 100.0),
     vendor_axes=("right", "forward", "up"),

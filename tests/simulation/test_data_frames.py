@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.simulation.simulator import opening, simulate
+from lidarspec.simulation.simulator import make_opening_frame, simulate
 from lidarspec.spec import Fields, Polar, Simulation, following, wrap
 from tests.shapes import SHAPES
 
@@ -21,7 +21,9 @@ MODES, AHEAD, OUTER = SHAPES["shape-modes"], SHAPES["shape-ahead"], SHAPES["shap
 def test_every_answer_is_simulated_by_its_own_sweep(answer: str) -> None:
     sensor = MODES.configure(answer=answer)
     frames = simulate(sensor, 40)
-    assert [found.frame for found in MODES.split(opening(sensor) + b"".join(frames))] == [
+    assert [
+        found.frame for found in MODES.split(make_opening_frame(sensor) + b"".join(frames))
+    ] == [
         f"begin_{answer}",
         *[answer] * 40,
     ]
@@ -31,7 +33,7 @@ def test_every_answer_is_simulated_by_its_own_sweep(answer: str) -> None:
 
 
 def test_a_sensor_that_needs_no_opening_has_none() -> None:
-    assert opening(AHEAD) == b""
+    assert make_opening_frame(AHEAD) == b""
 
 
 def test_simulated_packets_that_need_the_next_do_not_depend_on_batches() -> None:

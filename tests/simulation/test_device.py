@@ -17,11 +17,11 @@ from lidarspec import Sensor, UsageError
 from lidarspec.errors import OutOfRange
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.faults import Faults, FaultyLink, faults_of
-from lidarspec.simulation.simulator import Rest
+from lidarspec.simulation.simulator import RestingImu
 from lidarspec.spec import Command, Frame, Scaled
 from lidarspec.spec.fields import duration
 from lidarspec.testing.commands import the_simulated_sensor_answers
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.broken import sound
 from tests.shapes import SHAPES
 
@@ -71,7 +71,7 @@ def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
     stop = asked(device, "stop", 4 * SECOND)
     assert stop == bytes.fromhex("A55A 55 07 00000000000000 AD")
     assert passing(device, 4 * SECOND, 5 * SECOND) == b""
-    assert device.heard == ["start", "stop"]
+    assert device.commands_received == ["start", "stop"]
 
 
 def test_a_captured_start_of_a_coin_d4_comes_out_byte_for_byte_up_to_its_points() -> None:
@@ -92,7 +92,7 @@ def test_commands_without_an_answer_get_none_and_noise_is_ignored() -> None:
     assert asked(device, "low_exposure", 0) == b""
     device.receive(b"\x00\xaa\x55garbage", 0)
     assert asked(device, "get_version", SECOND)[2] == 0xFC ^ 0xA0
-    assert device.heard == ["low_exposure", "get_version"]
+    assert device.commands_received == ["low_exposure", "get_version"]
 
 
 def test_answers_stand_in_the_form_of_their_frames() -> None:
@@ -147,7 +147,7 @@ def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() ->
     assert b"\xa5\x5a\x14" not in asked(
         device, "get_info", 5 * SECOND
     )  # answered only while it does not scan
-    assert device.heard[-1] == "get_info"
+    assert device.commands_received[-1] == "get_info"
     assert asked(device, "stop", 5 * SECOND).count(b"\xa5\x5a") == 0
     assert a1().parse(asked(device, "get_info", 5 * SECOND)).hardware == 7
     assert passing(device, 5 * SECOND, 6 * SECOND) == b""
@@ -216,19 +216,19 @@ def test_a_deadline_is_when_something_comes() -> None:
 
 def test_frames_that_are_sent_unasked_are_made_together(monkeypatch: pytest.MonkeyPatch) -> None:
     filled = 0
-    fill = Rest.fill
+    fill = RestingImu.fill
 
-    def counting_fill(self: Rest, *arguments: Any) -> None:
+    def counting_fill(self: RestingImu, *arguments: Any) -> None:
         nonlocal filled
         filled += self._frame == "imu"
         fill(self, *arguments)
 
-    monkeypatch.setattr(Rest, "fill", counting_fill)
+    monkeypatch.setattr(RestingImu, "fill", counting_fill)
     sensor = SHAPES["shape-inertia"]
     device = on(sensor)
     times = []
     for now in range(0, SECOND, 10 * MS):
-        sent = [data for _, frame, data in device.sendings(now) if frame == "imu"]
+        sent = [data for _, frame, data in device.outgoing_with_types(now) if frame == "imu"]
         times += [sensor.parse(data, frame="imu").felt_at for data in sent]
     assert len(times) > 50
     assert times == sorted(set(times))
@@ -295,18 +295,18 @@ def test_lost_packets_are_missing_and_reordered_ones_are_late() -> None:
 
 def test_damage_in_datagrams_keeps_their_length() -> None:
     line = FaultyLink(Faults(errors=0.1), stream=False)
-    out = line.carry([("data", bytes(100))] * 50)
+    out = line.transmit([("data", bytes(100))] * 50)
     assert [len(data) for _, data in out] == [100] * 50
     assert 0.07 < np.mean([sum(map(bool, data)) for _, data in out]) / 100 < 0.13
 
 
 def test_every_byte_of_a_line_can_be_damaged() -> None:
-    out = FaultyLink(Faults(errors=1.0), stream=True).carry([("", bytes(300))])
+    out = FaultyLink(Faults(errors=1.0), stream=True).transmit([("", bytes(300))])
     assert 150 < len(out[0][1]) < 450
     assert all(
         a or b
         for a, b in pairwise(
-            FaultyLink(Faults(errors=1.0), stream=False).carry([("", bytes(300))])[0][1]
+            FaultyLink(Faults(errors=1.0), stream=False).transmit([("", bytes(300))])[0][1]
         )
     )
 
@@ -398,4 +398,4 @@ def test_a_reply_is_told_by_bytes_names_and_arrays(told: dict[str, Any]) -> None
             )
         },
     )
-    the_simulated_sensor_answers(Subject(sensor), "start")
+    the_simulated_sensor_answers(SensorUnderTest(sensor), "start")

@@ -34,7 +34,7 @@ from lidarspec.transports.simulated_files import write_file
 from lidarspec.view.terminal_screen import Keyboard
 from tests.broken import sound
 from tests.lines import TIMEOUT_S, free_port, read_until, until
-from tests.simulation.test_simulator import off
+from tests.simulation.test_simulator import distance_outside
 
 posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
 A1 = "slamtec-rplidar-a1"
@@ -159,10 +159,13 @@ def test_on_a_serial_port_nothing_is_lost_and_every_command_is_answered(name: st
             for command in (*sensor.on_open, *sensor.on_close)
             if sensor.commands[command].frame
         ]
-        until(lambda: port.device.heard == wanted)
+        until(lambda: port.device.commands_received == wanted)
     for scan in found:
         assert scan.points.valid.mean() > 0.98
-        assert off(room, scan.points.xyz[scan.points.valid].astype(np.float64)).max() < 0.0006
+        assert (
+            distance_outside(room, scan.points.xyz[scan.points.valid].astype(np.float64)).max()
+            < 0.0006
+        )
 
 
 @posix
@@ -350,7 +353,7 @@ def test_what_goes_wrong_in_the_thread_of_a_port_is_raised_at_its_end() -> None:
     tried = threading.Event()
 
     class Broken(SimulatedDevice):
-        def sendings(self, now: int) -> list[tuple[str, str, bytes]]:
+        def outgoing_with_types(self, now: int) -> list[tuple[str, str, bytes]]:
             tried.set()
             raise ZeroDivisionError
 
@@ -384,7 +387,7 @@ def test_descriptors_may_have_any_number(name: str, to: str) -> None:
     place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
     with virtual_port(name, to=place) as port, ls.open(port.path, name) as device:
         scans(device, 1)
-        assert bool(port.device.heard) == (name == A1)
+        assert bool(port.device.commands_received) == (name == A1)
 
 
 @posix

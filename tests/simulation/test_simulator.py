@@ -16,9 +16,9 @@ from lidarspec import Sensor, SourceError, SpecError, UsageError, simulate
 from lidarspec.errors import PluginError
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.simulation.scenes import Box, Mover, Room, make_room, read_scene, scene_of
-from lidarspec.simulation.simulator import simulation
+from lidarspec.simulation.simulator import frame_simulation
 from lidarspec.spec import Cartesian, Frame, Polar, Scaled, Serial, Simulation, Udp, stack
-from lidarspec.testing.geometry import off
+from lidarspec.testing.geometry import distance_outside
 from tests.engine import against_construct
 from tests.representatives import REPRESENTATIVES
 from tests.shapes import coordinates, count, sized
@@ -112,7 +112,9 @@ def assert_scene_comes_back(sensor: Sensor, frame: str, room: Room, *, number: i
     cloud = sensor.decode(frames if sensor.datagrams else b"".join(frames)).points()
     seen = _seen(sensor, frame, cloud, room, range(5, 5 + number))
     assert cloud.valid[seen].mean() > 0.98
-    assert off(room, placed(cloud, len(frames))).max() < half_step(sensor, frame) + EXACT
+    assert (
+        distance_outside(room, placed(cloud, len(frames))).max() < half_step(sensor, frame) + EXACT
+    )
 
 
 @pytest.mark.parametrize("name", REPRESENTATIVES)
@@ -145,7 +147,10 @@ def test_the_bytes_of_a_device_decode_to_the_scene_without_a_byte_too_many(name:
         2,
     )  # two stray bytes that a COIN-D4 was seen to send
     assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
-    assert off(room, placed(cloud, len(packets))).max() < half_step(sensor, packets.frame) + EXACT
+    assert (
+        distance_outside(room, placed(cloud, len(packets))).max()
+        < half_step(sensor, packets.frame) + EXACT
+    )
     assert set(np.round(np.sign(np.diff(packets.time_ns))).tolist()) <= {0.0, 1.0}
 
 
@@ -155,9 +160,9 @@ def test_a_mirrored_or_turned_scene_would_show() -> None:
     xyz = xyz / np.linalg.norm(xyz, axis=1)[:, None]
     azimuth, elevation = np.arctan2(xyz[:, 1], xyz[:, 0]), np.arcsin(xyz[:, 2])
     hits = xyz * room.measure(azimuth, elevation)[:, None]
-    assert off(room, hits).max() < 1e-9
-    assert off(room, hits * [1, -1, 1]).max() > 0.1
-    assert off(room, hits * [-1, 1, 1]).max() > 0.1
+    assert distance_outside(room, hits).max() < 1e-9
+    assert distance_outside(room, hits * [1, -1, 1]).max() > 0.1
+    assert distance_outside(room, hits * [-1, 1, 1]).max() > 0.1
 
 
 def test_beams_begin_where_they_are_said_to() -> None:
@@ -175,7 +180,7 @@ def test_beams_begin_where_they_are_said_to() -> None:
         )
         * ranges[:, None]
     )
-    assert off(room, hits + origin).max() < 1e-9
+    assert distance_outside(room, hits + origin).max() < 1e-9
 
 
 def test_somebody_walks() -> None:
@@ -224,11 +229,11 @@ def test_the_pace_is_that_of_the_clock_of_the_points_of_the_declaration_or_of_th
         "slamtec-rplidar-a1": 508e-6,  # declared
     }
     for name, seconds in wanted.items():
-        assert simulation(ls.sensor(name), ls.sensor(name).data_frame).interval == pytest.approx(
-            seconds * 1e9, rel=0.01
-        )
+        assert frame_simulation(
+            ls.sensor(name), ls.sensor(name).data_frame
+        ).interval == pytest.approx(seconds * 1e9, rel=0.01)
     bare = replace(SHAPE, links={"data": Serial(9600)})
-    assert simulation(bare, "data").interval == pytest.approx((9 + 3 * 40) * 10 / 9600 * 1e9)
+    assert frame_simulation(bare, "data").interval == pytest.approx((9 + 3 * 40) * 10 / 9600 * 1e9)
 
 
 def test_a_sensor_without_time_on_datagrams_has_to_declare_its_rate() -> None:
@@ -283,7 +288,7 @@ def test_corrected_ranges_go_back_through_the_correction(stretch: float, shift: 
     frames = simulate(replace(SHAPE, points=corrected), 9, scene=room)
     cloud = replace(SHAPE, points=corrected).decode(b"".join(frames)).points()
     assert cloud.valid.all()
-    assert off(room, cloud.xyz.astype(np.float64)).max() < 0.0005 * stretch + EXACT
+    assert distance_outside(room, cloud.xyz.astype(np.float64)).max() < 0.0005 * stretch + EXACT
     raw = SHAPE.decode(b"".join(frames)).points()
     np.testing.assert_allclose(cloud.range, raw.range * stretch + shift, atol=1e-5)
 
@@ -300,7 +305,9 @@ def test_coordinates_give_the_scene_back_along_the_directions_that_are_declared(
     assert (packets.stats.frames, packets.stats.lost) == (dict(device.sent), 0)
     assert cloud.valid.all()
     step = {"shape-millimetres": 0.001, "shape-centimetres": 0.01, "shape-floats": 0}[sensor.id]
-    assert off(room, cloud.xyz.astype(np.float64)).max() < step / 2 * np.sqrt(3) + EXACT
+    assert (
+        distance_outside(room, cloud.xyz.astype(np.float64)).max() < step / 2 * np.sqrt(3) + EXACT
+    )
     declared = np.concatenate([np.ravel(coordinates.directions(i)[0]) for i in range(len(packets))])
     np.testing.assert_allclose(cloud.azimuth, declared, atol=step + 1e-6)
 
@@ -334,7 +341,9 @@ def test_coordinates_are_solved_for_whatever_points_makes_of_the_fields() -> Non
     cloud = sensor.decode(frames).points()
     assert len(cloud) == sum(2 * (2 + i % 5) for i in range(50))
     assert cloud.valid.all()
-    assert off(room, cloud.xyz.astype(np.float64)).max() < 0.003 / 2 * np.sqrt(3) + EXACT
+    assert (
+        distance_outside(room, cloud.xyz.astype(np.float64)).max() < 0.003 / 2 * np.sqrt(3) + EXACT
+    )
     assert np.unique(np.round(cloud.elevation, 1)).tolist() == pytest.approx([0, 0.3])
 
 

@@ -29,7 +29,7 @@ from lidarspec.recording.format import DATAGRAM, HEADER, MAGIC, RECEIVED, Header
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Serial
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests import made_captures as made
 from tests.engine.oracle import Oracle
 from tests.engine.streams import Books, clean, damaged, decoded, hostile_streams, worst
@@ -66,12 +66,12 @@ def splits(share: float) -> Figure:
     """P1: two-way splits at every byte, and random ones, against the whole."""
     tried = differing = 0
     for sensor in streams().values():
-        subject = Subject(sensor)
+        subject = SensorUnderTest(sensor)
         data, source = clean(subject, length=max(int(1000 * share), 300)), subject.source("soak")
         books = Books(sensor).feed(data)
         whole, stats = books.finish(), books.decoder.stats
         cuts = [[data[:spot], data[spot:]] for spot in range(0, len(data), 1 if share == 1 else 7)]
-        for parts in [*cuts, *(list(material.pieces(data, source)) for _ in range(50))]:
+        for parts in [*cuts, *(list(material.cut_randomly(data, source)) for _ in range(50))]:
             books = Books(sensor)
             for part in parts:
                 books.feed(part)
@@ -88,7 +88,7 @@ def recovered(share: float) -> Figure:
     """P2: the frames of the engine against those of the oracle, whatever is damaged."""
     frames = missed = extra = 0
     for sensor, seed in itertools.product(streams().values(), range(max(int(3 * share), 1))):
-        data = clean(Subject(sensor), seed=seed, length=int(2000 * share) + 200)[:4000]
+        data = clean(SensorUnderTest(sensor), seed=seed, length=int(2000 * share) + 200)[:4000]
         for rate, burst in itertools.product(RATES, BURSTS) if share == 1 else [(1e-3, 1)]:
             noisy = damaged(data, rate, seed, burst=burst)
             found, wanted = set(decoded(sensor, noisy)), set(Oracle(sensor, noisy).frames())
@@ -176,7 +176,7 @@ def delay(share: float) -> Figure:
     """P6: bytes that come after a frame's last one before it is out, by the longest frame."""
     worst_share = 0.0
     for _, sensor in few(streams(), share):
-        data = Subject(sensor).stream(rounds=3)[: int(20_000 * share) + 3000]
+        data = SensorUnderTest(sensor).stream(rounds=3)[: int(20_000 * share) + 3000]
         bound = max(
             frame.max_length * frame.confirm
             for frame in sensor.frames.values()
@@ -291,7 +291,7 @@ def slowest(share: float) -> Figure:
     held = {}
     fastest = line_rates()
     for name, sensor in few(installed(streams()), share):
-        subject = Subject(sensor)
+        subject = SensorUnderTest(sensor)
         line = fastest[_frames_key(sensor)]
         for what, data in hostile_streams(subject, int(16_000 * share) + 4000):
             sensor.decoder().feed(data)  # what is made once, and for all decoders

@@ -21,7 +21,7 @@ from construct import BitsInteger, BitStruct, Const, Int8ub, Struct
 from numpy.typing import NDArray
 
 from lidarspec import SpecError
-from lidarspec.frames.row_checksums import batch, over
+from lidarspec.frames.row_checksums import compute_checksums, compute_over_spans
 from lidarspec.spec import Checksum, Checksummed, Crc, Fold15, Sum, WordXor, Xor, ZeroPadded
 from tests.engine import against_construct
 from tests.evidence import vector_bytes
@@ -128,7 +128,7 @@ def test_catalogue_check_values(crc: Crc, check: int) -> None:
         crc(b"123456789") == bitwise_crc(crc, b"123456789") == check
     )  # the oracle is held to them too
     rows = np.tile(np.frombuffer(b"123456789", np.uint8), (1000, 1))
-    assert batch(crc, rows).tolist() == [check] * 1000
+    assert compute_checksums(crc, rows).tolist() == [check] * 1000
 
 
 @pytest.mark.parametrize("length", [0, 1, 46, 1040, 5000, 300_001])
@@ -145,7 +145,7 @@ def test_rows_of_the_polynomial_of_zlib_agree_with_the_bitwise_oracle(
     crc = Crc(32, 0x04C11DB7, 0x12345678, True, refout, 0x9ABCDEF0)
     wide = random_rows(200, length + 9)
     for rows in (wide[:, 4:-5], np.asfortranarray(wide[:, 4:-5])):
-        assert batch(crc, rows)[::13].tolist() == [
+        assert compute_checksums(crc, rows)[::13].tolist() == [
             bitwise_crc(crc, row.tobytes()) for row in rows[::13]
         ]
 
@@ -172,7 +172,7 @@ def test_every_width_agrees_with_the_bitwise_oracle(width: int) -> None:
         ]
         for count, length in shapes:
             rows = random_rows(count, length, seed=width)
-            values = batch(crc, rows)
+            values = compute_checksums(crc, rows)
             for row in (0, count // 2, count - 1):
                 assert values[row] == bitwise_crc(crc, rows[row].tobytes()), (crc, length)
 
@@ -197,7 +197,9 @@ def test_agrees_with_crccheck() -> None:
             data = rng.randbytes(length)
             assert crc(data) == other.calc(data), (other, length)
         rows = random_rows(90, 31)
-        assert batch(crc, rows).tolist() == [other.calc(row.tobytes()) for row in rows], other
+        assert compute_checksums(crc, rows).tolist() == [
+            other.calc(row.tobytes()) for row in rows
+        ], other
 
 
 @pytest.mark.parametrize("algorithm", slow_unless(ALGORITHMS, QUICK_ALGORITHMS), ids=name_of)
@@ -211,7 +213,7 @@ class TestBatch:
                 3,
                 2048 // max(1, length) + 2,
             ):  # the last is past the point where CRCs leave the loop over bytes
-                values = batch(algorithm, random_rows(count, length))
+                values = compute_checksums(algorithm, random_rows(count, length))
                 assert values.dtype == np.uint64
                 assert values.tolist() == singly(algorithm, random_rows(count, length)), (
                     count,
@@ -226,7 +228,7 @@ class TestBatch:
         self, algorithm: Checksum, count: int, length: int
     ) -> None:
         rows = random_rows(count, length)
-        values = batch(algorithm, rows)
+        values = compute_checksums(algorithm, rows)
         for row in {*range(0, count, 211), count - 1}:
             data = rows[
                 row
@@ -249,12 +251,14 @@ class TestBatch:
             for count in (3, 300 if spans[0] == (0, 8) else 60):
                 rows = random_rows(count, 88)
                 joined = np.concatenate([rows[:, start:stop] for start, stop in spans], axis=1)
-                assert over(algorithm, rows, spans).tolist() == singly(algorithm, joined), (
+                assert compute_over_spans(algorithm, rows, spans).tolist() == singly(
+                    algorithm, joined
+                ), (
                     spans,
                     count,
                 )
         short = random_rows(400, 5)
-        assert over(algorithm, short, ((0, 1), (3, 5))).tolist() == singly(
+        assert compute_over_spans(algorithm, short, ((0, 1), (3, 5))).tolist() == singly(
             algorithm, short[:, [0, 3, 4]]
         )
 
@@ -268,7 +272,7 @@ class TestBatch:
                 np.asfortranarray(buffer[:, :length]),
             ):
                 assert not rows.flags.c_contiguous
-                assert batch(algorithm, rows).tolist() == singly(algorithm, rows)
+                assert compute_checksums(algorithm, rows).tolist() == singly(algorithm, rows)
 
 
 @pytest.mark.parametrize(
@@ -276,9 +280,9 @@ class TestBatch:
 )
 def test_temporary_memory_is_bounded(algorithm: Checksum) -> None:
     rows = random_rows(200_000, 47)
-    batch(algorithm, rows[:100])  # tables are not temporary
+    compute_checksums(algorithm, rows[:100])  # tables are not temporary
     tracemalloc.start()
-    batch(algorithm, rows)
+    compute_checksums(algorithm, rows)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert (
@@ -311,7 +315,7 @@ def test_fold15_by_its_formula_in_whole_numbers(length: int) -> None:
 def test_every_single_bit_error_is_seen(algorithm: Checksum) -> None:
     frame = random_rows(1, 46)
     flipped = frame ^ np.packbits(np.eye(8 * 46, dtype=np.uint8), axis=1)
-    assert not np.any(batch(algorithm, flipped) == algorithm(frame.tobytes()))
+    assert not np.any(compute_checksums(algorithm, flipped) == algorithm(frame.tobytes()))
     assert algorithm(frame.tobytes()) not in singly(algorithm, flipped)
 
 
@@ -382,7 +386,11 @@ def test_coin_d4_packets_of_a_capture() -> None:
         packets[:, 8] + 256 * packets[:, 9].astype(int),
         np.delete(packets, [8, 9], axis=1),
     )
-    assert batch(M1C1, covered).tolist() == stored.tolist() != WordXor().batch(covered).tolist()
+    assert (
+        compute_checksums(M1C1, covered).tolist()
+        == stored.tolist()
+        != WordXor().batch(covered).tolist()
+    )
 
 
 def test_algorithms_are_equal_and_hashed_by_their_parameters() -> None:
@@ -482,7 +490,7 @@ def test_long_rows_of_zlibs_polynomial_have_its_values_wherever_they_stand(
     rows = np.random.default_rng(5).integers(0, 256, (9, 3001), dtype=np.uint8)
     parts = [row[2:1400].tobytes() + row[1404:].tobytes() for row in rows]
     begin, end = int(f"{init:032b}"[::-1], 2) ^ 2**32 - 1, 2**32 - 1 ^ xorout
-    assert over(crc, rows, ((2, 1400), (1404, 3001))).tolist() == [
+    assert compute_over_spans(crc, rows, ((2, 1400), (1404, 3001))).tolist() == [
         zlib.crc32(part, begin) ^ end for part in parts
     ]
 

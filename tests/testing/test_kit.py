@@ -57,14 +57,14 @@ from lidarspec.testing import frames
 from lidarspec.testing.check import CheckTarget, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declaration import check_declaration
-from lidarspec.testing.findings import Violation, left_over
+from lidarspec.testing.findings import ViolationError, unacknowledged
 from lidarspec.testing.frames import (
     values_in_units_build_the_same_bytes,
     values_survive_building_and_parsing,
 )
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES, Property
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from lidarspec.testing.vectors import vectors_hold
 from tests.broken import (
     code_for_range,
@@ -207,7 +207,7 @@ def test_work_with_a_long_frame_is_limited_in_bytes(
     monkeypatch.setattr(frames, "FLIPPED_BYTES", FLIPPED_BYTES, raising=False)
     monkeypatch.setattr(Sensor, "parse", counting_parse)
     monkeypatch.setattr(CompiledCodec, "survey", counting_survey)
-    check.function(Subject(sensor), "picture")
+    check.function(SensorUnderTest(sensor), "picture")
 
 
 def test_progress_names_each_case_before_it_begins() -> None:
@@ -257,7 +257,7 @@ def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> N
 )
 def test_what_contradicts_itself_is_named(plugin: Any, code: str) -> None:
     def found(sensor: Sensor) -> set[str]:
-        subject = Subject(sensor)
+        subject = SensorUnderTest(sensor)
         consistent = [
             one for one in PROPERTIES if one.function.__module__.endswith("testing.consistency")
         ]
@@ -292,7 +292,7 @@ def test_what_cannot_be_derived_is_asked_for_by_name(how: object) -> None:
         plain, frames={**plain.frames, "info": Frame(INFO, max_length=6, plausible=rare)}
     )
     assert codes(sensor) == {"LS301"}
-    subject = Subject(sensor, 6, strategies={"info.key": how})
+    subject = SensorUnderTest(sensor, 6, strategies={"info.key": how})
     assert {sensor.parse(subject.example("info", seed=seed)).key for seed in range(5)} == {0xBEEF}
     values_survive_building_and_parsing(subject, "info")
 
@@ -308,8 +308,8 @@ class Lossy(Sensor):
 
 @pytest.mark.slow
 def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
-    with pytest.raises(Violation) as found:
-        values_survive_building_and_parsing(Subject(sound.sensor(kind=Lossy), 80), "data")
+    with pytest.raises(ViolationError) as found:
+        values_survive_building_and_parsing(SensorUnderTest(sound.sensor(kind=Lossy), 80), "data")
     assert (found.value.code, found.value.path) == ("LS305", "data.tilt")
     assert found.value.what == "-101 is written, and 101 is read"
 
@@ -317,15 +317,19 @@ def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
 @pytest.mark.slow
 def test_an_edit_is_read_back_beside_integers_that_cannot_be_edited() -> None:
     frame = sound.frame(sound.sealed(revision=Const(3, Int8ul)), max_length=sound.SIZE + 1)
-    with pytest.raises(Violation, match="-101 is written, and 101 is read"):
-        values_survive_building_and_parsing(Subject(sound.sensor(frame, Lossy), 200), "data")
+    with pytest.raises(ViolationError, match="-101 is written, and 101 is read"):
+        values_survive_building_and_parsing(
+            SensorUnderTest(sound.sensor(frame, Lossy), 200), "data"
+        )
 
 
 def left(sensor: Sensor) -> set[str]:
     """What its declaration leaves over."""
     return {
         finding.code
-        for finding in left_over(check_declaration(Subject(sensor)), sensor, whole=True)
+        for finding in unacknowledged(
+            check_declaration(SensorUnderTest(sensor)), sensor, whole=True
+        )
     }
 
 
@@ -374,7 +378,7 @@ def told(sensor: Sensor, vectors: list[dict[str, Any]] | None, *family: str) -> 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "vectors.json"
         file.write_text(json.dumps(vectors), encoding="utf-8")
-        subject = Subject(sensor, vectors=None if vectors is None else file, family=family)
+        subject = SensorUnderTest(sensor, vectors=None if vectors is None else file, family=family)
         about = [
             one
             for one in PROPERTIES
@@ -463,12 +467,12 @@ def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(
         return Polar(f.samples.distance, sign * sound.points(f).azimuth)
 
     right, wrong = (
-        Subject(sound.sensor(points=partial(turning, way), vendor_axes=axes))
+        SensorUnderTest(sound.sensor(points=partial(turning, way), vendor_axes=axes))
         for way in (sign, -sign)
     )
     the_points_turn_as_the_axes_do(right, "data")
     assert right.picture["data: sense"] == f"{sense} as first grows, seen from above"
-    with pytest.raises(Violation, match=f"angles run {sense}") as found:
+    with pytest.raises(ViolationError, match=f"angles run {sense}") as found:
         the_points_turn_as_the_axes_do(wrong, "data")
     assert found.value.code == "LS511"
 
@@ -551,7 +555,7 @@ def test_a_reply_that_nothing_makes_up_asks_for_answers() -> None:
         (answering,) = [one for one in PROPERTIES if one.function is the_simulated_sensor_answers]
         return [
             f"{found.code} {found.path}: {found.what}"
-            for found in answering.findings(Subject(sensor))
+            for found in answering.findings(SensorUnderTest(sensor))
         ]
 
     page = Frame(
@@ -591,8 +595,8 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
         ): "LS701",
     }.items():
         file.write_text(text, encoding="utf-8")
-        with pytest.raises(Violation) as found:
-            vectors_hold(Subject(sound.sensor(), vectors=file))
+        with pytest.raises(ViolationError) as found:
+            vectors_hold(SensorUnderTest(sound.sensor(), vectors=file))
         assert found.value.code == code, text
 
 
@@ -617,16 +621,18 @@ def test_vectors_hold_commands_and_their_replies(
     }
     (file := tmp_path / "vectors.json").write_text(json.dumps([vector | changes]), encoding="utf-8")
     if not said:
-        vectors_hold(Subject(sound.sensor(), vectors=file))
+        vectors_hold(SensorUnderTest(sound.sensor(), vectors=file))
         return
-    with pytest.raises(Violation, match=said):
-        vectors_hold(Subject(sound.sensor(), vectors=file))
+    with pytest.raises(ViolationError, match=said):
+        vectors_hold(SensorUnderTest(sound.sensor(), vectors=file))
 
 
 def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
     for kind, offset in ((Float16b, 0.0), (Float32l, 0.0), (Float32l, 3.0), (Float64l, 0.0)):
         fields = sound.sealed(warmth=Scaled(kind, 0.1, "degC", offset=offset))
-        subject = Subject(sound.sensor(sound.frame(fields, max_length=sound.SIZE + kind.sizeof())))
+        subject = SensorUnderTest(
+            sound.sensor(sound.frame(fields, max_length=sound.SIZE + kind.sizeof()))
+        )
         values_in_units_build_the_same_bytes(subject, "data")
 
 
@@ -659,7 +665,7 @@ def test_vectors_of_any_shape_are_a_fault_of_their_file(
     file = tmp_path / "strange.txt"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     (holding,) = [one for one in PROPERTIES if one.function is vectors_hold]
-    (found,) = holding.findings(Subject(sound.sensor(), vectors=file))
+    (found,) = holding.findings(SensorUnderTest(sound.sensor(), vectors=file))
     assert (found.code, found.file) == ("LS702", str(file))
     assert re.search(said, found.what)
 

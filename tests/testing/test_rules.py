@@ -21,10 +21,10 @@ from lidarspec.spec import (
 )
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declaration import check_declaration
-from lidarspec.testing.findings import left_over
+from lidarspec.testing.findings import unacknowledged
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES
-from lidarspec.testing.sensor_under_test import Subject
+from lidarspec.testing.sensor_under_test import SensorUnderTest
 from lidarspec.testing.vectors import every_checksum_is_checked
 from tests.broken import interpreted, sound
 
@@ -33,14 +33,16 @@ def declared_codes(sensor: Sensor) -> set[str]:
     """Return the rules that a declaration alone breaks."""
     return {
         finding.code
-        for finding in left_over(check_declaration(Subject(sensor)), sensor, whole=True)
+        for finding in unacknowledged(
+            check_declaration(SensorUnderTest(sensor)), sensor, whole=True
+        )
     }
 
 
 def found_by(function: Any, sensor: Sensor) -> set[str]:
     """Return the rules that one property finds broken."""
     (held,) = [one for one in PROPERTIES if one.function is function]
-    return {finding.code for finding in held.findings(Subject(sensor))}
+    return {finding.code for finding in held.findings(SensorUnderTest(sensor))}
 
 
 def with_frame(name: str, frame: Frame, **changes: Any) -> Sensor:
@@ -111,7 +113,7 @@ def test_answers_that_decide_by_the_arguments_may_keep_silent() -> None:
 
 
 def test_vectors_in_two_quadrants_prove_the_sense_of_the_points() -> None:
-    subject = Subject(sound.sensor(vendor_axes=("forward", "right", "up")))
+    subject = SensorUnderTest(sound.sensor(vendor_axes=("forward", "right", "up")))
     (held,) = [one for one in PROPERTIES if one.function is the_points_turn_as_the_axes_do]
     assert [finding.code for finding in held.findings(subject)] == ["LS511"]
     subject.placed.add("data")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 import lidarspec as ls
-from lidarspec.plugins import Registry, hookimpl, standing_in
+from lidarspec.plugins import Registry, hookimpl, use_registry
 from lidarspec.transports.open_url import live, transport
 from lidarspec.transports.protocol import Chunk, Transport
 
@@ -33,7 +33,7 @@ class Sources:
 @pytest.fixture(autouse=True)
 def registry() -> Iterator[None]:
     own = Registry()
-    with standing_in(own):
+    with use_registry(own):
         own.add(Sources(), name="sources")
         yield
 

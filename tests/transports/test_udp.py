@@ -16,7 +16,13 @@ from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import UdpLine
 from lidarspec.transports.protocol import Origin, endpoint
-from lidarspec.transports.udp import BUFFER, UdpTransport, _order_times, _Socket, shortfall
+from lidarspec.transports.udp import (
+    BUFFER,
+    UdpTransport,
+    _order_times,
+    _Socket,
+    warn_of_small_buffer,
+)
 from tests.lines import free_port, udp, until
 from tests.shapes import SHAPES
 
@@ -117,7 +123,7 @@ def test_what_is_sent_goes_to_the_sender_that_is_asked_for_and_no_other() -> Non
         one = opened(f"udp://:{port}?src=127.0.0.2:{wanted.getsockname()[1]}")
         other.sendto(b"here!", ("127.0.0.1", port))
         until(lambda: one.read(0.01) or one.foreign)
-        assert one.stranger == other.getsockname()
+        assert one.other_sender == other.getsockname()
         one.accept(other.getsockname())
         one.write(b"hello")
         assert wanted.recv(16) == b"hello"
@@ -242,8 +248,8 @@ def test_a_multicast_group_is_joined() -> None:
 
 
 def test_a_buffer_that_is_too_small_is_told_with_the_line_that_mends_it() -> None:
-    assert shortfall(BUFFER, BUFFER) == []
-    (text,) = shortfall(8 << 20, 212_992)
+    assert warn_of_small_buffer(BUFFER, BUFFER) == []
+    (text,) = warn_of_small_buffer(8 << 20, 212_992)
     assert text.endswith("next: sudo sysctl -w net.core.rmem_max=8388608")
     assert "208 KiB of 8192" in text
 

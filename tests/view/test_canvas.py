@@ -18,11 +18,11 @@ from lidarspec.view.canvas import (
     INKS,
     PLAIN,
     Canvas,
-    Cells,
+    CellGrid,
     sgr,
     style,
 )
-from lidarspec.view.terminal_screen import changes
+from lidarspec.view.terminal_screen import encode_changes
 from tests.view.test_polar import DOTS
 
 
@@ -34,7 +34,7 @@ def test_each_dot_has_its_bit(bit: int, place: tuple[int, int]) -> None:
 
 
 def test_texts_of_others_steer_no_terminal() -> None:
-    cells = Cells.blank(16, 1)
+    cells = CellGrid.blank(16, 1)
     cells.write(0, 0, "a\x1b[2J\u202eb\n")
     assert cells.lines() == [r"a\x1b[2J\u202eb "]
 
@@ -66,7 +66,7 @@ def test_the_nearest_and_the_strongest_point_colour_a_cell() -> None:
 
 
 def test_writing_and_pasting_stay_inside() -> None:
-    cells, small = Cells.blank(4, 2), Cells.blank(3, 3)
+    cells, small = CellGrid.blank(4, 2), CellGrid.blank(3, 3)
     small.write(0, 0, "abc", ALARM)
     cells.paste(1, 2, small)
     cells.write(0, -1, "xyz")
@@ -76,7 +76,7 @@ def test_writing_and_pasting_stay_inside() -> None:
 
 
 def test_ascii_keeps_the_density_of_dots() -> None:
-    cells = Cells.blank(5, 1)
+    cells = CellGrid.blank(5, 1)
     cells.write(0, 0, f"{chr(BLANK + 1)}{chr(BLANK + 255)}▲°e")
     assert cells.ascii().lines() == [".#^de"]
 
@@ -98,9 +98,9 @@ def shown(before: list[str], text: str) -> list[str]:
 
 def test_changes_bring_a_terminal_from_picture_to_picture() -> None:
     source = np.random.default_rng(4)
-    before = Cells.blank(30, 8)
+    before = CellGrid.blank(30, 8)
     for _ in range(50):
-        after = Cells(before.codes.copy(), before.inks.copy())
+        after = CellGrid(before.codes.copy(), before.inks.copy())
         for _ in range(source.integers(0, 30)):
             after.write(
                 int(source.integers(8)),
@@ -108,18 +108,18 @@ def test_changes_bring_a_terminal_from_picture_to_picture() -> None:
                 chr(source.integers(33, 126)),
                 int(source.integers(3)),
             )
-        text = changes(before, after, "256")
+        text = encode_changes(before, after, "256")
         assert shown(before.lines(), text) == after.lines()
         before = after
 
 
 def test_only_what_changed_is_written() -> None:
-    before, after = Cells.blank(80, 24), Cells.blank(80, 24)
-    assert changes(before, after, "truecolor") == ""
+    before, after = CellGrid.blank(80, 24), CellGrid.blank(80, 24)
+    assert encode_changes(before, after, "truecolor") == ""
     after.write(3, 7, "x", ALARM)
-    assert changes(before, after, "none") == "\x1b[4;8H\x1b[0;1mx"
-    recoloured = Cells(after.codes, np.zeros_like(after.inks))
-    assert changes(after, recoloured, "none") == "\x1b[4;8H\x1b[0mx"
+    assert encode_changes(before, after, "none") == "\x1b[4;8H\x1b[0;1mx"
+    recoloured = CellGrid(after.codes, np.zeros_like(after.inks))
+    assert encode_changes(after, recoloured, "none") == "\x1b[4;8H\x1b[0mx"
 
 
 def test_colours_are_what_the_terminal_can_show() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarspec.points.appearance import STEPS, look
+from lidarspec.points.appearance import STEPS, choose_appearance
 from lidarspec.points.colours import SCALES, Theme, colour, make_ramp, to_hex
 from lidarspec.view.canvas import FIRST_STEP, INKS
 from lidarspec.view.svg import svg
@@ -37,7 +37,7 @@ def test_lightness_rises_and_every_colour_is_readable(theme: Theme) -> None:
 def test_terminal_and_svg_have_the_scale() -> None:
     assert [ink.rgb for ink in INKS[FIRST_STEP:]] == make_ramp("dark", STEPS)
     points = cloud(*((x, 0, 0) for x in np.linspace(0.1, 5, 100)))
-    picture = svg(points, look(points), "title")
+    picture = svg(points, choose_appearance(points), "title")
     for step, (dark, light) in enumerate(
         zip(make_ramp("dark", STEPS), make_ramp("light", STEPS), strict=True)
     ):

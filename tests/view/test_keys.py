@@ -11,7 +11,7 @@ import pytest
 
 from lidarspec.view.canvas import STRONG, Canvas
 from lidarspec.view.terminal_screen import decode_keys
-from lidarspec.view.terminal_window import Choice
+from lidarspec.view.terminal_window import ViewSettings
 
 
 @pytest.mark.parametrize(
@@ -32,19 +32,22 @@ def test_keys_of_a_terminal(text: str, keys: list[str]) -> None:
 
 
 def test_keys_change_what_is_shown() -> None:
-    begin = Choice()
-    assert begin.after("c", 6).ramp == "intensity"
-    assert begin.after("c", 6).after("c", 6) == begin
-    assert begin.after("+", 6).after("-", 6) == begin
-    assert begin.after("+", 6).zoom > 1
-    assert begin.after("up", 5).middle == (1.0, 0.0)
-    assert begin.after("left", 5).middle == (0.0, 1.0)
-    assert begin.after("down", 5).after("right", 5).after("+", 5).after("0", 5) == begin
-    assert begin.after(" ", 6).paused
-    assert begin.after("q", 6).done
-    assert begin.after("?", 6).helped
-    assert not begin.after("?", 6).after("escape", 6).helped
-    assert begin.after("x", 6) is begin
+    begin = ViewSettings()
+    assert begin.after_key("c", 6).ramp == "intensity"
+    assert begin.after_key("c", 6).after_key("c", 6) == begin
+    assert begin.after_key("+", 6).after_key("-", 6) == begin
+    assert begin.after_key("+", 6).zoom > 1
+    assert begin.after_key("up", 5).middle == (1.0, 0.0)
+    assert begin.after_key("left", 5).middle == (0.0, 1.0)
+    assert (
+        begin.after_key("down", 5).after_key("right", 5).after_key("+", 5).after_key("0", 5)
+        == begin
+    )
+    assert begin.after_key(" ", 6).paused
+    assert begin.after_key("q", 6).done
+    assert begin.after_key("?", 6).helped
+    assert not begin.after_key("?", 6).after_key("escape", 6).helped
+    assert begin.after_key("x", 6) is begin
 
 
 def test_screens_of_the_docs_hold_every_dot_and_word() -> None:
@@ -63,6 +66,6 @@ def test_screens_of_the_docs_hold_every_dot_and_word() -> None:
 
 
 def test_c_goes_through_all_that_colours_can_show() -> None:
-    shown, choice = ["range", "velocity", "snr"], Choice()
-    seen = [(choice := choice.after("c", 6, shown)).ramp for _ in range(3)]
+    shown, choice = ["range", "velocity", "snr"], ViewSettings()
+    seen = [(choice := choice.after_key("c", 6, shown)).ramp for _ in range(3)]
     assert seen == ["velocity", "snr", "range"]

@@ -17,8 +17,8 @@ import pytest
 import lidarspec as ls
 from lidarspec import Scan, simulate
 from lidarspec.errors import UsageError
-from lidarspec.points.appearance import fit, look
-from lidarspec.view.live_scans import Feed
+from lidarspec.points.appearance import choose_appearance, fit_to_points
+from lidarspec.view.live_scans import LiveScans
 from tests.cli.running import ran
 from tests.formats.test_formats import scan
 from tests.libraries import Library, needs
@@ -39,12 +39,12 @@ def offsets(axes: Any) -> np.ndarray:
 
 def test_a_flat_scan_is_seen_from_above_forward_up_and_left_left() -> None:
     one = simulated("ldrobot-stl27l", 600)
-    axes, bar = figures.of_scan(one, look(one.points), "title").axes
+    axes, bar = figures.of_scan(one, choose_appearance(one.points), "title").axes
     cloud = one.points[one.points.valid]
     np.testing.assert_array_equal(offsets(axes), np.stack([cloud.y, cloud.x], axis=1))
     assert axes.get_aspect() == 1  # metres alike
     left, right = axes.get_xlim()
-    assert left == -right == look(one.points).reach
+    assert left == -right == choose_appearance(one.points).reach
     assert (axes.get_xlabel(), axes.get_ylabel(), bar.get_ylabel()) == (
         "y [m], left",
         "x [m], forward",
@@ -54,7 +54,9 @@ def test_a_flat_scan_is_seen_from_above_forward_up_and_left_left() -> None:
 
 def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
     one = simulated("velodyne-vlp16", 160)
-    above, side, bar = figures.of_scan(one, look(one.points, ramp="intensity"), "title").axes
+    above, side, bar = figures.of_scan(
+        one, choose_appearance(one.points, ramp="intensity"), "title"
+    ).axes
     cloud = one.points[one.points.valid]
     np.testing.assert_array_equal(offsets(side), np.stack([cloud.x, cloud.z], axis=1))
     np.testing.assert_array_equal(above.collections[0].get_array(), cloud.intensity)
@@ -68,7 +70,9 @@ def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
 
 def test_a_fitted_scan_fills_the_panel() -> None:
     one = simulated("velodyne-vlp16", 160)
-    above, side, _ = figures.of_scan(one, fit(one.points, look(one.points)), "title").axes
+    above, side, _ = figures.of_scan(
+        one, fit_to_points(one.points, choose_appearance(one.points)), "title"
+    ).axes
     cloud = one.points[one.points.valid]
     spans = [np.ptp(np.quantile(cloud.x, (0.01, 0.99))), np.ptp(np.quantile(cloud.y, (0.01, 0.99)))]
     for limits in (above.get_xlim(), above.get_ylim(), side.get_xlim()):
@@ -138,7 +142,7 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_rates_are_those_of_stats(lossy: Path) -> None:
     with ls.open(lossy) as device:
-        feed = Feed(device)
+        feed = LiveScans(device)
         rates = figures.Rates(feed, math.inf)
         reading = feed.meter.summary(device.stats)
     assert rates.totals[0].sum() == reading.packets

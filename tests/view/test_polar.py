@@ -13,14 +13,14 @@ from lidarspec import PointCloud
 from lidarspec.errors import UnknownName
 from lidarspec.points.appearance import (
     STEPS,
-    Look,
-    bounds,
-    fit,
-    look,
-    ramps,
+    CloudAppearance,
+    choose_appearance,
+    find_bounds,
+    fit_to_points,
+    list_ramps,
+    ramp_positions,
     ring_step,
-    rounded_up,
-    shade,
+    round_up,
 )
 from lidarspec.view.canvas import BLANK, FIRST_STEP
 from lidarspec.view.polar import picture
@@ -35,8 +35,8 @@ DOTS = {
     0x20: (2, 1),
     0x80: (3, 1),
 }
-FLAT = Look("range", 5, 5)
-TALL = Look("range", 5, 5, flat=False)
+FLAT = CloudAppearance("range", 5, 5)
+TALL = CloudAppearance("range", 5, 5, flat=False)
 
 
 def cloud(*xyz: tuple[float, float, float], intensity: Iterable[float] | None = None) -> PointCloud:
@@ -50,7 +50,9 @@ def cloud(*xyz: tuple[float, float, float], intensity: Iterable[float] | None = 
     )  # fmt: skip
 
 
-def drawn(points: PointCloud, look: Look = FLAT, width: int = 60, height: int = 30) -> list[str]:
+def drawn(
+    points: PointCloud, look: CloudAppearance = FLAT, width: int = 60, height: int = 30
+) -> list[str]:
     return picture(points, width=width, height=height, look=look).lines()
 
 
@@ -135,8 +137,8 @@ def test_the_middle_can_be_elsewhere() -> None:
     points = cloud((9, 3, 0))
     assert (
         len(
-            dots(drawn(points, Look("range", 5, 5, middle=(8.5, 3.0))))
-            - dots(drawn(points[:0], Look("range", 5, 5, (8.5, 3.0))))
+            dots(drawn(points, CloudAppearance("range", 5, 5, middle=(8.5, 3.0))))
+            - dots(drawn(points[:0], CloudAppearance("range", 5, 5, (8.5, 3.0))))
         )
         == 1
     )
@@ -144,10 +146,10 @@ def test_the_middle_can_be_elsewhere() -> None:
 
 def test_the_reach_takes_in_most_points_and_is_round() -> None:
     near = [(2.0 * np.cos(a), 2.0 * np.sin(a), 0.0) for a in np.linspace(0, 6.28, 500)]
-    assert look(cloud(*near)).reach == 2.0
-    assert look(cloud(*near, (90, 0, 0))).reach == 2.0
-    assert look(cloud()).reach == 1.0
-    assert [rounded_up(value) for value in (0.011, 1.0, 1.01, 5.3, 99, 101)] == pytest.approx(
+    assert choose_appearance(cloud(*near)).reach == 2.0
+    assert choose_appearance(cloud(*near, (90, 0, 0))).reach == 2.0
+    assert choose_appearance(cloud()).reach == 1.0
+    assert [round_up(value) for value in (0.011, 1.0, 1.01, 5.3, 99, 101)] == pytest.approx(
         [0.012, 1.0, 1.2, 6.0, 100.0, 120.0]
     )
 
@@ -160,8 +162,8 @@ def test_a_fitted_picture_is_filled_by_98_percent_of_the_points(
     turn = np.linspace(0, 2 * np.pi, 600)
     x, y = middle[0] + 4 * np.cos(turn), middle[1] + 2.5 * np.sin(turn)
     points = cloud(*zip(x, y, 0 * x, strict=True), *[(500.0, 300.0, 20.0)] * outliers)
-    plain = look(points)
-    fitted = fit(points, plain)
+    plain = choose_appearance(points)
+    fitted = fit_to_points(points, plain)
     assert fitted.middle == pytest.approx(middle, abs=0.2)
     assert 4 <= fitted.reach * 1.01 < 4 / 0.9
     assert (fitted.full, fitted.ramp) == (plain.full, plain.ramp)
@@ -171,25 +173,30 @@ def test_a_fitted_picture_shows_the_sensor_if_that_costs_little() -> None:
     across = np.linspace(-3, 3, 100)
     for x, forward in ((3.0, 1.5), (30.0, 30.0)):
         points = cloud(*((x, y, 0.0) for y in across))
-        assert fit(points, look(points)).middle[0] == pytest.approx(forward)
+        assert fit_to_points(points, choose_appearance(points)).middle[0] == pytest.approx(forward)
     empty = cloud()
-    assert fit(empty, look(empty)).middle == (0.0, 0.0)
-    assert [ends.tolist() for ends in bounds(empty)] == [[0, 0, 0], [0, 0, 0]]
+    assert fit_to_points(empty, choose_appearance(empty)).middle == (0.0, 0.0)
+    assert [ends.tolist() for ends in find_bounds(empty)] == [[0, 0, 0], [0, 0, 0]]
 
 
 def test_colours_go_from_near_to_far_and_from_weak_to_strong() -> None:
     points = cloud((0.1, 0.1, 0), (3.4, 3.4, 0), intensity=(200, 1))
     for ramp, last in (("range", [0, STEPS - 1]), ("intensity", [STEPS - 1, 0])):
         inks = picture(
-            points, width=60, height=30, look=Look(ramp, 5, 4.8 if ramp == "range" else 200)
+            points,
+            width=60,
+            height=30,
+            look=CloudAppearance(ramp, 5, 4.8 if ramp == "range" else 200),
         ).inks
         steps = inks[inks >= FIRST_STEP] - FIRST_STEP
         assert steps.tolist()[::-1] == last  # the near one is further down
 
 
 def test_without_intensity_colours_show_the_range() -> None:
-    assert look(cloud((1, 0, 0)), ramp="intensity").ramp == "range"
-    assert look(cloud((1, 0, 0), intensity=[7.0]), ramp="intensity") == Look("intensity", 1.0, 8.0)
+    assert choose_appearance(cloud((1, 0, 0)), ramp="intensity").ramp == "range"
+    assert choose_appearance(
+        cloud((1, 0, 0), intensity=[7.0]), ramp="intensity"
+    ) == CloudAppearance("intensity", 1.0, 8.0)
 
 
 def test_the_side_view_has_the_same_scale_and_up_is_up() -> None:
@@ -225,14 +232,14 @@ def test_colours_show_a_further_column_from_its_lowest_value_on() -> None:
         extra={"velocity": np.array([-3.0, np.nan, 5.0], np.float32)},
         units={"velocity": "m/s"},
     )
-    found = look(points, ramp="velocity")
+    found = choose_appearance(points, ramp="velocity")
     assert (found.ramp, found.low, found.full, found.ends) == (
         "velocity",
         -3.0,
         5.0,
         ("-3", "5 m/s"),
     )
-    assert shade(points, found).tolist() == [0.0, 0.0, 1.0]
-    assert ramps(points) == ["range", "velocity"]
+    assert ramp_positions(points, found).tolist() == [0.0, 0.0, 1.0]
+    assert list_ramps(points) == ["range", "velocity"]
     with pytest.raises(UnknownName, match="did you mean 'velocity'"):
-        look(points, ramp="velocty")
+        choose_appearance(points, ramp="velocty")

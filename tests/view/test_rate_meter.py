@@ -12,7 +12,7 @@ import lidarspec as ls
 from lidarspec import Decoder, Packets, simulate
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.stream import ScanStream
-from lidarspec.view.rate_meter import Meter
+from lidarspec.view.rate_meter import RateMeter
 
 ID = "ldrobot-stl27l"
 FRAMES = 540
@@ -26,7 +26,7 @@ class Bench:
         sensor = ls.sensor(ID)
         self.frames = simulate(sensor, frames)
         self.decoder: Decoder = sensor.decoder()
-        self.meter = Meter(self.decoder.stats, counts_losses=False)
+        self.meter = RateMeter(self.decoder.stats, counts_losses=False)
         self._packets, self._scans = (
             PacketStream(sensor, "data", self.decoder.stats),
             ScanStream(sensor),
@@ -90,7 +90,7 @@ def test_lost_packets_are_a_share_where_the_sensor_numbers_them() -> None:
     sensor = ls.sensor("robosense-m1")
     decoder = sensor.decoder()
     meter, stream = (
-        Meter(decoder.stats, counts_losses=True),
+        RateMeter(decoder.stats, counts_losses=True),
         PacketStream(sensor, "data", decoder.stats),
     )
     frames = [frame for number, frame in enumerate(simulate(sensor, 200)) if number % 10 != 5]

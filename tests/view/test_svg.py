@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from lidarspec.points.appearance import fit, look
+from lidarspec.points.appearance import choose_appearance, fit_to_points
 from lidarspec.view.svg import SIDE, svg
 from tests.view.test_polar import cloud
 
@@ -37,9 +37,9 @@ def walls(forward: float, left: float) -> list[tuple[float, float, float]]:
 @pytest.mark.parametrize("middle", [(0, 0), (4.2, 1), (90, -30)])
 def test_labels_are_whole_and_apart(middle: tuple[float, float]) -> None:
     points = cloud(*walls(*middle))
-    for view in ET.fromstring(svg(points, fit(points, look(points)), "title")).iter(
-        f"{NAMESPACE}svg"
-    ):
+    for view in ET.fromstring(
+        svg(points, fit_to_points(points, choose_appearance(points)), "title")
+    ).iter(f"{NAMESPACE}svg"):
         if view.get("x") is None:  # the whole picture
             continue
         _, top, width, height = (float(part) for part in view.attrib["viewBox"].split())
@@ -65,7 +65,9 @@ def test_labels_are_whole_and_apart(middle: tuple[float, float]) -> None:
 
 def test_points_fill_the_picture_whatever_a_few_far_ones_do() -> None:
     points = cloud(*walls(30, 5), *[(900.0, 700.0, 50.0)] * 4)
-    picture = svg(points, fit(points, look(points)), "title").partition("from the right")[0]
+    picture = svg(points, fit_to_points(points, choose_appearance(points)), "title").partition(
+        "from the right"
+    )[0]
     (scale,) = re.findall(r"scale\(([\d.]+)\)", picture)
     found = []
     for path in re.findall(r' d="([^"]*h0)"', picture):

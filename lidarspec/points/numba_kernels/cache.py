@@ -38,7 +38,7 @@ _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 _PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
-class Kept:
+class StoredKernel:
     """The compiled code of one kernel, as a dispatcher of Numba asks for it and hands it over.
 
     Args:
@@ -82,7 +82,7 @@ class Kept:
             _warn(f"compiled code is not kept between runs: {error}")
 
 
-def is_kept(name: str) -> bool:
+def is_stored(name: str) -> bool:
     """Whether there is a file of this kernel, for one processor or another."""
     try:
         folder = _own(cache_folder())

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D, Seal, Sums
-from lidarspec.frames.row_checksums import batch, finalize, places
+from lidarspec.frames.row_checksums import compute_checksums, finalize, make_place_tables
 from lidarspec.points.numba_kernels.kernels import function_of, require
 from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
@@ -110,7 +110,7 @@ def kernel(rows, size, spans, table, start, found):
 
 def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) -> NDArray[np.uint64]:
     """The CRCs of some bytes of each row, (n,)."""
-    table, _, _ = places(8, 0, algorithm.width, algorithm.poly, algorithm.refin)
+    table, _, _ = make_place_tables(8, 0, algorithm.width, algorithm.poly, algorithm.refin)
     found = np.empty(len(rows), np.int64)
     edges = np.array(spans, np.int64).reshape(-1)
     start = int(np.uint64(algorithm.start).astype(np.int64))
@@ -120,7 +120,7 @@ def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) ->
     return finalize(algorithm, found.view(np.uint64).astype(table.dtype))
 
 
-class _Shares:
+class _ByteShares:
     """The share of each byte of a frame in one checksum, computed on first use.
 
     Attributes:
@@ -150,7 +150,9 @@ class _Shares:
         places = self._places.tolist()
         rows = np.zeros((len(places), 256, len(places)), np.uint8)
         rows[np.arange(len(places)), :, np.arange(len(places))] = np.arange(256)
-        values = batch(self._seal.algorithm, rows.reshape(-1, len(places))).astype(np.uint16)
+        values = compute_checksums(self._seal.algorithm, rows.reshape(-1, len(places))).astype(
+            np.uint16
+        )
         shares = dict(zip(places, (values ^ values[0]).reshape(-1, 256), strict=True))
         words: list[int] = []
         for place in sorted(shares):
@@ -184,7 +186,7 @@ class _Shares:
         return found.view(np.uint64)
 
 
-_KNOWN: WeakKeyDictionary[Seal, _Shares] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()
 
 
 def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
@@ -201,7 +203,7 @@ def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
             return None
         return _along(algorithm, seal.spans, rows)
     if known is None:
-        known = _KNOWN[seal] = _Shares(seal)
+        known = _KNOWN[seal] = _ByteShares(seal)
     known.seen += len(rows)
     if (
         not known.is_suited

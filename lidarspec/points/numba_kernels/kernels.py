@@ -28,9 +28,9 @@ from lidarspec._version import __version__
 from lidarspec.errors import UsageError
 from lidarspec.frames.layout import Bytes2D, span
 from lidarspec.optional_libraries import import_library
-from lidarspec.points.numba_kernels.cache import Kept, is_kept
+from lidarspec.points.numba_kernels.cache import StoredKernel, is_stored
 from lidarspec.points.numba_kernels.source import KernelText, write_kernel
-from lidarspec.points.plan import Maker, Plan, PointsFunction, Values
+from lidarspec.points.plan import ColumnMaker, Plan, PointsFunction, Values
 
 THREADS = "LIDARSPEC_THREADS"
 
@@ -41,7 +41,7 @@ SHARE = 1 << 16
 _OWN: WeakKeyDictionary[PointsFunction, int] = WeakKeyDictionary()
 
 
-class Kernel(Maker):
+class Kernel(ColumnMaker):
     """The columns that a text describes, for frames of one layout.
 
     Args:
@@ -188,7 +188,7 @@ def _module_name(source: str) -> str:
 def compiled_before(source: str) -> bool:
     """Whether compiled code of a kernel is at hand, or in the cache folder."""
     name = _module_name(source)
-    return name in sys.modules or is_kept(name)
+    return name in sys.modules or is_stored(name)
 
 
 @functools.lru_cache(maxsize=256)
@@ -199,7 +199,7 @@ def function_of(source: str) -> Any:
     """
     name = _module_name(source)
     module = types.ModuleType(name)
-    module.__dict__["KEPT"] = Kept(name)
+    module.__dict__["KEPT"] = StoredKernel(name)
     sys.modules[name] = module  # Numba looks it up by its name as it loads compiled code
     try:
         exec(compile(source, name, "exec"), module.__dict__)

@@ -6,7 +6,7 @@ Each value is computed in the loop in which it varies: what a packet has once ou
 its blocks, and so on (`writer.KernelWriter`). `Expressions` writes a traced expression so, in
 float64 or float32; what has no text of its own is computed by NumPy before, and given to the
 kernel. Where sines and cosines of each point's own angle are left, the points of a few packets go
-through scratch arrays into a second, flat loop, which computes several at a time (`Later`,
+through scratch arrays into a second, flat loop, which computes several at a time (`DeferredFloat`,
 `KernelAssembly`). Lengths and places stand in the text as numbers where all frames have the same,
 else they are arguments, so that one kernel serves all lengths.
 """
@@ -34,14 +34,14 @@ from lidarspec.points.conventions import returned_range
 from lidarspec.points.lookup_tables import every_value, is_number, possible, window
 from lidarspec.points.numba_kernels.writer import (
     TEMPLATES,
+    KernelArguments,
+    KernelValue,
     KernelWriter,
-    Value,
-    Wanted,
     is_cheap,
     line,
 )
 from lidarspec.points.plan import Plan
-from lidarspec.spec.vocabulary import LookUp, side_by_side
+from lidarspec.spec.vocabulary import TableLookup, side_by_side
 
 #: points of which the scratch arrays stay in the fastest cache.
 CHUNK = 2048
@@ -100,7 +100,7 @@ def beam_of(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Later:
+class DeferredFloat:
     """A product or sum (`sign`) of float32 values.
 
     One of them is the sine or cosine of an angle, computed in the flat loop.
@@ -121,13 +121,13 @@ class Trig:
 class Expressions(KernelWriter):
     """Writes traced expressions into the loops, each value where it varies."""
 
-    def double(self, value: Any, depth: int = 0) -> Value:
+    def double(self, value: Any, depth: int = 0) -> KernelValue:
         """An expression in float64, or a condition."""
         if not isinstance(value, Node):
             return self.constant(value, depth)
         return self.once(("double", value), lambda: self._double(value))  # type: ignore[no-any-return]
 
-    def _double(self, node: Node) -> Value:
+    def _double(self, node: Node) -> KernelValue:
         if node.kind == "field":
             return self._physical(node)
         if node.kind == "call" and not self.is_shared(node):
@@ -143,7 +143,7 @@ class Expressions(KernelWriter):
             return self._row(node, "float64")
         return self.add_argument(node)
 
-    def _row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> Value:
+    def _row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> KernelValue:
         """An element of the row of a table, by default the node's own, at an index."""
         index = node.args[0]
         table = node.args[1] if table is None else table
@@ -180,7 +180,7 @@ class Expressions(KernelWriter):
             self.is_shared(arg) for arg in node.args if isinstance(arg, Node)
         )
 
-    def _call(self, node: Node) -> Value:
+    def _call(self, node: Node) -> KernelValue:
         depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
         if any(
             np.ndim(arg) > depth + 1 or (np.ndim(arg) == depth + 1 and len(arg) != 1)
@@ -198,7 +198,7 @@ class Expressions(KernelWriter):
             return parts[0]
         if len(node.shape) != depth:
             return self.add_argument(node)
-        if isinstance(node.function, LookUp) and len(node.function.entries):
+        if isinstance(node.function, TableLookup) and len(node.function.entries):
             index = self.double(node.args[0])
             table = self.array(node.function.entries)
             return self.let(index.level, f"looked_up({table}, {index.text})")
@@ -234,11 +234,13 @@ class Expressions(KernelWriter):
             return found
         return None
 
-    def _where(self, condition: Value, first: Value, second: Value) -> Value:
+    def _where(
+        self, condition: KernelValue, first: KernelValue, second: KernelValue
+    ) -> KernelValue:
         level = max(condition.level, first.level, second.level)
         return self.let(level, f"{first.text} if {condition.text} else {second.text}")
 
-    def _physical(self, node: Node) -> Value:
+    def _physical(self, node: Node) -> KernelValue:
         leaf = self.layout.leaves.get(node.path)
         raw = self.raw(leaf) if leaf is not None else None
         if raw is None or leaf is None:
@@ -254,7 +256,7 @@ class Expressions(KernelWriter):
         )
 
     def single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
-        """An expression in float32: a `Value`, or a `Later` that the flat loop completes.
+        """An expression in float32: a `KernelValue`, or a `DeferredFloat` that the flat loop completes.
 
         Args:
             exact: as the plain evaluation rounds it.
@@ -290,7 +292,7 @@ class Expressions(KernelWriter):
             made.level, f"np.float32({made.text if not exact else f'number({made.text})'})"
         )
 
-    def _along(self, beam: Beam) -> Value | None:
+    def _along(self, beam: Beam) -> KernelValue | None:
         """Return a coordinate along a beam, rounded once.
 
         It is the raw distance times a direction in two halves, plus the start of the beam. Returns
@@ -314,7 +316,7 @@ class Expressions(KernelWriter):
             f" {self._row(beam.start, 'float32').text}))",
         )
 
-    def _mark(self, node: Node, *, raw: bool = False) -> Value | None:
+    def _mark(self, node: Node, *, raw: bool = False) -> KernelValue | None:
         """Return a distance in float32.
 
         It is nan without a return, or if a condition says so. Returns None for other expressions,
@@ -357,11 +359,11 @@ class Expressions(KernelWriter):
 
     def combine(self, sign: str, first: Any, second: Any) -> Any:
         """A product or sum; in the loops where both parts are there."""
-        if isinstance(first, Value) and isinstance(second, Value):
+        if isinstance(first, KernelValue) and isinstance(second, KernelValue):
             return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
-        return Later(sign, (first, second))
+        return DeferredFloat(sign, (first, second))
 
-    def _of_field(self, node: Node, *, exact: bool) -> Value | None:
+    def _of_field(self, node: Node, *, exact: bool) -> KernelValue | None:
         """An expression of one field that each point has: by a straight line or a table."""
         source = only_field(node)
         if source is not None and is_full(source, self.width):
@@ -389,7 +391,7 @@ class Expressions(KernelWriter):
 
         return int(self.once(("angle", node), make))
 
-    def angle(self, value: Any, factor: float, depth: int) -> Value:
+    def angle(self, value: Any, factor: float, depth: int) -> KernelValue:
         """An angle times a factor that makes half turns of it, in float64."""
         if not isinstance(value, Node):
             return self.constant(np.asarray(value) * factor, depth)
@@ -403,7 +405,7 @@ class Expressions(KernelWriter):
             return self._scale(value, factor)
         return self._sum(value, factor)
 
-    def _sum(self, node: Node, factor: float) -> Value:
+    def _sum(self, node: Node, factor: float) -> KernelValue:
         function = node.function
         args = node.args
         depth = max(len(arg.shape) for arg in args if isinstance(arg, Node))
@@ -428,11 +430,11 @@ class Expressions(KernelWriter):
             )
         return self._scale(node, factor)
 
-    def _scale(self, node: Node, factor: float) -> Value:
+    def _scale(self, node: Node, factor: float) -> KernelValue:
         made = self.double(node)
         return self.let(made.level, f"{made.text} * {factor!r}")
 
-    def _small_angle(self, node: Node, source: Node, factor: float) -> Value | None:
+    def _small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
         """An angle by one field: a table in float32 where that is exact enough."""
         values = possible(node, self.layout.leaves)
         if values is None:
@@ -478,7 +480,7 @@ class KernelText:
     """
 
     source: str
-    wanted: Wanted
+    wanted: KernelArguments
     columns: Mapping[str, np.dtype[Any]]
 
 
@@ -493,14 +495,14 @@ class KernelAssembly:
 
     def column(self, name: str, made: Any) -> None:
         """Return the text of the array of a column."""
-        if isinstance(made, Value):
+        if isinstance(made, KernelValue):
             self.writer.lines[-1].append(f"put(out_{name}, o, {made.text})")
         else:
             self.flat.append(f"put(out_{name}, o, {self.text(made)})")
 
     def together(self, made: Mapping[str, Any]) -> None:
         """Coordinates that are nan all or none."""
-        if all(isinstance(value, Value) for value in made.values()):
+        if all(isinstance(value, KernelValue) for value in made.values()):
             lines = self.writer.lines[-1]
             texts = {name: value.text for name, value in made.items()}
         else:
@@ -512,7 +514,7 @@ class KernelAssembly:
 
     def text(self, made: Any) -> str:
         """An expression in the flat loop."""
-        if isinstance(made, Later):
+        if isinstance(made, DeferredFloat):
             return f"({f' {made.sign} '.join(map(self.text, made.parts))})"
         if isinstance(made, Trig):
             return f"{made.name}{made.angle}"
@@ -520,7 +522,7 @@ class KernelAssembly:
             return str(made.text)
         return self._store(made, "float32")
 
-    def _store(self, made: Value, kind: str) -> str:
+    def _store(self, made: KernelValue, kind: str) -> str:
         """A value of the loops, kept for the flat one."""
         if made.text not in self._kept:
             name = self._kept[made.text] = f"h{len(self.scratch)}"

@@ -2,11 +2,11 @@
 
 Each is written in the loop in which it varies.
 
-A `Value` is text and the loop at which it varies. `KernelWriter` keeps the lines of each loop, the
-arguments that the kernel is to be called with, and what it has written before, so that nothing is
-computed twice. A field is an expression of its bytes (`integer`); a function of one field is looked
-up in a table by them, or computed, where the table is a straight line (`LinearTable`). `TEMPLATES`
-are NumPy's functions of numbers.
+A `KernelValue` is text and the loop at which it varies. `KernelWriter` keeps the lines of each
+loop, the arguments that the kernel is to be called with, and what it has written before, so that
+nothing is computed twice. A field is an expression of its bytes (`integer`); a function of one
+field is looked up in a table by them, or computed, where the table is a straight line
+(`LinearTable`). `TEMPLATES` are NumPy's functions of numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.expressions.graph import FACTORS, Node, key, last_axis, traverse
+from lidarspec.expressions.graph import FACTORS, Node, last_axis, make_key, traverse
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
 from lidarspec.points.lookup_tables import CHEAP, every_value, raw_values, window
@@ -196,7 +196,7 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None
 
 
 @dataclass(frozen=True)
-class Value:
+class KernelValue:
     """An expression in a kernel, and the loop at which it varies.
 
     The level is 0 for never, 1 for the packet, 2 for its first array, and so on.
@@ -207,7 +207,7 @@ class Value:
 
 
 @dataclass
-class Wanted:
+class KernelArguments:
     """The arguments of a kernel besides the bytes.
 
     They are arrays and numbers that are known, and nodes with results to compute.
@@ -288,9 +288,9 @@ class KernelWriter:
         self.width = math.prod(shape)
         self.varying = varying
         self.inner = 1 + last_axis(shape)
-        self.wanted = Wanted()
+        self.wanted = KernelArguments()
         self.lines: list[list[str]] = [[] for _ in range(self.inner + 1)]
-        self.angles: list[Value] = []
+        self.angles: list[KernelValue] = []
         self.both: set[Node] = set()
         self._tables = tables
         self._known: dict[Any, Any] = {}
@@ -309,11 +309,11 @@ class KernelWriter:
             self._known[name] = make()
         return self._known[name]
 
-    def let(self, level: int, text: str) -> Value:
+    def let(self, level: int, text: str) -> KernelValue:
         """A variable in a loop."""
         self._made += 1
         self.lines[level].append(f"v{self._made} = {text}")
-        return Value(f"v{self._made}", level)
+        return KernelValue(f"v{self._made}", level)
 
     def place(self, shape: tuple[int, ...]) -> str:
         """The index of an element of an array of this shape in the loops."""
@@ -339,25 +339,25 @@ class KernelWriter:
         self.wanted.arrays.append(flat)
         return f"c{len(self.wanted.arrays) - 1}"
 
-    def constant(self, value: Any, depth: int, kind: str = "float64") -> Value:
+    def constant(self, value: Any, depth: int, kind: str = "float64") -> KernelValue:
         """A number, or an element of an array that all packets share."""
         array = np.asarray(value)
         if array.size == 1:
             number = (
                 array.reshape(()).astype(np.float64 if array.dtype.kind != "b" else np.bool_).item()
             )
-            return Value(f"np.float32({number!r})" if kind == "float32" else repr(number), 0)
+            return KernelValue(f"np.float32({number!r})" if kind == "float32" else repr(number), 0)
         shape = (1,) * (depth - array.ndim) + array.shape[max(array.ndim - depth, 0) :]
         name = self.array(
             self.once(("cast", id(value), kind), lambda: (array.astype(kind), value))[0]
         )
-        element: Value = self.once(
+        element: KernelValue = self.once(
             ("element", name, shape),
             lambda: self.let(1 + last_axis(shape), f"at({name}, {self.place(shape)})"),
         )
         return element
 
-    def add_argument(self, node: Node) -> Value:
+    def add_argument(self, node: Node) -> KernelValue:
         """Add an argument of the kernel that NumPy computes before."""
         if node not in self.wanted.nodes:
             self.wanted.nodes.append(node)
@@ -372,13 +372,13 @@ class KernelWriter:
             return found  # type: ignore[no-any-return]
         return self.once(("given flag", node), lambda: self.let(found.level, f"{found.text} != 0"))  # type: ignore[no-any-return]
 
-    def raw(self, leaf: Leaf) -> Value | None:
+    def raw(self, leaf: Leaf) -> KernelValue | None:
         """The raw number of a field; None where only NumPy reads it."""
         if leaf.info.path not in self._known:
             self._known[leaf.info.path] = self._float(leaf) or self._integer(leaf)
         return self._known[leaf.info.path]  # type: ignore[no-any-return]
 
-    def _integer(self, leaf: Leaf) -> Value | None:
+    def _integer(self, leaf: Leaf) -> KernelValue | None:
         word = None if self.varying else word_of(leaf, self.layout)
         if word is not None:
             place, shift, mask = word
@@ -394,17 +394,17 @@ class KernelWriter:
             return None
         return self.let(1 + last_axis(leaf.shape), text)
 
-    def _float(self, leaf: Leaf) -> Value | None:
+    def _float(self, leaf: Leaf) -> KernelValue | None:
         if leaf.wire is None or leaf.wire.kind != "f" or leaf.wire.itemsize < 4:
             return None
         order = "big" if leaf.wire.byteorder == ">" else "little"
         return self._read(leaf, leaf.offset, f"float{leaf.wire.itemsize}_{order}")
 
-    def byte(self, leaf: Leaf, offset: int) -> Value:
+    def byte(self, leaf: Leaf, offset: int) -> KernelValue:
         """A byte of the element of an array, or of the frame."""
         return self._read(leaf, offset, "byte_at")
 
-    def _read(self, leaf: Leaf, offset: int, reader: str) -> Value:
+    def _read(self, leaf: Leaf, offset: int, reader: str) -> KernelValue:
         """Return the value that a function of `arithmetic` reads at an offset.
 
         The offset is relative to the element of an array, or to the frame.
@@ -451,7 +451,7 @@ class KernelWriter:
         inside = bool(strides) and leaf.strides == strides and leaf.offset - first < strides[-1]
         return leaf.offset <= first or inside
 
-    def looked_up(self, node: Node, source: Node, kind: Any, factor: float) -> Value | None:
+    def looked_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
         """An expression of one field from a table; None where the field has too many values."""
         leaf = self.layout.leaves.get(source.path)
         seen = window(leaf) if leaf is not None else None
@@ -471,7 +471,7 @@ class KernelWriter:
             seen.size,
             leaf.size,
             leaf.info,
-            key(node),
+            make_key(node),
         )
         if name not in self._tables:
             self._tables[name] = np.ascontiguousarray(
@@ -487,12 +487,12 @@ class KernelWriter:
             return first
         return f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
 
-    def beside(self, node: Node, leaf: Leaf) -> Value:
+    def beside(self, node: Node, leaf: Leaf) -> KernelValue:
         """Return a cosine or sine from a table that has both side by side.
 
         Both are then loaded together.
         """
-        name = ("kernel", "both", leaf.info, leaf.size, key(node.args[0]))
+        name = ("kernel", "both", leaf.info, leaf.size, make_key(node.args[0]))
         if name not in self._tables:
             angles = np.asarray(every_value(node.args[0], leaf))
             self._tables[name] = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(

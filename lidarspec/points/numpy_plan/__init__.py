@@ -16,10 +16,10 @@ from typing import Any
 from numpy.typing import NDArray
 
 from lidarspec.points.numpy_plan.compiler import Compiler
-from lidarspec.points.plan import Maker, Plan
+from lidarspec.points.plan import ColumnMaker, Plan
 
 
-def compile(plan: Plan, names: tuple[str, ...]) -> Maker:
+def compile(plan: Plan, names: tuple[str, ...]) -> ColumnMaker:
     """Return a program for these columns of the plan's points; the plan keeps it."""
     if names not in plan.programs:
         plan.programs[names] = _compile(plan, names, plan.tables).program

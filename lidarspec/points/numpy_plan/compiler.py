@@ -17,11 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.expressions.graph import Node, Term, is_full, key, last_axis, only_field, terms
-from lidarspec.frames.arrays import deep
+from lidarspec.expressions.graph import (
+    Node,
+    Term,
+    is_full,
+    last_axis,
+    make_key,
+    only_field,
+    split_sum,
+)
+from lidarspec.frames.arrays import add_axes
 from lidarspec.frames.layout import Leaf, elements
 from lidarspec.points.lookup_tables import CHEAP, FieldWindow, every_value, window
-from lidarspec.points.numpy_plan.program import TYPES, Program, Read, Run
+from lidarspec.points.numpy_plan.program import TYPES, Program, ProgramRun, RegisterRead
 from lidarspec.points.plan import Plan
 from lidarspec.spec.vocabulary import row_numbers
 
@@ -89,7 +97,7 @@ class Compiler:
             register = self._product(node)
         if register is not None:
             return register
-        read = Read(self._double(node))
+        read = RegisterRead(self._double(node))
         return self.program.step(
             "as float32",
             "single",
@@ -110,22 +118,24 @@ class Compiler:
             return self.program.call(name, "single", node.function, first, second)
         return None
 
-    def _factor(self, value: Any) -> Callable[[Run], Any]:
+    def _factor(self, value: Any) -> Callable[[ProgramRun], Any]:
         """Return a factor of a float32 product: a number or a register."""
         if not isinstance(value, Node) and np.size(value) == 1:
             return _constant(np.float32(np.asarray(value).reshape(())))
         if is_full(value, self._width):
-            return Read(self._single(value))
-        return Read(self._once(("factor", id(value)), lambda: self._broadcast(value, "single")))
+            return RegisterRead(self._single(value))
+        return RegisterRead(
+            self._once(("factor", id(value)), lambda: self._broadcast(value, "single"))
+        )
 
     def _direction(self, function: np.ufunc, value: Node) -> int:
         """Compile the cosine or sine of an angle to float32."""
-        parts = terms(value, self._width)
+        parts = split_sum(value, self._width)
         is_fixed = all(part.low is None or part.row.size == 1 for part in parts)
         if is_fixed and all(part.full is None for part in parts):
             return self._compile_turned(function, parts)
         angle = self._once(("angle", value), lambda: self._full_angle(value))
-        return self.program.call(function.__name__, "single", function, Read(angle))
+        return self.program.call(function.__name__, "single", function, RegisterRead(angle))
 
     def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
         """Compile the cosine or sine of angles that are not full plus constants.
@@ -139,10 +149,10 @@ class Compiler:
         fixed_sin = np.sin(fixed).astype(np.float32)
         moving = [(part.low, part.row) for part in parts if part.low is not None]
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             target = out.reshape(-1, *self._shape)
             angle = sum(
-                row * deep(execution.part(execution.values(low)), depth) for low, row in moving
+                row * add_axes(execution.part(execution.values(low)), depth) for low, row in moving
             )
             near = (angle - np.rint(angle / TURN_RAD) * TURN_RAD).astype(np.float32)
             if function is np.cos:
@@ -156,10 +166,10 @@ class Compiler:
 
     def _full_angle(self, value: Node) -> int:
         """Compile an angle to float32, reduced to half a turn before it loses precision."""
-        angle = Read(self._double(value))
-        scratch = Read(self.program.register("double"))
+        angle = RegisterRead(self._double(value))
+        scratch = RegisterRead(self.program.register("double"))
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             radians = angle(execution)
             turns = scratch(execution)
             np.multiply(radians, 1 / TURN_RAD, out=turns)
@@ -212,7 +222,7 @@ class Compiler:
             return self._load_whole(leaf, kind)
         if seen is None or (is_long and node.function in _FASTER_THAN_TABLE):
             return None
-        index = Read(
+        index = RegisterRead(
             self._once(
                 ("index", seen, leaf.strides),
                 lambda: self._load(leaf, seen.dtype, seen.offset, "index"),
@@ -229,7 +239,7 @@ class Compiler:
 
     def _table(self, node: Node, leaf: Leaf, seen: FieldWindow, kind: str) -> NDArray[Any]:
         """Return the values of an expression for each value of its window."""
-        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info, key(node))
+        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info, make_key(node))
         if name not in self._tables:
             values = every_value(node, leaf)
             self._tables[name] = np.ascontiguousarray(values, TYPES[kind])
@@ -247,9 +257,9 @@ class Compiler:
         register = self._raw(leaf, kind)
         if not info.scaled:
             return register
-        raw = Read(register)
+        raw = RegisterRead(register)
 
-        def scale(execution: Run, out: NDArray[Any]) -> None:
+        def scale(execution: ProgramRun, out: NDArray[Any]) -> None:
             np.multiply(raw(execution), out.dtype.type(info.scale), out=out)
             if info.offset:
                 np.add(out, out.dtype.type(info.offset), out=out)
@@ -261,7 +271,7 @@ class Compiler:
         if leaf.wire is not None:
             return self._load(leaf, leaf.wire, leaf.offset, kind)
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             rows = execution.part(execution.rows)
             np.copyto(out.reshape(-1, *leaf.shape), leaf.load(rows), casting="unsafe")
 
@@ -271,7 +281,7 @@ class Compiler:
         """Load some bytes of every element of a field."""
         shape = leaf.shape[: len(leaf.strides)]
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             rows = execution.part(execution.rows)
             column = elements(rows, dtype, offset, shape, leaf.strides)
             np.copyto(out.reshape(column.shape), column, casting="unsafe")
@@ -288,7 +298,7 @@ class Compiler:
         self.low.append(index)
         rows = table.astype(TYPES[kind])
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             numbers = row_numbers(execution.part(execution.values(index)), len(rows))
             packets = len(out) // self._width
             each = np.broadcast_to(numbers, (packets, *index.shape)).reshape(-1)
@@ -301,7 +311,7 @@ class Compiler:
 
         Returns None if all terms are full, or if a full term has a row as its factor.
         """
-        parts = terms(node, self._width)
+        parts = split_sum(node, self._width)
         low = [part for part in parts if part.full is None]
         full = [part for part in parts if part.full is not None]
         if not low or any(part.row.ndim for part in full):
@@ -317,13 +327,13 @@ class Compiler:
         depth = len(shape)
         parts = sorted(parts, key=lambda part: part.row.size)  # small arrays are added first
 
-        def product(execution: Run, part: Term) -> NDArray[Any]:
+        def product(execution: ProgramRun, part: Term) -> NDArray[Any]:
             if part.low is None:
                 return part.row
-            numbers = deep(execution.part(execution.values(part.low)), depth)
+            numbers = add_axes(execution.part(execution.values(part.low)), depth)
             return np.asarray(part.row * numbers)
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             *others, last = [product(execution, part) for part in parts]
             np.add(sum(others), last, out=out.reshape(-1, *shape))
 
@@ -332,11 +342,11 @@ class Compiler:
     def _plus(self, sum_: int, part: Term) -> int:
         """Add a full term to a sum."""
         assert part.full is not None
-        before = Read(sum_)
-        full = Read(self._double(part.full))
+        before = RegisterRead(sum_)
+        full = RegisterRead(self._double(part.full))
         factor = float(part.row)
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             np.multiply(full(execution), factor, out=out)
             np.add(before(execution), out, out=out)
 
@@ -346,11 +356,11 @@ class Compiler:
         """Compile any other function of arrays, as NumPy evaluates it."""
         depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
         reads = [self._argument(arg, depth) for arg in node.args]
-        used = [Read(self._double(arg)) for arg in node.args if is_full(arg, self._width)]
+        used = [RegisterRead(self._double(arg)) for arg in node.args if is_full(arg, self._width)]
         function = node.function
         is_direct = isinstance(function, np.ufunc)
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             target = out.reshape(-1, *node.shape)
             if is_direct:
                 function(*(read(execution) for read in reads), out=target)
@@ -360,15 +370,15 @@ class Compiler:
         name = getattr(function, "__name__", "function")
         return self.program.step(f"{name} as it stands", kind, run, *used)
 
-    def _argument(self, value: Any, depth: int) -> Callable[[Run], Any]:
+    def _argument(self, value: Any, depth: int) -> Callable[[ProgramRun], Any]:
         if not isinstance(value, Node):
             return _constant(value)
         if is_full(value, self._width):
-            read = Read(self._double(value))
+            read = RegisterRead(self._double(value))
             shape = (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
         self.low.append(value)
-        return lambda run: deep(run.part(run.values(value)), depth)
+        return lambda run: add_axes(run.part(run.values(value)), depth)
 
     def _broadcast(self, value: Any, kind: str) -> int:
         """Broadcast a constant or a plain result to all points."""
@@ -378,11 +388,11 @@ class Compiler:
         self.low.append(value)
         depth = len(shape)
 
-        def run(execution: Run, out: NDArray[Any]) -> None:
-            out.reshape(-1, *shape)[...] = deep(execution.part(execution.values(value)), depth)
+        def run(execution: ProgramRun, out: NDArray[Any]) -> None:
+            out.reshape(-1, *shape)[...] = add_axes(execution.part(execution.values(value)), depth)
 
         return self.program.step("computed plainly before", kind, run)
 
 
-def _constant(value: Any) -> Callable[[Run], Any]:
+def _constant(value: Any) -> Callable[[ProgramRun], Any]:
     return lambda run: value

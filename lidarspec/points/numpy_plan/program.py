@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D
-from lidarspec.points.plan import Maker, Values
+from lidarspec.points.plan import ColumnMaker, Values
 
 #: points of a chunk; its scratch arrays stay in the cache.
 CHUNK_POINTS = 1 << 16
@@ -39,7 +39,7 @@ _NOTHING = np.empty(0)
 
 
 @dataclass
-class Run:
+class ProgramRun:
     """One execution: the frames, the plain results, and the current chunk.
 
     Attributes:
@@ -61,26 +61,26 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class ProgramStep:
     """One call, `run(execution, output)`, and the registers that it reads."""
 
     text: str
-    run: Callable[[Run, NDArray[Any]], Any]
+    run: Callable[[ProgramRun, NDArray[Any]], Any]
     output: int
     reads: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
-class Read:
+class RegisterRead:
     """A register as an argument of a step."""
 
     register: int
 
-    def __call__(self, run: Run) -> NDArray[Any]:
+    def __call__(self, run: ProgramRun) -> NDArray[Any]:
         return run.views[self.register]
 
 
-class Program(Maker):
+class Program(ColumnMaker):
     """The calls that make some flat columns.
 
     Args:
@@ -99,7 +99,7 @@ class Program(Maker):
         self.width = width
         self._safe = safe
         self.chunk = max(CHUNK_POINTS // max(width, 1), 1)
-        self.steps: list[Step] = []
+        self.steps: list[ProgramStep] = []
         self.kinds: list[str] = []
         self.outputs: dict[str, int] = {}
         self._tiles: dict[int, NDArray[Any]] = {}
@@ -113,16 +113,16 @@ class Program(Maker):
         self,
         text: str,
         kind: str,
-        run: Callable[[Run, NDArray[Any]], Any],
-        *reads: Callable[[Run], Any],
+        run: Callable[[ProgramRun, NDArray[Any]], Any],
+        *reads: Callable[[ProgramRun], Any],
     ) -> int:
         """Add a step; return its register."""
         output = self.register(kind)
-        registers = tuple(read.register for read in reads if isinstance(read, Read))
-        self.steps.append(Step(text, run, output, registers))
+        registers = tuple(read.register for read in reads if isinstance(read, RegisterRead))
+        self.steps.append(ProgramStep(text, run, output, registers))
         return output
 
-    def call(self, text: str, kind: str, function: Any, *reads: Callable[[Run], Any]) -> int:
+    def call(self, text: str, kind: str, function: Any, *reads: Callable[[ProgramRun], Any]) -> int:
         """Add a call of a function that takes `out`; return its register."""
         return self.step(
             text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads
@@ -148,7 +148,7 @@ class Program(Maker):
             slots.get(slot, self._tiles.get(register, _NOTHING))
             for register, slot in enumerate(self._slots)
         ]
-        execution = Run(rows, values)
+        execution = ProgramRun(rows, values)
         with np.errstate(all="ignore"):
             for start in range(0, len(rows), self.chunk):
                 execution.start = start
@@ -161,7 +161,7 @@ class Program(Maker):
                 place[bad] = np.nan
 
     def _run_chunk(
-        self, run: Run, registers: list[NDArray[Any]], columns: Mapping[str, NDArray[Any]]
+        self, run: ProgramRun, registers: list[NDArray[Any]], columns: Mapping[str, NDArray[Any]]
     ) -> None:
         chunk = slice(run.start * self.width, run.stop * self.width)
         run.views = [array[: chunk.stop - chunk.start] for array in registers]

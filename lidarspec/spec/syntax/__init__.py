@@ -20,22 +20,21 @@ from lidarspec.spec.syntax.meaning import (
 )
 from lidarspec.spec.syntax.refusals import check_struct as check_struct
 from lidarspec.spec.syntax.replacements import (
-    Describing as Describing,
+    DescribedField as DescribedField,
     Fault as Fault,
     MarkedStruct as MarkedStruct,
-    Mismatch as Mismatch,
+    MismatchError as MismatchError,
+    ParsedParts as ParsedParts,
     Partition as Partition,
-    Pieces as Pieces,
-    Sealing as Sealing,
-    Sizing as Sizing,
+    SealedStruct as SealedStruct,
+    SizeField as SizeField,
     WireNaN as WireNaN,
     check_bound as check_bound,
-    member as member,
-    verifying as verifying,
+    get_member as get_member,
+    is_verifying as is_verifying,
 )
 from lidarspec.spec.syntax.structs import (
     bit_width as bit_width,
-    clean as clean,
     field_path as field_path,
     fixed_size as fixed_size,
     has_member as has_member,
@@ -44,6 +43,7 @@ from lidarspec.spec.syntax.structs import (
     leaves as leaves,
     prepare as prepare,
     random_value as random_value,
+    remove_private as remove_private,
     seals as seals,
     unwrap as unwrap,
 )

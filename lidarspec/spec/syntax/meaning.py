@@ -37,14 +37,14 @@ from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, probe
 from lidarspec.spec.syntax.replacements import (
-    Bounded,
-    Counting,
-    Describing,
-    Filler,
-    Limited,
+    BoundedPart,
+    CountField,
+    DescribedField,
+    LimitedNumber,
+    PaddingField,
     Partition,
-    Sealing,
-    Sizing,
+    SealedStruct,
+    SizeField,
 )
 from lidarspec.spec.syntax.structs import (
     is_greedy,
@@ -59,10 +59,10 @@ def frame_tree(con: Construct) -> tree.Node:
     Raises:
         SpecError: for a constant that its Enum has no value for.
     """
-    return _twice(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[0]
+    return _build_twice(lambda builder: builder.node(con, _Context(tree.FieldInfo(""), None)))[0]
 
 
-def _twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
+def _build_twice(made: Callable[[_Builder], tree.Node]) -> tuple[tree.Node, _Builder]:
     """Return the node that `made` builds, and the builder.
 
     If rebuilt values depend on later fields, the node is built a second time by a builder that
@@ -165,7 +165,7 @@ class _Builder:
     """Makes the nodes of a struct.
 
     Args:
-        before: the builder of the first pass, if this is the second one (`_twice`).
+        before: the builder of the first pass, if this is the second one (`_build_twice`).
 
     Attributes:
         scopes: the complete scope of each struct, by its path.
@@ -182,7 +182,7 @@ class _Builder:
         self._asked: list[tree.Ref] = []
         #: the SizeOf fields that measure a part of each struct under construction, as (index in
         #: `sizes`, field).
-        self._measured: dict[tree.Scope, list[tuple[int, Sizing]]] = {}
+        self._measured: dict[tree.Scope, list[tuple[int, SizeField]]] = {}
 
     def node(self, con: Construct, place: _Context) -> tree.Node:
         """The node of a construct, whatever it is."""
@@ -194,7 +194,7 @@ class _Builder:
             return self._block(inner, place)
         if is_block:
             return self.node(inner.subcon, place)
-        if isinstance(inner, Sealing):
+        if isinstance(inner, SealedStruct):
             return self._seal(inner, place)
         if isinstance(inner, Struct):
             return self._struct(inner, place)
@@ -214,7 +214,7 @@ class _Builder:
             return tree.When(name, condition, *branches)
         if isinstance(inner, construct.Switch):
             return self._select(inner, place)
-        if isinstance(inner, Bounded) or (
+        if isinstance(inner, BoundedPart) or (
             isinstance(inner, construct.FixedSized)
             and is_greedy(inner.subcon, (type(construct.GreedyBytes),))
         ):
@@ -240,7 +240,7 @@ class _Builder:
             if isinstance(con, construct.Renamed):
                 if con.docs:
                     place = place.inside(docs=con.docs)
-            elif isinstance(con, Describing):
+            elif isinstance(con, DescribedField):
                 place = replace(place, info=con.describe(place.info))
             elif isinstance(con, construct.Enum):
                 place = place.inside(
@@ -248,11 +248,11 @@ class _Builder:
                 )
             elif isinstance(con, Const):
                 place = place.inside(const=_constant(con))
-            elif isinstance(con, Limited):
+            elif isinstance(con, LimitedNumber):
                 place = place.inside(allowed=con.allowed)
-            elif isinstance(con, Counting):
+            elif isinstance(con, CountField):
                 place = place.inside(held=True)
-            elif isinstance(con, Sizing):
+            elif isinstance(con, SizeField):
                 place = place.inside(rebuilt=self._measuring(con, place), held=True)
             elif isinstance(con, construct.Rebuild):
                 self.rebuilding = True
@@ -364,7 +364,7 @@ class _Builder:
                 filler := (
                     unwrap(part.thensubcon) if isinstance(part, construct.IfThenElse) else part
                 ),
-                Filler,
+                PaddingField,
             ):
                 inside = replace(
                     inside, room=self._padding(filler, inside, _from(members, filler.of[0]))
@@ -387,7 +387,7 @@ class _Builder:
         return made
 
     def _padding(
-        self, con: Filler, place: _Context, size: tree.Formula | None
+        self, con: PaddingField, place: _Context, size: tree.Formula | None
     ) -> tree.Formula | None:
         """The bytes behind a part of this size."""
         number = self._formula(con.modulus if con.to is None else con.to, place)
@@ -397,7 +397,7 @@ class _Builder:
             return size
         return tree.calculate("%", tree.calculate("-", size), number)
 
-    def _measuring(self, con: Sizing, place: _Context) -> tree.Formula | None:
+    def _measuring(self, con: SizeField, place: _Context) -> tree.Formula | None:
         """Return the formula for the size of a part, None in the first pass.
 
         Registers the SizeOf field, so that `_struct` computes the size when the struct is complete.
@@ -483,9 +483,9 @@ class _Builder:
         """A part as a frame in itself, and the size of the one behind it."""
 
         def around(builder: _Builder) -> _Context:
-            return _Context(tree.FieldInfo(""), tree.Outside(place.scope, builder._asked))  # type: ignore[arg-type]
+            return _Context(tree.FieldInfo(""), tree.OuterScope(place.scope, builder._asked))  # type: ignore[arg-type]
 
-        root, builder = _twice(lambda builder: builder.node(case, around(builder)))
+        root, builder = _build_twice(lambda builder: builder.node(case, around(builder)))
         if following is None:
             rule = None
         else:
@@ -527,7 +527,7 @@ class _Builder:
             f"{reason.partition(': ')[2]}: plausible=lambda f: ... is judged in bulk",
         )
 
-    def _seal(self, con: Sealing, place: _Context) -> tree.Node:
+    def _seal(self, con: SealedStruct, place: _Context) -> tree.Node:
         body = self.node(con.subcon, place)
         if not isinstance(body, tree.Struct | tree.Sealed):
             return tree.Opaque(
@@ -560,11 +560,13 @@ class _Builder:
             node: tree.Node = _number(info, con.length, is_big=big)
         elif isinstance(con, BytesInteger) and not _is_odd(con):
             node = _number(info, con.length, is_big=not con.swapped)
-        elif place.room is not None and (isinstance(con, Filler) or con is construct.GreedyBytes):
-            if isinstance(con, Filler):
+        elif place.room is not None and (
+            isinstance(con, PaddingField) or con is construct.GreedyBytes
+        ):
+            if isinstance(con, PaddingField):
                 info = replace(info, default=con.pattern)
             node = tree.Blob(name, info, place.room, info.const)
-        elif isinstance(con, Bytes) and not isinstance(con, Filler):
+        elif isinstance(con, Bytes) and not isinstance(con, PaddingField):
             node = tree.Blob(name, info, self._formula(con.length, place), info.const)
         else:
             kind = type(con).__name__

@@ -12,8 +12,8 @@ from construct import Array, Const, Construct, Container, Struct
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.syntax.replacements import (
-    Bounded,
-    Describing,
+    BoundedPart,
+    DescribedField,
     HeldCheck,
     Partition,
 )
@@ -70,7 +70,7 @@ _REFUSED: dict[type, tuple[str, str]] = {
 }
 
 #: what gives a greedy part its end, and what has none of its own.
-_BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, Bounded)
+_BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, BoundedPart)
 
 
 #: of what stands in a struct without a name, what to write in its place.
@@ -155,11 +155,11 @@ def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
     is_sized = isinstance(con, construct.FixedSized)
     fits = is_sized and isinstance(con.length, int) and fixed_size(con.subcon) == con.length
     if isinstance(con, _BOUNDED) and not fits and not _fills(con.subcon, padded=is_sized):
-        if isinstance(con, Bounded):
+        if isinstance(con, BoundedPart):
             name = "Prefixed"
         else:
             name = type(con).__name__
-        if isinstance(con, Bounded | construct.NullTerminated):
+        if isinstance(con, BoundedPart | construct.NullTerminated):
             named = ""
         else:
             named = ", unless it is a named member of a Struct"
@@ -235,7 +235,7 @@ def _check_measures(
         else:
             path = str(con.name)
         measure = (1, 0, "")
-    if isinstance(con, Describing):
+    if isinstance(con, DescribedField):
         said = con.describe(tree.FieldInfo(""))
         measure = (said.scale, said.offset, said.unit)
     is_number = isinstance(

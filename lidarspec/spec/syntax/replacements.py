@@ -41,7 +41,7 @@ _MISSING = object()
 Fault = construct.ConstructError
 
 
-class Mismatch(construct.ConstructError):  # type: ignore[misc]
+class MismatchError(construct.ConstructError):  # type: ignore[misc]
     """A value on the wire that is not what the spec asks for; made a `WireError` by the engine."""
 
     def __init__(self, path: str, offset: int, expected: object, got: object, reason: str) -> None:
@@ -66,7 +66,7 @@ class WireNaN(float):
         return WireNaN, (self.raw,)
 
 
-def verifying(context: Any) -> bool:
+def is_verifying(context: Any) -> bool:
     """Return whether constants, lengths, checksums and values are checked in this parse."""
     return bool(context._params.get("_verify", True))
 
@@ -78,7 +78,7 @@ def check_bound(number: int, limit: int, what: str, path: str) -> int:
     return number
 
 
-def member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
+def get_member(obj: Any, dotted: str, default: object = _MISSING) -> Any:
     """The member of a nested mapping under a dotted name."""
     for part in dotted.split("."):
         if default is not _MISSING and (not isinstance(obj, Mapping) or part not in obj):
@@ -91,8 +91,8 @@ class MarkedStruct(Struct):  # type: ignore[misc]
     """A Struct whose parsed container holds the (start, end) of each member under ``_marks``.
 
     construct's own does not keep them. `Checksummed` needs them to find its bytes, `SizeOf` and
-    `Filler` to measure, and `explain` to list the fields of a frame without a layout. A missing
-    value is reported with the path of its field.
+    `PaddingField` to measure, and `explain` to list the fields of a frame without a layout. A
+    missing value is reported with the path of its field.
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -107,19 +107,19 @@ class MarkedStruct(Struct):  # type: ignore[misc]
                 obj[con.name] = inner[con.name] = value
                 marks[con.name] = (start, end)
         obj["_marks"] = marks
-        for sizing, place, spot, value in inner._sizings if verifying(context) else ():
+        for sizing, place, spot, value in inner._sizings if is_verifying(context) else ():
             expected = sizing.value(obj)
             if value != expected:
-                raise Mismatch(place, spot, expected, value, "length")
+                raise MismatchError(place, spot, expected, value, "length")
         return obj
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         obj = {} if obj is None else obj
         if not isinstance(obj, dict):
-            raise Mismatch(path, 0, "a mapping of its fields", repr(obj), "value")
+            raise MismatchError(path, 0, "a mapping of its fields", repr(obj), "value")
         for con in self.subcons:
             if not con.flagbuildnone and con.name not in obj:
-                raise Mismatch(f"{path} -> {con.name}", 0, "a value", "none", "missing")
+                raise MismatchError(f"{path} -> {con.name}", 0, "a value", "none", "missing")
         inner = self._inner(stream, context, is_parsing=False)
         inner.update({name: value for name, value in obj.items() if name != "_marks"})
         marks = inner._marks
@@ -189,7 +189,7 @@ class IndexedArray(Array):  # type: ignore[misc]
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         count = construct.evaluate(self.count, context)
         if not isinstance(obj, list | tuple | bytes):
-            raise Mismatch(path, 0, "a list of its elements", repr(obj), "value")
+            raise MismatchError(path, 0, "a list of its elements", repr(obj), "value")
         if len(obj) != count:
             raise construct.RangeError(f"expected {count} elements, found {len(obj)}", path=path)
         return _built(self, obj, stream, context, path)
@@ -215,7 +215,7 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, list | tuple):
-            raise Mismatch(path, 0, "a list of its elements", repr(obj), "value")
+            raise MismatchError(path, 0, "a list of its elements", repr(obj), "value")
         return _built(self, obj, stream, context, path)
 
 
@@ -238,14 +238,14 @@ class CheckedConst(Const):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
-        if obj != self.value and verifying(context):
-            raise Mismatch(
+        if obj != self.value and is_verifying(context):
+            raise MismatchError(
                 path, start, tree.format_hex(self.value), tree.format_hex(obj), "constant"
             )
         return obj
 
 
-class Limited(Subconstruct):  # type: ignore[misc]
+class LimitedNumber(Subconstruct):  # type: ignore[misc]
     """A number that accepts only some raw values.
 
     It represents OneOf, NoneOf and Mapping of construct.
@@ -258,7 +258,7 @@ class Limited(Subconstruct):  # type: ignore[misc]
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
         obj = self.subcon._parsereport(stream, context, path)
-        if verifying(context):
+        if is_verifying(context):
             return self._hold(obj, start, path)
         return obj
 
@@ -267,7 +267,7 @@ class Limited(Subconstruct):  # type: ignore[misc]
 
     def _hold(self, obj: Any, start: int, path: str) -> Any:
         if int(obj) not in self.allowed:
-            raise Mismatch(path, start, tree.format_values(self.allowed), int(obj), "value")
+            raise MismatchError(path, start, tree.format_values(self.allowed), int(obj), "value")
         return obj
 
 
@@ -275,7 +275,7 @@ class HeldCheck(construct.Check):  # type: ignore[misc]
     """A Check that can be read unchecked, for ``parse(verify=False)`` and `explain`."""
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        if verifying(context):
+        if is_verifying(context):
             return super()._parse(stream, context, path)
         return None
 
@@ -346,7 +346,7 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
         return self._decode(raw, context, path)
 
 
-class Describing(Subconstruct):  # type: ignore[misc]
+class DescribedField(Subconstruct):  # type: ignore[misc]
     """A part that only says something of the field below it: parses and builds what that does."""
 
     def describe(self, info: tree.FieldInfo) -> tree.FieldInfo:
@@ -354,7 +354,7 @@ class Describing(Subconstruct):  # type: ignore[misc]
         raise NotImplementedError
 
 
-class Sealing(Subconstruct):  # type: ignore[misc]
+class SealedStruct(Subconstruct):  # type: ignore[misc]
     """A struct with a checksum.
 
     Attributes:
@@ -371,7 +371,7 @@ class Sealing(Subconstruct):  # type: ignore[misc]
     absent: frozenset[int]
 
 
-class Sizing(Subconstruct):  # type: ignore[misc]
+class SizeField(Subconstruct):  # type: ignore[misc]
     """A number that says how many bytes a part has: made of it, and held to it.
 
     Attributes:
@@ -399,7 +399,7 @@ class Sizing(Subconstruct):  # type: ignore[misc]
         """Return the size of the part, given the parsed or built struct that has it."""
         *parents, name = self.of[self.out :] or ("",)
         try:
-            marks = (member(obj, ".".join(parents)) if parents else obj)["_marks"]
+            marks = (get_member(obj, ".".join(parents)) if parents else obj)["_marks"]
             if name:
                 start, end = marks[name]
             else:
@@ -433,7 +433,7 @@ class Sizing(Subconstruct):  # type: ignore[misc]
         context.get("_sizings", []).append((self, *said))
 
 
-class Counting(Subconstruct):  # type: ignore[misc]
+class CountField(Subconstruct):  # type: ignore[misc]
     """The number of elements of a later array, `of`.
 
     It is built from the length of the array; the value given is ignored.
@@ -451,7 +451,7 @@ class Counting(Subconstruct):  # type: ignore[misc]
         )
 
 
-class Bounded(Subconstruct):  # type: ignore[misc]
+class BoundedPart(Subconstruct):  # type: ignore[misc]
     """A part that ends after `length` bytes of a frame that comes, and is as long as its values are
     in one that is made.
     """
@@ -471,7 +471,7 @@ class Bounded(Subconstruct):  # type: ignore[misc]
         return value
 
 
-class Filler(CountedBytes):
+class PaddingField(CountedBytes):
     """The bytes behind members (from one to another, `of`), up to a length (`to`) or to a multiple
     of one (`modulus`).
 
@@ -499,7 +499,7 @@ class Filler(CountedBytes):
         return super()._build(self.pattern * length if obj is None else obj, stream, context, path)
 
 
-class Pieces(construct.ListContainer):  # type: ignore[misc]
+class ParsedParts(construct.ListContainer):  # type: ignore[misc]
     """Parts that were parsed or built: kind, first byte and the one after the last of each as
     `spans`; `size`: the bytes of all.
     """

@@ -30,23 +30,23 @@ from construct import (
 from construct.expr import ExprMixin
 
 from lidarspec.spec.syntax.replacements import (
-    Bounded,
+    BoundedPart,
     CheckedConst,
     CountedBytes,
-    Counting,
+    CountField,
     ExactFloat,
     Fault,
-    Filler,
     FullRange,
     HeldCheck,
     IndexedArray,
-    Limited,
+    LimitedNumber,
     MarkedStruct,
     NamedEnum,
+    PaddingField,
+    ParsedParts,
     Partition,
-    Pieces,
-    Sealing,
-    Sizing,
+    SealedStruct,
+    SizeField,
     SoughtTerminator,
     check_bound,
 )
@@ -92,13 +92,13 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         *map(type, con.encmapping),
         *map(type, con.decmapping),
     } == {str, int}:
-        return Limited(
+        return LimitedNumber(
             NamedEnum(prepare(con.subcon, limit, in_bits=in_bits), **con.encmapping),
             tuple(sorted(con.decmapping)),
         )
     if isinstance(con, construct.ExprValidator) and (allowed := _find_allowed(con)) is not None:
-        return Limited(prepare(con.subcon, limit, in_bits=in_bits), allowed)
-    if isinstance(con, Filler):
+        return LimitedNumber(prepare(con.subcon, limit, in_bits=in_bits), allowed)
+    if isinstance(con, PaddingField):
         con.limit = limit
         return con
     if isinstance(con, Bytes):
@@ -109,7 +109,7 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         if in_bits:
             members = con.subcons
         else:
-            members = [member for child in con.subcons for member in _spelled_out(child)]
+            members = [member for child in con.subcons for member in _expand_macro(child)]
         return MarkedStruct(*(prepare(child, limit, in_bits=in_bits) for child in members))
     if isinstance(con, construct.Renamed):
         inner = con.subcon
@@ -145,7 +145,7 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     return same
 
 
-def _spelled_out(con: Construct) -> list[Construct]:
+def _expand_macro(con: Construct) -> list[Construct]:
     """A member of a struct; of those that construct prefixes, pads or aligns, what it does not
     show: the length or count, the padding.
     """
@@ -159,7 +159,7 @@ def _spelled_out(con: Construct) -> list[Construct]:
         return construct.Renamed(part, newname=name + ending, newdocs=f"{what} {name}")
 
     if name and isinstance(inner, construct.IfThenElse) and inner.elsesubcon is construct.Pass:
-        members = _spelled_out(construct.Renamed(inner.thensubcon, newname=name, newdocs=docs))
+        members = _expand_macro(construct.Renamed(inner.thensubcon, newname=name, newdocs=docs))
         optional = (
             construct.Renamed(
                 construct.If(inner.condfunc, one.subcon), newname=one.name, newdocs=one.docs
@@ -176,14 +176,14 @@ def _spelled_out(con: Construct) -> list[Construct]:
             plus = 0
         length = construct.this[f"{name}_size"]
         if is_greedy(inner.subcon):
-            content = Bounded(length - plus if plus else length, inner.subcon)
+            content = BoundedPart(length - plus if plus else length, inner.subcon)
         else:
             content = inner.subcon
-        members = _spelled_out(construct.Renamed(content, newname=name, newdocs=docs))
+        members = _expand_macro(construct.Renamed(content, newname=name, newdocs=docs))
         return [
             rename_ending(
                 "_size",
-                Sizing(inner.lengthfield, (members[-1].name,), plus, members[0].name),
+                SizeField(inner.lengthfield, (members[-1].name,), plus, members[0].name),
                 "bytes of",
             ),
             *members,
@@ -196,28 +196,31 @@ def _spelled_out(con: Construct) -> list[Construct]:
         count, items = (part.subcon for part in inner.subcons)
         array = Array(construct.this[f"{name}_count"], items.subcon)
         return [
-            rename_ending("_count", Counting(count.subcon, name), "number of"),
+            rename_ending("_count", CountField(count.subcon, name), "number of"),
             construct.Renamed(array, newname=name, newdocs=docs),
         ]
     if name and (
         isinstance(inner, construct.Aligned)
         or (isinstance(inner, construct.FixedSized) and not is_greedy(inner.subcon))
     ):
-        members = _spelled_out(construct.Renamed(inner.subcon, newname=name, newdocs=docs))
+        members = _expand_macro(construct.Renamed(inner.subcon, newname=name, newdocs=docs))
         span = (members[0].name, members[-1].name)
         if isinstance(inner, construct.Aligned):
             return [
                 *members,
                 rename_ending(
                     "_padding",
-                    Filler(span, modulus=inner.modulus, pattern=inner.pattern),
+                    PaddingField(span, modulus=inner.modulus, pattern=inner.pattern),
                     "padding of",
                 ),
             ]
         is_full = isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon)
         if is_full:
             return members
-        return [*members, rename_ending("_padding", Filler(span, to=inner.length), "padding of")]
+        return [
+            *members,
+            rename_ending("_padding", PaddingField(span, to=inner.length), "padding of"),
+        ]
     return [con]
 
 
@@ -289,7 +292,7 @@ def is_greedy(con: Construct, kinds: tuple[type, ...] = (*GREEDY, construct.Null
         | construct.NullStripped
         | construct.FixedSized
         | construct.Prefixed
-        | Bounded,
+        | BoundedPart,
     ):
         return False
     return any(
@@ -342,14 +345,18 @@ def fixed_size(con: Construct) -> int:
         return 0
 
 
-def clean(parsed: Any) -> Any:
+def remove_private(parsed: Any) -> Any:
     """The parsed object without construct's and our own private entries."""
     if isinstance(parsed, dict):
         return Container(
-            {name: clean(value) for name, value in parsed.items() if not name.startswith("_")}
+            {
+                name: remove_private(value)
+                for name, value in parsed.items()
+                if not name.startswith("_")
+            }
         )
     if isinstance(parsed, list):
-        return construct.ListContainer(clean(value) for value in parsed)
+        return construct.ListContainer(remove_private(value) for value in parsed)
     return parsed
 
 
@@ -369,9 +376,9 @@ def children(con: Construct) -> list[Construct]:
     return found + (list(con.cases.values()) if "cases" in vars(con) else [])
 
 
-def seals(con: Construct) -> Iterator[Sealing]:
+def seals(con: Construct) -> Iterator[SealedStruct]:
     """The sealed structs of a struct, outer ones first."""
-    if isinstance(con, Sealing):
+    if isinstance(con, SealedStruct):
         yield con
     for child in children(con):
         yield from seals(child)
@@ -465,7 +472,7 @@ def random_value(
             scope,
             path,
         )
-    if isinstance(con, Limited):
+    if isinstance(con, LimitedNumber):
         raw = source.choice(con.allowed)
         if isinstance(con.subcon, construct.Enum):
             return con.subcon._decode(raw, None, None)
@@ -483,7 +490,7 @@ def random_value(
     if isinstance(con, construct.NullTerminated) or not isinstance(con, Subconstruct):
         return _random_leaf(con, source, scope)
     if isinstance(con, construct.Adapter):
-        return clean(
+        return remove_private(
             con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path)))
         )
     return random_value(con.subcon, source, drawn, scope, path)
@@ -504,9 +511,9 @@ def _elements(con: Construct, scope: Any) -> int:
 
 def _random_parts(
     con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str
-) -> Pieces:
+) -> ParsedParts:
     """Some parts, with how long each is, which what stands behind them may ask for."""
-    found = Pieces()
+    found = ParsedParts()
     around = Container(
         {**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False}
     )
@@ -530,7 +537,7 @@ def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any
 
 
 def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
-    if con is construct.Pass or isinstance(con, construct.Check | Filler):
+    if con is construct.Pass or isinstance(con, construct.Check | PaddingField):
         # whether a Check holds, and how much there is to fill, is seen when the frame is built
         return None
     if isinstance(con, construct.NullTerminated):

@@ -7,8 +7,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.detect.identification import verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.identification import identify_sample
+from lidarspec.detect.sample_bytes import SampleBytes
 from tests.evidence import clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
@@ -52,9 +52,9 @@ def test_a_packet_whose_lengths_disagree_is_none() -> None:
 
 @pytest.mark.slow
 def test_a_2g_is_told_by_where_its_packets_start_and_the_others_not_at_all() -> None:
-    assert verdict(Heard("", tuple(simulate(DELTA_2G, 60)))).sensor is DELTA_2G
-    found = verdict(Heard("", tuple(simulate(DELTA_2A, 60))))
+    assert identify_sample(SampleBytes("", tuple(simulate(DELTA_2G, 60)))).sensor is DELTA_2G
+    found = identify_sample(SampleBytes("", tuple(simulate(DELTA_2A, 60))))
     assert found.sensor is None
-    assert {score.sensor.id for score in found.alike} == {
+    assert {score.sensor.id for score in found.candidates} == {
         f"3irobotix-{name}" for name in ("delta2a", "delta2b", "delta2d", "lds08rr")
     }

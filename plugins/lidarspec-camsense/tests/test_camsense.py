@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.identification import verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.identification import identify_sample
+from lidarspec.detect.sample_bytes import SampleBytes
 from tests.evidence import capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
@@ -58,8 +58,11 @@ def test_packets_of_an_lds08rr_are_told_from_those_of_an_x1() -> None:
     np.testing.assert_allclose(clockwise(cloud), points[:, 0], atol=1e-4)
     np.testing.assert_allclose(cloud.range * 1000, points[:, 1], atol=1e-3)
     np.testing.assert_array_equal(cloud.intensity, points[:, 2])
-    assert verdict(Heard("", (data,))).sensor is LDS08RR
-    assert verdict(Heard("", (vector_bytes(FILE, "camsense_x1_capture") * 3,))).sensor is X1
+    assert identify_sample(SampleBytes("", (data,))).sensor is LDS08RR
+    assert (
+        identify_sample(SampleBytes("", (vector_bytes(FILE, "camsense_x1_capture") * 3,))).sensor
+        is X1
+    )
 
 
 def test_a_packet_that_crosses_360_degrees_goes_on_forward() -> None:

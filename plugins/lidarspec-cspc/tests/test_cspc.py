@@ -13,7 +13,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.detect.identification import Heard, verdict
+from lidarspec.detect.identification import SampleBytes, identify_sample
 from tests.agreement import assert_same_points
 from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
@@ -180,8 +180,10 @@ def test_an_older_one_is_told_from_a_ydlidar_by_name_or_by_start_packets_with_a_
     YDLIDAR tells how fast it turns.
     """
     own, other = (b"".join(simulate(ls.sensor(name), 60)) for name in (V11.id, "ydlidar-x4"))
-    assert verdict(Heard("", (INFO + own,))).sensor is V11
-    assert V11.id not in {alike.sensor.id for alike in verdict(Heard("", (other,))).alike}
+    assert identify_sample(SampleBytes("", (INFO + own,))).sensor is V11
+    assert V11.id not in {
+        alike.sensor.id for alike in identify_sample(SampleBytes("", (other,))).candidates
+    }
 
 
 @pytest.mark.parametrize(

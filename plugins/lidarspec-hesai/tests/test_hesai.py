@@ -15,7 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.detect.identification import Heard, verdict
+from lidarspec.detect.identification import SampleBytes, identify_sample
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec import Learned, Tcp, Udp
 from lidarspec.testing.fixtures import virtual_port
@@ -550,7 +550,7 @@ def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> Non
         with ls.open(port.path, unit) as device:
             cloud = device.latest(SLACK).points
             assert device.send("speed", rate=600).values.code == 0x17
-        assert (cloud.nominal, device.warnings, port.device.heard) == (
+        assert (cloud.nominal, device.warnings, port.device.commands_received) == (
             False,
             [],
             ["get_calibration", "speed"],
@@ -562,7 +562,7 @@ def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> Non
             assert np.rad2deg(device.latest(SLACK).points.elevation[:2]) == pytest.approx(
                 [-4.5, -4.0]
             )
-        assert port.device.heard == ["get_calibration", "speed"]
+        assert port.device.commands_received == ["get_calibration", "speed"]
         with ls.open(
             f"{data}?control=127.0.0.1:{free_port()}", unit
         ) as device:  # where nobody answers
@@ -641,7 +641,10 @@ def test_points_and_times_by_hand_of_those_whose_status_tells_the_model(name: st
 @pytest.mark.parametrize("name", STATED)
 def test_those_whose_status_tells_the_model_are_told_from_all_others(name: str) -> None:
     sensor = ls.sensor(f"hesai-{name}")
-    assert verdict(Heard("", tuple(simulate(sensor, 20)), datagrams=True)).sensor is sensor
+    assert (
+        identify_sample(SampleBytes("", tuple(simulate(sensor, 20)), datagrams=True)).sensor
+        is sensor
+    )
 
 
 def test_channels_have_the_further_bytes_that_the_header_says() -> None:

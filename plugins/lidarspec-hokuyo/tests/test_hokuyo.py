@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.identification import verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.identification import identify_sample
+from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.simulation.device import SimulatedDevice
 from tests.evidence import decoded, vector_bytes
 
@@ -123,7 +123,7 @@ def test_a_cluster_of_00_is_one_step_and_the_numbers_of_errors_are_no_points() -
 def test_models_are_told_by_their_steps_and_by_what_they_answer() -> None:
     scans = b"".join(ls.simulate(UST, 3))
     assert not URG.decode(scans).stats.frames
-    assert {one.sensor.id for one in verdict(Heard("", (scans,))).alike} | {
+    assert {one.sensor.id for one in identify_sample(SampleBytes("", (scans,))).candidates} | {
         "hokuyo-ust10lx"
     } == LOOK_ALIKE
     device = SimulatedDevice(UTM)
@@ -134,6 +134,6 @@ def test_models_are_told_by_their_steps_and_by_what_they_answer() -> None:
     device.receive(UTM.command("start"), 10**6)
     data = b"".join(data for _, data in device.outgoing(10**8))
     assert data.startswith(b"MD0000108001000\n00P\n\nMD0000108001000\n99b\n")
-    assert {one.sensor.id for one in verdict(Heard("", (told + data,))).alike} == {
-        "hokuyo-utm30lxew"
-    }
+    assert {
+        one.sensor.id for one in identify_sample(SampleBytes("", (told + data,))).candidates
+    } == {"hokuyo-utm30lxew"}

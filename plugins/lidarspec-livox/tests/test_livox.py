@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.identification import verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.identification import identify_sample
+from lidarspec.detect.sample_bytes import SampleBytes
 from tests.evidence import decoded, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
@@ -197,8 +197,10 @@ def test_what_an_imu_feels_is_in_si(sensor: ls.Sensor) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [MID360.id, HAP.id, *FIRST])
 def test_a_model_is_not_taken_for_a_relative(name: str) -> None:
-    found = verdict(Heard("a wire", tuple(ls.simulate(ls.sensor(name), 40)), datagrams=True))
-    told = {one.sensor.id for one in found.alike}
+    found = identify_sample(
+        SampleBytes("a wire", tuple(ls.simulate(ls.sensor(name), 40)), datagrams=True)
+    )
+    told = {one.sensor.id for one in found.candidates}
     same_pace = {"livox-mid40": FIRST[:2], "livox-mid70": FIRST[:2]}.get(name, FIRST[2:])
     assert told == ({name} if name in (MID360.id, HAP.id) else set(same_pace))
 
@@ -217,8 +219,8 @@ def test_what_it_broadcasts_names_the_model(name: str) -> None:
         device_type=who,
         data_reserved=0,
     )
-    found = verdict(Heard("a wire", (said, *ls.simulate(sensor, 40)), datagrams=True))
-    assert [one.sensor.id for one in found.alike] == [name]
+    found = identify_sample(SampleBytes("a wire", (said, *ls.simulate(sensor, 40)), datagrams=True))
+    assert [one.sensor.id for one in found.candidates] == [name]
 
 
 @pytest.mark.slow

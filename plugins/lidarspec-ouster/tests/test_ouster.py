@@ -18,7 +18,7 @@ import pytest
 import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.captures.pcap import CaptureReader
-from lidarspec.detect.identification import verdicts
+from lidarspec.detect.identification import identify_senders
 from lidarspec.spec import Learned
 from lidarspec_ouster import nominal
 from lidarspec_ouster.metadata import read
@@ -236,10 +236,10 @@ def test_lost_and_invalid_columns_leave_gaps() -> None:
 @pytest.mark.slow
 def test_packets_alone_tell_their_layout() -> None:
     for name, (_, layout) in CAPTURES.items():
-        found = verdicts(capture(f"ouster/{name}.pcap"))[0]
-        options = found.alike[0].sensor.options
+        found = identify_senders(capture(f"ouster/{name}.pcap"))[0]
+        options = found.candidates[0].sensor.options
         assert (options["profile"], options["rows"], options["turn"]) == layout
-        assert f"profile={layout[0]}, rows={layout[1]}, turn=1024" in found.alike[0].why
+        assert f"profile={layout[0]}, rows={layout[1]}, turn=1024" in found.candidates[0].why
 
 
 @pytest.mark.parametrize("name", VECTORS)

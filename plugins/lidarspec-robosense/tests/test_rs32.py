@@ -13,8 +13,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.detect.identification import verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.identification import identify_sample
+from lidarspec.detect.sample_bytes import SampleBytes
 from tests.evidence import assert_points, decoded, vector_bytes, vectors
 from tests.installed import sensor_ids
 
@@ -169,7 +169,10 @@ def test_the_date_is_taken_for_utc() -> None:
 @pytest.mark.parametrize("sensor_id", sensor_ids("lidarspec-robosense"))
 def test_every_model_is_told_from_the_others(sensor_id: str) -> None:
     sensor = ls.sensor(sensor_id)
-    assert verdict(Heard("", tuple(simulate(sensor, 20)), datagrams=True)).sensor is sensor
+    assert (
+        identify_sample(SampleBytes("", tuple(simulate(sensor, 20)), datagrams=True)).sensor
+        is sensor
+    )
 
 
 @pytest.mark.slow
@@ -187,8 +190,8 @@ def test_a_helios_of_16_lasers_and_one_of_32_are_told_apart_with_dual_return_too
         packet = large.parse(frame)
         packet.blocks[1::2] = packet.blocks[::2]
         pairs.append(large.build("data", packet))
-    assert verdict(Heard("", tuple(twice), datagrams=True)).sensor is small
-    assert verdict(Heard("", tuple(pairs), datagrams=True)).sensor is large
+    assert identify_sample(SampleBytes("", tuple(twice), datagrams=True)).sensor is small
+    assert identify_sample(SampleBytes("", tuple(pairs), datagrams=True)).sensor is large
 
 
 def ruby(azimuths: Sequence[int], distances: Sequence[int], *, returns: int) -> bytes:

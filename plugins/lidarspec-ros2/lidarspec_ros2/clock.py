@@ -54,14 +54,14 @@ EARLY, LATE, UNSETTLED = 5_000_000, 10_000_000, 1_000_000_000
 SURELY, PROBABLY, FOR = 3, 5, 1_000_000_000
 
 
-class Sample(NamedTuple):
+class ClockSample(NamedTuple):
     """A time of the sensor, and the difference to when it arrived, ns."""
 
     device: int
     delay: int
 
 
-class Line(NamedTuple):
+class ClockLine(NamedTuple):
     """The difference of a packet without delay: at a time of the sensor, and its slope."""
 
     device: int
@@ -73,7 +73,7 @@ class Line(NamedTuple):
         return self.delay + round(self.slope * (device - self.device))
 
 
-class Stamps:
+class MessageStamps:
     """The stamps of one sensor's messages, in ROS's time.
 
     Args:
@@ -143,12 +143,12 @@ class DeviceClock:
         self._stamp = -(1 << 62)
         self.jumps, self.jump = 0, ""
         self._least, self._strays, self._since = (
-            deque[Sample](maxlen=PARTS),
-            deque[Sample](maxlen=PROBABLY),
+            deque[ClockSample](maxlen=PARTS),
+            deque[ClockSample](maxlen=PROBABLY),
             0,
         )
-        self._line, self._known = Line(0, 0, 0.0), 0.0
-        self._shown: Sample | None = None
+        self._line, self._known = ClockLine(0, 0, 0.0), 0.0
+        self._shown: ClockSample | None = None
 
     @property
     def offset_ns(self) -> int:
@@ -172,7 +172,7 @@ class DeviceClock:
         edges = np.flatnonzero(np.diff(device // PART)) + 1
         for times, late in zip(np.split(device, edges), np.split(delays, edges), strict=True):
             if len(late):
-                self._take(Sample(times.item(late.argmin()), late.item(late.argmin())))
+                self._take(ClockSample(times.item(late.argmin()), late.item(late.argmin())))
 
     def stamp(self, device_ns: int, host_ns: int) -> int:
         """The host's time of a time of the sensor, later than all that were given before; learns
@@ -185,13 +185,13 @@ class DeviceClock:
         self.observe(device_ns, host_ns)
         went_back = self._shown is not None and device_ns <= self._shown.device
         offset = (
-            host_ns - device_ns if went_back else min(self._slewed(device_ns), host_ns - device_ns)
+            host_ns - device_ns if went_back else min(self._slew(device_ns), host_ns - device_ns)
         )
-        self._shown = Sample(device_ns, offset)
+        self._shown = ClockSample(device_ns, offset)
         self._stamp = max(device_ns + offset, self._stamp + 1)
         return self._stamp
 
-    def _slewed(self, device: int) -> int:
+    def _slew(self, device: int) -> int:
         """The offset that follows the line."""
         if self._shown is None:
             return self._line.at(device)
@@ -200,7 +200,7 @@ class DeviceClock:
         wanted, limit = (self._line.at(device) - steady) * min(step / FOLLOWS, 1.0), SLEW * step
         return steady + round(min(max(wanted, -limit), limit))
 
-    def _take(self, sample: Sample) -> None:
+    def _take(self, sample: ClockSample) -> None:
         """Learn from the least delayed of some packets."""
         off, has_paused = (
             self._off(sample),
@@ -225,7 +225,7 @@ class DeviceClock:
         self._strays.clear()
         self._shown = None
 
-    def _off(self, sample: Sample) -> int:
+    def _off(self, sample: ClockSample) -> int:
         """By how much a sample is above the line, ns."""
         return sample.delay - self._line.at(sample.device)
 
@@ -257,7 +257,7 @@ class DeviceClock:
         for sample in strays:
             self._learn(sample)
 
-    def _learn(self, sample: Sample) -> None:
+    def _learn(self, sample: ClockSample) -> None:
         """Keep a sample where it is the least of its part, and draw the line anew."""
         slope = self._line.slope
         if self._least and sample.device // PART <= self._least[-1].device // PART:
@@ -268,14 +268,14 @@ class DeviceClock:
                 return
             self._least.pop()
         self._least.append(sample)
-        self._line = drawn(self._least, self._known)
+        self._line = fit_line(self._least, self._known)
         if len(self._least) >= SETTLED:
             self.jump = ""
         if len(self._least) == PARTS:
             self._known = self._line.slope
 
 
-def drawn(least: Sequence[Sample], known: float) -> Line:
+def fit_line(least: Sequence[ClockSample], known: float) -> ClockLine:
     """The line under some samples that is as near to them as can be, of a slope that they are sure
     of.
 
@@ -295,10 +295,10 @@ def drawn(least: Sequence[Sample], known: float) -> Line:
         least[place].delay - last.delay - slope * (least[place].device - last.device)
         for place in hull
     )
-    return Line(last.device, last.delay + round(height), slope)
+    return ClockLine(last.device, last.delay + round(height), slope)
 
 
-def lower_hull(samples: Sequence[Sample]) -> list[int]:
+def lower_hull(samples: Sequence[ClockSample]) -> list[int]:
     """The places of those samples that lie on the lower convex hull, from left to right."""
     hull: list[int] = []
     for place, (device, delay) in enumerate(samples):
@@ -311,7 +311,7 @@ def lower_hull(samples: Sequence[Sample]) -> list[int]:
     return hull
 
 
-def slope_over(place: float, samples: Sequence[Sample], hull: Sequence[int]) -> float:
+def slope_over(place: float, samples: Sequence[ClockSample], hull: Sequence[int]) -> float:
     """The slope of the edge of a hull over a place among the samples."""
     end = min(max(bisect_left(hull, place), 1), len(hull) - 1)
     (left, low), (right, high) = samples[hull[end - 1]], samples[hull[end]]

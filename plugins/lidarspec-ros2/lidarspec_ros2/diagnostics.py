@@ -14,7 +14,7 @@ from lidarspec.view.rate_meter import MeterReading
 LOST = ("disconnected", "silent")
 
 
-def status(
+def make_status(
     name: str, device: Device, reading: MeterReading, said: Sequence[str], more: Mapping[str, str]
 ) -> DiagnosticStatus:
     """How a device is doing.

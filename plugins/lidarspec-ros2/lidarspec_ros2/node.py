@@ -32,9 +32,9 @@ from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
 from lidarspec.explaining.assignments import arguments
 from lidarspec.explaining.explanation import reply_text
-from lidarspec.view.live_scans import LOOK_S, Feed
+from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading
-from lidarspec_ros2.diagnostics import LOST, status
+from lidarspec_ros2.diagnostics import LOST, make_status
 from lidarspec_ros2.packets import PacketLog
 from lidarspec_ros2.parameters import NAMED, NODE_NAME, PARAMETERS, Parameter, Settings
 from lidarspec_ros2.topics import Topics
@@ -176,7 +176,7 @@ class LidarNode(LifecycleNode):
             played=not device.is_live,
             max_cloud_bytes=self._max_cloud_bytes,
         )
-        packets.publish = topics.raw
+        packets.publish = topics.publish_packet
         self._serve_commands(device)
         self._warn_of_unknown_parameters()
         self._stopping.clear()
@@ -189,15 +189,15 @@ class LidarNode(LifecycleNode):
     def _read(self, device: Device, topics: Topics) -> None:
         """Publish what comes, until the node is stopped or the input ends."""
         speed = self._settings["replay_speed"]
-        feed = Feed(
+        feed = LiveScans(
             device, played=speed > 0, speed=speed, ahead=None
         )  # what is read tells of the sensor's clock before it is shown
         due, expected = time.monotonic(), 0.0
         try:
             while not self._stopping.is_set() and not feed.ended:
-                feed.pump(0.0 if device.is_live else time.monotonic() + LOOK_S)
+                feed.read(0.0 if device.is_live else time.monotonic() + LOOK_S)
                 self._publish(feed, topics)
-                expected = _expected(expected, feed)
+                expected = _predict_scan_end(expected, feed)
                 device.gather(
                     min(expected, time.monotonic() + SOON) if device.sensor.imu_frames else expected
                 )
@@ -205,16 +205,18 @@ class LidarNode(LifecycleNode):
                 if (now := time.monotonic()) >= due:
                     due = now + SECOND
                     reading = feed.meter.reading(device.stats, SECOND if device.is_live else None)
-                    self._soon(partial(self._tell, device, topics, reading))
+                    self._call_in_executor(
+                        partial(self._publish_diagnostics, device, topics, reading)
+                    )
         except Exception as error:
             self._fail(error)
         if not self._stopping.is_set():
-            self._soon(self._end)
+            self._call_in_executor(self._end)
 
-    def _publish(self, feed: Feed, topics: Topics) -> None:
+    def _publish(self, feed: LiveScans, topics: Topics) -> None:
         if feed.packets is not None and len(feed.packets):
             topics.learn(feed.packets)
-        topics.feel(feed.device.imu_samples)
+        topics.publish_imu(feed.device.imu_samples)
         for scan in feed.scans:
             if scan.whole:
                 topics.publish(scan)
@@ -223,7 +225,7 @@ class LidarNode(LifecycleNode):
         """Have the node be inactive while the sensor is gone, which has been there."""
         is_lost = device.state in LOST and bool(device.stats.frames)
         if is_lost != self._was_lost and (self._was_lost or self._is_active):
-            self._soon(self._lose if is_lost else self._regain)
+            self._call_in_executor(self._lose if is_lost else self._regain)
 
     @property
     def _is_active(self) -> bool:
@@ -238,7 +240,7 @@ class LidarNode(LifecycleNode):
         if self._was_lost:
             self.trigger_activate()
 
-    def _tell(self, device: Device, topics: Topics, reading: MeterReading) -> None:
+    def _publish_diagnostics(self, device: Device, topics: Topics, reading: MeterReading) -> None:
         """Say how the sensor is doing."""
         if device is not self._device:  # which is closed
             return
@@ -252,14 +254,14 @@ class LidarNode(LifecycleNode):
             "clock drift [ppm]": f"{clock.drift_ppm:+.1f}",
             "clock set": f"{clock.jumps} times",
         }
-        found = status(
+        found = make_status(
             self.get_name(), device, reading, [*filter(None, (clock.jump, topics.fault))], more
         )
         self._diagnostics.publish(
             DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[found])
         )
 
-    def _soon(self, callback: Callable[[], Any]) -> None:
+    def _call_in_executor(self, callback: Callable[[], Any]) -> None:
         """Have something done in the thread of the executor."""
         if self.executor is not None:
             self.executor.create_task(callback)
@@ -297,7 +299,7 @@ class LidarNode(LifecycleNode):
         except UsageError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if self._topics is not None and ours:
-            self._topics.show(self._settings)
+            self._topics.use_settings(self._settings)
         return SetParametersResult(successful=True)
 
     def _warn_of_unknown_parameters(self) -> None:
@@ -351,7 +353,7 @@ class LidarNode(LifecycleNode):
         return response
 
 
-def _expected(before: float, feed: Feed) -> float:
+def _predict_scan_end(before: float, feed: LiveScans) -> float:
     """When the next scan may end, a time of `time.monotonic`, a little too early; one that is late
     is waited for less eagerly.
     """

@@ -20,7 +20,7 @@ from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
 from lidarspec.recording.background_writer import TrafficLog
-from lidarspec.scans.beams import Planes
+from lidarspec.scans.beams import PlanarScans
 from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
@@ -239,17 +239,17 @@ class Settings:
             ranges=(self["range_min"], far), beams=self["beams"] or None, frame_id=self["frame_id"]
         )
 
-    def planes(self) -> Planes:
+    def make_planar_scans(self) -> PlanarScans:
         """What makes planar scans."""
         first, seen = self["angle_min"], (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
         low, high = self["scan_z_min"], self["scan_z_max"]
-        return Planes(
+        return PlanarScans(
             field=(first, first + seen) if seen else None,
             ring=self["scan_ring"] if self["scan_ring"] >= 0 else None,
             heights=(low, high) if low < high else None,
         )
 
-    def narrowed(self, planar: LaserScan) -> LaserScan:
+    def limit_ranges(self, planar: LaserScan) -> LaserScan:
         """A planar scan that says of its ranges what is wanted of them, where that is less than the
         sensor has.
         """

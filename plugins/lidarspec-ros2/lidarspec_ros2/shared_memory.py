@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.formats.messages import records
+from lidarspec.formats.messages import make_records
 from lidarspec.sensor_operations import Sensor
-from lidarspec.simulation.simulator import opening, simulate, simulation
+from lidarspec.simulation.simulator import frame_simulation, make_opening_frame, simulate
 from lidarspec.spec.timing import Every
 
 #: The variable that names the file of profiles, of Fast DDS 3 (Kilted and later) and Fast DDS 2.
@@ -170,16 +170,18 @@ def largest_cloud_bytes(sensor: Sensor) -> int | None:
     Raises:
         LidarSpecError: if the sensor cannot be simulated.
     """
-    interval_s = simulation(sensor, sensor.data_frame).interval * 1e-9
+    interval_s = frame_simulation(sensor, sensor.data_frame).interval * 1e-9
     if not interval_s:
         return None
     scan_s = _longest_scan_s(sensor)
     if scan_s is None:
         count = min(math.ceil(PROBED_S / interval_s), MAX_PROBED_PACKETS)
         scans = sensor.scans(_simulate_packets(sensor, count))
-        return max((records(scan.points, every_point=True).nbytes for scan in scans), default=0)
+        return max(
+            (make_records(scan.points, every_point=True).nbytes for scan in scans), default=0
+        )
     cloud = sensor.decode(_simulate_packets(sensor, PROBED_PACKETS)).points()
-    packet_bytes = records(cloud, every_point=True).nbytes / PROBED_PACKETS
+    packet_bytes = make_records(cloud, every_point=True).nbytes / PROBED_PACKETS
     return math.ceil(packet_bytes * scan_s / interval_s)
 
 
@@ -192,7 +194,7 @@ def _longest_scan_s(sensor: Sensor) -> float | None:
 
 def _simulate_packets(sensor: Sensor, count: int) -> bytes | list[bytes]:
     """Return the first packets of a simulated sensor."""
-    frames = [frame for frame in (opening(sensor), *simulate(sensor, count)) if frame]
+    frames = [frame for frame in (make_opening_frame(sensor), *simulate(sensor, count)) if frame]
     return frames if sensor.datagrams else b"".join(frames)
 
 

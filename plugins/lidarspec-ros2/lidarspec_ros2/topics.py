@@ -21,19 +21,19 @@ from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 from std_msgs.msg import UInt8MultiArray
 
 from lidarspec.errors import UsageError
-from lidarspec.formats.messages import CLOUD, IMU, SCAN, Message, Messages
+from lidarspec.formats.messages import CLOUD, IMU, SCAN, RosMessage, RosMessages
 from lidarspec.framing.results import Counters
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream
 from lidarspec.points.mount import Mount
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import Sieve
+from lidarspec.scans.selection import ScanSelector
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.robotics_logs import RAW
-from lidarspec_ros2.clock import Stamps
+from lidarspec_ros2.clock import MessageStamps
 from lidarspec_ros2.parameters import Settings
 from lidarspec_ros2.shared_memory import format_megabytes
 
@@ -85,9 +85,9 @@ class Topics:
         self._node, self._sensor, self.stamps = (
             node,
             sensor,
-            Stamps(None if played else HostClock()),
+            MessageStamps(None if played else HostClock()),
         )
-        self._messages = Messages("ROS2_HUMBLE")
+        self._messages = RosMessages("ROS2_HUMBLE")
         self._reliability = (
             ReliabilityPolicy.RELIABLE
             if settings["qos"] == "reliable"
@@ -98,27 +98,27 @@ class Topics:
         self._others = list[Any]()
         self.active, self.latency_s, self.fault = False, 0.0, ""
         self._arrived = 0
-        self.show(settings)
+        self.use_settings(settings)
         self._publisher(CLOUD)
         if settings["publish_packets"]:
             self._publisher(RAW)
-        self._is_felt_by_clock = ImuStream(sensor, Counters()).waiting is not None
+        self._is_imu_by_clock = ImuStream(sensor, Counters()).waiting is not None
         if sensor.imu_frames:
             self._publisher(IMU)
         if settings["publish_tf"]:
             self._publish_transform(settings)
         self._time = (
-            self._other(Clock, "/clock", 10)
+            self._make_plain_publisher(Clock, "/clock", 10)
             if played and node.get_parameter("use_sim_time").value
             else None
         )
 
-    def show(self, settings: Settings) -> None:
+    def use_settings(self, settings: Settings) -> None:
         """Publish by other parameters from now on."""
         self._settings, self._planes, self._sieve = (
             settings,
-            settings.planes(),
-            Sieve(settings.selection()),
+            settings.make_planar_scans(),
+            ScanSelector(settings.selection()),
         )
 
     def learn(self, packets: Packets) -> None:
@@ -128,37 +128,37 @@ class Topics:
 
     def publish(self, scan: Scan) -> None:
         """Publish a scan, as far as anybody listens."""
-        wanted = self._sieve.take(scan)
+        wanted = self._sieve.select(scan)
         assert wanted is not None  # nothing is selected by number or time
         at, settings = self._stamp(scan), self._settings
-        if self._listened(CLOUD):
+        if self._has_subscribers(CLOUD):
             organised = settings["organized"] and wanted.points.shape is not None
             self._send(self._messages.cloud(wanted, at, every_point=organised))
         try:
-            planar, self.fault = self._planes.scan(wanted), ""
+            planar, self.fault = self._planes.project(wanted), ""
         except UsageError as error:  # a ring that the sensor lacks: it is set at run time
             planar, self.fault = None, str(error)
-        if planar is not None and self._listened(SCAN):
+        if planar is not None and self._has_subscribers(SCAN):
             self._send(
                 self._messages.laserscan(
-                    wanted, settings.narrowed(planar), at + planar.stamp_ns - scan.stamp_ns
+                    wanted, settings.limit_ranges(planar), at + planar.stamp_ns - scan.stamp_ns
                 )
             )
         self.latency_s = (time.time_ns() - self._arrived) / 1e9
         if self._time is not None and self.active:
             self._time.publish(Clock(clock=Time(nanoseconds=at).to_msg()))
 
-    def feel(self, felt: ImuSamples) -> None:
+    def publish_imu(self, felt: ImuSamples) -> None:
         """Publish what the IMU felt."""
-        for index in range(len(felt)) if len(felt) and self._listened(IMU) else ():
+        for index in range(len(felt)) if len(felt) and self._has_subscribers(IMU) else ():
             at = self.stamps.at(
-                int(felt.time_ns[index]), self._settings, by_clock=self._is_felt_by_clock
+                int(felt.time_ns[index]), self._settings, by_clock=self._is_imu_by_clock
             )
             self._send(self._messages.imu(felt, index, at, self._settings["frame_id"]))
 
-    def raw(self, chunk: Chunk) -> None:
+    def publish_packet(self, chunk: Chunk) -> None:
         """Publish what the sensor sent."""
-        if self._listened(RAW):
+        if self._has_subscribers(RAW):
             self._send(self._messages.raw(chunk, datagram=self._sensor.datagrams))
 
     def activate(self, *, active: bool) -> None:
@@ -198,7 +198,7 @@ class Topics:
                     publisher.on_activate(None)
         return self._publishers[kind]
 
-    def _other(self, message: Any, topic: str, qos: Any) -> Any:
+    def _make_plain_publisher(self, message: Any, topic: str, qos: Any) -> Any:
         """A publisher that is not the lifecycle's."""
         self._others.append(self._node.create_publisher(message, topic, qos))
         return self._others[-1]
@@ -213,14 +213,14 @@ class Topics:
             ) from None
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         stamp = self._node.get_clock().now().to_msg()
-        self._other(TFMessage, "/tf_static", qos).publish(
-            TFMessage(transforms=[transform(settings, stamp)])
+        self._make_plain_publisher(TFMessage, "/tf_static", qos).publish(
+            TFMessage(transforms=[make_transform(settings, stamp)])
         )
 
-    def _listened(self, kind: str) -> bool:
+    def _has_subscribers(self, kind: str) -> bool:
         return self.active and self._publisher(kind).get_subscription_count() > 0
 
-    def _send(self, message: Message) -> None:
+    def _send(self, message: RosMessage) -> None:
         publisher, data = self._publisher(message.kind), bytes(message.data)
         if message.kind == CLOUD:
             self._warn_of_large_cloud(len(data))
@@ -245,7 +245,7 @@ class Topics:
         )
 
 
-def transform(settings: Settings, stamp: Any) -> TransformStamped:
+def make_transform(settings: Settings, stamp: Any) -> TransformStamped:
     """The mount, from the frame of the carrier to that of the points."""
     mount = settings.mount() or Mount()
     roll, pitch, yaw = (

@@ -15,7 +15,7 @@ from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 from lidarspec.transports.host_clock import HostClock
-from lidarspec_ros2.clock import DeviceClock, Stamps
+from lidarspec_ros2.clock import DeviceClock, MessageStamps
 from lidarspec_ros2.parameters import PARAMETERS, Settings
 
 SECOND = 1_000_000_000
@@ -56,7 +56,7 @@ def made(wall: HostClock | None = None, **wanted: Any) -> NDArray[np.int64]:
     of these.
     """
     stamps, values = (
-        Stamps(wall),
+        MessageStamps(wall),
         Settings({parameter.name: parameter.default for parameter in PARAMETERS} | wanted),
     )
     found = []

@@ -31,7 +31,7 @@ import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.formats.messages import SCAN
 from lidarspec_ros2.parameters import PARAMETERS, Settings
-from lidarspec_ros2.topics import transform
+from lidarspec_ros2.topics import make_transform
 
 STL = ("sim:ldrobot-stl27l", "-s", "ldrobot-stl27l")
 
@@ -339,7 +339,7 @@ def test_a_transform_turns_as_the_mount_does(
         | given
         | {"source": "udp://", "frame_id": "mast"}
     )
-    found = transform(settings, Time(sec=5))
+    found = make_transform(settings, Time(sec=5))
     q = found.transform.rotation
     turned = [
         [1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y - q.z * q.w), 2 * (q.x * q.z + q.y * q.w)],

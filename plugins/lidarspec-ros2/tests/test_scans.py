@@ -21,14 +21,14 @@ from std_msgs.msg import Header, UInt8MultiArray
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.formats.messages import CLOUD, SCAN, Messages
+from lidarspec.formats.messages import CLOUD, SCAN, RosMessages
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.recording.recorders import Recorder
-from lidarspec.scans.beams import Planes
+from lidarspec.scans.beams import PlanarScans
 from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.robotics_logs import RAW, raw_chunk
 
-MESSAGES = Messages("ROS2_HUMBLE")
+MESSAGES = RosMessages("ROS2_HUMBLE")
 WHOLE, STAMP = 6, 1_700_000_000_123_456_789
 #: bytes between fields that a message of ours has at the most: three before each number behind a
 #: text.
@@ -47,14 +47,14 @@ def recorded(packets: list[bytes], path: Path, sensor: str) -> Path:
 
 def expected(path: Path, sensor: str, kind: str) -> list[Any]:
     """The messages that the library makes of the whole scans of a recording."""
-    planes, found = Planes(GRID["beams"], (GRID["angle_min"], GRID["angle_max"])), []
+    planes, found = PlanarScans(GRID["beams"], (GRID["angle_min"], GRID["angle_max"])), []
     with ls.open(path, sensor) as device:
         for scan in device.scans():
             if scan.whole and kind == CLOUD:
                 found.append(
                     MESSAGES.cloud(scan, 0, every_point=scan.points.shape is not None).data
                 )
-            elif scan.whole and (planar := planes.scan(scan)) is not None:
+            elif scan.whole and (planar := planes.project(scan)) is not None:
                 found.append(MESSAGES.laserscan(scan, planar, 0).data)
     return [unstamped(message(bytes(data), kind)) for data in found]
 
@@ -164,10 +164,10 @@ def test_bytes_are_those_of_ros_itself(sensor: str, every_point: bool) -> None:
     """What rclpy makes of a message that it has read, or that its own classes hold, is the same
     byte for byte.
     """
-    spec, planes = ls.sensor(sensor), Planes()
+    spec, planes = ls.sensor(sensor), PlanarScans()
     scan = next(scan for scan in spec.scans(simulate(spec, 2000)) if scan.whole)
     made = [(MESSAGES.cloud(scan, STAMP, every_point=every_point), PointCloud2)]
-    if (planar := planes.scan(scan)) is not None:
+    if (planar := planes.project(scan)) is not None:
         made.append((MESSAGES.laserscan(scan, planar, STAMP), LaserScan))
         values = {
             name: getattr(planar, name)

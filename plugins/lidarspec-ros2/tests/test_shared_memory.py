@@ -16,7 +16,7 @@ from sensor_msgs.msg import PointCloud2
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.formats.messages import Messages
+from lidarspec.formats.messages import RosMessages
 from lidarspec.sensor_operations import Sensor
 from lidarspec_ros2 import shared_memory
 from lidarspec_ros2.shared_memory import (
@@ -143,7 +143,7 @@ def test_the_calculated_size_is_that_of_a_message(
     data = simulate(spec, packets)
     scans = spec.scans(data if spec.datagrams else b"".join(data))
     scan = next(scan for scan in scans if scan.whole)
-    message = Messages("ROS2_HUMBLE").cloud(scan, 10**18, every_point=True)
+    message = RosMessages("ROS2_HUMBLE").cloud(scan, 10**18, every_point=True)
     assert largest_cloud_bytes(spec) == pytest.approx(len(message.data) / slowest_share, rel=0.05)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.identification import verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.identification import identify_sample
+from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.errors import CommandError, UsageError
 from tests.evidence import capture, decoded, vector_bytes, vectors
 
@@ -48,7 +48,7 @@ def test_every_scan_of_a_tim871s_is_read() -> None:
     )
     np.testing.assert_array_equal(cloud.valid[:811], raw >= 50)
     assert len(list(TIM871S.scans(data))) == 150
-    named = {one.sensor.id for one in verdict(Heard("", (data,))).alike}
+    named = {one.sensor.id for one in identify_sample(SampleBytes("", (data,))).candidates}
     assert named == {"sick-tim561", "sick-tim571", "sick-tim781", "sick-tim781s", "sick-tim871s"}
 
 

@@ -13,7 +13,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import OutOfRange
-from lidarspec.frames.row_checksums import batch
+from lidarspec.frames.row_checksums import compute_checksums
 from lidarspec.framing.frame_engine import codec
 from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
 
@@ -228,7 +228,9 @@ def test_an_hq_capsule_by_hand() -> None:
 def test_the_padded_checksum_of_a_batch() -> None:
     algorithm = A1.frames["hq"].struct.algorithm
     rows = np.frombuffer(random.Random(3).randbytes(40 * 777), np.uint8).reshape(40, 777)
-    assert batch(algorithm, rows).tolist() == [zlib.crc32(row.tobytes() + bytes(3)) for row in rows]
+    assert compute_checksums(algorithm, rows).tolist() == [
+        zlib.crc32(row.tobytes() + bytes(3)) for row in rows
+    ]
     assert algorithm(b"1234") == zlib.crc32(b"1234")
 
 

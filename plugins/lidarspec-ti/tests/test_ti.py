@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import lidarspec as ls
-from lidarspec.detect.identification import verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.identification import identify_sample
+from lidarspec.detect.sample_bytes import SampleBytes
 from tests.evidence import decoded
 
 RADAR = ls.sensor("ti-iwr6843")
@@ -67,9 +67,10 @@ def test_each_frame_is_a_scan_and_is_known_by_its_own() -> None:
     wire = b"".join(ls.simulate(RADAR, 12))
     scans = list(RADAR.scans(wire))
     assert [len(scan.points) for scan in scans] == [24] * 12
-    assert [one.sensor.id for one in verdict(Heard("a wire", (wire,), datagrams=False)).alike] == [
-        "ti-iwr6843"
-    ]
+    assert [
+        one.sensor.id
+        for one in identify_sample(SampleBytes("a wire", (wire,), datagrams=False)).candidates
+    ] == ["ti-iwr6843"]
 
 
 @pytest.mark.slow

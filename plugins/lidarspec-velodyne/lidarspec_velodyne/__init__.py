@@ -237,7 +237,10 @@ VLP16 = Sensor(
     scan=OnWrap("blocks.azimuth"),
     links={"data": Udp(2368, 8308)},
     clock=Clock(
-        "timestamp", wraps_at=HOUR, pace=partial(pace, model=VLP16_FIRINGS), told=("position", told)
+        "timestamp",
+        wraps_at=HOUR,
+        pace=partial(pace, model=VLP16_FIRINGS),
+        reference=("position", told),
     ),
     simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
     configure=configure,
@@ -268,7 +271,10 @@ def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
         model=model,
         points=partial(points, model=firings),
         clock=Clock(
-            "timestamp", wraps_at=HOUR, pace=partial(pace, model=firings), told=("position", told)
+            "timestamp",
+            wraps_at=HOUR,
+            pace=partial(pace, model=firings),
+            reference=("position", told),
         ),
         simulation=Simulation(partial(sweep, model=firings)),
         **facts,

@@ -21,9 +21,9 @@ from typing import Any
 from lidarspec import Device, LidarSpecError, Scan, Selection, UsageError
 from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.view.live_scans import DEFAULT_STEP_S, LOOK_S, Feed
-from lidarspec_web.recent_bytes import Backlog
-from lidarspec_web.scan_message import message
+from lidarspec.view.live_scans import DEFAULT_STEP_S, LOOK_S, LiveScans
+from lidarspec_web.recent_bytes import RecentBytes
+from lidarspec_web.scan_message import make_scan_message
 
 #: Duration of the stored figures.
 HISTORY_S = 60.0
@@ -36,7 +36,7 @@ MAX_SPEED = 100.0
 PAUSED_CHECK_S = 0.25
 
 
-class Shown:
+class ShownScan:
     """A scan that viewers show.
 
     Attributes:
@@ -60,7 +60,7 @@ class Shown:
         The message is cached until `most` changes.
         """
         if most != self._message_most:
-            self._message = message(
+            self._message = make_scan_message(
                 self.scan, self.number, position=self.position, sent=self.sent, most=most
             )
             self._message_most = most
@@ -101,8 +101,8 @@ class Broadcast:
         self.source = source
         self.device = device
         self.switch = switch
-        self.shown: Shown | None = None
-        self.backlog = Backlog(device.sensor)
+        self.shown: ShownScan | None = None
+        self.backlog = RecentBytes(device.sensor)
         self.paused = False
         self.speed = 1.0
         self.warnings: list[str] = []
@@ -115,7 +115,7 @@ class Broadcast:
         self._clock = HostClock()
         self._first_scan: Scan | None = None
         self._scan_count = 0
-        self._by_number = weakref.WeakValueDictionary[int, Shown]()
+        self._by_number = weakref.WeakValueDictionary[int, ShownScan]()
         self._seek_target: float | None = None
         self._steps = 0  # requested, but not done yet
         self._has_moved = False
@@ -182,7 +182,7 @@ class Broadcast:
         """Return the time in seconds since 1970, by the clock that stamps arrivals."""
         return self._clock.now() * 1e-9
 
-    def find_scan(self, number: int) -> Shown | None:
+    def find_scan(self, number: int) -> ShownScan | None:
         """Return a scan by its number, None if no page holds it."""
         return self._by_number.get(number)
 
@@ -279,9 +279,9 @@ class Broadcast:
             self._read(feed.step)
         elif self._is_playing:
             feed.speed = self.speed
-            self._read(lambda: feed.pump(time.monotonic() + LOOK_S))
+            self._read(lambda: feed.read(time.monotonic() + LOOK_S))
         else:
-            feed.rest()
+            feed.read_rest()
             self._has_request.wait(PAUSED_CHECK_S)
             self._has_request.clear()
 
@@ -314,9 +314,9 @@ class Broadcast:
         self._feed = self._make_feed(select)
         self._read(self._feed.step)
 
-    def _make_feed(self, select: Selection) -> Feed:
+    def _make_feed(self, select: Selection) -> LiveScans:
         self.device.observe(self.backlog)
-        return Feed(self.device, played=True, select=select)
+        return LiveScans(self.device, played=True, select=select)
 
     def _update(self) -> None:
         """Take over a new scan, the figures, and the end of a file; announce what is new."""
@@ -337,7 +337,9 @@ class Broadcast:
         if self._first_scan is None:
             self._first_scan = feed.scans[0] if feed.scans else feed.scan
         number = self._scan_count
-        self.shown = Shown(feed.scan, number, self._position(feed.scan), self._arrival(feed.scan))
+        self.shown = ShownScan(
+            feed.scan, number, self._position(feed.scan), self._arrival(feed.scan)
+        )
         self._by_number[number] = self.shown
         self._scan_count += 1
         return True

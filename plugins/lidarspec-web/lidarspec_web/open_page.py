@@ -23,17 +23,17 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from lidarspec import LidarSpecError, UsageError
 from lidarspec.errors import suggestion
-from lidarspec_web.broadcast import Shown
-from lidarspec_web.page_messages import Answers
+from lidarspec_web.broadcast import ShownScan
+from lidarspec_web.page_messages import PageMessages
 from lidarspec_web.page_requests import (
     MESSAGES_AT_ONCE,
     MESSAGES_PER_S,
-    Lane,
     PageRequest,
     RateLimit,
+    RequestQueue,
     Workers,
 )
-from lidarspec_web.recent_bytes import Backlog
+from lidarspec_web.recent_bytes import RecentBytes
 
 #: Number of unsent replies above which no further request is read.
 MAX_REPLIES = 16
@@ -65,7 +65,7 @@ class OpenPage:
         workers: the threads for slow requests.
     """
 
-    def __init__(self, answers: Answers, socket: WebSocket, workers: Workers) -> None:
+    def __init__(self, answers: PageMessages, socket: WebSocket, workers: Workers) -> None:
         self._answers = answers
         self._broadcast = answers.broadcast
         self._socket = socket
@@ -73,11 +73,11 @@ class OpenPage:
         self._replies = deque[dict[str, Any]]()
         self._has_news = asyncio.Event()
         self._rate_limit = RateLimit(MESSAGES_AT_ONCE, MESSAGES_PER_S)
-        self._questions = Lane(workers.answers, self._finish)
-        self._commands = Lane(workers.commands, self._finish)
+        self._questions = RequestQueue(workers.answers, self._finish)
+        self._commands = RequestQueue(workers.commands, self._finish)
         self._wanted_points: int | None = None  # of the requested scan
-        self._held = deque[Shown](maxlen=HELD_SCANS)
-        self._frozen: Backlog | None = None
+        self._held = deque[ShownScan](maxlen=HELD_SCANS)
+        self._frozen: RecentBytes | None = None
         self._shows_frames = False
         self._sent_frame = -1
         self._sent_damaged = 0
@@ -118,12 +118,12 @@ class OpenPage:
                 message = await self._next_message()
                 if message is None:
                     await self._wait_for_news()
-                elif not await self._is_taken(message):
+                elif not await self._send_in_time(message):
                     return "dropped: it takes nothing any more"
         except WebSocketDisconnect:
             return "closed"
 
-    async def _is_taken(self, message: bytes | dict[str, Any]) -> bool:
+    async def _send_in_time(self, message: bytes | dict[str, Any]) -> bool:
         """Send a message, and return whether the page reads it in time."""
         try:
             await asyncio.wait_for(self._send(message), SEND_TIMEOUT_S)
@@ -224,7 +224,7 @@ class OpenPage:
         current = switch.recording
         return current[0] if current is not None else "", switch.trouble
 
-    def _unseen_scan(self) -> Shown | None:
+    def _unseen_scan(self) -> ShownScan | None:
         """Return the newest scan, None if the page has it or is paused."""
         shown = self._broadcast.shown
         if shown is None or self._frozen is not None:
@@ -234,7 +234,7 @@ class OpenPage:
         return shown
 
     @property
-    def _backlog(self) -> Backlog:
+    def _backlog(self) -> RecentBytes:
         return self._frozen or self._broadcast.backlog
 
     # Requests of the page.

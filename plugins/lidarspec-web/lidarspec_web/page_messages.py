@@ -14,12 +14,12 @@ from typing import Any
 from lidarspec import LidarSpecError, UsageError, __version__, explain
 from lidarspec.explaining.assignments import arguments
 from lidarspec.explaining.explanation import Explanation, reply_text
-from lidarspec.explaining.file_contents import duration
+from lidarspec.explaining.file_contents import measure_duration
 from lidarspec.points.appearance import is_flat
 from lidarspec.scans.provenance import PointOrigin
-from lidarspec_web.broadcast import Broadcast, Shown
+from lidarspec_web.broadcast import Broadcast, ShownScan
 from lidarspec_web.command_forms import find_restart, make_form
-from lidarspec_web.recent_bytes import MAX_DAMAGED, Backlog, Damaged, Taken
+from lidarspec_web.recent_bytes import MAX_DAMAGED, DamagedBytes, RecentBytes, StoredFrame
 
 #: Number of cached explanations of frames.
 KEPT_EXPLANATIONS = 16
@@ -27,7 +27,7 @@ KEPT_EXPLANATIONS = 16
 MAX_DAMAGED_LISTED = 20
 
 
-class Answers:
+class PageMessages:
     """Makes the messages to the pages of a broadcast.
 
     Args:
@@ -63,13 +63,13 @@ class Answers:
             "why_no_control": self.why_no_control,
             "commands": [make_form(sensor, name) for name in sensor.commands],
             "restart": find_restart(sensor),
-            "saves": saves(),
+            "saves": list_save_formats(),
             "records": broadcast.switch is not None,
             "history": list(broadcast.history),
             "version": __version__,
         }
 
-    def state(self, *, frozen: bool, since: int, at: Shown | None = None) -> dict[str, Any]:
+    def state(self, *, frozen: bool, since: int, at: ShownScan | None = None) -> dict[str, Any]:
         """Return the state of the source.
 
         Args:
@@ -102,7 +102,9 @@ class Answers:
             "damaged": {"total": broadcast.backlog.damaged, "newest": self._list_damaged(since)},
         }
 
-    def frame(self, taken: Taken, why: str, place: PointOrigin | None = None) -> dict[str, Any]:
+    def frame(
+        self, taken: StoredFrame, why: str, place: PointOrigin | None = None
+    ) -> dict[str, Any]:
         """Return a frame with every byte explained.
 
         Args:
@@ -124,30 +126,30 @@ class Answers:
             "explanation": explanation.to_dict(),
         }
 
-    def find_frame(self, number: int, backlog: Backlog) -> dict[str, Any]:
+    def find_frame(self, number: int, backlog: RecentBytes) -> dict[str, Any]:
         """Return a frame by its number."""
         taken = backlog.frame(number)
         if taken is None:
-            return _gone(f"frame {number}")
+            return _discarded_reply(f"frame {number}")
         return self.frame(taken, "number")
 
     def origin(
-        self, shown: Shown | None, number: int, index: int, backlog: Backlog
+        self, shown: ShownScan | None, number: int, index: int, backlog: RecentBytes
     ) -> dict[str, Any]:
         """Return the frame that a point of a scan came from, with the path of its field."""
         if shown is None or index >= len(shown.scan):
-            return _gone(f"point {index} of scan {number}")
+            return _discarded_reply(f"point {index} of scan {number}")
         place = shown.scan.provenance(index)
-        taken = backlog.at(place)
+        taken = backlog.find_point_frame(place)
         if taken is None:
-            return _gone(f"the frame of point {index}")
+            return _discarded_reply(f"the frame of point {index}")
         return self.frame(taken, "point", place)
 
-    def find_damaged(self, number: int, backlog: Backlog) -> dict[str, Any]:
+    def find_damaged(self, number: int, backlog: RecentBytes) -> dict[str, Any]:
         """Return a damaged piece with the changes that would explain the damage."""
         piece = backlog.find_damaged(number)
         if piece is None:
-            return _gone(f"damaged piece {number}")
+            return _discarded_reply(f"damaged piece {number}")
         return {
             "is": "frame",
             "number": number,
@@ -197,7 +199,7 @@ class Answers:
     def _make_explanation(self, frame: str, data: bytes) -> Explanation:
         return explain(data, self.broadcast.device.sensor, frame)
 
-    def _make_verdict(self, piece: Damaged) -> str:
+    def _make_verdict(self, piece: DamagedBytes) -> str:
         return piece.verdict(self.broadcast.device.sensor)
 
     def _position(self, at: int) -> float | None:
@@ -218,11 +220,11 @@ class Answers:
                 "size": piece.size,
                 "verdict": self._verdict(piece),
             }
-            for piece in backlog.since(max(since, backlog.damaged - MAX_DAMAGED_LISTED))
+            for piece in backlog.list_damaged(max(since, backlog.damaged - MAX_DAMAGED_LISTED))
         ]
 
 
-def saves() -> list[str]:
+def list_save_formats() -> list[str]:
     """Return the suffixes of the files that a scan can be saved as."""
     suffixes = ["pcd", "ply", "csv"]
     if find_spec("laspy") is not None:
@@ -231,7 +233,7 @@ def saves() -> list[str]:
     return suffixes
 
 
-def _gone(what: str) -> dict[str, Any]:
+def _discarded_reply(what: str) -> dict[str, Any]:
     """Return the reply for data that is no longer kept."""
     return {"is": "gone", "what": what}
 
@@ -240,7 +242,7 @@ def _assignments(texts: Mapping[str, str]) -> list[str]:
     return [f"{name}={text}" for name, text in texts.items()]
 
 
-def _is_planar(shown: Shown | None) -> bool:
+def _is_planar(shown: ShownScan | None) -> bool:
     """Return whether the points of a scan lie in one plane."""
     if shown is None:
         return False
@@ -253,7 +255,7 @@ def _duration(broadcast: Broadcast) -> float | None:
     if not broadcast.can_seek:
         return None
     try:
-        return duration(broadcast.source)
+        return measure_duration(broadcast.source)
     except LidarSpecError:
         return None
 

@@ -73,7 +73,7 @@ class PageRequest:
     work: Callable[[], dict[str, Any] | None]
 
 
-class Lane:
+class RequestQueue:
     """Requests of one page that run one after another, in a thread.
 
     Args:

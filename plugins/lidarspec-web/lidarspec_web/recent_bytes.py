@@ -1,8 +1,8 @@
 """The newest bytes of a source: frames by number and offset, and damaged bytes.
 
-A decoder passes the backlog its input and the frames that it found (`Witness`). Both are stored
-unchanged, up to a limit, so that reading is not slowed down; a frame is cut out on request. Bytes
-that the decoder skipped are cut out at once, because their input is dropped soon: they are
+A decoder passes the backlog its input and the frames that it found (`DecoderObserver`). Both are
+stored unchanged, up to a limit, so that reading is not slowed down; a frame is cut out on request.
+Bytes that the decoder skipped are cut out at once, because their input is dropped soon: they are
 explained when a page asks for them.
 """
 
@@ -35,7 +35,7 @@ MAX_DAMAGED_BYTES = 1 << 13
 
 
 @dataclass(frozen=True)
-class Damaged:
+class DamagedBytes:
     """Bytes in no frame: a damaged frame, or other bytes.
 
     Attributes:
@@ -66,7 +66,7 @@ class Damaged:
 
 
 @dataclass(frozen=True)
-class Taken:
+class StoredFrame:
     """One frame of the backlog.
 
     Attributes:
@@ -118,10 +118,10 @@ class _Result:
     def last_offset(self) -> int:
         return int(self.frames.places[-1])
 
-    def take(self, index: int) -> Taken:
+    def take(self, index: int) -> StoredFrame:
         frames = self.frames
         kind = int(frames.kinds[index])
-        return Taken(
+        return StoredFrame(
             self.first_number + index,
             frames.names[kind],
             int(frames.at[index]),
@@ -129,8 +129,8 @@ class _Result:
         )
 
 
-class Backlog:
-    """Stores the newest input of a decoder and the frames in it: a `Witness`.
+class RecentBytes:
+    """Stores the newest input of a decoder and the frames in it: a `DecoderObserver`.
 
     One thread adds to it; any thread may read it.
 
@@ -150,7 +150,7 @@ class Backlog:
         self._results = deque[_Result]()
         self._frame_count = 0
         self._end = 0  # end of the last frame, an offset in the input
-        self._damaged = deque[Damaged](maxlen=MAX_DAMAGED)
+        self._damaged = deque[DamagedBytes](maxlen=MAX_DAMAGED)
 
     def observe_input(
         self, decoder: Decoder, buffer: NDArray[np.uint8], starts: Numbers, sizes: NDArray[np.intp]
@@ -164,7 +164,7 @@ class Backlog:
             self._input_size += added.size
             self._drop_old()
 
-    def found(self, frames: Frames) -> None:
+    def observe_frames(self, frames: Frames) -> None:
         """Store frames of the input, in its order."""
         if not len(frames):
             return
@@ -183,9 +183,9 @@ class Backlog:
             self._input_size = 0
             self._end = 0
 
-    def freeze(self) -> Backlog:
+    def freeze(self) -> RecentBytes:
         """Return a copy of the current frames and damaged pieces, which does not change."""
-        copy = Backlog(self.sensor)
+        copy = RecentBytes(self.sensor)
         with self._lock:
             copy._results = deque(self._results)
             copy._damaged = deque(self._damaged)
@@ -198,7 +198,7 @@ class Backlog:
         """The number of the newest frame; -1 if there is none yet."""
         return self._frame_count - 1
 
-    def frame(self, number: int) -> Taken | None:
+    def frame(self, number: int) -> StoredFrame | None:
         """Return a frame by its number, None if it is no longer stored."""
         with self._lock:
             following = bisect_right(self._results, number, key=lambda one: one.first_number)
@@ -207,7 +207,7 @@ class Backlog:
             return None
         return result.take(number - result.first_number)
 
-    def at(self, place: PointOrigin) -> Taken | None:
+    def find_point_frame(self, place: PointOrigin) -> StoredFrame | None:
         """Return the frame that a point came from.
 
         Returns None if it is no longer stored and the scan does not have its original bytes.
@@ -222,18 +222,18 @@ class Backlog:
                 return result.take(index)
         if self.sensor.frames[place.frame].wire is not None:
             return None
-        return Taken(None, place.frame, place.host_ns or -1, place.data)
+        return StoredFrame(None, place.frame, place.host_ns or -1, place.data)
 
-    def find_damaged(self, number: int) -> Damaged | None:
+    def find_damaged(self, number: int) -> DamagedBytes | None:
         """Return a damaged piece by its number, None if it is no longer stored."""
-        return next((piece for piece in self.since(number) if piece.number == number), None)
+        return next((piece for piece in self.list_damaged(number) if piece.number == number), None)
 
-    def since(self, number: int) -> list[Damaged]:
+    def list_damaged(self, number: int) -> list[DamagedBytes]:
         """Return the stored damaged pieces from a number on."""
         with self._lock:
             return [piece for piece in self._damaged if piece.number >= number]
 
-    def explain_damaged(self, piece: Damaged) -> dict[str, Any]:
+    def explain_damaged(self, piece: DamagedBytes) -> dict[str, Any]:
         """Return one explanation of a damaged piece, as `Explanation.to_dict`.
 
         It has the rows of each damaged frame in it, with the change that would explain the damage,
@@ -289,7 +289,7 @@ class Backlog:
         self, offset: int, size: int, at: int, data: bytes, *, is_datagram: bool
     ) -> None:
         data = data[:MAX_DAMAGED_BYTES]
-        self._damaged.append(Damaged(self.damaged, offset, size, at, data, is_datagram))
+        self._damaged.append(DamagedBytes(self.damaged, offset, size, at, data, is_datagram))
         self.damaged += 1
 
     def _stream_bytes(self, begin: int, end: int) -> bytes:

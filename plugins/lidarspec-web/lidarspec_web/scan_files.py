@@ -18,9 +18,9 @@ from starlette.types import Receive, Scope, Send
 
 from lidarspec import LidarSpecError
 from lidarspec.formats import write
-from lidarspec.points.appearance import fit, look
+from lidarspec.points.appearance import choose_appearance, fit_to_points
 from lidarspec.view.svg import svg
-from lidarspec_web.broadcast import Shown
+from lidarspec_web.broadcast import ShownScan
 from lidarspec_web.connections import Client
 from lidarspec_web.temporary_folder import TemporaryFolder
 
@@ -33,7 +33,7 @@ MAX_REST_S = 2.0
 SEND_TIMEOUT_S = 20.0
 
 
-class Saves:
+class ScanSaver:
     """Saves scans on request.
 
     Args:
@@ -53,12 +53,12 @@ class Saves:
         self._writing = asyncio.Lock()
         self._rests_until = 0.0
 
-    def response(self, shown: Shown, suffix: str) -> Response:
+    def response(self, shown: ShownScan, suffix: str) -> Response:
         """Return the response that writes and sends a scan."""
         return _SavedScan(self, shown, suffix)
 
     async def serve(
-        self, shown: Shown, suffix: str, scope: Scope, receive: Receive, send: Send
+        self, shown: ShownScan, suffix: str, scope: Scope, receive: Receive, send: Send
     ) -> None:
         """Write a scan and send it, or send the reason why that is not possible."""
         if self._count >= MAX_SAVES:
@@ -72,7 +72,7 @@ class Saves:
             self._count -= 1
 
     async def _write_and_send(
-        self, shown: Shown, suffix: str, scope: Scope, receive: Receive, send: Send
+        self, shown: ShownScan, suffix: str, scope: Scope, receive: Receive, send: Send
     ) -> None:
         try:
             path = self._folder.path / f"{next(self._numbers)}.{suffix}"
@@ -87,7 +87,7 @@ class Saves:
         finally:
             path.unlink()
 
-    async def _write(self, path: Path, shown: Shown) -> None:
+    async def _write(self, path: Path, shown: ShownScan) -> None:
         """Write a scan after the previous one and a pause of the same duration for pages."""
         loop = asyncio.get_running_loop()
         async with self._writing:
@@ -103,7 +103,7 @@ class Saves:
 class _SavedScan(Response):
     """A scan that is written when its request is served."""
 
-    def __init__(self, saves: Saves, shown: Shown, suffix: str) -> None:
+    def __init__(self, saves: ScanSaver, shown: ShownScan, suffix: str) -> None:
         super().__init__()
         self._saves = saves
         self._shown = shown
@@ -114,11 +114,15 @@ class _SavedScan(Response):
         await self._saves.serve(self._shown, self._suffix, scope, receive, send)
 
 
-def write_file(path: Path, shown: Shown) -> None:
+def write_file(path: Path, shown: ShownScan) -> None:
     """Write a scan to a file, by its suffix."""
     if path.suffix == ".svg":
         points = shown.scan.points
-        text = svg(points, fit(points, look(points)), f"{shown.scan.sensor.id}: {shown.scan}")
+        text = svg(
+            points,
+            fit_to_points(points, choose_appearance(points)),
+            f"{shown.scan.sensor.id}: {shown.scan}",
+        )
         path.write_text(text, encoding="utf-8")
     else:
         write(path, [shown.scan])

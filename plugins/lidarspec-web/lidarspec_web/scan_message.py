@@ -32,7 +32,7 @@ _HEADER_LENGTH = struct.Struct("<I")
 _GOLDEN_SECTION = (math.sqrt(5) - 1) / 2
 
 
-def message(scan: Scan, number: int, *, position: float, sent: float, most: int) -> bytes:
+def make_scan_message(scan: Scan, number: int, *, position: float, sent: float, most: int) -> bytes:
     """Return a scan as a message, without points that have no return.
 
     Args:

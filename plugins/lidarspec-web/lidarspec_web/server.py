@@ -28,9 +28,9 @@ from lidarspec_web.access import ANY_ADDRESS, Guard, add_token, make_token, writ
 from lidarspec_web.broadcast import Broadcast
 from lidarspec_web.connections import BACKLOG, Connections, ErrorReporter
 from lidarspec_web.open_page import SEND_TIMEOUT_S, OpenPage, describe_bug
-from lidarspec_web.page_messages import Answers, saves
+from lidarspec_web.page_messages import PageMessages, list_save_formats
 from lidarspec_web.page_requests import Workers
-from lidarspec_web.scan_files import Saves
+from lidarspec_web.scan_files import ScanSaver
 from lidarspec_web.temporary_folder import TemporaryFolder, remove_stale_folders
 
 #: The built page.
@@ -45,7 +45,7 @@ SHUTDOWN_TIMEOUT_S = 1
 MAX_NUMBER_DIGITS = 12
 
 
-class Site:
+class PageSite:
     """Serves the page of a broadcast while its context lasts.
 
     Args:
@@ -75,14 +75,14 @@ class Site:
     ) -> None:
         self._broadcast = broadcast
         self._report = report
-        self._answers = Answers(broadcast, control=control)
+        self._answers = PageMessages(broadcast, control=control)
         self._open_pages = set[OpenPage]()
         self._opened_count = 0
         self._files = page or PAGE
         self._folder = TemporaryFolder()
         self._workers = Workers()
         self._connections = Connections(report)
-        self._saves = Saves(self._folder, self._workers.saves, self._connections.drop)
+        self._saves = ScanSaver(self._folder, self._workers.saves, self._connections.drop)
         self._socket = _listen(host, port)
         self._token = make_token()
         name = _link_host(host)
@@ -198,8 +198,8 @@ class Site:
     async def _save_scan(self, request: Request) -> Response:
         """Send a scan as a file, by its number."""
         number, _, suffix = request.path_params["name"].partition(".")
-        if suffix not in saves():
-            return PlainTextResponse(f"a scan is saved as {', '.join(saves())}", 404)
+        if suffix not in list_save_formats():
+            return PlainTextResponse(f"a scan is saved as {', '.join(list_save_formats())}", 404)
         shown = None
         if number.isdecimal() and len(number) < MAX_NUMBER_DIGITS:
             shown = self._broadcast.find_scan(int(number))

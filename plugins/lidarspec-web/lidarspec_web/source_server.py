@@ -15,7 +15,7 @@ from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.transports.open_url import is_live
 from lidarspec.view.live_scans import LOOK_S
 from lidarspec_web.broadcast import Broadcast
-from lidarspec_web.server import Site
+from lidarspec_web.server import PageSite
 
 
 class SourceServer:
@@ -64,7 +64,7 @@ class SourceServer:
             switch=self.switch,
         )
         try:
-            self.site = Site(
+            self.site = PageSite(
                 self.broadcast, host=host, port=port, control=control, page=page, report=report
             )
         except BaseException:

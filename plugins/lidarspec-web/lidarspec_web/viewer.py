@@ -19,7 +19,7 @@ from lidarspec import LidarSpecError, Selection, Sensor, UsageError, open as ope
 from lidarspec.errors import suggest, suggestion
 from lidarspec.view.live_scans import LOOK_S
 from lidarspec_web.broadcast import Broadcast
-from lidarspec_web.page_messages import Answers
+from lidarspec_web.page_messages import PageMessages
 
 #: The built widget.
 SCRIPT = Path(__file__).parent / "page" / "widget.js"
@@ -56,7 +56,7 @@ class Viewer:
         self._select = select
         self._lock = threading.RLock()  # the reading thread and the notebook's thread send
         self._broadcast: Broadcast | None = None
-        self._answers: Answers | None = None
+        self._answers: PageMessages | None = None
         self._is_closed = False
         self._failure = ""
         self._ending = ""
@@ -110,7 +110,7 @@ class Viewer:
         reopen = functools.partial(open_device, self._source, device.sensor)
         with Broadcast(self._source, device, reopen=reopen, select=self._select) as broadcast:
             broadcast.news = self._send_news
-            self._answers = Answers(broadcast, control=False)
+            self._answers = PageMessages(broadcast, control=False)
             self._broadcast = broadcast
             if not self._is_closed:
                 broadcast.run(math.inf)
@@ -141,7 +141,7 @@ class Viewer:
             if self._ending:
                 self._send({"is": "ended", "text": self._ending})
 
-    def _send_scan(self, broadcast: Broadcast, answers: Answers) -> None:
+    def _send_scan(self, broadcast: Broadcast, answers: PageMessages) -> None:
         """Send the newest scan, after hello and state if they are due."""
         shown = broadcast.shown
         if shown is None:

@@ -235,7 +235,7 @@ def test_what_is_damaged_in_a_file_is_what_explain_finds(tmp_path: Path) -> None
     with Station(path, tmp_path, FLAT) as station, station.page() as page:
         page.say("speed", times=20)
         page.until("ended")
-        pieces = station.broadcast.backlog.since(0)
+        pieces = station.broadcast.backlog.list_damaged(0)
         assert [(piece.offset, piece.size) for piece in pieces] == gaps[-500:]
         assert all(piece.data == data[piece.offset : piece.offset + piece.size] for piece in pieces)
         assert station.broadcast.backlog.damaged == len(gaps) > 10

@@ -16,7 +16,7 @@ import pytest
 from lidarspec_web import scan_files as saving
 from lidarspec_web.connections import Client, Connections
 from lidarspec_web.page_requests import MAX_WAITING, RateLimit
-from lidarspec_web.recent_bytes import Backlog
+from lidarspec_web.recent_bytes import RecentBytes
 from lidarspec_web.temporary_folder import PREFIX
 
 from .pages import DEADLINE, FLAT, Station
@@ -87,18 +87,18 @@ def test_a_page_that_asks_without_end_waits_for_itself(
 ) -> None:
     """Another page gets its scans meanwhile, and pausing again does nothing."""
     counts = Counter[str]()
-    delay_s, frozen = RateLimit.delay_s, Backlog.freeze
+    delay_s, frozen = RateLimit.delay_s, RecentBytes.freeze
 
     def counted_delay_s(limit: RateLimit, now: float) -> float:
         counts["messages"] += 1
         return delay_s(limit, now)
 
-    def counted_freeze(backlog: Backlog) -> Backlog:
+    def counted_freeze(backlog: RecentBytes) -> RecentBytes:
         counts["freeze"] += 1
         return frozen(backlog)
 
     monkeypatch.setattr(RateLimit, "delay_s", counted_delay_s)
-    monkeypatch.setattr(Backlog, "freeze", counted_freeze)
+    monkeypatch.setattr(RecentBytes, "freeze", counted_freeze)
     with station.page() as flooding, station.page() as other:
         flooding.scan()
         for _ in range(FLOOD):

@@ -10,7 +10,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Scan
-from lidarspec_web.scan_message import message, thin_out
+from lidarspec_web.scan_message import make_scan_message, thin_out
 
 from .messages import parsed
 
@@ -25,7 +25,7 @@ def scan_of(sensor: str) -> Scan:
 
 
 def sent(scan: Scan, most: int = ALL) -> bytes:
-    return message(scan, 12, position=1.5, sent=1.7e9, most=most)
+    return make_scan_message(scan, 12, position=1.5, sent=1.7e9, most=most)
 
 
 @pytest.mark.parametrize("sensor", [FLAT, SOLID])

@@ -11,8 +11,8 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from lidarspec.detect.identification import contradiction, verdict
-from lidarspec.detect.sample_bytes import Heard
+from lidarspec.detect.identification import find_contradiction, identify_sample
+from lidarspec.detect.sample_bytes import SampleBytes
 from tests.evidence import capture, clockwise, decoded, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
@@ -151,19 +151,19 @@ def test_packets_of_a_tmini_pro() -> None:
 @pytest.mark.slow
 def test_a_tmini_is_told_from_other_makes_and_models_by_what_its_packets_say_of_its_state() -> None:
     tminis = {"ydlidar-tmini", "ydlidar-tmini-plus", "ydlidar-tmini-pro"}
-    heard = Heard("", (capture("ydlidar/packets_checksum_ok_concat.bin").read_bytes(),))
-    assert {score.sensor.id for score in verdict(heard).alike} == tminis
+    heard = SampleBytes("", (capture("ydlidar/packets_checksum_ok_concat.bin").read_bytes(),))
+    assert {score.sensor.id for score in identify_sample(heard).candidates} == tminis
     information = TMINI.build(
         "info", model=150, firmware={"minor": 0, "major": 1}, hardware=2, serial=bytes(16)
     )
-    found = verdict(Heard("", (information + heard.chunks[0],)))
-    assert (found.sensor, found.alike[0].why) == (TMINI, "info.model is T-mini Pro")
-    others = verdict(Heard("", tuple(simulate(ls.sensor("ydlidar-g2"), 60))))
+    found = identify_sample(SampleBytes("", (information + heard.chunks[0],)))
+    assert (found.sensor, found.candidates[0].why) == (TMINI, "info.model is T-mini Pro")
+    others = identify_sample(SampleBytes("", tuple(simulate(ls.sensor("ydlidar-g2"), 60))))
     assert {"cspc-coin-d4", "ydlidar-g2", "ydlidar-s4b"} <= {
-        score.sensor.id for score in others.alike
+        score.sensor.id for score in others.candidates
     }
-    assert verdict(
-        Heard("", tuple(simulate(ls.sensor("ydlidar-tmini-plus-sh"), 60)))
+    assert identify_sample(
+        SampleBytes("", tuple(simulate(ls.sensor("ydlidar-tmini-plus-sh"), 60)))
     ).sensor is ls.sensor("ydlidar-tmini-plus-sh")
 
 
@@ -180,6 +180,6 @@ def test_a_relative_whose_other_frames_differ_contradicts_nothing() -> None:
     )
     started = coin.split(info + b"".join(simulate(coin, 20)))
     assert started[0].frame == "info"
-    assert contradiction(coin, started) == ""
-    said = contradiction(TMINI, TMINI.split(vector_bytes(FILE, "yd_devinfo_tmini_plus")))
+    assert find_contradiction(coin, started) == ""
+    said = find_contradiction(TMINI, TMINI.split(vector_bytes(FILE, "yd_devinfo_tmini_plus")))
     assert said == "the frames are those of ydlidar-tmini-plus (info.model is T-mini Plus)"
