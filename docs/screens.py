@@ -144,16 +144,17 @@ def main() -> None:
 
 def printed(page: str) -> str:
     """A page with what its commands print now; a simulated sensor stands in for its port, made
-    bytes for its file.
+    bytes for its file. Outputs that the page shortens with "..." are kept.
     """
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder, "port")
         Path(folder, "unknown.bin").write_bytes(b"".join(sealed(index) for index in range(60)))
         with virtual_port("ldrobot-stl27l", link=link, faults=Faults(errors=0.0001)):
             return re.sub(
-                r"(?<=```text\n)\$ lidarspec (.*)\n(?:.*\n)*?(?=```)",
+                r"(?<=```text\n)\$ lidarspec (.*)\n(?:(?!\.\.\.$).*\n)*?(?=```)",
                 lambda found: shown(found[1], link),
                 page,
+                flags=re.MULTILINE,
             )
 
 
