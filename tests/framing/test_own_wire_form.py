@@ -14,7 +14,7 @@ from tests.shapes import SHAPES
 
 @dataclass(frozen=True)
 class HexLines:
-    """A colon, two digits for each byte, and a line end, as in docs/how-to/wire-forms.md."""
+    """A colon, two digits for each byte, and a line end; linked from docs/how-to/wire-forms.md."""
 
     is_text = False
 
