@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from lidarspec.exports.quick_start import list_commands, read_notes, typical_sou
 from tests.libraries import needs
 
 ROOT = Path(__file__).parents[2]
+NOTES = sorted(ROOT.glob("plugins/*/lidarspec_*/notes/*.md"))
 
 
 def run(arguments: list[str], folder: Path) -> str:
@@ -58,8 +60,25 @@ def test_notes_are_read_from_the_plugin() -> None:
 
 
 def test_each_notes_file_belongs_to_a_sensor() -> None:
-    files = list(ROOT.glob("plugins/*/lidarspec_*/notes/*.md"))
-    assert files
-    for file in files:
+    assert NOTES
+    for file in NOTES:
         assert read_notes(file.stem) == file.read_text(encoding="utf-8").strip()
         assert not file.read_text(encoding="utf-8").startswith("# ")
+
+
+@pytest.mark.parametrize("file", NOTES, ids=lambda file: file.stem)
+def test_the_commands_in_notes_exist(file: Path) -> None:
+    """Sensor, command, arguments and options of each command line; nothing is sent."""
+    for line in re.findall(r"^\$ lidarspec (.*)", file.read_text(encoding="utf-8"), re.MULTILINE):
+        words = shlex.split(line)
+        if "-s" not in words:
+            continue
+        assert words[words.index("-s") + 1] == file.stem
+        sensor = ls.sensor(file.stem)
+        if words[0] == "send" and "--hex" not in words:
+            command = sensor.commands[words[2]]
+            given = {word.partition("=")[0] for word in words[3:] if "=" in word}
+            assert given == {*command.args}
+        options = [words[i + 1] for i, word in enumerate(words) if word == "-O"]
+        known = {"answer", *sensor.configure.types}
+        assert {option.partition("=")[0] for option in options} <= known
