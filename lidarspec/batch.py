@@ -261,21 +261,21 @@ def make_pieces(
     else:
         name = sensor or ""
         options = {}
-    made: dict[str, FilePiece] = {}
+    by_output: dict[str, FilePiece] = {}
     for source, below in (pair for pattern in sources for pair in find_files(str(pattern))):
         if to:
             target = f"{folder.rstrip('/')}/{below.rpartition('.')[0] or below}.{to}"
         else:
             target = source
-        if target in made and made[target].source != source:
+        if target in by_output and by_output[target].source != source:
             raise UsageError(
-                f"{made[target].source} and {source} would both become {target}: convert them to"
-                " two folders"
+                f"{by_output[target].source} and {source} would both become {target}: convert them"
+                " to two folders"
             )
-        made[target] = FilePiece(
+        by_output[target] = FilePiece(
             source, name, options, target if to else "", every_point, size, select
         )
-    return list(made.values())
+    return list(by_output.values())
 
 
 #: Keys of each record of a manifest, with their types.
@@ -665,8 +665,8 @@ def read(
         size=size,
         select=select,
     )
-    found = dask.compute(*(dask.delayed(_cut_into_pieces)(piece) for piece in todo))
-    cut = [piece for pieces in found for piece in pieces if piece.count != 0 or not piece.number]
+    results = dask.compute(*(dask.delayed(_cut_into_pieces)(piece) for piece in todo))
+    cut = [piece for pieces in results for piece in pieces if piece.count != 0 or not piece.number]
     return frames.from_map(_partition, cut, meta=_partition(replace(cut[0], count=1)).iloc[:0])
 
 
@@ -685,8 +685,8 @@ def _cut_into_pieces(piece: FilePiece) -> list[FilePiece]:
 def _partition(piece: FilePiece) -> Any:
     """Return the points of a piece as a pandas dataframe."""
     with piece.open_scans() as scans:
-        made = iter_tables(piece.iter_numbered(scans), every_point=piece.every_point)
-        table = import_library("pyarrow", "arrow").concat_tables(made)
+        tables = iter_tables(piece.iter_numbered(scans), every_point=piece.every_point)
+        table = import_library("pyarrow", "arrow").concat_tables(tables)
         if not table.num_rows and piece.is_last and not piece.first:
             raise WireError(f"no scan in {piece.source}: {scans.stats}")
     return table.to_pandas()

@@ -67,10 +67,10 @@ def entry_points(group: str) -> list[EntryPoint]:
     those of the first.
     """
     try:
-        found = [entry for folder in _distributions() for entry in _iter_declared(folder, group)]
+        entries = [entry for folder in _distributions() for entry in _iter_declared(folder, group)]
     except _NonFolderPathError:
-        found = _read_by_metadata(group)
-    return sorted(found, key=lambda entry: (entry.name, entry.value))
+        entries = _read_by_metadata(group)
+    return sorted(entries, key=lambda entry: (entry.name, entry.value))
 
 
 def _distributions() -> Iterator[str]:
@@ -144,7 +144,7 @@ def _text(folder: str, name: str) -> str:
 def _read_by_metadata(group: str) -> list[EntryPoint]:
     import importlib.metadata
 
-    found: dict[str, list[EntryPoint]] = {}
+    entries_by_group: dict[str, list[EntryPoint]] = {}
     for distribution in importlib.metadata.distributions():
         name = str(getattr(distribution, "_path", "?"))
         version = "?"
@@ -164,5 +164,5 @@ def _read_by_metadata(group: str) -> list[EntryPoint]:
             FileNotFoundError
         ):  # so the finder of the library importlib_metadata says that there is no metadata
             continue
-        found.setdefault(normalise_name(name), entries)
-    return [entry for entries in found.values() for entry in entries]
+        entries_by_group.setdefault(normalise_name(name), entries)
+    return [entry for entries in entries_by_group.values() for entry in entries]

@@ -154,14 +154,14 @@ def raised_at(error: BaseException) -> tuple[str, int]:
     from traceback import extract_tb
 
     ours = os.path.join(os.path.dirname(__file__), "")
-    for spot in reversed(extract_tb(error.__traceback__)):
-        file = spot.filename
+    for entry in reversed(extract_tb(error.__traceback__)):
+        file = entry.filename
         if (
             os.path.isfile(file)
             and not file.startswith(ours)
             and not set(file.split(os.sep)) & set(_NOT_ITS_OWN)
         ):
-            return file, spot.lineno or 0
+            return file, entry.lineno or 0
     return "", 0
 
 

@@ -405,9 +405,9 @@ class Registry:
             if name not in self._claims:
                 return None
             whose = [home[0] for home in self._claims[name]]
-            told = f"{' and '.join(dict.fromkeys(whose))} each have a sensor of this name"
+            owners = f"{' and '.join(dict.fromkeys(whose))} each have a sensor of this name"
             error = UsageError(
-                f"{name}: {told}; say whose it is in {own_settings()}: [owners] {name} ="
+                f"{name}: {owners}; say whose it is in {own_settings()}: [owners] {name} ="
                 f' "{whose[0]}"'
             )
             raise suggest(error, "lidarspec plugins")
@@ -510,20 +510,20 @@ class Registry:
         """
         if name in self._ready:
             return self._ready[name]
-        found = self._find(name)
-        if found is None:
+        plugin_sensor = self._find(name)
+        if plugin_sensor is None:
             self._load_all()
             name = next(
                 (known for known in self._claims if _letters(known) == _letters(name)), name
             )
-            found = self._find(name)
-        if found is not None and found.id != name:
-            own = found
-            name = found.id  # the owner of an id owns its aliases too
-            found = self._find(name)
-            if found is None or found.id != own.id:
-                found = None
-        if found is None:
+            plugin_sensor = self._find(name)
+        if plugin_sensor is not None and plugin_sensor.id != name:
+            own = plugin_sensor
+            name = plugin_sensor.id  # the owner of an id owns its aliases too
+            plugin_sensor = self._find(name)
+            if plugin_sensor is None or plugin_sensor.id != own.id:
+                plugin_sensor = None
+        if plugin_sensor is None:
             known = self._found()
             aliases = {alias: one.id for one in known.values() for alias in one.aliases}
             raise self._load_error(name) or unknown_sensor(
@@ -531,7 +531,7 @@ class Registry:
             )
         if name not in self._ready:
             self._ready.setdefault(
-                name, self.apply_hooks(found)
+                name, self.apply_hooks(plugin_sensor)
             )  # another thread may have been first
         return self._ready[name]
 
@@ -822,10 +822,10 @@ def try_plugins() -> list[Plugin]:
 
 def _modules() -> list[EntryPoint]:
     """Return the entry points of modules with hooks, the first one of each module."""
-    found: dict[Home, EntryPoint] = {}
+    entries: dict[Home, EntryPoint] = {}
     for entry in entry_points(GROUP) + entry_points(VERBS) + entry_points(PAGE):
-        found.setdefault((entry.distribution, entry.module), entry)
-    return list(found.values())
+        entries.setdefault((entry.distribution, entry.module), entry)
+    return list(entries.values())
 
 
 def _trials(homes: list[Home]) -> dict[Home, tuple[str, str]]:
@@ -1040,8 +1040,8 @@ def _faults_of(file: Path) -> Iterator[None]:
 
 def rebuild_sensor(sensor_id: str, options: Mapping[str, Any]) -> Sensor:
     """Return an installed sensor with options; used to unpickle one."""
-    known = sensor(sensor_id)
-    return known.configure(**options) if options else known
+    installed = sensor(sensor_id)
+    return installed.configure(**options) if options else installed
 
 
 def _reduce(value: Sensor) -> tuple[Callable[..., Sensor], tuple[str, dict[str, Any]]]:

@@ -128,12 +128,12 @@ def resolve_beside(folder: Path, value: object) -> Path:
         UsageError: for any other path, and unless it is a regular file.
     """
     if isinstance(value, str) and "\0" not in value:
-        found = folder / value
+        path = folder / value
     else:
-        found = folder
-    if not found.is_file() or not found.resolve().is_relative_to(folder.resolve()):
+        path = folder
+    if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
         raise UsageError(f"{value!r} is no file beside it")
-    return found
+    return path
 
 
 def read_document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:

@@ -83,14 +83,14 @@ class RecordKind:
         """
         same = lengths == self.length
         if not same.all():
-            found = np.zeros(len(starts), np.bool_)
+            matches = np.zeros(len(starts), np.bool_)
             if same.any():
                 some, at = self.find(storage, starts[same], lengths[same])
             else:
                 some = None
                 at = np.empty(0, np.int64)
-            found[same] = True if some is None else some
-            return found, at
+            matches[same] = True if some is None else some
+            return matches, at
         heads = _windows(storage, starts, self.value.nbytes)
         differs = heads.view(np.uint64) ^ self.value
         differs &= self.mask
@@ -277,23 +277,25 @@ class CapturedDatagrams:
             )
             start = stop
 
-    def sent(self, found: Frames) -> Iterator[tuple[str, Sender]]:
+    def sent(self, frames: Frames) -> Iterator[tuple[str, Sender]]:
         """Yield the type and sender of the frames found in these datagrams.
 
         A type is repeated each time its sender changes.
         """
         if len(self.names) == 1:
             yield from (
-                (found.names[kind], self.names[0])
-                for kind in np.flatnonzero(np.bincount(found.kinds)).tolist()
+                (frames.names[kind], self.names[0])
+                for kind in np.flatnonzero(np.bincount(frames.kinds)).tolist()
             )
             return
         order = np.argsort(self.starts, kind="stable")
-        senders = self.senders[order[np.searchsorted(self.starts[order], found.starts)]]
-        for kind in np.unique(found.kinds).tolist():
-            own = senders[found.kinds == kind]
+        senders = self.senders[order[np.searchsorted(self.starts[order], frames.starts)]]
+        for kind in np.unique(frames.kinds).tolist():
+            own = senders[frames.kinds == kind]
             changes = np.flatnonzero(np.diff(own, prepend=-1))
-            yield from ((found.names[kind], self.names[sender]) for sender in own[changes].tolist())
+            yield from (
+                (frames.names[kind], self.names[sender]) for sender in own[changes].tolist()
+            )
 
 
 class CaptureBatches(CaptureReader):
@@ -306,7 +308,7 @@ class CaptureBatches(CaptureReader):
 
     def batches(self) -> Iterator[CapturedDatagrams]:
         """Yield the datagrams of the file, one batch for each buffer that was read."""
-        known: list[RecordKind] = []
+        kinds: list[RecordKind] = []
         with self._count_end():
             form = self._form = self._form or make_record_reader(self._source)
             while self._source.begin_record():
@@ -317,10 +319,10 @@ class CaptureBatches(CaptureReader):
                     continue
                 if len(starts) <= 1:
                     starts = np.array([self._source.at])
-                found = _RecordBlock(self, self._source, form, starts, known)
-                ended = found.read()
+                block = _RecordBlock(self, self._source, form, starts, kinds)
+                ended = block.read()
                 place = self._source.offset
-                if len(batch := found.batch()):
+                if len(batch := block.batch()):
                     self.stats.datagrams += len(batch)
                     yield batch
                 if self._source.offset != place:
@@ -329,7 +331,7 @@ class CaptureBatches(CaptureReader):
                     self._skip_damage(form)
                 elif ended is not None:
                     raise ended
-                known = found.select_known()
+                kinds = block.select_known()
 
 
 class StreamBatches(StreamReader, CaptureBatches):
@@ -345,12 +347,12 @@ class _RecordBlock:
         source: BufferedInput,
         form: Form,
         starts: Indices,
-        known: list[RecordKind],
+        kinds: list[RecordKind],
     ) -> None:
         self._reader = reader
         self._source = source
         self._form = form
-        self._known = known
+        self._known = kinds
         number = max(len(starts) - 1, 1)
         self._are_whole = len(starts) > 1
         self._starts, self._lengths = (
@@ -405,9 +407,9 @@ class _RecordBlock:
         """Return the datagrams of these records."""
         if self._only is not None and not self._singles:
             return self._uniform(self._only)
-        known = np.flatnonzero(self._kinds >= 0)
-        self._reader.stats.packets += len(known) - self._matched_singles
-        kinds = self._kinds[known]
+        matched = np.flatnonzero(self._kinds >= 0)
+        self._reader.stats.packets += len(matched) - self._matched_singles
+        kinds = self._kinds[matched]
         names: dict[Sender, int] = {}
         facts = np.array(
             [
@@ -419,14 +421,14 @@ class _RecordBlock:
         if len(facts) != 1:
             starts, sizes, senders = facts[kinds].T
         else:
-            starts, sizes, senders = (np.full(len(known), fact) for fact in facts.ravel())
-        columns = [self._starts[known] + starts, sizes, self._at[known], senders]
-        if len(known):
+            starts, sizes, senders = (np.full(len(matched), fact) for fact in facts.ravel())
+        columns = [self._starts[matched] + starts, sizes, self._at[matched], senders]
+        if len(matched):
             buffer = self._buffer
         else:
             buffer = np.empty(0, np.uint8)
         if self._singles:
-            buffer = self._append_singles(buffer, columns, known, names)
+            buffer = self._append_singles(buffer, columns, matched, names)
         return CapturedDatagrams(
             buffer, columns[0], columns[1], columns[2], columns[3], tuple(names)
         )
@@ -449,7 +451,7 @@ class _RecordBlock:
         self,
         buffer: NDArray[np.uint8],
         columns: list[NDArray[Any]],
-        known: Indices,
+        matched: Indices,
         names: dict[Sender, int],
     ) -> NDArray[np.uint8]:
         """Return the buffer with the datagrams appended that were read one by one.
@@ -465,7 +467,7 @@ class _RecordBlock:
             )
             at += len(datagram.data)
         order = np.argsort(
-            np.concatenate([known, np.array(list(self._singles), np.intp)]), kind="stable"
+            np.concatenate([matched, np.array(list(self._singles), np.intp)]), kind="stable"
         )
         columns[:] = [
             np.concatenate(parts)[order]
@@ -483,10 +485,10 @@ class _RecordBlock:
         if self._kinds_added == MOST_KNOWN or not self._are_whole:
             return
         record = self._storage[self._starts[index] : self._starts[index + 1]].tobytes()
-        found = make_record_kind(record, datagram, self._form)
-        if found is not None:
+        kind = make_record_kind(record, datagram, self._form)
+        if kind is not None:
             self._kinds_added += 1
-            self._known = [*self._known, found]
+            self._known = [*self._known, kind]
             self._match(len(self._known) - 1, since=index)
             if self._kinds[index] >= 0:
                 del self._singles[index]
@@ -501,17 +503,17 @@ class _RecordBlock:
         template = self._known[kind]
         number = len(self._kinds)
         if kind == since == 0 and self._are_whole:
-            found, at = template.find(self._storage, self._starts[:number], self._lengths)
-            if found is None:
+            matches, at = template.find(self._storage, self._starts[:number], self._lengths)
+            if matches is None:
                 self._only = template
                 self._at = at
                 self._kinds = np.broadcast_to(np.intp(0), number)
                 return True
-            left = np.flatnonzero(found)
+            left = np.flatnonzero(matches)
         else:
             left = since + np.flatnonzero(self._kinds[since:] < 0)
-            found, at = template.find(self._storage, self._starts[left], self._lengths[left])
-            left = left if found is None else left[found]
+            matches, at = template.find(self._storage, self._starts[left], self._lengths[left])
+            left = left if matches is None else left[matches]
         self._kinds[left] = kind
         self._at[left] = at
-        return found is None and not since
+        return matches is None and not since

@@ -391,7 +391,7 @@ class PcapngBlocks:
         If an interface block was lost, only the start of a section counts. Packets refer to
         interfaces by number, so that a lost one would assign all later packets wrongly.
         """
-        sections = (found.start() for found in re.finditer(re.escape(_SECTION), data[: stop + 3]))
+        sections = (match.start() for match in re.finditer(re.escape(_SECTION), data[: stop + 3]))
         section = next((at for at in sections if bytes(data[at + 8 : at + 12]) in _ORDERS), None)
         count = len(data) - 11
         if not self._knows_all or count <= 0:
@@ -447,9 +447,9 @@ def skip_damage(source: BufferedInput, form: Form) -> bool:
     """
     source.skip(len(source.peek(1)))
     while data := source.peek(_STEP + _REACH):
-        found = form.find_next_record(data, _STEP, is_end=len(data) < _STEP + _REACH)
-        source.skip(min(_STEP, len(data)) if found is None else found)
-        if found is not None:
+        offset = form.find_next_record(data, _STEP, is_end=len(data) < _STEP + _REACH)
+        source.skip(min(_STEP, len(data)) if offset is None else offset)
+        if offset is not None:
             return True
     return False
 
@@ -475,11 +475,11 @@ def seek_time(source: BufferedInput, form: Form, at: int) -> bool:
     first = _find_timed_packet(source.open_at(here), form, high)
     while first is not None and high - low > NEAR:
         middle = (low + high) // 2
-        found = _find_timed_packet(source.open_at(middle), form, high)
-        if found is None or found[0] >= at or abs(found[0] - first[0]) > _YEAR * _SECOND:
+        packet = _find_timed_packet(source.open_at(middle), form, high)
+        if packet is None or packet[0] >= at or abs(packet[0] - first[0]) > _YEAR * _SECOND:
             high = middle
         else:
-            low = found[1]
+            low = packet[1]
     source.seek(low)
     return low > here
 

@@ -124,8 +124,11 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
     )
     if not any(chunk.data for chunk in chunks):
         raise WireError(no_bytes(capture, opened.warnings))
-    found = draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
-    note(f"{capture}: {len(found.frames)} frames, {found.share:.1%} of {found.bytes_in} bytes")
+    frame_draft = draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
+    note(
+        f"{capture}: {len(frame_draft.frames)} frames,"
+        f" {frame_draft.share:.1%} of {frame_draft.bytes_in} bytes"
+    )
     receiver = chunks[0].receiver
     chosen: Link = (
         "udp" if (link or ("udp" if opened.datagrams else "serial")) == "udp" else "serial"
@@ -133,7 +136,7 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
     return make_draft_files(
         names,
         chosen,
-        found,
+        frame_draft,
         origin=f"a capture, {Path(capture).name}",
         port=receiver[1] if receiver else None,
     )
@@ -183,17 +186,19 @@ def check(
             line(lambda: text, (done, total))
 
         line(lambda: f"{name}: loading", (0, 1))
-        found = list(reports(target(name), name, examples=max_examples, vectors=file, watch=show))
+        found_reports = list(
+            reports(target(name), name, examples=max_examples, vectors=file, watch=show)
+        )
     if as_json:
-        emit_json([report.to_dict() for report in found], output)
+        emit_json([report.to_dict() for report in found_reports], output)
     else:
         emit(
             "\n\n".join(
-                text for report in found for text in _format_report(report, verbose=verbose)
+                text for report in found_reports for text in _format_report(report, verbose=verbose)
             ),
             output,
         )
-    if any(report.findings for report in found):
+    if any(report.findings for report in found_reports):
         ctx.exit(FINDINGS)
 
 

@@ -192,17 +192,17 @@ def _write(
     before = len(answer.chunks)
     device.write(data)
     note(f"sent {len(data)} byte{'s' * (len(data) != 1)}: {data.hex(' ')}")
-    heard = answer.after(before, ANSWERED if timeout is None else timeout)
-    if heard:
-        found = list(iter_pieces(sensor, heard, datagrams=sensor.datagrams))
+    chunks = answer.after(before, ANSWERED if timeout is None else timeout)
+    if chunks:
+        pieces = list(iter_pieces(sensor, chunks, datagrams=sensor.datagrams))
     else:
-        found = []
-    rest = [piece for piece in found if piece.frame not in sensor.data_frames]
+        pieces = []
+    rest = [piece for piece in pieces if piece.frame not in sensor.data_frames]
     if len(rest) < len(
-        found
+        pieces
     ):  # data frames continue: the incomplete pieces at both ends belong to them
-        note(f"{len(found) - len(rest)} data frames received meanwhile")
-        rest = [piece for piece in rest if piece.is_valid or piece not in (found[0], found[-1])]
+        note(f"{len(pieces) - len(rest)} data frames received meanwhile")
+        rest = [piece for piece in rest if piece.is_valid or piece not in (pieces[0], pieces[-1])]
     parts = [
         (piece, part)
         for cut in rest

@@ -370,8 +370,8 @@ def _detect_sensor(source: str, target: str) -> Sensor:
     except UsageError as error:
         raise suggest(error, f"lidarspec convert {quote(source)} {quote(target)} -s ID") from None
     except WireError as error:
-        given = None if suggestion(error) else reread(source)
-        raise error if given is None else nearest_fault_error(given) from None
+        sample = None if suggestion(error) else reread(source)
+        raise error if sample is None else nearest_fault_error(sample) from None
 
 
 def _no_data_error(device: Device, target: str) -> Exception:
@@ -394,9 +394,9 @@ def _no_data_error(device: Device, target: str) -> Exception:
     if instead is not None:
         error = WireError(f"{source} {instead[0]}", sensor=sensor.id)
         return suggest(error, f"lidarspec convert {quote(source)} {quote(target)} {instead[1]}")
-    given = reread(source) if not stats.frames else None
-    if given is not None:
-        return no_frame_error(sensor, given)
+    sample = reread(source) if not stats.frames else None
+    if sample is not None:
+        return no_frame_error(sensor, sample)
     return suggest(
         WireError(f"no data frame in {source}: {stats}", sensor=sensor.id),
         f"lidarspec explain {quote(source)} -s {sensor.id}",

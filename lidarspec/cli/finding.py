@@ -176,33 +176,33 @@ def _frames(words: Sequence[str], period: int | None, offset: int) -> list[bytes
 
 def _read_frames(path: str, period: int | None, offset: int) -> list[bytes]:
     if path != "-" and not path.endswith(HEX):
-        heard = max(read_samples(path), key=lambda one: one.size)
-        if not heard.size:
-            raise suggest(WireError(no_bytes(path, heard.warnings)), "lidarspec sensors")
-        for warning in heard.warnings:
+        sample = max(read_samples(path), key=lambda one: one.size)
+        if not sample.size:
+            raise suggest(WireError(no_bytes(path, sample.warnings)), "lidarspec sensors")
+        for warning in sample.warnings:
             note(warning)
-        chunks = heard.chunks
-        datagrams = heard.datagrams
+        chunks = sample.chunks
+        datagrams = sample.datagrams
     else:
-        given = read([path])
-        chunks = tuple(chunk for chunk in given.chunks if chunk)
+        sample_bytes = read([path])
+        chunks = tuple(chunk for chunk in sample_bytes.chunks if chunk)
         datagrams = path.endswith(HEX) and len(chunks) > 1 and max(map(len, chunks)) < LONGEST
     if period is not None:
         return split_frames(b"".join(chunks), period, offset)
     if datagrams and path.endswith(HEX):
         return list(chunks)
-    found = find_structure(chunks, datagrams=datagrams)
-    if found is None:
+    structure = find_structure(chunks, datagrams=datagrams)
+    if structure is None:
         raise suggest(
             UsageError(f"{path}: cannot find where its frames begin"),
             f"lidarspec crc {quote(path)} --period BYTES --offset BYTES",
         )
-    if found.period:
-        length = f"{found.period} bytes"
+    if structure.period:
+        length = f"{structure.period} bytes"
     else:
-        length = f"{found.length} bytes"
-    note(f"{len(found.frames)} frames that begin with {found.sync.hex(' ')}, {length} long")
-    return list(found.frames)
+        length = f"{structure.length} bytes"
+    note(f"{len(structure.frames)} frames that begin with {structure.sync.hex(' ')}, {length} long")
+    return list(structure.frames)
 
 
 def match_to_dict(match: ChecksumMatch) -> dict[str, Any]:
@@ -279,46 +279,46 @@ def detect(
             "lidarspec detect FILE",
         )
     if source is None:
-        found = list(_detect_all_ports(duration, start=start))
+        found_verdicts = list(_detect_all_ports(duration, start=start))
     else:
         source = resolve(source)
         with Progress() as progress:
-            found = _detect_source(
+            found_verdicts = _detect_source(
                 source,
                 duration,
                 start=start,
                 tell=lambda text: progress(lambda: f"listening to {text}"),
             )
-    fitting = [one for one in found if one.scores]
-    if fitting or any(one.fault for one in found):
+    fitting = [one for one in found_verdicts if one.scores]
+    if fitting or any(one.fault for one in found_verdicts):
         unknown = None
     else:
-        unknown = _find_structure(found)
+        unknown = _find_structure(found_verdicts)
     if as_json:
         emit_json(
             {
-                "sources": [_verdict_to_dict(one) for one in found],
+                "sources": [_verdict_to_dict(one) for one in found_verdicts],
                 "structure": _structure_to_dict(unknown),
             },
             output,
         )
     elif fitting:
-        emit(_detected_text(found, output), output)
+        emit(_detected_text(found_verdicts, output), output)
     elif unknown is not None:
         emit(_structure_text(unknown), output)
-    for line in _conclusions(source, found, unknown, start=start):
+    for line in _conclusions(source, found_verdicts, unknown, start=start):
         note(line)
     if not any(one.candidates for one in fitting):
-        raise click.exceptions.Exit(_code(source, found))
+        raise click.exceptions.Exit(_code(source, found_verdicts))
 
 
-def _code(source: str | None, found: Sequence[Verdict]) -> int:
+def _code(source: str | None, verdicts: Sequence[Verdict]) -> int:
     """Return the exit code if no sensor fits.
 
     It is `DEVICE` if every live source was silent, else `NO_DATA`.
     """
     is_live = source is None or live_address(source) is not None
-    is_silent = is_live and not any(one.sample.size for one in found)
+    is_silent = is_live and not any(one.sample.size for one in verdicts)
     if is_silent:
         return DEVICE
     return NO_DATA
@@ -327,13 +327,13 @@ def _code(source: str | None, found: Sequence[Verdict]) -> int:
 def _detect_source(
     source: str, duration: float, *, start: bool, tell: Callable[[str], None] = ignore_progress
 ) -> list[Verdict]:
-    found = identify_senders(source, seconds=duration, tell=tell)
-    if start and not any(one.scores for one in found):
-        for heard in probe(source):
-            found = [select_best([*found, identify_sample(heard)])]
-            if found[0].is_clear:
+    verdicts = identify_senders(source, seconds=duration, tell=tell)
+    if start and not any(one.scores for one in verdicts):
+        for sample in probe(source):
+            verdicts = [select_best([*verdicts, identify_sample(sample)])]
+            if verdicts[0].is_clear:
                 break
-    return found
+    return verdicts
 
 
 def _detect_all_ports(duration: float, *, start: bool) -> Iterator[Verdict]:
@@ -360,31 +360,33 @@ def _detect_all_ports(duration: float, *, start: bool) -> Iterator[Verdict]:
         yield from itertools.chain.from_iterable(pool.map(listen, sources))
 
 
-def _find_structure(found: Sequence[Verdict]) -> FrameStructure | None:
+def _find_structure(verdicts: Sequence[Verdict]) -> FrameStructure | None:
     """Return the structure of the bytes that fit no sensor."""
-    heard = max((one.sample for one in found), key=lambda heard: heard.size, default=None)
-    if heard is not None and heard.size:
-        return find_structure(heard.chunks, datagrams=heard.datagrams)
+    sample = max(
+        (verdict.sample for verdict in verdicts), key=lambda sample: sample.size, default=None
+    )
+    if sample is not None and sample.size:
+        return find_structure(sample.chunks, datagrams=sample.datagrams)
     return None
 
 
-def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
+def _detected_text(verdicts: Sequence[Verdict], output: str | None) -> str:
     rows = []
-    for one in found:
-        alike = {score.sensor.id for score in one.candidates}
-        listed = one.scores
-        if voice.loudness <= 0 and (one.candidates or one.others):
-            listed = one.candidates  # without the sensors that were ruled out
+    for verdict in verdicts:
+        alike = {score.sensor.id for score in verdict.candidates}
+        listed = verdict.scores
+        if voice.loudness <= 0 and (verdict.candidates or verdict.others):
+            listed = verdict.candidates  # without the sensors that were ruled out
         for score in listed:
             if score.sensor.id not in alike:
                 verdict_of = "no"
-            elif one.sensor is not None:
+            elif verdict.sensor is not None:
                 verdict_of = "yes"
             else:
                 verdict_of = "perhaps"
             rows.append(
                 [
-                    _place(one.sample),
+                    _place(verdict.sample),
                     score.sensor.id,
                     verdict_of,
                     f"{score.share:.1%}",
@@ -394,61 +396,62 @@ def _detected_text(found: Sequence[Verdict], output: str | None) -> str:
             )
         verdict_of = "perhaps" if alike else "yes"
         rows += [
-            [_place(one.sample), f"{name}, not installed", verdict_of, "", "", why]
-            for name, why in one.others.items()
+            [_place(verdict.sample), f"{name}, not installed", verdict_of, "", "", why]
+            for name, why in verdict.others.items()
         ]
     return table(
         ["source", "sensor", "match", "in frames", "data frames", "evidence"], rows, output
     )
 
 
-def _place(heard: SampleBytes) -> str:
-    where = heard.source + (f" from {heard.sender}" if heard.sender else "")
-    if heard.baud is not None:
-        return f"{where} at {heard.baud} baud"
+def _place(sample: SampleBytes) -> str:
+    where = sample.source + (f" from {sample.sender}" if sample.sender else "")
+    if sample.baud is not None:
+        return f"{where} at {sample.baud} baud"
     return where
 
 
 def _conclusions(
-    source: str | None, found: Sequence[Verdict], unknown: FrameStructure | None, *, start: bool
+    source: str | None, verdicts: Sequence[Verdict], unknown: FrameStructure | None, *, start: bool
 ) -> Iterator[str]:
-    missing = _find_uninstalled(found)
+    missing = _find_uninstalled(verdicts)
     if not sensors() and not missing:
         yield no_sensors()
-    yield from dict.fromkeys(warning for one in found for warning in one.sample.warnings)
-    for one in found:
-        if one.sample.failure is not None:
-            yield f"{one.sample.failure}"
-        elif one.sensor is not None:
-            options = format_sensor_options(one.sensor)
-            yield f"next: lidarspec {_verb(one)} {_format_source(one)} {options}"
-        elif one.candidates:
+    yield from dict.fromkeys(warning for verdict in verdicts for warning in verdict.sample.warnings)
+    for verdict in verdicts:
+        if verdict.sample.failure is not None:
+            yield f"{verdict.sample.failure}"
+        elif verdict.sensor is not None:
+            options = format_sensor_options(verdict.sensor)
+            yield f"next: lidarspec {_verb(verdict)} {_format_source(verdict)} {options}"
+        elif verdict.candidates:
             yield (
-                f"{_place(one.sample)}: {', '.join(list_candidates(one))} send the same frames,"
-                " which do not identify the model: choose one"
+                f"{_place(verdict.sample)}: {', '.join(list_candidates(verdict))} send the same"
+                " frames, which do not identify the model: choose one"
             )
             if files := [
                 name
-                for name in one.candidates[0].sensor.configure.files
-                if one.candidates[0].sensor.recognise is not None
+                for name in verdict.candidates[0].sensor.configure.files
+                if verdict.candidates[0].sensor.recognise is not None
             ]:
                 yield (f"the packets do not contain beam angles: pass -O {files[0]}=FILE")
-            options = format_sensor_options(one.candidates[0].sensor)
-            yield f"next: lidarspec {_verb(one)} {_format_source(one)} {options}"
-        elif one.others:
-            yield f"{_place(one.sample)}: {describe_unsupported_models(one)}"
-            relative = next(iter(one.others))
-            known = find_known_sensor(relative)
-            if known is not None:
-                yield f"next: {install_command(known.distribution)}"
+            options = format_sensor_options(verdict.candidates[0].sensor)
+            yield f"next: lidarspec {_verb(verdict)} {_format_source(verdict)} {options}"
+        elif verdict.others:
+            yield f"{_place(verdict.sample)}: {describe_unsupported_models(verdict)}"
+            relative = next(iter(verdict.others))
+            known_sensor = find_known_sensor(relative)
+            if known_sensor is not None:
+                yield f"next: {install_command(known_sensor.distribution)}"
             else:
-                yield f"next: lidarspec new {relative} --from-capture {quote(one.sample.source)}"
-    if any(one.scores for one in found):
+                source_word = quote(verdict.sample.source)
+                yield f"next: lidarspec new {relative} --from-capture {source_word}"
+    if any(verdict.scores for verdict in verdicts):
         return
-    size = sum(one.sample.size for one in found)
-    for one in (faulty := [one for one in found if one.fault]):
-        yield f"{_place(one.sample)}: {one.fault}"
-        yield f"next: lidarspec crc {quote(one.sample.source)}"
+    size = sum(verdict.sample.size for verdict in verdicts)
+    for verdict in (faulty := [verdict for verdict in verdicts if verdict.fault]):
+        yield f"{_place(verdict.sample)}: {verdict.fault}"
+        yield f"next: lidarspec crc {quote(verdict.sample.source)}"
     if faulty:
         return
     if missing:
@@ -456,7 +459,7 @@ def _conclusions(
         yield f"next: {install_commands(missing)}"
         return
     if size:
-        if any(one.sample.is_text for one in found):
+        if any(verdict.sample.is_text for verdict in verdicts):
             kind = " of text"
         else:
             kind = ""
@@ -468,10 +471,12 @@ def _conclusions(
         yield f"next: {_following(source, unknown)}"
         return
     if source is not None and live_address(source) is None:
-        yield from [no_bytes(source, ())] * (not any(one.sample.warnings for one in found))
+        yield from [no_bytes(source, ())] * (
+            not any(verdict.sample.warnings for verdict in verdicts)
+        )
         yield "next: lidarspec sensors"
         return
-    yield from [] if any(one.sample.warnings for one in found) else ["no data received"]
+    yield from [] if any(verdict.sample.warnings for verdict in verdicts) else ["no data received"]
     is_serial = source is None or (
         (address := live_address(source)) is not None and address.scheme == "serial"
     )
@@ -485,21 +490,23 @@ def _conclusions(
         yield f"next: lidarspec doctor {quote(source) if source else ''}".rstrip()
 
 
-def _find_uninstalled(found: Sequence[Verdict]) -> list[KnownSensor]:
+def _find_uninstalled(verdicts: Sequence[Verdict]) -> list[KnownSensor]:
     """Return the sensors that are not installed and may have sent most of the bytes.
 
     Returns an empty list if an installed sensor fits.
     """
-    if any(one.scores or one.fault for one in found):
+    if any(verdict.scores or verdict.fault for verdict in verdicts):
         return []
-    largest = max((one.sample for one in found), key=lambda heard: heard.size, default=None)
+    largest = max(
+        (verdict.sample for verdict in verdicts), key=lambda sample: sample.size, default=None
+    )
     if largest is not None and largest.size:
         return recognize(largest)
     return []
 
 
-def _verb(one: Verdict) -> str:
-    if live_address(one.sample.source) is None:
+def _verb(verdict: Verdict) -> str:
+    if live_address(verdict.sample.source) is None:
         return "read"
     return "view"
 
@@ -517,31 +524,35 @@ def _following(source: str | None, unknown: FrameStructure | None) -> str:
     return f"lidarspec crc {quote(source)}{period}"
 
 
-def _format_source(one: Verdict) -> str:
+def _format_source(verdict: Verdict) -> str:
     """Return the source with the baud rate and the sender that were found."""
-    source = one.sample.source
-    heard = one.sample
-    link = data_link(one.sensor, Serial)
-    if heard.baud is not None and "baud=" not in source and not (link and link.baud == heard.baud):
-        source = with_option(source, "baud", heard.baud)
-    if heard.sender and "src=" not in source:
-        source = with_option(source, "src", heard.sender)
+    source = verdict.sample.source
+    sample = verdict.sample
+    link = data_link(verdict.sensor, Serial)
+    if (
+        sample.baud is not None
+        and "baud=" not in source
+        and not (link and link.baud == sample.baud)
+    ):
+        source = with_option(source, "baud", sample.baud)
+    if sample.sender and "src=" not in source:
+        source = with_option(source, "src", sample.sender)
     return quote(source)
 
 
-def _verdict_to_dict(one: Verdict) -> dict[str, Any]:
+def _verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
     """Return a verdict as a JSON object."""
-    heard = one.sample
+    sample = verdict.sample
     return {
-        "source": heard.source,
-        "baud": heard.baud,
-        "sender": heard.sender or None,
-        "bytes": heard.size,
-        "failure": str(heard.failure) if heard.failure else None,
-        "sensor": one.sensor.id if one.sensor is not None else None,
-        "alike": [score.sensor.id for score in one.candidates],
-        "not_installed": dict(one.others),
-        "fault": one.fault or None,
+        "source": sample.source,
+        "baud": sample.baud,
+        "sender": sample.sender or None,
+        "bytes": sample.size,
+        "failure": str(sample.failure) if sample.failure else None,
+        "sensor": verdict.sensor.id if verdict.sensor is not None else None,
+        "alike": [score.sensor.id for score in verdict.candidates],
+        "not_installed": dict(verdict.others),
+        "fault": verdict.fault or None,
         "fits": [
             {
                 "sensor": score.sensor.id,
@@ -549,35 +560,35 @@ def _verdict_to_dict(one: Verdict) -> dict[str, Any]:
                 "data_frames": score.data_frames,
                 "told_by": score.why,
             }
-            for score in one.scores
+            for score in verdict.scores
         ],
     }
 
 
-def _structure_to_dict(found: FrameStructure | None) -> dict[str, Any] | None:
-    if found is None:
+def _structure_to_dict(structure: FrameStructure | None) -> dict[str, Any] | None:
+    if structure is None:
         return None
     return {
-        "sync": found.sync.hex(" "),
-        "period": found.period,
-        "length": str(found.length) if found.length else None,
-        "share": round(found.share, 4),
-        "frames": len(found.frames),
-        "checksums": [match_to_dict(match) for match in found.checksums],
+        "sync": structure.sync.hex(" "),
+        "period": structure.period,
+        "length": str(structure.length) if structure.length else None,
+        "share": round(structure.share, 4),
+        "frames": len(structure.frames),
+        "checksums": [match_to_dict(match) for match in structure.checksums],
     }
 
 
-def _structure_text(found: FrameStructure) -> str:
-    if found.period:
-        length = f"{found.period} bytes each"
+def _structure_text(structure: FrameStructure) -> str:
+    if structure.period:
+        length = f"{structure.period} bytes each"
     else:
-        length = f"of {found.length} bytes"
+        length = f"of {structure.length} bytes"
     lines = [
         "unknown frames:",
-        f"  sync      {found.sync.hex(' ') or 'unknown'}",
-        f"  length    {length}: {len(found.frames)} frames, {found.share:.0%} of the bytes",
+        f"  sync      {structure.sync.hex(' ') or 'unknown'}",
+        f"  length    {length}: {len(structure.frames)} frames, {structure.share:.0%} of the bytes",
     ]
-    for match in found.checksums[:TOLD]:
+    for match in structure.checksums[:TOLD]:
         if "\n" not in match.paste:
             checksum = match.paste
         else:
@@ -586,7 +597,7 @@ def _structure_text(found: FrameStructure) -> str:
             f"  checksum  {checksum} in {match.place}: correct in {match.right} of {match.total}"
         )
     return "\n".join(
-        lines if found.checksums else [*lines, "  checksum  not found at the usual places"]
+        lines if structure.checksums else [*lines, "  checksum  not found at the usual places"]
     )
 
 

@@ -46,14 +46,14 @@ def parse(
 
     --slice selects by arrival time; offsets then count from the beginning of the slice.
     """
-    with open_input(words, selection.times) as (given, chunks):
-        sensor, fits = _sensor(given, sensor_id)
+    with open_input(words, selection.times) as (sample, chunks):
+        sensor, fits = _sensor(sample, sensor_id)
         wanted = FrameSelection(sensor, count=count)
-        found = wanted.frames(iter_pieces(sensor, chunks, datagrams=given.datagrams))
-        first = next(found, None)
+        selected = wanted.frames(iter_pieces(sensor, chunks, datagrams=sample.datagrams))
+        first = next(selected, None)
         if first is None:
-            raise no_frame_error(sensor, given)
-        frames = itertools.chain([first], found)
+            raise no_frame_error(sensor, sample)
+        frames = itertools.chain([first], selected)
         if as_json:
             emit_json_list(
                 {"sensor": sensor.id, "fits": fits},
@@ -143,22 +143,22 @@ def explain(
         raise UsageError(
             "--at and --bytes cannot be combined: use --at for a byte, --bytes for a range"
         )
-    with open_input(words, selection.times) as (given, chunks):
-        sensor, fits = _sensor(given, sensor_id, damaged=True)
-        if not given.data:
-            raise no_frame_error(sensor, given)
-        found = iter_pieces(sensor, chunks, datagrams=given.datagrams, frame=frame)
+    with open_input(words, selection.times) as (sample, chunks):
+        sensor, fits = _sensor(sample, sensor_id, damaged=True)
+        if not sample.data:
+            raise no_frame_error(sensor, sample)
+        pieces = iter_pieces(sensor, chunks, datagrams=sample.datagrams, frame=frame)
         if diff is not None:
-            _compare(sensor, given, found, diff, frame, as_json=as_json, output=output)
+            _compare(sensor, sample, pieces, diff, frame, as_json=as_json, output=output)
             return
         wanted = FrameSelection(sensor, frame, count=count, bad=bad, at=at, stretch=stretch)
-        parts = wanted.parts(found)
+        parts = wanted.parts(pieces)
         if as_json:
             listed = ({"offset": piece.offset, **part.to_dict()} for piece, part in parts)
             emit_json_list({"sensor": sensor.id, "fits": fits}, "frames", listed, output)
         else:
             emit_lines(listing(sensor, parts, at, every=bits, verdicts=bad), output)
-        wanted.conclude(given)
+        wanted.conclude(sample)
 
 
 def listing(
@@ -237,9 +237,9 @@ class FrameSelection:
         self._ended = False
         self.valid = self.damaged = self.unframed = self.others = 0
 
-    def frames(self, found: Iterable[InputPiece]) -> Iterator[InputPiece]:
+    def frames(self, pieces: Iterable[InputPiece]) -> Iterator[InputPiece]:
         """Yield the valid frames."""
-        for piece in found:
+        for piece in pieces:
             if piece.is_valid:
                 self.valid += 1
                 yield piece
@@ -248,13 +248,13 @@ class FrameSelection:
             else:
                 self.unframed += len(piece.data)
 
-    def parts(self, found: Iterable[InputPiece]) -> Iterator[tuple[InputPiece, Explanation]]:
+    def parts(self, pieces: Iterable[InputPiece]) -> Iterator[tuple[InputPiece, Explanation]]:
         """Yield the selected pieces with their explanations, as they are found.
 
         Raises:
             WireError: if no part of the input begins like a frame.
         """
-        for piece in found:
+        for piece in pieces:
             if piece.offset >= self._to:
                 return
             self._end = piece.end
@@ -289,7 +289,7 @@ class FrameSelection:
         except WireError as fault:
             raise suggest(fault, f"lidarspec show {self._sensor.id}") from None
 
-    def conclude(self, given: SampleBytes) -> None:
+    def conclude(self, sample: SampleBytes) -> None:
         """Print the counts of an input that was shown.
 
         Raises:
@@ -298,7 +298,7 @@ class FrameSelection:
             Exit: if `bad` is set and there is damage.
         """
         if self._ended and not self._shown and self._end <= self._from:
-            raise UsageError(f"{given.source} has {self._end} bytes: no byte {self._from}")
+            raise UsageError(f"{sample.source} has {self._end} bytes: no byte {self._from}")
         if not self.valid and (self._ended or not self._bad):
             if self._fault is None and self._frame is not None:
                 if self.others:
@@ -306,10 +306,10 @@ class FrameSelection:
                 else:
                     others = ""
                 raise WireError(
-                    f"no {self._frame} frame in {given.source}{others}", sensor=self._sensor.id
+                    f"no {self._frame} frame in {sample.source}{others}", sensor=self._sensor.id
                 )
             raise (
-                no_frame_error(self._sensor, given)
+                no_frame_error(self._sensor, sample)
                 if self._fault is None
                 else suggest(self._fault, f"lidarspec show {self._sensor.id}")
             )
@@ -342,8 +342,8 @@ def _stretch(text: str | None) -> tuple[float, float]:
 
 def _compare(
     sensor: Sensor,
-    given: SampleBytes,
-    found: Iterator[InputPiece],
+    sample: SampleBytes,
+    pieces: Iterator[InputPiece],
     diff: str,
     frame: str | None,
     *,
@@ -353,22 +353,22 @@ def _compare(
     """Print the differences between the first frame of the input and another frame."""
     frames = (
         piece
-        for piece in found
+        for piece in pieces
         if piece.frame and (frame is None or piece.frame == frame or not piece.is_valid)
     )
     first = next(frames, None)
     if first is None:
-        raise no_frame_error(sensor, given)
+        raise no_frame_error(sensor, sample)
     if diff == "next":
         other = next((piece for piece in frames if piece.frame == first.frame), None)
         if other is None:
             raise UsageError(f"the input has no second {first.frame} frame to compare with")
     else:
-        with open_input([diff]) as (heard, chunks):
-            second = iter_pieces(sensor, chunks, datagrams=heard.datagrams, frame=frame)
+        with open_input([diff]) as (other_sample, chunks):
+            second = iter_pieces(sensor, chunks, datagrams=other_sample.datagrams, frame=frame)
             other = next(
                 (piece for piece in second if piece.frame == first.frame),
-                InputPiece(0, heard.data, first.frame),
+                InputPiece(0, other_sample.data, first.frame),
             )
     (_, before), (_, after) = (
         next(explain_piece(sensor, piece, frame)) for piece in (first, other)
@@ -394,7 +394,7 @@ def _compare(
 
 
 def _sensor(
-    given: SampleBytes, sensor_id: str | Sensor | None, *, damaged: bool = False
+    sample: SampleBytes, sensor_id: str | Sensor | None, *, damaged: bool = False
 ) -> tuple[Sensor, list[str]]:
     """Return the sensor that is named or fits the bytes, and the ids of all that fit."""
     if sensor_id is not None:
@@ -403,7 +403,7 @@ def _sensor(
         find_fitting_sensors,
     )  # not needed for a named sensor, and slow to import
 
-    sensors = find_fitting_sensors(given.chunks, datagrams=given.datagrams)
+    sensors = find_fitting_sensors(sample.chunks, datagrams=sample.datagrams)
     if sensors:
         fits = [sensor.id for sensor in sensors]
         note(
@@ -411,7 +411,7 @@ def _sensor(
             + (f", and also {', '.join(fits[1:])}: choose with -s" if fits[1:] else "")
         )
         return sensors[0], fits
-    fault = nearest_fault_error(given)
+    fault = nearest_fault_error(sample)
     if not damaged or not fault.sensor:
         raise fault
     note(f"these bytes match no sensor; the closest is {fault.sensor}")

@@ -93,8 +93,8 @@ def open_input(
             if (device := find_device(text)) is None:
                 raise _no_bytes_error(words, error) from None
             reading = open_input([device.source], times)
-    with reading as given:
-        yield given
+    with reading as sample:
+        yield sample
 
 
 def _is_file(text: str) -> bool:
@@ -117,9 +117,9 @@ def _file(path: str, times: Times) -> Iterator[tuple[SampleBytes, Iterator[Chunk
             chunks = iter_received(file, times, path)
         with _read_beginning(
             path, chunks, datagrams=file.datagrams, warnings=file.warnings
-        ) as given:
-            yield given
-        for warning in file.warnings if given[0].chunks else ():
+        ) as opened:
+            yield opened
+        for warning in file.warnings if opened[0].chunks else ():
             note(warning)
 
 
@@ -167,8 +167,8 @@ def read(words: Sequence[str]) -> SampleBytes:
         UsageError: for text that is neither hexadecimal nor a file.
         SourceError: for a file that cannot be read.
     """
-    with open_input(words) as (given, chunks):
-        return replace(given, chunks=tuple(chunk.data for chunk in take_leading(chunks, MOST)))
+    with open_input(words) as (sample, chunks):
+        return replace(sample, chunks=tuple(chunk.data for chunk in take_leading(chunks, MOST)))
 
 
 def _no_bytes_error(words: Sequence[str], error: ValueError) -> LidarSpecError:
@@ -207,7 +207,7 @@ def refuse_overwriting(
         if os.path.exists(file)
     ]
     files = [file for file in existing if os.path.isfile(file)]
-    for path in [path for given in inputs for path in _read_for(given)] if files else ():
+    for path in [path for source in inputs for path in _read_for(source)] if files else ():
         if os.path.exists(path):
             same = next((file for file in files if os.path.samefile(path, file)), None)
         else:
@@ -225,12 +225,14 @@ def refuse_overwriting(
         raise suggest(error, "repeat with --force, or with another file")
 
 
-def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
+def _read_for(argument: str | Path | Sensor | None) -> Iterator[str | int]:
     """Yield the files that may be read for this argument."""
-    if isinstance(given, Sensor):
-        yield from (str(value) for value in given.options.values() if isinstance(value, str | Path))
+    if isinstance(argument, Sensor):
+        yield from (
+            str(value) for value in argument.options.values() if isinstance(value, str | Path)
+        )
         return
-    word = str(given or "")
+    word = str(argument or "")
     yield from (
         [0]
         if word == "-"
@@ -241,26 +243,26 @@ def _read_for(given: str | Path | Sensor | None) -> Iterator[str | int]:
     with contextlib.suppress(
         LidarSpecError
     ):  # errors in the settings are reported when a device is looked up
-        known = find_device(word)
+        device = find_device(word)
         yield from (
-            (known.source.partition("?")[0], *map(str, known.options.values())) if known else ()
+            (device.source.partition("?")[0], *map(str, device.options.values())) if device else ()
         )
 
 
-def no_frame_error(sensor: Sensor, given: SampleBytes) -> WireError:
+def no_frame_error(sensor: Sensor, sample: SampleBytes) -> WireError:
     """Return the error for input without a frame of this sensor."""
-    data = given.data
+    data = sample.data
     longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
-    command = f"lidarspec explain {quote(given.source)} -s {sensor.id}"
+    command = f"lidarspec explain {quote(sample.source)} -s {sensor.id}"
     if not data:
         return suggest(
-            WireError(no_bytes(given.source, given.warnings), sensor=sensor.id),
+            WireError(no_bytes(sample.source, sample.warnings), sensor=sensor.id),
             f"lidarspec build {sensor.id} --help",
         )
-    if (fault := _wrong_checksums_error(given)) is not None:
+    if (fault := _wrong_checksums_error(sample)) is not None:
         return fault
     if len(data) > longest:
-        kind = " of text" if given.is_text else ""
+        kind = " of text" if sample.is_text else ""
         error = WireError(
             f"no frame in {len(data)} bytes{kind}",
             sensor=sensor.id,
@@ -275,7 +277,7 @@ def no_frame_error(sensor: Sensor, given: SampleBytes) -> WireError:
     return suggest(WireError("the bytes are not plausible", sensor=sensor.id, data=data), command)
 
 
-def nearest_fault_error(given: SampleBytes) -> WireError:
+def nearest_fault_error(sample: SampleBytes) -> WireError:
     """Return the error for input that no sensor fits.
 
     It is the error of the sensor that parsed most of the input, or a general one.
@@ -283,34 +285,34 @@ def nearest_fault_error(given: SampleBytes) -> WireError:
     from lidarspec.detect.identification import find_nearest_fault
     from lidarspec.detect.uninstalled_sensors import suggest_installation
 
-    if not given.data:
-        return suggest(WireError(no_bytes(given.source, given.warnings)), "lidarspec sensors")
-    if (fault := _wrong_checksums_error(given)) is not None:
+    if not sample.data:
+        return suggest(WireError(no_bytes(sample.source, sample.warnings)), "lidarspec sensors")
+    if (fault := _wrong_checksums_error(sample)) is not None:
         return fault
-    best = find_nearest_fault(given.data)
+    best = find_nearest_fault(sample.data)
     if best is None:
         if sensors():
             text = f"no frame of the {len(sensors())} installed sensors"
         else:
             text = "no frame of an installed sensor"
-        if given.is_text:
-            text = f"{given.source} is text: {text}"
-        error = suggest_installation(WireError(text, data=given.data[:QUOTED]), given)
+        if sample.is_text:
+            text = f"{sample.source} is text: {text}"
+        error = suggest_installation(WireError(text, data=sample.data[:QUOTED]), sample)
         return suggest(error, "lidarspec sensors")
-    return suggest(best, f"lidarspec explain {quote(given.source)} -s {best.sensor}")
+    return suggest(best, f"lidarspec explain {quote(sample.source)} -s {best.sensor}")
 
 
-def _wrong_checksums_error(given: SampleBytes) -> WireError | None:
+def _wrong_checksums_error(sample: SampleBytes) -> WireError | None:
     """Return an error if all frames of a sensor in the input have wrong checksums.
 
     Returns None otherwise.
     """
     from lidarspec.detect.identification import find_wrong_checksums
 
-    fault = find_wrong_checksums(given.chunks, datagrams=given.datagrams)
+    fault = find_wrong_checksums(sample.chunks, datagrams=sample.datagrams)
     if fault:
         return suggest(
-            WireError(f"{given.source}: {fault}"), f"lidarspec crc {quote(given.source)}"
+            WireError(f"{sample.source}: {fault}"), f"lidarspec crc {quote(sample.source)}"
         )
     return None
 
@@ -330,10 +332,10 @@ def no_scan_error(device: Device, source: str, seconds: float | None = None) -> 
             return suggest(
                 WireError(f"{source} {instead[0]}", sensor=sensor.id), f"repeat with {instead[1]}"
             )
-        given = None if stats.frames else reread(source)
-        if given is not None and (fault := _wrong_checksums_error(given)) is not None:
+        sample = None if stats.frames else reread(source)
+        if sample is not None and (fault := _wrong_checksums_error(sample)) is not None:
             return fault
-        if given is not None and given.is_text:
+        if sample is not None and sample.is_text:
             error = WireError(f"{source} is text without a data frame: {stats}", sensor=sensor.id)
             return suggest(error, f"lidarspec detect {quote(source)}")
         if stats.bytes_in:
@@ -407,8 +409,8 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
     """
     from lidarspec.detect.identification import format_sensor_options, identify_sample
 
-    given = reread(source)
-    scores = identify_sample(given).scores if given is not None else ()
+    sample = reread(source)
+    scores = identify_sample(sample).scores if sample is not None else ()
     own = next((score.sensor.options for score in scores if score.sensor.id == sensor.id), None)
     if own:
         assignments = " and ".join(f"{name}={value}" for name, value in own.items())

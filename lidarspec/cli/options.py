@@ -88,12 +88,12 @@ def configure_sensor(
         return sensor_id
     if sensor_id is None:
         raise UsageError(f"-O {options[0].partition('=')[0]} requires a sensor: name it with -s")
-    given = dict(option.partition("=")[::2] for option in options)
+    texts = dict(option.partition("=")[::2] for option in options)
     if unset := [option for option in options if "=" not in option]:
         raise UsageError(f"-O {unset[0]}: expected NAME=VALUE")
     named: Sensor = sensor(sensor_id)
     configured: Sensor = named.configure(
-        **{name: _value(named, name, text) for name, text in given.items()}
+        **{name: _value(named, name, text) for name, text in texts.items()}
     )
     return configured
 

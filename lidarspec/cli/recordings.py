@@ -151,15 +151,15 @@ def _print_recording(task: SourceRecording) -> None:
         )
 
 
-def _describe_recording(task: SourceRecording, kept: BackgroundWriter) -> str:
+def _describe_recording(task: SourceRecording, recorder: BackgroundWriter) -> str:
     """Return the number of records and bytes in words."""
     packets = f"{task.packets} packets, " if task.packets else ""
-    return f"{packets}{kept.records} records, {size(kept.bytes)} in {task.elapsed:.1f} s"
+    return f"{packets}{recorder.records} records, {size(recorder.bytes)} in {task.elapsed:.1f} s"
 
 
 def _sum_up_recording(
     task: SourceRecording,
-    kept: BackgroundWriter,
+    recorder: BackgroundWriter,
     source: str,
     sensor: Sensor | None,
     *,
@@ -167,9 +167,9 @@ def _sum_up_recording(
 ) -> None:
     """Print a summary of a recording and the next command; delete an empty file."""
     device = task.device
-    if not kept.records:
-        if not kept.discard():
-            note(f"{kept.path} was not changed")
+    if not recorder.records:
+        if not recorder.discard():
+            note(f"{recorder.path} was not changed")
         if device is not None:
             raise no_scan_error(device, source, task.elapsed)
         if live_address(source) is not None:
@@ -178,19 +178,19 @@ def _sum_up_recording(
             )
         raise suggest(WireError(f"{source} contains no received data"), "lidarspec record --help")
     stats = device.stats if device is not None else None
-    summary = f"{kept.path}: {_describe_recording(task, kept)}"
+    summary = f"{recorder.path}: {_describe_recording(task, recorder)}"
     if stats is not None and (damage := _describe_damage(stats)):
         summary += f"; {damage}"
     note(summary)
-    note(f"next: {_view_command(kept, sensor)}")
+    note(f"next: {_view_command(recorder, sensor)}")
     if as_json:
-        facts = {"output": kept.path, "source": source, "sensor": sensor.id if sensor else None}
+        facts = {"output": recorder.path, "source": source, "sensor": sensor.id if sensor else None}
         counts = {
-            "records": kept.records,
-            "bytes": kept.bytes,
+            "records": recorder.records,
+            "bytes": recorder.bytes,
             "packets": task.packets,
             "seconds": task.elapsed,
-            "dropped": kept.dropped,
+            "dropped": recorder.dropped,
         }
         emit_json({**facts, **counts, "stats": stats.to_dict() if stats else None}, None)
     if stats is not None and not stats.frames and device is not None:
@@ -208,11 +208,11 @@ def _describe_damage(stats: Counters) -> str:
     return ", ".join(f"{name} {value}" for name, value in counters.items() if value)
 
 
-def _view_command(kept: BackgroundWriter, sensor: Sensor | None) -> str:
+def _view_command(recorder: BackgroundWriter, sensor: Sensor | None) -> str:
     """Return the command that shows a recording."""
-    if isinstance(kept, Recorder) and kept.header.sensor:
-        return f"lidarspec view {shlex.quote(kept.path)}"
-    return f"lidarspec {_view_words(sensor, kept.path)}"
+    if isinstance(recorder, Recorder) and recorder.header.sensor:
+        return f"lidarspec view {shlex.quote(recorder.path)}"
+    return f"lidarspec {_view_words(sensor, recorder.path)}"
 
 
 @click.command()

@@ -150,22 +150,22 @@ class Verbs(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name in VERBS:
-            found: click.Command = getattr(
+            command: click.Command = getattr(
                 importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}"), cmd_name
             )
         elif cmd_name in find_added_verbs():
             from lidarspec.plugins import verb
 
-            found = verb(find_added_verbs()[cmd_name])
+            command = verb(find_added_verbs()[cmd_name])
         else:
             return None
-        known = {param.name for param in found.params}
-        found.params += [option for option in SPOKEN if option.name not in known]
+        parameters = {param.name for param in command.params}
+        command.params += [option for option in SPOKEN if option.name not in parameters]
         if ctx.resilient_parsing:
             from lidarspec.cli.completion import attach
 
-            attach(found)
-        return found
+            attach(command)
+        return command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -195,15 +195,15 @@ class Verbs(click.Group):
         """Return the verbs, without loading them, and the options."""
         from click.shell_completion import CompletionItem
 
-        known = {verb: text for verb, (_, text) in VERBS.items()} | {
+        verbs = {verb: text for verb, (_, text) in VERBS.items()} | {
             verb: _load_verb(entry) for verb, entry in find_added_verbs().items()
         }
-        found = [
+        items = [
             CompletionItem(verb, help=text)
-            for verb, text in known.items()
+            for verb, text in verbs.items()
             if verb.startswith(incomplete)
         ]
-        return found + click.Command.shell_complete(self, ctx, incomplete)
+        return items + click.Command.shell_complete(self, ctx, incomplete)
 
     def main(  # type: ignore[override]
         self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any

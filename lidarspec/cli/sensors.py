@@ -200,12 +200,12 @@ def _plan(sensor: Sensor, frame: str) -> list[str]:
     from lidarspec.simulation.frame_maker import FrameMaker
 
     try:
-        made = FrameMaker(sensor, frame)
+        maker = FrameMaker(sensor, frame)
         sweep = sensor.simulation_of(frame).sweep
     except SpecError as error:
         return [f"plain evaluation: {error}"]
     if sweep:
-        frames = made.seal(made.table([sweep(index) for index in range(PACKETS)]))
+        frames = maker.seal(maker.table([sweep(index) for index in range(PACKETS)]))
     else:
         frames = [sensor.example(frame)]
     sent = pack_found([Found(frame, 0, data) for data in frames])

@@ -148,8 +148,10 @@ def sim(
     """
     sensor = named_sensor(sensor_id)
     faults = Faults(errors, loss, reorder, unplug or 0.0, absent, rotor or "", shake)
-    seen = read_scene(scene) if scene is not None else None
-    device = SimulatedDevice(sensor, scene=seen, seed=seed, rate=parse_rate(rate), faults=faults)
+    simulated_scene = read_scene(scene) if scene is not None else None
+    device = SimulatedDevice(
+        sensor, scene=simulated_scene, seed=seed, rate=parse_rate(rate), faults=faults
+    )
     place = to or ("udp://" if sensor.datagrams else "pty")
     if place != "pty" and "://" not in place:
         if link is not None:
@@ -211,17 +213,17 @@ def _announce(
 def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Callable[[], None]:
     """Return a callback that prints received commands, and when the plug is pulled."""
     began = time.monotonic()
-    heard = 0
+    printed = 0
     present = True
 
     def turn() -> None:
-        nonlocal heard, present
-        events = device.commands_received[heard:]
+        nonlocal printed, present
+        events = device.commands_received[printed:]
         if device.present != present:
             events += [f"plugged in again at {opened.place}" if device.present else "unplugged"]
         for event in events:
             progress.note(f"{time.monotonic() - began:.1f} s: {event}")
-        heard = len(device.commands_received)
+        printed = len(device.commands_received)
         present = device.present
         progress(lambda: f"{time.monotonic() - began:.0f} s, {_format_sent(device)}")
 

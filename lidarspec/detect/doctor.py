@@ -105,11 +105,11 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
         yield Diagnosis(False, f"{path} is empty")
     else:
         found_verdicts = identify_senders(path)
-        found = max(found_verdicts, key=lambda one: one.sample.size)
-        if found.sample.size:
-            yield _verdict(path, found, sensor)
+        largest = max(found_verdicts, key=lambda verdict: verdict.sample.size)
+        if largest.sample.size:
+            yield _verdict(path, largest, sensor)
         yield from _several(path, found_verdicts)
-        for text in found.sample.warnings or [no_bytes(path, ())] * (not found.sample.size):
+        for text in largest.sample.warnings or [no_bytes(path, ())] * (not largest.sample.size):
             yield Diagnosis(False, text)
 
 
@@ -166,9 +166,9 @@ def _udp(
         return
     before = ports.count_received()
     began = time.monotonic()
-    found = list(_examine_bytes(source, sensor, seconds))
-    yield from found
-    if any("no data received" in finding.text for finding in found):
+    findings = list(_examine_bytes(source, sensor, seconds))
+    yield from findings
+    if any("no data received" in finding.text for finding in findings):
         rates = {
             name: (count - before.get(name, count)) / (time.monotonic() - began)
             for name, count in ports.count_received().items()
@@ -178,9 +178,9 @@ def _udp(
 
 def _udp_numbers(address: SourceAddress, sensor: Sensor | None) -> list[int]:
     port = address.host_and_port()[1]
-    given = address.options.get("port", "")
-    if given:
-        return [int(part) for part in given.split(",") if part.isdecimal()]
+    text = address.options.get("port", "")
+    if text:
+        return [int(part) for part in text.split(",") if part.isdecimal()]
     link = data_link(sensor, Udp)
     if port:
         return [port]
@@ -250,7 +250,7 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
     try:
         if sensor is not None:
             tried = [
-                identify_sample(heard) for heard in read_sensor_sample(source, sensor, seconds)
+                identify_sample(sample) for sample in read_sensor_sample(source, sensor, seconds)
             ]
         else:
             tried = []
@@ -268,10 +268,10 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
     yield from _several(source, tried)
 
 
-def _several(source: str, found: Sequence[Verdict]) -> Iterator[Diagnosis]:
+def _several(source: str, verdicts: Sequence[Verdict]) -> Iterator[Diagnosis]:
     """Yield a finding for several senders of one sensor's frames."""
     senders: dict[str, list[str]] = {}
-    for one in found:
+    for one in verdicts:
         if one.scores and one.sample.sender:
             senders.setdefault(one.scores[0].sensor.id, []).append(one.sample.sender)
     for name, several in senders.items():
@@ -282,32 +282,32 @@ def _several(source: str, found: Sequence[Verdict]) -> Iterator[Diagnosis]:
             )
 
 
-def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
+def _verdict(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
     """Return the finding about the data of one sender."""
-    heard = found.sample
-    ids = [score.sensor.id for score in found.scores]
-    may_be = {score.sensor.id: score.why for score in found.candidates} or dict(found.others)
+    sample = verdict.sample
+    ids = [score.sensor.id for score in verdict.scores]
+    may_be = {score.sensor.id: score.why for score in verdict.candidates} or dict(verdict.others)
     quoted = quote(source)
-    if not heard.size and heard.warnings:
+    if not sample.size and sample.warnings:
         return Diagnosis(
-            False, heard.warnings[0], f"lidarspec detect {quote(source.partition('?')[0])}"
+            False, sample.warnings[0], f"lidarspec detect {quote(source.partition('?')[0])}"
         )
-    if not heard.size:
+    if not sample.size:
         return _nothing(source, sensor)
-    if found.fault:
-        return Diagnosis(False, found.fault, f"lidarspec crc {quoted}")
-    if not found.scores:
-        if heard.baud is not None and len(list_bauds()) > 1:
+    if verdict.fault:
+        return Diagnosis(False, verdict.fault, f"lidarspec crc {quoted}")
+    if not verdict.scores:
+        if sample.baud is not None and len(list_bauds()) > 1:
             at = " at any baud rate"
         else:
             at = ""
         return Diagnosis(
             False,
-            f"{heard.size} bytes received, but no frame of an installed sensor{at}",
+            f"{sample.size} bytes received, but no frame of an installed sensor{at}",
             f"lidarspec detect {quoted}",
         )
-    if heard.baud is not None:
-        at = f" at {heard.baud} baud"
+    if sample.baud is not None:
+        at = f" at {sample.baud} baud"
     else:
         at = ""
     if sensor is not None and sensor.id not in ids:
@@ -319,24 +319,24 @@ def _verdict(source: str, found: Verdict, sensor: Sensor | None) -> Diagnosis:
     name = sensor.id if sensor is not None else ids[0]
     if name not in may_be:
         other, why = next(iter(may_be.items()))
-        if found.candidates:
+        if verdict.candidates:
             command = f"lidarspec view {quoted} -s {other}"
         else:
             command = f"lidarspec detect {quoted}"
         return Diagnosis(False, f"received frames of {other} ({why}){at}, not of {name}", command)
-    score = next(score for score in found.scores if score.sensor.id == name)
+    score = next(score for score in verdict.scores if score.sensor.id == name)
     link = data_link(score.sensor, Serial)
-    if heard.baud is not None and link and heard.baud not in link.bauds:
-        again = quote(with_option(source, "baud", heard.baud))
+    if sample.baud is not None and link and sample.baud not in link.bauds:
+        again = quote(with_option(source, "baud", sample.baud))
         return Diagnosis(
             False,
             f"{name} sends{at}, but {link.baud} is declared",
             f"lidarspec view {again} -s {name}",
         )
     cut_off = (
-        2 * max(frame.max_length for frame in score.sensor.incoming.values()) / heard.size
+        2 * max(frame.max_length for frame in score.sensor.incoming.values()) / sample.size
     )  # the first and the last frame
-    if score.share + (0 if heard.datagrams else cut_off) < CLEAR:
+    if score.share + (0 if sample.datagrams else cut_off) < CLEAR:
         return Diagnosis(
             False,
             f"{name} sends{at}, but {1 - score.share:.0%} of the bytes are outside frames: check"

@@ -85,27 +85,29 @@ class Distinction(NamedTuple):
     others: dict[str, str]
 
 
-def distinguish(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found]]) -> Distinction:
+def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Found]]) -> Distinction:
     """Decide which of several sensors with the same data frames sent some frames.
 
     Packets that only one model sends decide first, then the pace of the clock, then model names.
 
     Args:
         candidates: sensors that decode the same data frames.
-        found: sensor id -> the frames that this sensor decoded, in the order of their arrival.
+        frames: sensor id -> the frames that this sensor decoded, in the order of their arrival.
     """
     ids = {sensor.id for sensor in candidates}
-    excluding = {sensor.id: _excluding_relatives(sensor, found[sensor.id]) for sensor in candidates}
+    excluding = {
+        sensor.id: _excluding_relatives(sensor, frames[sensor.id]) for sensor in candidates
+    }
     left = [sensor for sensor in candidates if not excluding[sensor.id]]
     reasons = {name: why for relatives in excluding.values() for name, why in relatives.items()}
     if not left:
         return Distinction({}, {name: why for name, why in reasons.items() if name not in ids})
-    timed = _keep_matching(left, _match_clock, found)
+    timed = _keep_matching(left, _match_clock, frames)
     named_among = [sensor for sensor in left if sensor.id in timed] or left
     if len(timed) == 1:
         selected = timed
     else:
-        selected = _keep_matching(named_among, _match_name, found) or timed
+        selected = _keep_matching(named_among, _match_name, frames) or timed
     if selected:
         return Distinction(selected, {})
     differences = {
@@ -121,16 +123,16 @@ def distinguish(candidates: Sequence[Sensor], found: Mapping[str, Sequence[Found
     )
 
 
-def find_contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
+def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
     """Return the evidence that another model sent some frames, "" if there is none."""
     relatives = map(registry().find, sensor.relatives)  # loads only their plugins
     alike = [sensor, *(relative for relative in relatives if relative is not None)]
-    result = distinguish(alike, {one.id: found for one in alike})
+    result = distinguish(alike, {one.id: frames for one in alike})
     if sensor.id not in result.candidates:
         return "the frames are those of " + " or ".join(
             f"{name} ({why})" for name, why in (result.candidates or result.others).items()
         )
-    names = _models(sensor, found)
+    names = _models(sensor, frames)
     fits = any(
         _plain(part) in _plain(sensor.model)
         for name in names
@@ -141,7 +143,7 @@ def find_contradiction(sensor: Sensor, found: Sequence[Found]) -> str:
     return f"{sensor.info['model']} is {names[0]}"
 
 
-def _excluding_relatives(sensor: Sensor, found: Sequence[Found]) -> dict[str, str]:
+def _excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
     """Return the relatives that alone send most of these packets: id -> difference."""
     single = {
         name: relative
@@ -149,7 +151,7 @@ def _excluding_relatives(sensor: Sensor, found: Sequence[Found]) -> dict[str, st
         if isinstance(relative, Relative)
     }
     if single:
-        data = [item.data for item in found if item.frame == sensor.data_frame]
+        data = [item.data for item in frames if item.frame == sensor.data_frame]
     else:
         data = []
     if not data:
@@ -168,7 +170,7 @@ def _excluding_relatives(sensor: Sensor, found: Sequence[Found]) -> dict[str, st
 def _keep_matching(
     left: Sequence[Sensor],
     why: Callable[[Sensor, Sequence[Found]], str],
-    found: Mapping[str, Sequence[Found]],
+    frames: Mapping[str, Sequence[Found]],
 ) -> dict[str, str]:
     """Select the sensors that match by one criterion: id -> reason.
 
@@ -180,15 +182,15 @@ def _keep_matching(
     """
     if len(left) == 1 and not left[0].relatives:
         return {}
-    reasons = {sensor.id: reason for sensor in left if (reason := why(sensor, found[sensor.id]))}
+    reasons = {sensor.id: reason for sensor in left if (reason := why(sensor, frames[sensor.id]))}
     if len(left) == 1 or len(reasons) < len(left):
         return reasons
     return {}
 
 
-def _match_clock(sensor: Sensor, found: Sequence[Found]) -> str:
+def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
     """Return a reason if the clock in the frames has the pace of this sensor, else ""."""
-    data = [item for item in found if item.frame == sensor.data_frame]
+    data = [item for item in frames if item.frame == sensor.data_frame]
     if sensor.clock is None or len(data) < 3:
         return ""
     packets = sensor.decode(
@@ -253,22 +255,22 @@ def _declared_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
     return float(np.median(np.asarray(pace(Fields(packets.batch())), np.float64))) * 1e9
 
 
-def _match_name(sensor: Sensor, found: Sequence[Found]) -> str:
+def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
     """Return a reason if the frames name the model of this sensor, else ""."""
     return next(
         (
             f"{sensor.info['model']} is {text}"
-            for text in _models(sensor, found)
+            for text in _models(sensor, frames)
             if _plain(text) == _plain(sensor.model)
         ),
         "",
     )
 
 
-def _models(sensor: Sensor, found: Sequence[Found]) -> list[str]:
+def _models(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
     """Return the models that the first frames with a model field name."""
     frame, _, path = sensor.info.get("model", "").partition(".")
-    named_frames = (item for item in found if item.frame == frame)
+    named_frames = (item for item in frames if item.frame == frame)
     names = []
     for item in itertools.islice(named_frames, MAX_NAMED_FRAMES):
         try:
@@ -278,13 +280,13 @@ def _models(sensor: Sensor, found: Sequence[Found]) -> list[str]:
     return [name for name in names if name]
 
 
-def read_info(sensor: Sensor, found: Iterable[Found]) -> dict[str, str]:
+def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     """Return the values of the sensor's `info` fields in the last frame of each type.
 
     Returns:
         Role -> text, such as "serial" -> "A1234"; numbers have a unit.
     """
-    last = {item.frame: item for item in found}
+    last = {item.frame: item for item in frames}
     texts = dict[str, str]()
     for role, path in sensor.info.items():
         frame, _, field_path = path.partition(".")
@@ -395,13 +397,13 @@ class Verdict:
 
 def rate_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
     """Return the scores of all installed sensors with at least one data frame, best first."""
-    known = _sensors_with_frames()
-    found = _score_each(known, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
-    if not any(score.share >= FITS for score in found):
-        found += _score_each(
-            known, lambda sensor: _score_mid_stream(sensor, chunks, datagrams=datagrams)
+    candidates = _sensors_with_frames()
+    scores = _score_each(candidates, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
+    if not any(score.share >= FITS for score in scores):
+        scores += _score_each(
+            candidates, lambda sensor: _score_mid_stream(sensor, chunks, datagrams=datagrams)
         )
-    return sorted(found, key=lambda score: (-score.share, score.sensor.id))
+    return sorted(scores, key=lambda score: (-score.share, score.sensor.id))
 
 
 def _sensors_with_frames() -> list[Sensor]:
@@ -419,17 +421,17 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
         _sensors_with_frames(),
         lambda sensor: _score(sensor, chunks, datagrams=datagrams, sums=_stored_checksums),
     )
-    found = [
+    matches = [
         score
         for score in unchecked
         if score.share >= CLEAR and score.data_frames >= MIN_UNCHECKED_FRAMES
     ]
-    if not found or _score(found[0].sensor, chunks, datagrams=datagrams) is not None:
+    if not matches or _score(matches[0].sensor, chunks, datagrams=datagrams) is not None:
         return ""
-    kinds = [item.frame for item in found[0].found]
+    kinds = [item.frame for item in matches[0].found]
     most = max(set(kinds), key=kinds.count)
-    frames = [item.data for item in found[0].found if item.frame == most]
-    ids = " or ".join(score.sensor.id for score in found)
+    frames = [item.data for item in matches[0].found if item.frame == most]
+    ids = " or ".join(score.sensor.id for score in matches)
     text = (
         f"{len(frames)} {most} frames match {ids} in constants, lengths and rhythm, but all their"
         " checksums are wrong"
@@ -454,10 +456,12 @@ def _stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
     return seal.load_stored(rows)
 
 
-def _score_each(known: Sequence[Sensor], rate: Callable[[Sensor], Score | None]) -> list[Score]:
+def _score_each(
+    candidates: Sequence[Sensor], rate: Callable[[Sensor], Score | None]
+) -> list[Score]:
     """Return the score of each sensor; sensors with identical frames are decoded only once."""
     shared: dict[object, Score | None] = {}
-    for sensor in known:
+    for sensor in candidates:
         frames = (
             sensor.fillers,
             *(
@@ -512,16 +516,18 @@ def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: boo
     )
 
 
-def identify_sample(heard: SampleBytes) -> Verdict:
+def identify_sample(sample: SampleBytes) -> Verdict:
     """Identify the sensor by frames, then by clocks and names, then by the baud rate."""
     fitting = [
         score
-        for score in rate_sensors(heard.chunks, datagrams=heard.datagrams)
+        for score in rate_sensors(sample.chunks, datagrams=sample.datagrams)
         if score.share >= FITS
     ]
     best = [score for score in fitting if score.share >= fitting[0].share - AS_GOOD]
     if not best:
-        return Verdict(heard, fault=find_wrong_checksums(heard.chunks, datagrams=heard.datagrams))
+        return Verdict(
+            sample, fault=find_wrong_checksums(sample.chunks, datagrams=sample.datagrams)
+        )
     result = distinguish(
         [score.sensor for score in best], {score.sensor.id: score.found for score in best}
     )
@@ -530,11 +536,11 @@ def identify_sample(heard: SampleBytes) -> Verdict:
         for score in best
         if score.sensor.id in result.candidates
     ]
-    if len(alike) > 1 and heard.baud is not None:
-        why = f"it runs at {heard.baud} baud"
+    if len(alike) > 1 and sample.baud is not None:
+        why = f"it runs at {sample.baud} baud"
         links = [(score, data_link(score.sensor, Serial)) for score in alike]
         alike = [
-            replace(score, why=why) for score, link in links if link and heard.baud in link.bauds
+            replace(score, why=why) for score, link in links if link and sample.baud in link.bauds
         ] or alike
     alike = [
         replace(
@@ -550,7 +556,7 @@ def identify_sample(heard: SampleBytes) -> Verdict:
     ruled_out = [
         score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}
     ]
-    return Verdict(heard, (*alike, *ruled_out), tuple(alike), result.others)
+    return Verdict(sample, (*alike, *ruled_out), tuple(alike), result.others)
 
 
 def identify_senders(
@@ -568,9 +574,9 @@ def identify_senders(
         SourceError: if the source cannot be opened.
     """
     tried: list[Verdict] = []
-    for heard in read_samples(source, seconds=seconds, tell=tell):
-        tried.append(identify_sample(heard))
-        if heard.baud is not None and tried[-1].is_clear:
+    for sample in read_samples(source, seconds=seconds, tell=tell):
+        tried.append(identify_sample(sample))
+        if sample.baud is not None and tried[-1].is_clear:
             break
     if len({one.sample.baud for one in tried}) > 1:
         return [select_best(tried)]
@@ -596,18 +602,20 @@ def detect(source: str | Path) -> Sensor:
     declared_sensor = find_declared_sensor(source)
     if declared_sensor is not None:
         return declared_sensor
-    found = identify_senders(resolve(source))
-    fitting = [one for one in found if one.scores]
+    verdicts = identify_senders(resolve(source))
+    fitting = [verdict for verdict in verdicts if verdict.scores]
     if not fitting:
-        raise _no_sensor_error(str(source), found)
-    if not any(one.candidates for one in fitting):
+        raise _no_sensor_error(str(source), verdicts)
+    if not any(verdict.candidates for verdict in fitting):
         raise suggest(
             WireError(f"{source}: {describe_unsupported_models(fitting[0])}"),
             f"lidarspec detect {quote(str(source))}",
         )
-    if len({one.sensor.id for one in fitting if one.sensor}) > 1:
+    if len({verdict.sensor.id for verdict in fitting if verdict.sensor}) > 1:
         listed = ", ".join(
-            f"{one.sensor.id} ({one.sample.sender})" for one in fitting if one.sensor
+            f"{verdict.sensor.id} ({verdict.sample.sender})"
+            for verdict in fitting
+            if verdict.sensor
         )
         raise UsageError(
             f"{source}: several sensors send: {listed}; choose one with ?src=ADDRESS and -s"
@@ -631,18 +639,18 @@ def format_sensor_options(sensor: Sensor) -> str:
     )
 
 
-def list_candidates(found: Verdict) -> list[str]:
+def list_candidates(verdict: Verdict) -> list[str]:
     """Return the ids of all possible sensors, and mark those that are not installed."""
     return [
-        *(score.sensor.id for score in found.candidates),
-        *(f"{name} (not installed)" for name in found.others),
+        *(score.sensor.id for score in verdict.candidates),
+        *(f"{name} (not installed)" for name in verdict.others),
     ]
 
 
-def describe_unsupported_models(found: Verdict) -> str:
+def describe_unsupported_models(verdict: Verdict) -> str:
     """Return a message for frames of models that are known but not installed."""
     return (
-        " or ".join(f"these are frames of {name} ({why})" for name, why in found.others.items())
+        " or ".join(f"these are frames of {name} ({why})" for name, why in verdict.others.items())
         + ", which no installed plugin supports"
     )
 
@@ -685,23 +693,23 @@ def find_simulated_sensor(source: str | Path) -> Sensor | None:
     return named_sensor(address.place)
 
 
-def _no_sensor_error(source: str, found: Sequence[Verdict]) -> Exception:
+def _no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception:
     """Return the error for a source for which no sensor fits."""
-    heard = max(
-        (one.sample for one in found), key=lambda one: one.size, default=SampleBytes(source)
+    largest = max(
+        (one.sample for one in verdicts), key=lambda one: one.size, default=SampleBytes(source)
     )
-    if fault := next((one.fault for one in found if one.fault), ""):
+    if fault := next((one.fault for one in verdicts if one.fault), ""):
         return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {quote(str(source))}")
-    if heard.size:
-        kind = " in this text" if heard.is_text else ""
+    if largest.size:
+        kind = " in this text" if largest.is_text else ""
         error = WireError(
-            f"{source}: no frame of an installed sensor{kind}", data=heard.chunks[0][:SHOWN]
+            f"{source}: no frame of an installed sensor{kind}", data=largest.chunks[0][:SHOWN]
         )
-        return suggest_installation(error, heard)
+        return suggest_installation(error, largest)
     if live_address(source) is None:
-        return WireError(no_bytes(source, heard.warnings))
-    if heard.warnings:
-        why = heard.warnings[0]
+        return WireError(no_bytes(source, largest.warnings))
+    if largest.warnings:
+        why = largest.warnings[0]
     else:
         why = f"{source}: no data received; if the sensor must be started first, name it with -s"
     return suggest(CommandError(why), f"lidarspec doctor {quote(source)}")
@@ -716,15 +724,17 @@ def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Se
 
     If all bytes together are exactly one frame of some sensors, only these are returned.
     """
-    known = list(sensors().values())
+    installed = list(sensors().values())
     data = b"".join(chunks)
     whole = [
-        sensor for sensor in known if any(_is_frame(sensor, name, data) for name in sensor.frames)
+        sensor
+        for sensor in installed
+        if any(_is_frame(sensor, name, data) for name in sensor.frames)
     ]
     if whole:
         return whole
-    found = rate_sensors(chunks, datagrams=datagrams) if data else []
-    return [score.sensor for score in found if score.share >= max(found[0].share - AS_GOOD, FITS)]
+    scores = rate_sensors(chunks, datagrams=datagrams) if data else []
+    return [score.sensor for score in scores if score.share >= max(scores[0].share - AS_GOOD, FITS)]
 
 
 def find_nearest_fault(data: bytes) -> WireError | None:
@@ -752,8 +762,8 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
         return False
     engine = codec(frame)
     if any(
-        spot >= len(data) or data[spot] & mask != value
-        for spot, (mask, value) in engine.prefix.items()
+        offset >= len(data) or data[offset] & mask != value
+        for offset, (mask, value) in engine.prefix.items()
     ):
         return False
     survey = engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
@@ -769,9 +779,9 @@ def _begins_like_frame(fault: WireError) -> bool:
         return False
     prefix = codec(sensors()[fault.sensor].frames[fault.frame]).prefix
     constants = [
-        (fault.data[spot], mask, value)
-        for spot, (mask, value) in prefix.items()
-        if spot < len(fault.data)
+        (fault.data[offset], mask, value)
+        for offset, (mask, value) in prefix.items()
+        if offset < len(fault.data)
     ]
     return (
         all(byte & mask == value for byte, mask, value in constants)

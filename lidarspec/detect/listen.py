@@ -107,9 +107,9 @@ def read_samples(
             if is_silent and baud in other_rates:
                 return
             tell(f"{text} at {baud} baud")
-            for heard in _read_sample(with_option(text, "baud", baud), seconds, baud, text):
-                is_silent = is_silent and not heard.size
-                yield heard
+            for sample in _read_sample(with_option(text, "baud", baud), seconds, baud, text):
+                is_silent = is_silent and not sample.size
+                yield sample
     elif (
         address is not None
         and address.scheme == "udp"
@@ -158,8 +158,8 @@ def _other_senders_warning(opened: LiveTransport) -> tuple[str, ...]:
     return (f"{opened.label}: no data from the requested sender; {others}",)
 
 
-def _split_by_sender(heard: SampleBytes, chunks: Sequence[Chunk]) -> Iterator[SampleBytes]:
-    """Yield a copy of `heard` with the chunks of each sender.
+def _split_by_sender(sample: SampleBytes, chunks: Sequence[Chunk]) -> Iterator[SampleBytes]:
+    """Yield a copy of `sample` with the chunks of each sender.
 
     If there is only one sender, its name is left empty.
     """
@@ -170,7 +170,7 @@ def _split_by_sender(heard: SampleBytes, chunks: Sequence[Chunk]) -> Iterator[Sa
     for sender, sent in by_sender.items():
         ports = frozenset(chunk.receiver[1] for chunk in sent if chunk.receiver is not None)
         data = tuple(chunk.data for chunk in sent)
-        yield replace(heard, chunks=data, sender=sender if len(by_sender) > 1 else "", ports=ports)
+        yield replace(sample, chunks=data, sender=sender if len(by_sender) > 1 else "", ports=ports)
 
 
 def read_sensor_sample(source: str | Path, sensor: Sensor, seconds: float) -> list[SampleBytes]:
@@ -232,15 +232,15 @@ def probe(source: str | Path) -> Iterator[SampleBytes]:
     for sensor in list_start_required():
         link = data_link(sensor, Serial)
         for baud in link.bauds if link else ():
-            asked = (None if plain else baud, *(sensor.command(name) for name in sensor.on_open))
-            if asked in tried or address.options.get("baud", str(baud)) != str(baud):
+            requests = (None if plain else baud, *(sensor.command(name) for name in sensor.on_open))
+            if requests in tried or address.options.get("baud", str(baud)) != str(baud):
                 continue
-            tried.add(asked)
+            tried.add(requests)
             if "baud" in address.options:
-                given = str(source)
+                text = str(source)
             else:
-                given = with_option(source, "baud", baud)
-            with contextlib.closing(live(given, sensor)) as opened:
+                text = with_option(source, "baud", baud)
+            with contextlib.closing(live(text, sensor)) as opened:
                 chunks = _StartProbe(sensor, opened).run()
             yield SampleBytes(str(source), tuple(chunks), baud=None if plain else baud)
 
@@ -264,12 +264,12 @@ class _StartProbe:
                 lambda: sum(map(len, self._sample)) >= PLENTY,
                 ANSWERED if any(map(_is_answered, started)) else UNANSWERED,
             )
-            found = list(self._sample)
+            samples = list(self._sample)
             stopped = self._request(self._sensor.on_close)
             self._turns(lambda: all(pending.done for pending in stopped), STOPPING)
         except LidarSpecError:
             return self._sample
-        return found
+        return samples
 
     def _request(self, names: tuple[str, ...]) -> list[PendingReply]:
         self._session.abandon("asked for something else")
@@ -286,11 +286,11 @@ class _StartProbe:
                 self._opened.write(out.data)
             chunks = self._opened.read(TURN)
             if chunks:
-                found = [item for chunk in chunks for item in self._decoder.feed(chunk.data)]
+                frames = [item for chunk in chunks for item in self._decoder.feed(chunk.data)]
             else:
-                found = self._decoder.idle()
+                frames = self._decoder.idle()
             self._sample += [chunk.data for chunk in chunks]
-            self._session.receive(found, time.monotonic_ns())
+            self._session.receive(frames, time.monotonic_ns())
 
 
 def _is_answered(pending: PendingReply) -> bool:

@@ -76,11 +76,11 @@ def read_beginning(opened: Transport, most: int, *, number: int | None = None) -
 
 def take_leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:
     """Return the first chunks, until they have `most` bytes."""
-    found = list[Chunk]()
+    taken = list[Chunk]()
     size = 0
     for chunk in chunks:
-        found.append(chunk)
+        taken.append(chunk)
         size += len(chunk.data)
         if size >= most:
             break
-    return found
+    return taken

@@ -35,7 +35,7 @@ MAX_LISTED = 6
 
 def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
     """Return the signatures of the data frames of a sensor that have enough constant bytes."""
-    found = []
+    signatures = []
     for name in sensor.data_frames:
         engine = codec(sensor.frames[name])
         constant = {
@@ -44,9 +44,9 @@ def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
             if mask == 0xFF and offset < MAX_SYNC_BYTES
         }
         signature = Signature(_sync_text(constant), engine.size or 0)
-        if len(constant) >= MIN_SYNC_BYTES and signature not in found:
-            found.append(signature)
-    return tuple(found)
+        if len(constant) >= MIN_SYNC_BYTES and signature not in signatures:
+            signatures.append(signature)
+    return tuple(signatures)
 
 
 def _sync_text(constant: dict[int, int]) -> str:
@@ -56,19 +56,19 @@ def _sync_text(constant: dict[int, int]) -> str:
     )
 
 
-def recognize(heard: SampleBytes) -> list[KnownSensor]:
+def recognize(sample: SampleBytes) -> list[KnownSensor]:
     """Return the sensors of the table, not installed, that may have sent these bytes.
 
     If no frame matches, these are the sensors with the destination port.
     """
     installed = set(registry().names())
     missing = [row for row in known_sensors() if row.id not in installed]
-    shares = [_matching_share(row, heard) if heard.size else 0.0 for row in missing]
+    shares = [_matching_share(row, sample) if sample.size else 0.0 for row in missing]
     best = max(shares, default=0.0)
     matching = []
     if best >= MIN_MATCHING_SHARE:
         matching = [row for row, share in zip(missing, shares, strict=True) if share == best]
-    at_port = [row for row in matching or missing if heard.ports & _udp_ports(row)]
+    at_port = [row for row in matching or missing if sample.ports & _udp_ports(row)]
     return at_port or matching
 
 
@@ -76,15 +76,15 @@ def _udp_ports(row: KnownSensor) -> set[int]:
     return {port for link in row.links.values() if link.kind == "udp" for port in link.numbers}
 
 
-def _matching_share(row: KnownSensor, heard: SampleBytes) -> float:
+def _matching_share(row: KnownSensor, sample: SampleBytes) -> float:
     is_datagram = any(link.kind == "udp" for link in row.links.values())
-    if is_datagram != heard.datagrams:
+    if is_datagram != sample.datagrams:
         return 0.0
-    if heard.datagrams:
+    if sample.datagrams:
         share = _share_of_datagrams
     else:
         share = _share_of_stream
-    return max((share(signature, heard) for signature in row.signatures), default=0.0)
+    return max((share(signature, sample) for signature in row.signatures), default=0.0)
 
 
 def _pattern(sync: str) -> bytes:
@@ -93,20 +93,20 @@ def _pattern(sync: str) -> bytes:
     )
 
 
-def _share_of_datagrams(signature: Signature, heard: SampleBytes) -> float:
+def _share_of_datagrams(signature: Signature, sample: SampleBytes) -> float:
     begins = re.compile(_pattern(signature.sync), re.DOTALL)
     if signature.size:
         sizes = {signature.size}
     else:
-        sizes = {len(datagram) for datagram in heard.chunks}
+        sizes = {len(datagram) for datagram in sample.chunks}
     count = sum(
-        begins.match(datagram) is not None for datagram in heard.chunks if len(datagram) in sizes
+        begins.match(datagram) is not None for datagram in sample.chunks if len(datagram) in sizes
     )
-    return count / len(heard.chunks)
+    return count / len(sample.chunks)
 
 
-def _share_of_stream(signature: Signature, heard: SampleBytes) -> float:
-    data = heard.data
+def _share_of_stream(signature: Signature, sample: SampleBytes) -> float:
+    data = sample.data
     offsets = [
         match.start()
         for match in re.finditer(b"(?=" + _pattern(signature.sync) + b")", data, re.DOTALL)
@@ -126,32 +126,32 @@ def _share_of_stream(signature: Signature, heard: SampleBytes) -> float:
     return min(1.0, count * signature.size / len(data))
 
 
-def describe(found: Sequence[KnownSensor]) -> str:
+def describe(sensors: Sequence[KnownSensor]) -> str:
     """Return the sentence that names the sensors and their distributions."""
-    ids = [row.id for row in found[:MAX_LISTED]]
-    more = len(found) - len(ids)
+    ids = [row.id for row in sensors[:MAX_LISTED]]
+    more = len(sensors) - len(ids)
     if more:
         listed = f"{', '.join(ids)} and {more} more"
     else:
         listed = " or ".join(ids)
-    distributions = _distributions(found)
+    distributions = _distributions(sensors)
     verb = "are" if len(distributions) > 1 else "is"
     return f"this looks like data of {listed}; {' and '.join(distributions)} {verb} not installed"
 
 
-def suggest_installation(error: WireError, heard: SampleBytes) -> WireError:
+def suggest_installation(error: WireError, sample: SampleBytes) -> WireError:
     """Add the distributions to install to the error for unknown bytes, if known."""
-    missing = recognize(heard)
+    missing = recognize(sample)
     if missing:
         error.add_note(describe(missing))
         suggest(error, install_commands(missing))
     return error
 
 
-def install_commands(found: Sequence[KnownSensor]) -> str:
+def install_commands(sensors: Sequence[KnownSensor]) -> str:
     """Return the command that installs the distributions of the sensors."""
-    return install_command(*_distributions(found))
+    return install_command(*_distributions(sensors))
 
 
-def _distributions(found: Sequence[KnownSensor]) -> list[str]:
-    return sorted({row.distribution for row in found})
+def _distributions(sensors: Sequence[KnownSensor]) -> list[str]:
+    return sorted({row.distribution for row in sensors})

@@ -68,12 +68,12 @@ class DeviceInput(Protocol):
     learned: Mapping[str, Any] = MappingProxyType({})
     info_frames: Mapping[str, Found] = MappingProxyType({})
 
-    def store_info_frames(self, found: Sequence[Frames]) -> None:
+    def store_info_frames(self, batches: Sequence[Frames]) -> None:
         """Keep the latest frame of each type that reports values of the sensor.
 
         A frame with parts is ignored if it lacks values that an earlier frame reported.
         """
-        for frames in found:
+        for frames in batches:
             for name in self.sensor.info_frames:
                 if name not in frames.names:
                     continue
@@ -84,10 +84,10 @@ class DeviceInput(Protocol):
 
     def _lacks_values(self, item: Found) -> bool:
         """Return whether a frame with parts lacks values that an earlier one reported."""
-        known = self.info_frames.get(item.frame)
-        if known is None or not schema(self.sensor.frames[item.frame].tree).parts:
+        earlier = self.info_frames.get(item.frame)
+        if earlier is None or not schema(self.sensor.frames[item.frame].tree).parts:
             return False
-        return not read_info(self.sensor, [known]).keys() <= read_info(self.sensor, [item]).keys()
+        return not read_info(self.sensor, [earlier]).keys() <= read_info(self.sensor, [item]).keys()
 
     @property
     def state(self) -> str:
@@ -215,8 +215,8 @@ def decode_chunks(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
         end += len(chunk.data)
         ends.append(end)
         times.append(-1 if chunk.at is None else chunk.at)
-    found = decoder.frames(b"".join([chunk.data for chunk in chunks]), chunks[-1].at)
-    return _set_arrival(found, np.array(ends), np.array(times))
+    batches = decoder.frames(b"".join([chunk.data for chunk in chunks]), chunks[-1].at)
+    return _set_arrival(batches, np.array(ends), np.array(times))
 
 
 def _decode_stream(
@@ -237,7 +237,7 @@ def _decode_stream(
 
 
 def _set_arrival(
-    found: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
+    batches: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
 ) -> list[Frames]:
     """Return frames with the arrival times of the pieces of input that hold their last bytes.
 
@@ -247,14 +247,14 @@ def _set_arrival(
     """
     return [
         frames.with_arrivals(times[ends.searchsorted(frames.offsets + frames.sizes)])
-        for frames in found
+        for frames in batches
     ]
 
 
-def select_frames(found: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
+def select_frames(batches: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
     """Return the frames of some types, one by one."""
     picked = []
-    for frames in found:
+    for frames in batches:
         kinds = [index for index, name in enumerate(frames.names) if name in awaited]
         picked += frames.select(np.isin(frames.kinds, kinds)).found()
     return picked
@@ -294,7 +294,7 @@ class FileInput(DeviceInput):
 
     @property
     def warnings(self) -> list[str]:
-        said = list(self._transport.warnings)
+        warnings = list(self._transport.warnings)
         stats = self.decoder.stats
         if (
             self.state == "ended"
@@ -305,8 +305,8 @@ class FileInput(DeviceInput):
                 f"{self._source}: {stats.bytes_in} bytes, and no data frame of {self.sensor.id}"
                 " among them"
             )
-            said.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
-        return said
+            warnings.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
+        return warnings
 
     @property
     def stats(self) -> Counters:
@@ -400,10 +400,10 @@ class FileInput(DeviceInput):
         for batch in self._batches():
             if batch[0].gap or batch[0].quiet:
                 yield Arrival(self.decoder.take_pending(), interrupted=batch[0].gap)
-            found = decode_chunks(self.decoder, batch)
+            batches = decode_chunks(self.decoder, batch)
             if not self.decoder.stream:
-                self.senders.check(frame_senders(batch, found[0], self.decoder.stats.bytes_in))
-            yield Arrival(found)
+                self.senders.check(frame_senders(batch, batches[0], self.decoder.stats.bytes_in))
+            yield Arrival(batches)
         yield Arrival(self.decoder.take_pending())
 
     def _batches(self) -> Iterator[list[Chunk]]:
@@ -411,22 +411,22 @@ class FileInput(DeviceInput):
 
         A batch ends before an interruption or silence of the line.
         """
-        found: list[Chunk] = []
+        batch: list[Chunk] = []
         size = 0
         for chunk in self._portions():
-            if found and (
+            if batch and (
                 chunk.gap
                 or chunk.quiet
                 or size >= (self._batch_bytes or BATCH_BYTES)
-                or len(found) >= BATCH_CHUNKS
+                or len(batch) >= BATCH_CHUNKS
             ):
-                yield found
-                found = []
+                yield batch
+                batch = []
                 size = 0
-            found.append(chunk)
+            batch.append(chunk)
             size += len(chunk.data)
-        if found:
-            yield found
+        if batch:
+            yield batch
 
     def _portions(self) -> Iterator[Chunk]:
         """Yield the chunks; chunks of a stream are cut to the size of `read_ahead`."""

@@ -183,12 +183,12 @@ def _constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
 
 
 def _name_parts(
-    value: Any, name: tuple[Any, ...], found: dict[tuple[Any, ...], Any], seen: set[int]
+    value: Any, name: tuple[Any, ...], names: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
     """Add a value and its parts, each under the names that lead to it."""
     if isinstance(value, _PLAIN) or id(value) in seen:
         return
-    found[name] = value
+    names[name] = value
     seen.add(id(value))
     parts: Mapping[Any, Any] = {}
     if is_dataclass(value):
@@ -198,7 +198,7 @@ def _name_parts(
     elif isinstance(value, tuple | list):
         parts = dict(enumerate(value))
     for key, part in parts.items():
-        _name_parts(part, (*name, key), found, seen)
+        _name_parts(part, (*name, key), names, seen)
 
 
 class _StatePickler(pickle.Pickler):

@@ -82,13 +82,13 @@ def _find_reference(
     assert sensor.clock is not None
     table = codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:
-        told = reported_seconds(sensor.clock, table)
+        seconds = reported_seconds(sensor.clock, table)
         readings = reference_readings(sensor, table)
     except Exception:
         return None  # reported when the packets are decoded
-    known = np.flatnonzero(np.isfinite(told))
-    if not len(known):
+    finite = np.flatnonzero(np.isfinite(seconds))
+    if not len(finite):
         return None
-    first = known.item(0)
+    first = finite.item(0)
     host_ns = max(frames.at.item(rows.item(first)), 0)
-    return ClockReference(readings.item(first), told.item(first), host_ns)
+    return ClockReference(readings.item(first), seconds.item(first), host_ns)

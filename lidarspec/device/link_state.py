@@ -61,10 +61,10 @@ class LinkState:
         elif self._only_others_since is None:
             self._only_others_since = time.monotonic()
 
-    def record_frames(self, found: Sequence[Frames]) -> None:
+    def record_frames(self, batches: Sequence[Frames]) -> None:
         """Record decoded frames."""
         stats = self._decoder.stats
-        if any(map(len, found)):
+        if any(map(len, batches)):
             self._framed_bytes = stats.bytes_in
             self._frameless_since = None
             if not self.has_data:

@@ -142,30 +142,30 @@ class LiveInput(DeviceInput):
 
     @property
     def warnings(self) -> list[str]:
-        said = [
+        warnings = [
             warning
             for capture in self._captures.values()
             for warning in (*capture.transport.warnings, *capture.warnings)
         ]
         for senders in (self._senders, *self._answering.values()):
-            said += senders.warnings
-        said += self._reported_warnings
+            warnings += senders.warnings
+        warnings += self._reported_warnings
         if self._recorder is not None and self._recorder.error is not None:
-            said.append(f"the recording has stopped: {self._recorder.error}")
+            warnings.append(f"the recording has stopped: {self._recorder.error}")
         silent = [
             f"{self._source}: {error}; it is started again"
             for error in list(self._session.unanswered.values())
         ]
         if self._closed:
-            return said
-        return said + silent + self._link_state.warnings
+            return warnings
+        return warnings + silent + self._link_state.warnings
 
     @property
     def stats(self) -> Counters:
         stats = self.decoder.stats
         captures = list(self._captures.values())
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
-        others = sum(kept.foreign for kept in self._answering.values())
+        others = sum(sender_filter.foreign for sender_filter in self._answering.values())
         stats.foreign = (
             self._senders.foreign + others + sum(capture.transport.foreign for capture in captures)
         )
@@ -442,13 +442,13 @@ class LiveInput(DeviceInput):
         if not chunks:
             return
         decoder = self.decoder
-        found = decode_chunks(decoder, chunks)
+        batches = decode_chunks(decoder, chunks)
         if not decoder.stream:
-            senders = frame_senders(chunks, found[0], decoder.stats.bytes_in)
-            found = [self._senders.select_ports(senders, found[0])]
+            senders = frame_senders(chunks, batches[0], decoder.stats.bytes_in)
+            batches = [self._senders.select_ports(senders, batches[0])]
         if self._senders.address is not None:
             self._captures["data"].transport.accept(self._senders.address)
-        self._hand_on("data", found)
+        self._hand_on("data", batches)
 
     def _select_sensor_chunks(self, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks that the sensor sent.
@@ -476,23 +476,25 @@ class LiveInput(DeviceInput):
     def _host(self) -> str | None:
         """Return the address of the sensor, None if unknown."""
         answered = [
-            kept.address[0] for kept in self._answering.values() if kept.address is not None
+            sender_filter.address[0]
+            for sender_filter in self._answering.values()
+            if sender_filter.address is not None
         ]
         return self._captures["data"].transport.peer() or next(iter(answered), None)
 
-    def _hand_on(self, link: str, found: list[Frames], *, interrupted: bool = False) -> None:
-        self.store_info_frames(found)
+    def _hand_on(self, link: str, batches: list[Frames], *, interrupted: bool = False) -> None:
+        self.store_info_frames(batches)
         with self._session_lock:
             awaited = self._session.awaited_frames(link)
-            for item in select_frames(found, awaited) if awaited else ():
+            for item in select_frames(batches, awaited) if awaited else ():
                 at = self._clock.now() if item.at is None else item.at
                 self._session.receive([item], at, link=link)
             if awaited:
                 self._send_outgoing()
         if link == "data":
-            self._link_state.record_frames(found)
-            if interrupted or any(map(len, found)):
-                self._ready.append(Arrival(found, interrupted=interrupted))
+            self._link_state.record_frames(batches)
+            if interrupted or any(map(len, batches)):
+                self._ready.append(Arrival(batches, interrupted=interrupted))
 
     def _restart_sensor(self) -> None:
         """Send the opening commands again: the device is back, and has lost its state."""

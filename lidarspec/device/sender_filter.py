@@ -64,15 +64,15 @@ class SenderCheck:
 
         Returns None if there is none. The frames then come from this port.
         """
-        known = self._now.setdefault(name, sender)
+        port = self._now.setdefault(name, sender)
         before = self._before.setdefault(name, {})
-        if sender == known or sender in before:
-            if sender == known:
+        if sender == port or sender in before:
+            if sender == port:
                 return None
-            return known
+            return port
         if len(before) == MAX_SENDERS:
             del before[next(iter(before))]
-        before[known], self._now[name] = None, sender
+        before[port], self._now[name] = None, sender
         return None
 
     def _warn_of_senders(self, first: Sender, other: Sender) -> UsageError:
@@ -161,13 +161,13 @@ class SenderFilter(SenderCheck):
                 self._count_foreign(chunk.sender)
         return mine
 
-    def select_ports(self, sent: Sequence[tuple[str, Sender]], found: Frames) -> Frames:
+    def select_ports(self, sent: Sequence[tuple[str, Sender]], frames: Frames) -> Frames:
         """Return those of the frames from the address of the sensor that its ports sent.
 
         Args:
             sent: the type and the sender of each frame, or of each type if one sender sent all.
         """
-        known = len(self._other_senders)
+        count_before = len(self._other_senders)
         for name, sender in sent:
             if sender not in self._other_senders:
                 self._take_turns(name, sender)
@@ -175,13 +175,13 @@ class SenderFilter(SenderCheck):
                     self._owner = sender
                 else:
                     self._owner = self._owner
-        if len(self._other_senders) == known or len(sent) < len(found):
-            return found
+        if len(self._other_senders) == count_before or len(sent) < len(frames):
+            return frames
         mine = [sender not in self._other_senders for _, sender in sent]
         for (_, sender), is_mine in zip(sent, mine, strict=True):
             if not is_mine:
                 self._count_foreign(sender)
-        return found.select(np.array(mine, np.bool_))
+        return frames.select(np.array(mine, np.bool_))
 
     def _replaces(self, sender: Sender, chunk: Chunk) -> bool:
         """Decide from a chunk which sender is the sensor.
@@ -204,8 +204,8 @@ class SenderFilter(SenderCheck):
         self._is_sure = any(self._sensor.frames[name].data for name in names)
         if self._is_sure or (names and owner is None):
             self._owner = self._now[""] = sender
-        known = owner or self._first
-        return known is not None and self._owner is not None and not self._is_ours(known)
+        current = owner or self._first
+        return current is not None and self._owner is not None and not self._is_ours(current)
 
     def _is_ours(self, sender: Sender) -> bool:
         if self._owner is None:
@@ -248,7 +248,7 @@ class SenderFilter(SenderCheck):
         self.other_sender = self.other_sender or sender
 
 
-def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tuple[str, Sender]]:
+def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
     """Return the type and the sender of each frame found in datagrams.
 
     If one sender sent all of them, each type is listed once. Returns [] if senders are not known.
@@ -261,15 +261,15 @@ def frame_senders(chunks: Sequence[Chunk], found: Frames, end: int) -> list[tupl
         return []
     if len(senders) == 1:
         return [
-            (found.names[kind], sender)
+            (frames.names[kind], sender)
             for sender in senders
             if sender
-            for kind in np.unique(found.kinds).tolist()
+            for kind in np.unique(frames.kinds).tolist()
         ]
     ends = end - np.cumsum([len(chunk.data) for chunk in reversed(chunks)])[::-1]
-    places = np.searchsorted(ends, found.offsets, side="right") - 1
-    known = [chunk.sender for chunk in chunks if chunk.sender is not None]
+    places = np.searchsorted(ends, frames.offsets, side="right") - 1
+    chunk_senders = [chunk.sender for chunk in chunks if chunk.sender is not None]
     return [
-        (found.names[kind], known[place])
-        for kind, place in zip(found.kinds.tolist(), places.tolist(), strict=True)
+        (frames.names[kind], chunk_senders[place])
+        for kind, place in zip(frames.kinds.tolist(), places.tolist(), strict=True)
     ]

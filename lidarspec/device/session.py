@@ -93,13 +93,12 @@ class Reply:
             for info in self.fields.values()
             if info.const is None and get_nested(self.values, info.path) is not _MISSING
         ]
-        told = [
+        texts = [
             f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}"
             for info in free[:SHOWN]
         ]
-        return (
-            f"Reply({self.command}, {self.frame}: {', '.join(told)}{', ...' * (len(free) > SHOWN)})"
-        )
+        more = ", ..." if len(free) > SHOWN else ""
+        return f"Reply({self.command}, {self.frame}: {', '.join(texts)}{more})"
 
 
 class PendingReply:
@@ -158,14 +157,16 @@ class ExpectedReply:
         """Return the differences between a frame and the reply; empty if there are none."""
         if frame not in self.tables:
             return [f"a frame {frame}"]
-        asked = {path: value for path, value in self.values.items() if path in self.tables[frame]}
-        got = {path: get_nested(values, path) for path in asked}
+        expected = {
+            path: value for path, value in self.values.items() if path in self.tables[frame]
+        }
+        got = {path: get_nested(values, path) for path in expected}
         wrong = [
             (path, "missing" if got[path] is _MISSING else got[path])
-            for path in asked
-            if got[path] != asked[path]
+            for path in expected
+            if got[path] != expected[path]
         ]
-        return [f"{path} {there} instead of {asked[path]}" for path, there in wrong]
+        return [f"{path} {there} instead of {expected[path]}" for path, there in wrong]
 
     def overlaps(self, other: ExpectedReply) -> bool:
         """Return whether one frame could be the reply to both."""
@@ -376,12 +377,12 @@ class Session:
         )
         return frozenset(name for one in expected for name in (*one.tables, one.refusal) if name)
 
-    def receive(self, found: Iterable[Found], now: int, *, link: str = "data") -> None:
+    def receive(self, frames: Iterable[Found], now: int, *, link: str = "data") -> None:
         """Process frames that arrived on a link at the time `now`."""
         line = self._lines.get(link)
         if line is None:
             return
-        for item in found:
+        for item in frames:
             if (
                 line.current is not None or line.late_replies
             ) and item.frame in self.awaited_frames(link):

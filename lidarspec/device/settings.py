@@ -137,18 +137,17 @@ def find_device(source: str | Path) -> NamedDevice | None:
     word = str(source)
     if not isinstance(source, str) or not _NAME.fullmatch(word):
         return None
-    known, faults = _read_all()
-    if word not in known and not os.path.exists(word):
+    by_name, faults = _read_all()
+    if word not in by_name and not os.path.exists(word):
         if faults:
             raise faults[0]
-        if known:
-            places = sorted({device.file for device in known.values()})
-            raise UsageError(
-                f"{word!r} is no file, and no device of {', '.join(places)}{_closest(word, known)}"
-            )
+        if by_name:
+            places = sorted({device.file for device in by_name.values()})
+            closest = _closest(word, by_name)
+            raise UsageError(f"{word!r} is no file, and no device of {', '.join(places)}{closest}")
     for fault in faults:
         warnings.warn(f"{fault}; its devices are left out", stacklevel=2)
-    device = known.get(word)
+    device = by_name.get(word)
     if device is None:
         return None
     if refused := device.refusal():
@@ -167,7 +166,7 @@ def devices() -> dict[str, NamedDevice]:
 
 def _read_all() -> tuple[dict[str, NamedDevice], list[LidarSpecError]]:
     """Return all devices, and the errors of files that could not be read."""
-    known: dict[str, NamedDevice] = {}
+    by_name: dict[str, NamedDevice] = {}
     faults = []
     for path in files():
         try:
@@ -176,8 +175,10 @@ def _read_all() -> tuple[dict[str, NamedDevice], list[LidarSpecError]]:
             faults.append(fault)
             continue
         for name, device in devices.items():
-            known[name] = replace(known[name], hidden=device.file) if name in known else device
-    return known, faults
+            by_name[name] = (
+                replace(by_name[name], hidden=device.file) if name in by_name else device
+            )
+    return by_name, faults
 
 
 def files() -> list[Path]:
@@ -188,14 +189,14 @@ def files() -> list[Path]:
     """
     own = own_settings()
     here = Path.cwd()
-    found = [own] if os.path.isfile(own) else []
+    paths = [own] if os.path.isfile(own) else []
     for path in (folder / FILE for folder in (here, *here.parents)):
         if path == own or not os.path.isfile(path):
             continue
         if not (reason := find_distrust(path)):
-            return [*found, path]
+            return [*paths, path]
         warnings.warn(f"{path} is not read: {reason}", stacklevel=2)
-    return found
+    return paths
 
 
 def read(path: Path) -> dict[str, NamedDevice]:
@@ -266,10 +267,10 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice:
     )
 
 
-def _mount(path: Path, place: str, given: Mapping[str, Any]) -> Mount:
+def _mount(path: Path, place: str, table: Mapping[str, Any]) -> Mount:
     kinds = {f.name: type(f.default) for f in fields(Mount)}
-    _check_keys(path, f"{place} mount", given, kinds)
-    for key, value in given.items():
+    _check_keys(path, f"{place} mount", table, kinds)
+    for key, value in table.items():
         if kinds[key] is bool:
             right = isinstance(value, bool)
         else:
@@ -280,20 +281,20 @@ def _mount(path: Path, place: str, given: Mapping[str, Any]) -> Mount:
             else:
                 wanted = "a number"
             raise UsageError(f"{path}: {place}: mount.{key} is {wanted}, not {shown(value)}")
-    return Mount(**given)
+    return Mount(**table)
 
 
-def _check_keys(path: Path, place: str, given: Iterable[str], known: Iterable[str]) -> None:
-    for key in given:
-        if key not in known:
+def _check_keys(path: Path, place: str, keys: Iterable[str], allowed: Iterable[str]) -> None:
+    for key in keys:
+        if key not in allowed:
             raise UsageError(
                 f"{path}: {place + ': ' if place else ''}unknown {'key' if place else 'table'}"
-                f" {key!r}{_closest(key, known)}"
+                f" {key!r}{_closest(key, allowed)}"
             )
 
 
-def _closest(word: str, known: Iterable[str]) -> str:
-    return did_you_mean(word, known) or f" (known: {', '.join(known)})"
+def _closest(word: str, words: Iterable[str]) -> str:
+    return did_you_mean(word, words) or f" (known: {', '.join(words)})"
 
 
 def _resolve_path(path: Path, value: Any) -> Any:

@@ -191,7 +191,7 @@ class SourceRecording:
         """
         news = list[str]()
         failures = dict[str, None]()
-        known = set[str]()
+        printed = set[str]()
         with Device(
             self._source, sensor, start=self._start, record=RecorderFactory(self._open_log)
         ) as self.device:
@@ -211,8 +211,8 @@ class SourceRecording:
                         ] = None
                         time.sleep(TURN)
                     current = {_FIGURES.sub("", text): text for text in [*news, *failures]}
-                    yield "\n".join(text for what, text in current.items() if what not in known)
-                    known = set(current)
+                    yield "\n".join(text for what, text in current.items() if what not in printed)
+                    printed = set(current)
             finally:
                 self._end(log)
                 with contextlib.suppress(Exception, SystemExit):

@@ -251,7 +251,7 @@ def crc_matches(
             )
             if work_left < 0:
                 return
-            found = (
+            results = (
                 list(
                     _iter_matches(
                         samples, some, place, span, reading, tried, by_catalogue=by_catalogue
@@ -259,7 +259,7 @@ def crc_matches(
                 )
                 for some in chosen
             )
-            for match in next((matches for matches in found if matches), []):
+            for match in next((matches for matches in results if matches), []):
                 sure = sure or match.sure
                 yield match
         if sure:
@@ -392,8 +392,8 @@ def _polynomials(multiples: Sequence[int], width: int) -> list[int]:
         for poly in divisors(common_divisor(multiples, floor=width), width)
         if poly != xor_polynomial
     ]
-    known = [poly for poly in polynomials if poly & ((1 << width) - 1) in KNOWN[width]]
-    return (known + [poly for poly in polynomials if poly not in known])[:MAX_POLYNOMIALS]
+    catalogued = [poly for poly in polynomials if poly & ((1 << width) - 1) in KNOWN[width]]
+    return (catalogued + [poly for poly in polynomials if poly not in catalogued])[:MAX_POLYNOMIALS]
 
 
 def _registers(
@@ -465,9 +465,9 @@ def _solve_registers(
             (sum((columns[bit] >> row & 1) << bit for bit in bits), wanted >> row & 1)
             for row in bits
         ]
-    found = solve(equations, reading.width)
-    if found is not None:
-        first, free = found
+    solution = solve(equations, reading.width)
+    if solution is not None:
+        first, free = solution
         some = (
             chosen for count in range(1 + len(free[:4])) for chosen in combinations(free[:4], count)
         )

@@ -186,29 +186,29 @@ def draft(chunks: Sequence[bytes], *, datagrams: bool) -> Draft:
     Raises:
         WireError: if no frames of one kind are found.
     """
-    found = find_structure(chunks, datagrams=datagrams)
-    if found is None:
+    structure = find_structure(chunks, datagrams=datagrams)
+    if structure is None:
         raise WireError(
             "no repeated frame structure found in these bytes", data=b"".join(chunks[:1])[:16]
         )
     parts = chunks if datagrams else [b"".join(chunks)]
     size = sum(map(len, chunks))
-    if datagrams or found.period is None or size % found.period == 0:
+    if datagrams or structure.period is None or size % structure.period == 0:
         start = 0
     else:
-        start = max(parts[0].find(found.sync), 0)
-    first = Draft(datagrams, b"", found.period, found.length, (), size)
+        start = max(parts[0].find(structure.sync), 0)
+    first = Draft(datagrams, b"", structure.period, structure.length, (), size)
     first = (
         _find_sync(first, parts, start)
-        or _find_sync(first, parts, max(parts[0].find(found.sync), 0))
-        or replace(first, sync=found.sync)
+        or _find_sync(first, parts, max(parts[0].find(structure.sync), 0))
+        or replace(first, sync=structure.sync)
     )
-    known = _find_count(replace(first, frames=tuple(_iter_frames(first, parts))), parts[-1])
-    known = _find_front(known, parts)
-    known = replace(known, candidates=tuple(find_rising_fields(known.rows)))
-    seals = _seals(known)
-    known = replace(known, seal=seals[0] if seals else None, others=tuple(seals[1:]))
-    return _add_details(replace(known, frames=tuple(_iter_frames(known, parts))))
+    result = _find_count(replace(first, frames=tuple(_iter_frames(first, parts))), parts[-1])
+    result = _find_front(result, parts)
+    result = replace(result, candidates=tuple(find_rising_fields(result.rows)))
+    seals = _seals(result)
+    result = replace(result, seal=seals[0] if seals else None, others=tuple(seals[1:]))
+    return _add_details(replace(result, frames=tuple(_iter_frames(result, parts))))
 
 
 def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None:
@@ -239,40 +239,40 @@ def _find_sync(first: Draft, parts: Sequence[bytes], start: int) -> Draft | None
     return None
 
 
-def _iter_frames(known: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
+def _iter_frames(draft: Draft, parts: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
     """Yield offset and bytes of the frames that fit, in order.
 
     After a sync that begins no valid frame, the search continues at the next byte.
     """
     base = 0
     for part in parts:
-        offset = part.find(known.sync)
+        offset = part.find(draft.sync)
         while 0 <= offset < len(part):
-            size = _frame_size(known, part, offset)
+            size = _frame_size(draft, part, offset)
             if size:
                 yield base + offset, part[offset : offset + size]
-            if known.datagrams:
+            if draft.datagrams:
                 break
-            offset = part.find(known.sync, offset + (size or 1))
+            offset = part.find(draft.sync, offset + (size or 1))
         base += len(part)
 
 
-def _frame_size(known: Draft, part: bytes, at: int) -> int:
+def _frame_size(draft: Draft, part: bytes, at: int) -> int:
     """Return the length of the frame at an offset; 0 if no valid frame begins there."""
-    size = known.size
-    if size is None and known.length is not None:
-        if at + known.length.end <= len(part):
-            size = known.length.read(part[at : at + known.length.end])
+    size = draft.size
+    if size is None and draft.length is not None:
+        if at + draft.length.end <= len(part):
+            size = draft.length.read(part[at : at + draft.length.end])
         else:
             size = 0
     if (
         not size
         or at + size > len(part)
-        or (known.datagrams and (at or size != len(part)))
-        or size < known.head + known.tail
+        or (draft.datagrams and (at or size != len(part)))
+        or size < draft.head + draft.tail
     ):
         return 0
-    if known.seal is None or _has_valid_checksum(known.seal, part[at : at + size]):
+    if draft.seal is None or _has_valid_checksum(draft.seal, part[at : at + size]):
         return size
     return 0
 
@@ -284,18 +284,18 @@ def _has_valid_checksum(seal: ChecksumMatch, frame: bytes) -> bool:
     return seal.algorithm(covered) == stored
 
 
-def _find_count(known: Draft, data: bytes) -> Draft:
+def _find_count(draft: Draft, data: bytes) -> Draft:
     """Return the draft with a length field if an incomplete last frame has another count.
 
     If all whole frames have one length, only the incomplete frame after them can show that a
     constant byte is a count. Otherwise the draft is returned unchanged.
     """
-    if known.size is None or known.datagrams or not known.frames:
-        return known
-    offset, last = known.frames[-1]
+    if draft.size is None or draft.datagrams or not draft.frames:
+        return draft
+    offset, last = draft.frames[-1]
     rest = data[offset + len(last) :]
-    for place in range(len(known.sync), HEADER):
-        same = len({frame[: place + 1] for _, frame in known.frames}) == 1
+    for place in range(len(draft.sync), HEADER):
+        same = len({frame[: place + 1] for _, frame in draft.frames}) == 1
         if (
             not same
             or len(rest) <= place
@@ -304,43 +304,43 @@ def _find_count(known: Draft, data: bytes) -> Draft:
         ):
             continue
         lengths = [
-            LengthField(place, 1, "little", unit, known.size - unit * last[place])
+            LengthField(place, 1, "little", unit, draft.size - unit * last[place])
             for unit in range(MIN_ELEMENT_BYTES, MAX_ELEMENT_BYTES + 1)
         ]
         fitting = [
             length for length in lengths if length.rest > place and length.read(rest) > len(rest)
         ]
         if fitting:
-            return replace(known, size=None, length=min(fitting, key=lambda length: length.rest))
-    return known
+            return replace(draft, size=None, length=min(fitting, key=lambda length: length.rest))
+    return draft
 
 
-def _find_front(known: Draft, parts: Sequence[bytes]) -> Draft:
+def _find_front(draft: Draft, parts: Sequence[bytes]) -> Draft:
     """Return the draft with `front` if the length field counts bytes.
 
     Frames that are shorter than `front` are then dropped, since they are probably of another type.
     """
-    if known.length is None or known.length.unit > 1 or not known.frames:
-        return known
-    lengths = sorted(len(frame) for _, frame in known.frames)
-    known = replace(
-        known, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - MAX_CHECKSUM_BYTES)
+    if draft.length is None or draft.length.unit > 1 or not draft.frames:
+        return draft
+    lengths = sorted(len(frame) for _, frame in draft.frames)
+    draft = replace(
+        draft, front=min(FRONT, lengths[int(len(lengths) * (1 - STEADY))] - MAX_CHECKSUM_BYTES)
     )
-    return replace(known, frames=tuple(_iter_frames(known, parts)))
+    return replace(draft, frames=tuple(_iter_frames(draft, parts)))
 
 
-def _seals(known: Draft) -> list[ChecksumMatch]:
+def _seals(draft: Draft) -> list[ChecksumMatch]:
     """Return the matching checksums, except at rising or nearly constant bytes."""
-    frames = [frame for _, frame in known.frames]
+    frames = [frame for _, frame in draft.frames]
     step = max(1, len(frames) // MAX_CHECKSUM_FRAMES)
     shortest = min(map(len, frames), default=0)
     some = frames[::step][:MAX_CHECKSUM_FRAMES]
     free = (
         match
         for match in search(some)
-        if not any(_overlaps(match.place, one, shortest) for one in known.candidates)
+        if not any(_overlaps(match.place, one, shortest) for one in draft.candidates)
     )
-    return [match for match in free if _is_declarable(known, match) and _changes(match, some)]
+    return [match for match in free if _is_declarable(draft, match) and _changes(match, some)]
 
 
 def _changes(match: ChecksumMatch, frames: Sequence[bytes]) -> bool:
@@ -361,7 +361,7 @@ def _overlaps(place: ChecksumPlace, one: RisingField, length: int) -> bool:
     return start < one.end and one.offset < start + place.size
 
 
-def _is_declarable(known: Draft, match: ChecksumMatch) -> bool:
+def _is_declarable(draft: Draft, match: ChecksumMatch) -> bool:
     """Return whether a struct can declare the checksum.
 
     It must not be in the part of varying length or split into nibbles, and has to cover one range.
@@ -374,19 +374,19 @@ def _is_declarable(known: Draft, match: ChecksumMatch) -> bool:
         0,
     )
     at_end = place.offset == -place.size
-    if known.size is None and not at_end:
-        return 0 <= place.offset <= known.head - place.size and whole
+    if draft.size is None and not at_end:
+        return 0 <= place.offset <= draft.head - place.size and whole
     return whole or at_end or span.part == "behind"
 
 
-def _add_details(known: Draft) -> Draft:
+def _add_details(draft: Draft) -> Draft:
     """Return the draft with rising fields and blocks, except for fields at the checksum."""
-    if not known.frames:
-        return known
-    rows = known.rows
-    found = known.candidates
-    if known.size is not None:
-        blocks = _find_flagged_blocks(rows) or _find_blocks_of_fields(found, rows.shape[1])
+    if not draft.frames:
+        return draft
+    rows = draft.rows
+    rising = draft.candidates
+    if draft.size is not None:
+        blocks = _find_flagged_blocks(rows) or _find_blocks_of_fields(rising, rows.shape[1])
     else:
         blocks = None
     if blocks is not None:
@@ -397,13 +397,15 @@ def _add_details(known: Draft) -> Draft:
         else:
             blocks = None
     if blocks is not None:
-        found = tuple(one for one in found if one.end <= blocks.start or one.offset >= blocks.end)
-    shortest = min(len(frame) for _, frame in known.frames)
+        rising = tuple(one for one in rising if one.end <= blocks.start or one.offset >= blocks.end)
+    shortest = min(len(frame) for _, frame in draft.frames)
     free = tuple(
-        one for one in found if known.seal is None or not _overlaps(known.seal.place, one, shortest)
+        one
+        for one in rising
+        if draft.seal is None or not _overlaps(draft.seal.place, one, shortest)
     )
     return replace(
-        known, candidates=tuple(one for one in free if one.offset >= len(known.sync)), blocks=blocks
+        draft, candidates=tuple(one for one in free if one.offset >= len(draft.sync)), blocks=blocks
     )
 
 
@@ -430,14 +432,14 @@ def _find_flagged_blocks(rows: NDArray[np.uint8]) -> RepeatedBlocks | None:
     return max(blocks_found, key=lambda blocks: blocks.count * blocks.size, default=None)
 
 
-def _find_blocks_of_fields(found: Sequence[RisingField], length: int) -> RepeatedBlocks | None:
+def _find_blocks_of_fields(fields: Sequence[RisingField], length: int) -> RepeatedBlocks | None:
     """Return the largest blocks that each begin with a rising field of one kind."""
     rows = []
-    for one in found:
+    for one in fields:
         like = [(one.size, one.order, one.kind, one.circle)]
         same = [
             other.offset
-            for other in found
+            for other in fields
             if (other.size, other.order, other.kind, other.circle) in like
             and other.offset >= one.offset
         ]
@@ -540,17 +542,21 @@ def make_template_values(draft: Draft, *, origin: str, link: str) -> dict[str, s
 def _fields(draft: Draft) -> Iterator[DraftField]:
     """Yield the fields of a frame in their order."""
     rows = draft.rows
-    known = _known_fields(draft)
+    known_fields = _known_fields(draft)
     cuts = sorted(
         {
             0,
             draft.head,
             *_span_cuts(draft),
-            *(edge for one in known for edge in (one.start, one.start + one.size)),
+            *(
+                edge
+                for known_field in known_fields
+                for edge in (known_field.start, known_field.start + known_field.size)
+            ),
         }
     )
     offset = 0
-    for field in [*known, DraftField(draft.head, 0, "", "")]:
+    for field in [*known_fields, DraftField(draft.head, 0, "", "")]:
         yield from _gap(rows, offset, field.start, cuts)
         if field.name:
             yield field

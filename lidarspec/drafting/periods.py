@@ -146,12 +146,12 @@ def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
     """
     if len(rows) < 3:
         return []
-    found = sorted(
+    fields = sorted(
         _iter_rising_fields(rows),
         key=lambda one: (one.kind == "rising", -one.size, -one.right / one.total, one.offset),
     )
     chosen: list[RisingField] = []
-    for one in found:
+    for one in fields:
         if all(one.end <= other.offset or one.offset >= other.end for other in chosen):
             chosen.append(one)
     return sorted(chosen, key=lambda one: one.offset)
@@ -406,15 +406,15 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
     equal = np.array([float((data[lag:] == data[:-lag]).mean()) for lag in lags])
     likely = lags[np.argsort(equal)[::-1][:MAX_DISTANCES]].tolist()
     framed = [
-        (weight, found)
+        (weight, structure)
         for lag in likely
-        for weight, found in _iter_frames_of_length(data, lag)
-        if found.share > MIN_SHARE
+        for weight, structure in _iter_frames_of_length(data, lag)
+        if structure.share > MIN_SHARE
     ]
     best = max((weight for weight, _ in framed), default=0.0)
     shortest = min(
-        (found for weight, found in framed if weight > MIN_RELATIVE_WEIGHT * best),
-        key=lambda found: found.period or 0,
+        (structure for weight, structure in framed if weight > MIN_RELATIVE_WEIGHT * best),
+        key=lambda structure: structure.period or 0,
         default=None,
     )
     if shortest is None:
@@ -430,16 +430,16 @@ def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStruct
     """
     period = whole.period or 0
     for part in (part for part in range(SHORTEST, period // 2 + 1) if period % part == 0):
-        for _, found in _iter_frames_of_length(data, part):
-            if found.share > whole.share - SHARE_TOLERANCE and (
-                len(set(found.sync)) > 1 or _is_counted(found)
+        for _, structure in _iter_frames_of_length(data, part):
+            if structure.share > whole.share - SHARE_TOLERANCE and (
+                len(set(structure.sync)) > 1 or _is_counted(structure)
             ):
-                return found
+                return structure
     return whole
 
 
-def _is_counted(found: FrameStructure) -> bool:
-    rows = np.frombuffer(b"".join(found.frames), np.uint8).reshape(len(found.frames), -1)
+def _is_counted(structure: FrameStructure) -> bool:
+    rows = np.frombuffer(b"".join(structure.frames), np.uint8).reshape(len(structure.frames), -1)
     return any(one.kind == "counter" for one in find_rising_fields(rows))
 
 
@@ -522,18 +522,18 @@ def _find_varying_length(data: NDArray[np.uint8]) -> FrameStructure | None:
         starts = np.flatnonzero(pairs == pair)
         if pair in (0, 0xFFFF) or len(starts) < 2 * MIN_FRAMES:
             continue
-        found = _find_length_field(data, starts, bytes([pair >> 8, pair & 0xFF]))
-        if found is None:
+        structure = _find_length_field(data, starts, bytes([pair >> 8, pair & 0xFF]))
+        if structure is None:
             continue
         # Several pairs of a header explain the lengths equally well. Use the one that occurs first,
         # since captures often begin with a frame.
         begins = int(starts[0])
         if (
             best is None
-            or found.share > best[0] + SHARE_TOLERANCE
-            or (found.share > best[0] - SHARE_TOLERANCE and begins < best[1])
+            or structure.share > best[0] + SHARE_TOLERANCE
+            or (structure.share > best[0] - SHARE_TOLERANCE and begins < best[1])
         ):
-            best = (found.share, begins, found)
+            best = (structure.share, begins, structure)
     if best is not None and best[0] > MIN_SHARE:
         return best[2]
     return None

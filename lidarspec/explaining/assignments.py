@@ -92,13 +92,15 @@ def _octets(text: str, place: str) -> bytes:
 
 def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, str]:
     """Return a number, converted to `unit` if it has a unit, and its own unit."""
-    digits, given = split_unit(text)
-    if given:
-        per_unit = factor(given, unit)
+    digits, unit_text = split_unit(text)
+    if unit_text:
+        per_unit = factor(unit_text, unit)
     else:
         per_unit = Fraction(1)
     if per_unit is None:
-        raise UsageError(f"{place}: expected {unit or 'no unit'}, cannot convert from {given!r}")
+        raise UsageError(
+            f"{place}: expected {unit or 'no unit'}, cannot convert from {unit_text!r}"
+        )
     try:
         if digits[:2].lower() in ("0x", "0b", "0o"):
             number = Fraction(int(digits, 0))
@@ -106,7 +108,7 @@ def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, st
             number = Fraction(digits)
     except ValueError:
         raise UsageError(f"{place}: expected {wanted}, got {text!r}") from None
-    return number * per_unit, given
+    return number * per_unit, unit_text
 
 
 def _nearest(info: FieldInfo, number: Fraction, path: str, place: str) -> int | float:

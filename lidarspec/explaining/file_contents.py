@@ -240,7 +240,7 @@ def _size(path: Path) -> int:
     return path.stat().st_size
 
 
-def _count(found: FileContents, opened: Transport) -> None:
+def _count(contents: FileContents, opened: Transport) -> None:
     """Count the beginning of the file, and find the last time."""
     flows = dict[tuple[Sender | None, Sender | None], PacketFlow]()
     left = LOOKED_AT
@@ -254,16 +254,16 @@ def _count(found: FileContents, opened: Transport) -> None:
             flow.bytes + len(chunk.data),
             left - len(chunk.data),
         )
-        if found.first_ns is None:
-            found.first_ns = chunk.at
+        if contents.first_ns is None:
+            contents.first_ns = chunk.at
         else:
-            found.first_ns = found.first_ns
-        found.last_read_ns = found.last_ns = chunk.at or found.last_ns
+            contents.first_ns = contents.first_ns
+        contents.last_read_ns = contents.last_ns = chunk.at or contents.last_ns
         if left <= 0 or number >= PACKETS:
-            found.last_ns = _find_last_time(opened, chunks)
-            found.whole = False
+            contents.last_ns = _find_last_time(opened, chunks)
+            contents.whole = False
             break
-    found.flows = sorted(flows.values(), key=lambda flow: -flow.bytes)
+    contents.flows = sorted(flows.values(), key=lambda flow: -flow.bytes)
 
 
 def _find_last_time(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
@@ -274,17 +274,21 @@ def _find_last_time(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
     return last
 
 
-def _find_sensors(found: FileContents) -> list[SensorContent]:
+def _find_sensors(contents: FileContents) -> list[SensorContent]:
     """Return the data of each sensor."""
     try:
-        if (known := find_declared_sensor(found.path)) is not None:
-            return [SensorContent(found.path, (known.id,), None, "", _reading(found.path, known))]
+        if (declared := find_declared_sensor(contents.path)) is not None:
+            return [
+                SensorContent(
+                    contents.path, (declared.id,), None, "", _reading(contents.path, declared)
+                )
+            ]
     except LidarSpecError as error:
-        found.warnings.append(str(error))
-    judged = identify_senders(found.path)
+        contents.warnings.append(str(error))
+    judged = identify_senders(contents.path)
     if any(one.sample.is_text for one in judged) and not any(one.candidates for one in judged):
-        found.kind = "text"
-    return [_content(found.path, one) for one in judged]
+        contents.kind = "text"
+    return [_content(contents.path, one) for one in judged]
 
 
 def _content(path: str, one: Verdict) -> SensorContent:
@@ -319,30 +323,30 @@ def _reading(source: str, sensor: Sensor) -> MeterReading | None:
         return None
 
 
-def format_contents(found: FileContents) -> Sequence[tuple[str, str]]:
+def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
     """Return the description of a file as lines of (word, text)."""
     lines = list[tuple[str, str]]()
-    if (header := found.header) is not None:
+    if (header := contents.header) is not None:
         lines.append(("recorded", f"{header.created} from {header.source or 'an unknown source'}"))
-    if found.first_ns is not None:
-        if found.last_ns is not None:
-            until = f" to {format_date(found.last_ns)}, {found.seconds:.3f} s"
+    if contents.first_ns is not None:
+        if contents.last_ns is not None:
+            until = f" to {format_date(contents.last_ns)}, {contents.seconds:.3f} s"
         else:
             until = ""
-        lines.append(("time", f"{format_date(found.first_ns)}{until}"))
+        lines.append(("time", f"{format_date(contents.first_ns)}{until}"))
     else:
         lines.append(("time", "no arrival times"))
-    seconds = found.read_seconds or 0.0
+    seconds = contents.read_seconds or 0.0
     if seconds:
-        rate = f", {found.packets / seconds:.1f}/s, {found.bytes / seconds / 1e3:.1f} kB/s"
+        rate = f", {contents.packets / seconds:.1f}/s, {contents.bytes / seconds / 1e3:.1f} kB/s"
     else:
         rate = ""
-    if any(flow.sender for flow in found.flows):
+    if any(flow.sender for flow in contents.flows):
         unit = "packets"
     else:
         unit = "pieces"
-    lines.append(("holds", f"{found.packets} {unit}, {found.bytes} bytes{rate}"))
-    for flow in found.flows[:FLOWS]:
+    lines.append(("holds", f"{contents.packets} {unit}, {contents.bytes} bytes{rate}"))
+    for flow in contents.flows[:FLOWS]:
         if flow.sender is not None:
             if flow.receiver is not None:
                 to = f" to {endpoint(flow.receiver)}"
@@ -351,19 +355,19 @@ def format_contents(found: FileContents) -> Sequence[tuple[str, str]]:
             lines.append(
                 ("from", f"{endpoint(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes")
             )
-    if further := found.flows[FLOWS:]:
+    if further := contents.flows[FLOWS:]:
         lines.append(
             ("from", f"{len(further)} others: {sum(flow.packets for flow in further)} packets")
         )
-    if not found.whole:
+    if not contents.whole:
         lines.append(
             (
                 "part",
                 "the file is long: only its beginning is counted"
-                + ", and its end is unknown" * (found.last_ns is None),
+                + ", and its end is unknown" * (contents.last_ns is None),
             )
         )
-    for content in found.contents:
+    for content in contents.contents:
         lines.extend(_describe_content(content))
     return lines
 

@@ -101,12 +101,14 @@ def iter_pieces(
     try:
         yield InputPiece(0, whole, identify(sensor, whole, frame=frame))
     except LidarSpecError:
-        found = list(
+        frames = list(
             _split_input(
                 sensor if frame is None else _prefer_frame(sensor, frame), head, datagrams=datagrams
             )
         )
-        yield from found if any(piece.frame for piece in found) else [InputPiece(0, whole, NEAREST)]
+        yield from (
+            frames if any(piece.frame for piece in frames) else [InputPiece(0, whole, NEAREST)]
+        )
 
 
 def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:

@@ -231,5 +231,5 @@ def _command(name: str, command: Command) -> str:
     )
 
 
-def _quote(said: str) -> str:
-    return said.replace("\\", "\\\\").replace('"', "'")
+def _quote(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', "'")

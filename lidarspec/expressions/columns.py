@@ -269,12 +269,12 @@ class Column(NDArrayOperatorsMixin):
         place = _find_axis(
             table.shape[1:], [None] * depth, [1] * depth, self.batch.table, without=own
         )
-        found = table.take(
+        rows = table.take(
             row_numbers(add_axes(self.array, depth).squeeze(1 + place), len(table)), axis=0
         )
         axes = [*self.axes, *(None,) * (depth - len(self.axes))]
         axes[place] = f"?{self.batch.table.schema.chain[place]}"
-        return Column(np.moveaxis(found, -1, 1 + place), tuple(axes), self.batch, ready=self.ready)
+        return Column(np.moveaxis(rows, -1, 1 + place), tuple(axes), self.batch, ready=self.ready)
 
     def running(self) -> Column:
         """The sum of the values so far along the innermost array that they are in."""
@@ -485,24 +485,24 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
     ]
 
 
-def _merge_axis_names(known: str | None, name: str | None) -> str | None:
+def _merge_axis_names(first: str | None, name: str | None) -> str | None:
     """The name of an axis that has two, of which one may be None.
 
     Raises:
         SpecError: for those of different arrays, unless one is a guess.
     """
-    if known is None or name is None:
-        return known or name
+    if first is None or name is None:
+        return first or name
     if (
-        known.strip("?") != name.strip("?")
-        and not known.startswith("?")
+        first.strip("?") != name.strip("?")
+        and not first.startswith("?")
         and not name.startswith("?")
     ):
         raise SpecError(
-            f"axis {known.strip('?')!r} meets axis {name.strip('?')!r}: put one on the other's"
+            f"axis {first.strip('?')!r} meets axis {name.strip('?')!r}: put one on the other's"
             " place with .on(...)"
         )
-    return min(known, name, key=lambda one: (one.startswith("?"), one.endswith("?")))
+    return min(first, name, key=lambda one: (one.startswith("?"), one.endswith("?")))
 
 
 def _length(value: AlongAxis, axis: str) -> int:
@@ -566,14 +566,14 @@ def _find_axis(
         if axis not in texts and place not in without
     }
     for known in (there, whole):
-        spots = [
+        positions = [
             [(first + place, length) for place, length in wanted]
             for first in range(len(lengths) - len(shape) + 1)
         ]
         found = {
-            first: [known[spot] for spot in some]
-            for first, some in enumerate(spots)
-            if all(spot in known for spot in some)
+            first: [known[position] for position in some]
+            for first, some in enumerate(positions)
+            if all(position in known for position in some)
         }
         fixed = {
             first: names
@@ -681,7 +681,7 @@ def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None
     number are left out.
     """
     names = ("packets", *((name or "").strip("?") for name in axes))
-    told = []
+    texts = []
     for what, array in arrays.items():
         own = [
             f"{name} {size}".strip()
@@ -689,8 +689,8 @@ def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None
             if size != 1
         ]
         extra = [str(size) for size in array.shape[: max(array.ndim - len(names), 0)]]
-        told += [f"{what}: {' x '.join(extra + own[::-1])}"] if what and (own or extra) else []
-    return ", ".join(told)
+        texts += [f"{what}: {' x '.join(extra + own[::-1])}"] if what and (own or extra) else []
+    return ", ".join(texts)
 
 
 def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
@@ -817,18 +817,18 @@ class Fields:
         if name == "frame" and not self._prefix and not self._frame and AROUND in self._batch.state:
             return Fields(self._batch, frame=AROUND)
         path = f"{self._prefix}{name}"
-        known = _paths(self._batch, self._frame)
+        paths = _paths(self._batch, self._frame)
         base = without_indices(path)[0]
-        if base in known:
+        if base in paths:
             return _column(self._batch, self._frame, path)
-        if any(other.startswith(f"{base}.") for other in known):
+        if any(other.startswith(f"{base}.") for other in paths):
             return Fields(self._batch, f"{path}.", self._frame)
         axis = base.rpartition(".")[0]
         if name == "index" and not self._frame and axis in self._batch.table.schema.arrays:
             return AlongAxis((axis,), np.arange(self._batch.table.length(axis)))
         raise UnknownField(
             path,
-            known,
+            paths,
             place=(
                 "frame" if self._frame == AROUND else f"state.{self._frame}" if self._frame else ""
             ),

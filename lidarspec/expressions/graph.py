@@ -89,7 +89,7 @@ class Node:
         depth = max((len(arg.sample.axes) for arg in self.args if isinstance(arg, Node)), default=0)
         if self.kind != "call" or len(self.sample.axes) != depth:
             return None
-        found: dict[Node, None] = {}
+        field_nodes: dict[Node, None] = {}
         for arg in self.args:
             if isinstance(arg, Node):
                 fields = arg.fields
@@ -99,8 +99,8 @@ class Node:
                 fields = None
             if fields is None:
                 return None
-            found |= dict.fromkeys(fields)
-        return tuple(found)
+            field_nodes |= dict.fromkeys(fields)
+        return tuple(field_nodes)
 
     @cached_property
     def _first(self) -> int:
@@ -261,9 +261,9 @@ class TracedColumn(NDArrayOperatorsMixin):
         """0, 1, 2 ... up to the largest value in the sample; the tape remembers how many these
         were.
         """
-        found = self.node.sample.steps()
-        self._tape.steps.append((self.node, len(found)))
-        return found
+        indices = self.node.sample.steps()
+        self._tape.steps.append((self.node, len(indices)))
+        return indices
 
     def shift(self, step: int) -> TracedColumn:
         """The value `step` places later (earlier if negative) in stream order, noted down."""
@@ -430,12 +430,12 @@ def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> 
 
 
 def compute(
-    node: Node, known: dict[Node, Any], source: Callable[[Node], Any] = lambda node: None
+    node: Node, results: dict[Node, Any], source: Callable[[Node], Any] = lambda node: None
 ) -> Any:
     """Return the value of a node, given the fields.
 
     Args:
-        known: the values of nodes: columns, or arrays whose first axis is for the packets; added
+        results: the values of nodes: columns, or arrays whose first axis is for the packets; added
             to, so that each is computed once.
         source: the value of a node that is not computed from others, such as a field; None for
             those that are.
@@ -443,14 +443,17 @@ def compute(
     Returns:
         A column or an array, as those that it is made of are.
     """
-    value = known.get(node)
+    value = results.get(node)
     if value is None:
         value = source(node)
         if value is None:
             value = node.value(
-                [compute(arg, known, source) if isinstance(arg, Node) else arg for arg in node.args]
+                [
+                    compute(arg, results, source) if isinstance(arg, Node) else arg
+                    for arg in node.args
+                ]
             )
-        known[node] = value
+        results[node] = value
     return value
 
 
@@ -501,14 +504,14 @@ def values_of(
 ) -> list[NDArray[Any]]:
     """Return the values of expressions, as `Expression.values`; common nodes are computed once."""
     infos = {info.path: info for expression in expressions for info in expression.fields}
-    known = dict[Node, Any]()
+    results = dict[Node, Any]()
     with np.errstate(all="ignore"):
         columns = {
             path: info.physical(np.asarray(raw.get(path, np.nan), np.float64))
             for path, info in infos.items()
         }
         return [
-            np.asarray(compute(expression.node, known, lambda node: columns.get(node.path)))
+            np.asarray(compute(expression.node, results, lambda node: columns.get(node.path)))
             for expression in expressions
         ]
 
@@ -599,13 +602,13 @@ class _ResultPart:
     def _once(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
         """The integer of one packet, (1,), which a later one with equal readings shares."""
         key = tuple(column.item(0) for column in columns)
-        found = self._known.get(key)
-        if found is None:
-            found = self._compute(columns)
+        cached = self._known.get(key)
+        if cached is None:
+            cached = self._compute(columns)
             if len(self._known) >= REMEMBERED:
                 self._known.clear()
-            self._known[key] = found
-        return found
+            self._known[key] = cached
+        return cached
 
     def _compute(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
         raw = {

@@ -91,23 +91,23 @@ def format_of(path: str | Path) -> Format:
     """
     return (
         _find_by_suffix(path, BUILT_IN)
-        or _find_by_suffix(path, known := formats())
-        or _unknown_format_error(path, known)
+        or _find_by_suffix(path, formats_by_suffix := formats())
+        or _unknown_format_error(path, formats_by_suffix)
     )
 
 
-def _find_by_suffix(path: str | Path, known: Mapping[str, Format]) -> Format | None:
+def _find_by_suffix(path: str | Path, formats_by_suffix: Mapping[str, Format]) -> Format | None:
     """Return the format with the longest suffix of a name, such as .csv.gz."""
     name = Path(path).name.lower()
     return max(
-        (found for suffix, found in known.items() if name.endswith(suffix)),
-        key=lambda found: len(found.suffix),
+        (format for suffix, format in formats_by_suffix.items() if name.endswith(suffix)),
+        key=lambda format: len(format.suffix),
         default=None,
     )
 
 
-def _unknown_format_error(path: str | Path, known: Mapping[str, Format]) -> NoReturn:
-    raise UnknownFormat(Path(path).suffix or str(path), known, place=str(path))
+def _unknown_format_error(path: str | Path, formats_by_suffix: Mapping[str, Format]) -> NoReturn:
+    raise UnknownFormat(Path(path).suffix or str(path), formats_by_suffix, place=str(path))
 
 
 def write_imu(path: str | Path, samples: ImuSamples) -> None:
@@ -120,8 +120,10 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
         SourceError: if the file cannot be written.
     """
     path = Path(path)
-    known = {format.suffix: format for format in (CSV, NPZ)}
-    chosen = _find_by_suffix(path, known) or _unknown_format_error(path, known)
+    formats_by_suffix = {format.suffix: format for format in (CSV, NPZ)}
+    chosen = _find_by_suffix(path, formats_by_suffix) or _unknown_format_error(
+        path, formats_by_suffix
+    )
     with replace_file(path) as part:
         if chosen is CSV:
             write_columns(part, samples.columns)

@@ -39,10 +39,10 @@ def _write(
     `sensor`, `source` (the facts about its format), `frame` (the directions of x, y and z), `units`
     as JSON, and `calibration`: "nominal" or "own".
     """
-    made = iter_tables(scans, path, every_point=every_point)
-    first = next(made)
+    tables = iter_tables(scans, path, every_point=every_point)
+    first = next(tables)
     with open_writer(path, first.schema) as writer, write_in_thread(writer.write_table) as write:
-        for table in itertools.chain([first], made):
+        for table in itertools.chain([first], tables):
             write(table)
 
 
@@ -95,8 +95,8 @@ def _of_scans(path: Path | None) -> list[Any]:
 
 def _schema(arrow: Any, scan: Scan, cloud: PointCloud, of_scans: Sequence[Any]) -> Any:
     """Return the schema of the points of a scan."""
-    known = arrow_schema(cloud.columns, units_of(cloud), scan.facts)
-    return arrow.schema([*known, *of_scans], known.metadata)
+    schema = arrow_schema(cloud.columns, units_of(cloud), scan.facts)
+    return arrow.schema([*schema, *of_scans], schema.metadata)
 
 
 def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) -> Any:

@@ -130,13 +130,13 @@ class RosMessages:
         values: dict[str, Any] = {}
         for name in ("angular_velocity", "linear_acceleration"):
             measured = getattr(samples, name)[index]
-            known = bool(np.isfinite(measured).all())
+            is_finite = bool(np.isfinite(measured).all())
             values |= {
-                name: vector(*np.where(known, measured, 0.0).tolist()),
-                f"{name}_covariance": _covariance(known=known),
+                name: vector(*np.where(is_finite, measured, 0.0).tolist()),
+                f"{name}_covariance": _covariance(is_known=is_finite),
             }
         upright = self.types.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-        turned = {"orientation": upright, "orientation_covariance": _covariance(known=False)}
+        turned = {"orientation": upright, "orientation_covariance": _covariance(is_known=False)}
         return self._message(IMU, at, header=self._header(0, at, frame_id), **turned, **values)
 
     def _message(self, name: str, at: int, **values: Any) -> RosMessage:
@@ -156,9 +156,9 @@ class RosMessages:
         return self.types.types["builtin_interfaces/msg/Time"](*divmod(at, _SECOND))
 
 
-def _covariance(*, known: bool) -> NDArray[np.float64]:
+def _covariance(*, is_known: bool) -> NDArray[np.float64]:
     values = np.zeros(9)
-    values[0] = 0.0 if known else -1.0
+    values[0] = 0.0 if is_known else -1.0
     return values
 
 

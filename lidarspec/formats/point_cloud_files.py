@@ -155,10 +155,10 @@ def _ply_header(rows: PointRows) -> bytes:
     return "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
 
 
-def _packed_dtype(types: Mapping[str, Any], known: Mapping[str, str]) -> np.dtype[Any]:
+def _packed_dtype(types: Mapping[str, Any], supported: Mapping[str, str]) -> np.dtype[Any]:
     """Return the type of a row without gaps, in types that a format supports."""
     codes = {name: np.dtype(dtype).str[1:] for name, dtype in types.items()}
-    return np.dtype([(name, "<" + known.get(code, code)) for name, code in codes.items()])
+    return np.dtype([(name, "<" + supported.get(code, code)) for name, code in codes.items()])
 
 
 def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:

@@ -55,9 +55,9 @@ def is_counted(numbers: NDArray[np.int64]) -> bool:
 
 @lru_cache(maxsize=1)
 def _numbers() -> NDArray[np.int64]:
-    found = np.arange(COUNTED)
-    found.setflags(write=False)
-    return found
+    numbers = np.arange(COUNTED)
+    numbers.setflags(write=False)
+    return numbers
 
 
 def broadcast_value(values: NDArray[np.int64]) -> int | None:
@@ -75,13 +75,13 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
     Args:
         few: so many different ones are found one by one sooner than sorted.
     """
-    found = list[int]()
+    values_found = list[int]()
     left = values
-    while len(left) and len(found) < few:
-        found.append(left.item(0))
+    while len(left) and len(values_found) < few:
+        values_found.append(left.item(0))
         left = left[left != left[0]]
     if not len(left):
-        return [(value, np.flatnonzero(values == value)) for value in sorted(found)]
+        return [(value, np.flatnonzero(values == value)) for value in sorted(values_found)]
     order = np.argsort(values, kind="stable")
     ordered = values[order]
     edges = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist(), len(values)]

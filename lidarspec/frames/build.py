@@ -52,13 +52,13 @@ def build(
     declared = sensor.frames[frame]
     place = f"{sensor.id} {frame}"
     checker = _Values(schema(declared.tree), list_paths(declared.tree), place, units=units)
-    given = checker.check({**(value or {}), **values}, "")
+    checked = checker.check({**(value or {}), **values}, "")
     layouts = frame_layouts(declared)
     if isinstance(layouts, NotCompilableError):
-        fill_counts(given, schema(declared.tree))
-        return build_plain(declared, given, place)
+        fill_counts(checked, schema(declared.tree))
+        return build_plain(declared, checked, place)
     try:
-        struct = encode(layouts, given, place)
+        struct = encode(layouts, checked, place)
     except LidarSpecError:
         raise
     except Exception as error:  # an expression or a checksum of the plugin
@@ -80,9 +80,9 @@ class _Values:
     Names and ranges are checked, and units if the values are physical.
     """
 
-    def __init__(self, table: Schema, known: frozenset[str], place: str, *, units: bool) -> None:
+    def __init__(self, table: Schema, paths: frozenset[str], place: str, *, units: bool) -> None:
         self._table = table
-        self._known = known
+        self._known = paths
         self._place = place
         self._units = units
 
@@ -97,18 +97,18 @@ class _Values:
         if isinstance(value, np.ndarray):
             value = value.tolist()
         if isinstance(value, list | tuple):
-            found = []
+            elements = []
             for index, element in enumerate(value):
-                found.append(self.check(element, path, f"{shown}[{index}]"))
+                elements.append(self.check(element, path, f"{shown}[{index}]"))
             if info is not None and info.kind == "bytes":
-                return self._bytes(found, shown)
-            return found
+                return self._bytes(elements, shown)
+            return elements
         if info is None or value is None:
             return value
         return self._number(info, value, shown)
 
     def _mapping(self, value: Mapping[str, Any], path: str, shown: str) -> Container:
-        found = Container()
+        checked = Container()
         for name, element in value.items():
             if name.startswith("_"):
                 continue
@@ -117,21 +117,21 @@ class _Values:
                 raise UnknownField(
                     below, [known for known in self._known if known], place=self._place
                 )
-            found[name] = self.check(element, below, f"{shown}.{name}" if shown else name)
-        return found
+            checked[name] = self.check(element, below, f"{shown}.{name}" if shown else name)
+        return checked
 
-    def _bytes(self, found: list[Any], shown: str) -> bytes | list[Any]:
+    def _bytes(self, numbers: list[Any], shown: str) -> bytes | list[Any]:
         """Return a byte string of numbers.
 
         Arrays of other values, such as byte strings, are returned unchanged.
         """
-        if not any(isinstance(part, int | str) for part in found):
-            return found
+        if not any(isinstance(part, int | str) for part in numbers):
+            return numbers
         try:
-            return bytes(found)
+            return bytes(numbers)
         except (TypeError, ValueError):
             raise UsageError(
-                f"{self._place}: {shown} takes bytes, or numbers from 0 to 255, not {found!r:.60}"
+                f"{self._place}: {shown} takes bytes, or numbers from 0 to 255, not {numbers!r:.60}"
             ) from None
 
     def _number(self, info: FieldInfo, value: Any, shown: str) -> Any:
@@ -161,6 +161,10 @@ class _Values:
             raw = int(value)
         low, high = info.limits
         if not low <= raw <= high:
-            told = [info.physical(part) if self._units else part for part in (raw, low, high)]
-            raise OutOfRange(shown, *told, unit=info.unit if self._units else "", place=self._place)
+            shown_values = [
+                info.physical(part) if self._units else part for part in (raw, low, high)
+            ]
+            raise OutOfRange(
+                shown, *shown_values, unit=info.unit if self._units else "", place=self._place
+            )
         return int(raw)

@@ -132,10 +132,10 @@ class _Encoder:
         path = leaf.info.path
         if path in self._totals:
             return self._totals[path]
-        found = self.read(path)
-        if found is None:
+        value = self.read(path)
+        if value is None:
             raise self._missing_count_error(path)
-        return int(found)
+        return int(value)
 
     def read(self, path: str) -> Any:
         """Return the value of a field, as formulas read it (`lidarspec.spec.tree.Read`)."""
@@ -173,17 +173,17 @@ class _Encoder:
 
     def _encode_parts(self, node: PartSequence) -> list[bytes]:
         """Return the bytes of parts, and fill in the fields that count or measure them."""
-        given = get_member(self._given, node.axis, None)
-        if given is None:
+        parts = get_member(self._given, node.axis, None)
+        if parts is None:
             raise self._missing(node.axis)
-        if not isinstance(given, list) or not all(isinstance(part, dict) for part in given):
-            raise self._wrong(self._shown(node.axis), "a list of its parts", given)
+        if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
+            raise self._wrong(self._shown(node.axis), "a list of its parts", parts)
         around = {}
         for ref in node.outer:
-            found = self.read(ref.path)
-            if found is not None:
-                around[ref.path] = int(found)
-        kinds = [find_kind(node, part) for part in given]
+            value = self.read(ref.path)
+            if value is not None:
+                around[ref.path] = int(value)
+        kinds = [find_kind(node, part) for part in parts]
         layouts = {
             kind.node: kind.layouts
             for kind in kinds_of(node, tuple(around.items()), self._layouts.limit)
@@ -191,9 +191,9 @@ class _Encoder:
         encoded: list[bytes] = []
         following = 0
         # From the last to the first: a part of a chain says how long the next one is.
-        for index in reversed(range(len(given))):
+        for index in reversed(range(len(parts))):
             kind = kinds[index]
-            part = given[index]
+            part = parts[index]
             fill_in(kind.following, part, following, schema(kind.root).fields, node.axis)
             prefix = self._shown(f"{node.axis}[{index}]")
             encoder = _Encoder(layouts[kind], part, self._place, prefix, around)

@@ -151,10 +151,10 @@ class CompiledTable:
         return there
 
     def counts(self, axis: str) -> NDArray[np.intp]:
-        found = np.zeros(len(self), np.intp)
+        counts = np.zeros(len(self), np.intp)
         for group in self.groups:
-            found[group.where] = group.layout.lengths.get(axis, 0)
-        return found
+            counts[group.where] = group.layout.lengths.get(axis, 0)
+        return counts
 
     def length(self, axis: str) -> int:
         """Return the maximum length of an array."""
@@ -167,16 +167,16 @@ class CompiledTable:
     def sizes(self) -> NDArray[np.intp]:
         if len(self.groups) == 1:
             return repeat(self.groups[0].layout.size, len(self))
-        found = np.empty(len(self), np.intp)
+        sizes = np.empty(len(self), np.intp)
         for group in self.groups:
-            found[group.where] = group.layout.size
-        return found
+            sizes[group.where] = group.layout.size
+        return sizes
 
     def frame(self, index: int) -> bytes:
         for group in self.groups:
-            spot = np.flatnonzero(group.where == index)
-            if len(spot):
-                return bytes(group.rows[spot[0]].tobytes())
+            row = np.flatnonzero(group.where == index)
+            if len(row):
+                return bytes(group.rows[row[0]].tobytes())
         raise IndexError(index)
 
     def take(self, which: NDArray[np.intp]) -> CompiledTable:
@@ -222,23 +222,25 @@ class CompiledTable:
     def parts(self, axis: str, kind: str = "") -> tuple[CompiledTable, NDArray[np.intp]]:
         node = self.schema.parts[axis]
         wanted = next(number for number, one in enumerate(node.kinds) if one.name == kind)
-        found = list[_PartRows]()
+        part_rows = list[_PartRows]()
         for group, buffer, walked in self.walks(axis):
             rounds = (piece for pieces in walked.rounds for piece in pieces if piece.kind == wanted)
-            found += [
-                _PartRows(buffer, piece.layout, piece.spots, group.where[piece.owners])
+            part_rows += [
+                _PartRows(buffer, piece.layout, piece.offsets, group.where[piece.owners])
                 for piece in rounds
             ]
         counts = np.zeros(len(self), np.intp)
-        for piece in found:
+        for piece in part_rows:
             counts[piece.frames] += 1
         ranks = list[NDArray[np.intp]]()
         following = np.cumsum(counts) - counts
-        for piece in found:  # in the order of the rounds; each frame has at most one part in each
+        for (
+            piece
+        ) in part_rows:  # in the order of the rounds; each frame has at most one part in each
             ranks.append(following[piece.frames])
             following[piece.frames] += 1
         return CompiledTable(
-            schema(node.kinds[wanted].root), _group_by_layout(found, ranks)
+            schema(node.kinds[wanted].root), _group_by_layout(part_rows, ranks)
         ), np.repeat(np.arange(len(self)), counts)
 
     @staticmethod
@@ -254,27 +256,29 @@ class CompiledTable:
             return CompiledTable(
                 tables[0].schema, [LayoutRows(alone[0].layout, count_up(len(rows)), rows)]
             )
-        found: dict[int, list[LayoutRows]] = {}
+        groups_by_layout: dict[int, list[LayoutRows]] = {}
         start = 0
         for table in tables:
             for group in table.groups:
-                found.setdefault(id(group.layout), []).append(
+                groups_by_layout.setdefault(id(group.layout), []).append(
                     LayoutRows(group.layout, group.where + start, group.rows)
                 )
             start += len(table)
-        return CompiledTable(tables[0].schema, [_merge_groups(groups) for groups in found.values()])
+        return CompiledTable(
+            tables[0].schema, [_merge_groups(groups) for groups in groups_by_layout.values()]
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class _PartRows:
     """Parts of one layout that were found in one round.
 
-    `spots` are their offsets in the buffer, (k,). `frames` are the indices of their frames, (k,).
+    `offsets` are their offsets in the buffer, (k,). `frames` are the indices of their frames, (k,).
     """
 
     buffer: NDArray[np.uint8]
     layout: Layout
-    spots: NDArray[np.intp]
+    offsets: NDArray[np.intp]
     frames: NDArray[np.intp]
 
 
@@ -300,7 +304,7 @@ def _group_by_layout(
 def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> LayoutRows:
     """Return pieces of one layout in one buffer as a group, in stream order."""
     where = np.concatenate([own for _, own in parts])
-    spots = np.concatenate([piece.spots for piece, _ in parts])
+    offsets = np.concatenate([piece.offsets for piece, _ in parts])
     first, _ = parts[0]
     if len(where) and where.max() == len(where) - 1:
         # The group has all parts of the table, so that `where` is a permutation: no need to sort.
@@ -311,7 +315,7 @@ def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> Layout
     return LayoutRows(
         first.layout,
         where[order],
-        rows_at(first.buffer, spots[order], first.layout.size, gathered=False),
+        rows_at(first.buffer, offsets[order], first.layout.size, gathered=False),
     )
 
 
@@ -330,10 +334,10 @@ def _stack_rows(parts: list[Bytes2D]) -> Bytes2D:
     """Stack arrays of rows, without a copy if they follow one another in memory."""
     base = parts[0].base
     width = parts[0].shape[1]
-    spots = [_address(part) for part in parts]
+    addresses = [_address(part) for part in parts]
     follow = (
-        spot + part.size == after
-        for spot, part, after in zip(spots, parts, spots[1:], strict=False)
+        address + part.size == after
+        for address, part, after in zip(addresses, parts, addresses[1:], strict=False)
     )
     if (
         not isinstance(base, np.ndarray)
@@ -347,7 +351,7 @@ def _stack_rows(parts: list[Bytes2D]) -> Bytes2D:
         (count, width),
         np.uint8,
         base.data.cast("B") if base.ndim else base,
-        spots[0] - _address(base),
+        addresses[0] - _address(base),
     )
 
 
@@ -380,17 +384,17 @@ class ParsedTable:
         info, (base, indices) = self.schema.fields[path], without_indices(path)
         if indices:
             return self._take_element(self.raw(base), base, indices)[0]
-        found = [
+        values = [
             _collect_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed
         ]
         lengths = [self.length(axis) for axis in info.axes]
         if info.dtype is not None:
             dtype = info.dtype
         else:
-            dtype = _find_common_dtype(found, path)
+            dtype = _find_common_dtype(values, path)
         column = np.zeros((len(self), *lengths), dtype)
         try:
-            for index, value in enumerate(found):
+            for index, value in enumerate(values):
                 _copy_value(column, index, value)
         except (IndexError, TypeError, ValueError):
             raise SpecError(
@@ -403,15 +407,17 @@ class ParsedTable:
             return None
         axes, (base, indices) = self.schema.fields[path].axes, without_indices(path)
         if indices:
-            known = self.present(base)
+            base_present = self.present(base)
             elements, inside = self._take_element(
-                self.raw(base) if known is None or known.ndim == 1 else known, base, indices
+                self.raw(base) if base_present is None or base_present.ndim == 1 else base_present,
+                base,
+                indices,
             )
-            if known is None:
+            if base_present is None:
                 return inside
             return (
-                inside & known
-                if known.ndim == 1
+                inside & base_present
+                if base_present.ndim == 1
                 else add_axes(inside, elements.ndim - 1) & elements
             )
         there = [
@@ -440,34 +446,38 @@ class ParsedTable:
         for axis in sorted(indices, key=axes.index, reverse=True):
             place = 1 + axes.index(axis)
             counts = self.counts(axis)
-            spots = indices[axis] + (counts if indices[axis] < 0 else 0)
-            inside &= (spots >= 0) & (spots < counts)
+            element_indices = indices[axis] + (counts if indices[axis] < 0 else 0)
+            inside &= (element_indices >= 0) & (element_indices < counts)
             if not column.shape[place]:
                 return (
                     np.zeros((*column.shape[:place], *column.shape[place + 1 :]), column.dtype),
                     inside,
                 )
-            spots = np.broadcast_to(np.clip(spots, 0, column.shape[place] - 1), len(self))
-            column = np.take_along_axis(column, add_axes(spots, column.ndim - 1), place).squeeze(
-                place
+            element_indices = np.broadcast_to(
+                np.clip(element_indices, 0, column.shape[place] - 1), len(self)
             )
+            column = np.take_along_axis(
+                column, add_axes(element_indices, column.ndim - 1), place
+            ).squeeze(place)
         return np.where(add_axes(inside, column.ndim - 1), column, 0).astype(column.dtype), inside
 
     def counts(self, axis: str) -> NDArray[np.intp]:
         lengths = self._lengths(axis)
-        if any(len(found) > 1 for found in lengths):
+        if any(len(frame_lengths) > 1 for frame_lengths in lengths):
             raise SpecError(
                 "its length differs within one frame, and a column has one for each frame",
                 path=axis,
             )
-        return np.array([max(found, default=0) for found in lengths], np.intp)
+        return np.array([max(frame_lengths, default=0) for frame_lengths in lengths], np.intp)
 
     def length(self, axis: str) -> int:
         """Return the maximum length of an array."""
         declared = self.schema.arrays.get(axis)
         if isinstance(declared, int):
             return declared
-        return max((max(found, default=0) for found in self._lengths(axis)), default=0)
+        return max(
+            (max(frame_lengths, default=0) for frame_lengths in self._lengths(axis)), default=0
+        )
 
     def _lengths(self, axis: str) -> list[set[int]]:
         brackets = axis.count("[]")
@@ -488,21 +498,21 @@ class ParsedTable:
 
     def parts(self, axis: str, kind: str = "") -> tuple[ParsedTable, NDArray[np.intp]]:
         node = self.schema.parts[axis]
-        found = list[tuple[int, Any, bytes]]()
+        parts = list[tuple[int, Any, bytes]]()
         for index, (parsed, frame) in enumerate(zip(self._parsed, self._frames, strict=True)):
             pieces = get_member(parsed, axis, None)
             if pieces is not None:
                 spans = zip(pieces, pieces.spans, strict=True)
-                found += [
+                parts += [
                     (index, part, frame[start:end])
                     for part, (name, start, end) in spans
                     if name == kind
                 ]
         own = next(one for one in node.kinds if one.name == kind)
-        frames = np.array([index for index, _, _ in found], np.intp)
+        frames = np.array([index for index, _, _ in parts], np.intp)
         return (
             ParsedTable(
-                schema(own.root), [part for _, part, _ in found], [data for _, _, data in found]
+                schema(own.root), [part for _, part, _ in parts], [data for _, _, data in parts]
             ),
             frames,
         )
@@ -539,20 +549,20 @@ def _collect_values(parsed: Any, names: list[str], axes: int) -> Any:
 
 
 def _collect_elements(parsed: list[Any], names: list[str], axes: int) -> list[Any] | None:
-    found = [_collect_values(element, names, axes) for element in parsed]
-    if found and all(part is None for part in found):
+    values = [_collect_values(element, names, axes) for element in parsed]
+    if values and all(part is None for part in values):
         return None
-    return found
+    return values
 
 
 def _find_present(value: Any) -> Any:
     """Return whether there is a value; nested lists of booleans if some elements lack it."""
     if not isinstance(value, list):
         return value is not None
-    found = [_find_present(part) for part in value]
-    if all(part is True for part in found):
+    present = [_find_present(part) for part in value]
+    if all(part is True for part in present):
         return True
-    return found
+    return present
 
 
 def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
@@ -585,12 +595,12 @@ def _collect_lengths(value: Any, names: list[str], brackets: int) -> set[int]:
         return {length for part in value for length in _collect_lengths(part, names, below)}
     if names:
         if isinstance(value, dict):
-            found = value.get(names[0])
+            element = value.get(names[0])
         else:
-            found = None
-        if found is None:
+            element = None
+        if element is None:
             return set()
-        return _collect_lengths(found, names[1:], brackets)
+        return _collect_lengths(element, names[1:], brackets)
     if isinstance(value, list | bytes):
         return {len(value)}
     return set()
@@ -605,13 +615,13 @@ def _iter_numbers(value: Any) -> Iterator[Any]:
         yield value
 
 
-def _find_common_dtype(found: list[Any], path: str) -> np.dtype[Any]:
+def _find_common_dtype(raw_values: list[Any], path: str) -> np.dtype[Any]:
     """Return the dtype for the values of a field without a declared dtype.
 
     Raises:
         SpecError: if the values are not numbers, or do not fit into 64 bits.
     """
-    values = list(_iter_numbers(found))
+    values = list(_iter_numbers(raw_values))
     if not all(isinstance(value, int | float) for value in values):
         raise SpecError(
             "its values are no numbers, and a column holds numbers: declare a text as bytes",

@@ -165,13 +165,13 @@ class Leaf:
         """
         there = offsets + (self.offset + self.size) <= (len(buffer) if stops is None else stops)
         which = None if there.all() else np.flatnonzero(there)
-        spots = (offsets if which is None else offsets[which]) + self.offset
-        if self.wire is not None and len(spots):
+        starts = (offsets if which is None else offsets[which]) + self.offset
+        if self.wire is not None and len(starts):
             windows: NDArray[Any] = np.ndarray(
                 (len(buffer) - self.size + 1,), self.wire, buffer.data, 0, (1,)
             )
-            return which, windows[spots].astype(self._native)
-        return which, self._is_scalar.load(rows_at(buffer, spots, self.size))
+            return which, windows[starts].astype(self._native)
+        return which, self._is_scalar.load(rows_at(buffer, starts, self.size))
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
         """Return its value in the first bytes of a frame, None if they are too few."""
@@ -298,8 +298,10 @@ class Leaf:
         """
         if not self.elements:
             return self.offset, self.offset + self.size
-        spots = [self.offset + part.byte for element in self.elements for part in element.segments]
-        return min(spots), max(spots) + 1
+        byte_offsets = [
+            self.offset + part.byte for element in self.elements for part in element.segments
+        ]
+        return min(byte_offsets), max(byte_offsets) + 1
 
     def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
         """Return one element of its arrays, None if it does not exist.
@@ -500,8 +502,8 @@ class Condition:
             path: array.astype(self._dtype).reshape(*array.shape, *(1,) * (depth - array.ndim))
             for path, array in raw.items()
         }
-        found = np.asarray(arrays(self.formula, columns, self._dtype))
-        return found if found.dtype == np.bool_ else found != 0
+        results = np.asarray(arrays(self.formula, columns, self._dtype))
+        return results if results.dtype == np.bool_ else results != 0
 
     @cached_property
     def _dtype(self) -> Any:
@@ -597,20 +599,20 @@ class Layout:
         They are the constants and the lengths in `byte_span`.
         """
         both = dict(self.constants)
-        for spot, (mask, value) in self.held.items():
-            other = both.get(spot, (0, 0))
-            both[spot] = (mask | other[0], value | other[1])
+        for offset, (mask, value) in self.held.items():
+            other = both.get(offset, (0, 0))
+            both[offset] = (mask | other[0], value | other[1])
         return both
 
     @cached_property
     def _mask(self) -> int:
-        """The masks of `known` as one little-endian number."""
-        return sum(mask << 8 * spot for spot, (mask, _) in self.known.items())
+        """The masks of `bits_by_offset` as one little-endian number."""
+        return sum(mask << 8 * offset for offset, (mask, _) in self.known.items())
 
     @cached_property
     def _value(self) -> int:
-        """The values of `known` as one little-endian number."""
-        return sum(value << 8 * spot for spot, (_, value) in self.known.items())
+        """The values of `bits_by_offset` as one little-endian number."""
+        return sum(value << 8 * offset for offset, (_, value) in self.known.items())
 
     def sound(self, frame: bytes) -> bool:
         """Return whether one frame is valid.
@@ -651,11 +653,11 @@ class Layout:
         set_bits(rows, self.known)
 
 
-def set_bits(rows: Bytes2D, known: Mapping[int, tuple[int, int]]) -> None:
+def set_bits(rows: Bytes2D, bits_by_offset: Mapping[int, tuple[int, int]]) -> None:
     """Write bits into frames given as rows of bytes: offset -> (mask, value)."""
-    if known:
-        offsets = list(known)
-        bits = np.array(list(known.values()), np.uint8)
+    if bits_by_offset:
+        offsets = list(bits_by_offset)
+        bits = np.array(list(bits_by_offset.values()), np.uint8)
         rows[:, offsets] = rows[:, offsets] & ~bits[:, 0] | bits[:, 1]
 
 
@@ -668,8 +670,8 @@ Word = tuple[int, np.dtype[Any], Any, Any]
 
 def sort_constants(constants: Mapping[int, tuple[int, int]]) -> Marks:
     """Return constants sorted by offset, whole bytes first because they are more distinctive."""
-    found = [(spot, mask, value) for spot, (mask, value) in constants.items()]
-    return tuple(sorted(found, key=lambda mark: (mark[1] != 0xFF, mark[0])))
+    constant_bytes = [(offset, mask, value) for offset, (mask, value) in constants.items()]
+    return tuple(sorted(constant_bytes, key=lambda mark: (mark[1] != 0xFF, mark[0])))
 
 
 @lru_cache(maxsize=2048)
@@ -678,47 +680,47 @@ def merge_constants(constants: Marks) -> tuple[Word, ...]:
 
     The first and the last byte of each word have constant bits.
     """
-    left = {spot: (mask, value) for spot, mask, value in constants}
-    found = list[Word]()
+    left = {offset: (mask, value) for offset, mask, value in constants}
+    merged = list[Word]()
     while left:
         first = min(left)
         size = next(size for size in (8, 4, 2, 1) if first + size - 1 in left)
-        pairs = [left.pop(spot, (0, 0)) for spot in range(first, first + size)]
+        pairs = [left.pop(offset, (0, 0)) for offset in range(first, first + size)]
         dtype = np.dtype(f"<u{size}")
         mask, value = (
             np.frombuffer(bytes(column), dtype)[0] for column in zip(*pairs, strict=True)
         )
-        found.append(
+        merged.append(
             (first, dtype, None if all(pair[0] == 0xFF for pair in pairs) else mask, value)
         )
-    return tuple(found)
+    return tuple(merged)
 
 
 def are_contradictory(some: Marks, others: Marks) -> bool:
     """Return whether two sets of constants contradict each other."""
-    known = {spot: (mask, value) for spot, mask, value in others}
+    bits_by_offset = {offset: (mask, value) for offset, mask, value in others}
     both = [
-        (mask & known[spot][0], value ^ known[spot][1])
-        for spot, mask, value in some
-        if spot in known
+        (mask & bits_by_offset[offset][0], value ^ bits_by_offset[offset][1])
+        for offset, mask, value in some
+        if offset in bits_by_offset
     ]
     return any(mask & differing for mask, differing in both)
 
 
-def match_word(found: NDArray[Any], word: Word) -> NDArray[np.bool_]:
+def match_word(values: NDArray[Any], word: Word) -> NDArray[np.bool_]:
     """Return whether values read at the offset of a word match it, element by element."""
     _, _, mask, value = word
-    return np.asarray((found if mask is None else found & mask) == value)
+    return np.asarray((values if mask is None else values & mask) == value)
 
 
 def match_constants(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
     """Return which rows have all constants, (n,); None if all rows do."""
     held: NDArray[np.bool_] | None = None
     for word in constants:
-        spot, dtype, _, _ = word
-        if spot + dtype.itemsize > rows.shape[1]:
+        offset, dtype, _, _ = word
+        if offset + dtype.itemsize > rows.shape[1]:
             return np.zeros(len(rows), np.bool_)
-        each = match_word(elements(rows, dtype, spot, (), ()), word)
+        each = match_word(elements(rows, dtype, offset, (), ()), word)
         number = np.count_nonzero(each)
         if number < len(rows):
             if held is None:

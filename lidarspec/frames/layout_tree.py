@@ -388,8 +388,8 @@ class HeaderWalk:
 
     def _bit_constant(self, element: BitField, value: int) -> None:
         for part in element.segments:
-            mask, known = self.constants.get(self.cursor + part.byte, (0, 0))
-            byte = known | (value >> part.target << part.low) & part.mask
+            mask, bits = self.constants.get(self.cursor + part.byte, (0, 0))
+            byte = bits | (value >> part.target << part.low) & part.mask
             self.constants[self.cursor + part.byte] = (mask | part.mask, byte)
 
     def _add(self, leaf: Leaf) -> None:
@@ -417,8 +417,8 @@ class HeaderWalk:
         They are constant within one layout.
         """
         rows = np.zeros((2, self.cursor), np.uint8)
-        found = [leaf for leaf in self.leaves.values() if leaf.info.held]
-        for leaf in found:
+        held_leaves = [leaf for leaf in self.leaves.values() if leaf.info.held]
+        for leaf in held_leaves:
             (low, high), rebuilt = leaf.info.limits, leaf.info.rebuilt
             if rebuilt is not None:
                 value = operator.index(tree.evaluate(rebuilt, self._read_known))
@@ -430,8 +430,8 @@ class HeaderWalk:
                         2, *(1 for _ in leaf.shape)
                     ),
                 )
-        spots = np.flatnonzero(rows[1]).tolist() if found else []
-        return {spot: (int(rows[1, spot]), int(rows[0, spot])) for spot in spots}
+        offsets = np.flatnonzero(rows[1]).tolist() if held_leaves else []
+        return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
     def _following(self) -> Iterator[tuple[Leaf, int]]:
         """Yield the values of rebuilt fields that follow from known values.
@@ -557,16 +557,16 @@ class _ValueClasses:
 
         Returns all its values if this cannot be derived from the formulas.
         """
-        (low, high), known = info.limits, list(tree.nodes(root))
+        (low, high), nodes = info.limits, list(tree.nodes(root))
         asking = [
             (node, formula)
-            for node in known
+            for node in nodes
             for formula in tree.formulas(node)
             if _depends_on(formula, info)
         ]
         if any(
             own.rebuilt is not None and not own.held and _depends_on(own.rebuilt, info)
-            for node in known
+            for node in nodes
             for own in tree.infos(node)
         ):
             return cls(info.limits, low, high)
@@ -732,16 +732,17 @@ class _CandidateSet:
         offsets = self._offsets[which]
         stops = len(self._buffer) if self.stops is None else self.stops[which]
         wrong = np.zeros(len(which), np.bool_)
-        for spot, (mask, value) in constants.items() if len(which) else ():
-            there = offsets + spot < stops
-            wrong[there] |= self._buffer[offsets[there] + spot] & mask != value
+        for offset, (mask, value) in constants.items() if len(which) else ():
+            there = offsets + offset < stops
+            wrong[there] |= self._buffer[offsets[there] + offset] & mask != value
         return wrong
 
 
 def _is_refuted(constants: Mapping[int, tuple[int, int]], data: bytes | memoryview) -> bool:
     """Return whether a constant is wrong, as far as the bytes go."""
     return any(
-        spot < len(data) and data[spot] & mask != value for spot, (mask, value) in constants.items()
+        offset < len(data) and data[offset] & mask != value
+        for offset, (mask, value) in constants.items()
     )
 
 
@@ -838,10 +839,10 @@ class HeaderTree:
         """The fields and the constants whose place depends on no header field."""
         self._explore(self._root)
         if isinstance(self._root.result, Layout):
-            known = self._root.result.leaves
+            leaves = self._root.result.leaves
         else:
-            known = self._root.before
-        return tuple(known.values()), prefix_of(self.root, self.limit)
+            leaves = self._root.before
+        return tuple(leaves.values()), prefix_of(self.root, self.limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
         """Return the common layout of candidates, one a row, else None.
@@ -995,7 +996,9 @@ class HeaderTree:
         Candidates are known to have the constants that all frames begin with.
         """
         return {
-            spot: known for spot, known in walk.constants.items() if self._prefix.get(spot) != known
+            offset: bits
+            for offset, bits in walk.constants.items()
+            if self._prefix.get(offset) != bits
         }
 
     def _get_value_classes(self, leaf: Leaf | PartsSize) -> _ValueClasses | None:

@@ -65,10 +65,10 @@ def parse(
         UnknownFrame: if the sensor has no such frame type.
     """
     data = _as_bytes(data)
-    found = _find_sound(sensor, data, frame)
-    if found is None:
-        found = _parse_unsound(sensor, data, frame, verify=verify)
-    name, values = found
+    typed_values = _find_sound(sensor, data, frame)
+    if typed_values is None:
+        typed_values = _parse_unsound(sensor, data, frame, verify=verify)
+    name, values = typed_values
     if units:
         return _convert_units(schema(sensor.frames[name].tree).all_fields, values, "")
     return values
@@ -85,9 +85,9 @@ def identify(sensor: SensorDescription, data: bytes, *, frame: str | None = None
         UnknownFrame: if the sensor has no such frame type.
     """
     data = _as_bytes(data)
-    found = _find_sound(sensor, data, frame)
-    if found is not None:
-        return found[0]
+    typed_values = _find_sound(sensor, data, frame)
+    if typed_values is not None:
+        return typed_values[0]
     return _parse_unsound(sensor, data, frame, verify=True)[0]
 
 
@@ -105,13 +105,13 @@ def _find_sound(
     names = sensor.frames if frame is None or frame not in sensor.frames else (frame,)
     for name in names:
         try:
-            found = _parse_sound(sensor.frames[name], data)
+            values = _parse_sound(sensor.frames[name], data)
         except SpecError:
             raise
         except Exception:
             continue  # an expression of the plugin failed: `_parse_unsound` raises its error
-        if found is not None:
-            return name, found[0]
+        if values is not None:
+            return name, values[0]
     return None
 
 

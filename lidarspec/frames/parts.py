@@ -138,13 +138,13 @@ class PartRound:
     Attributes:
         kind: the index of their kind.
         owners: the indices of the frames that contain them.
-        spots: their offsets in the buffer.
+        offsets: their offsets in the buffer.
     """
 
     kind: int
     layout: Layout
     owners: Offsets
-    spots: Offsets
+    offsets: Offsets
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,10 +226,10 @@ class Region:
     def list_parts(self, frame: bytes) -> list[tuple[PartKind, Layout, bytes]]:
         """Return kind, layout and bytes of each part of one frame."""
         _, walked = self.in_rows(np.frombuffer(frame, np.uint8).reshape(1, -1))
-        pieces = ((piece, int(piece.spots[0])) for pieces in walked.rounds for piece in pieces)
+        pieces = ((piece, int(piece.offsets[0])) for pieces in walked.rounds for piece in pieces)
         return [
-            (self.kinds[piece.kind], piece.layout, frame[spot : spot + piece.layout.size])
-            for piece, spot in pieces
+            (self.kinds[piece.kind], piece.layout, frame[offset : offset + piece.layout.size])
+            for piece, offset in pieces
         ]
 
 
@@ -388,22 +388,23 @@ class _PartWalk:
     def _advance(self, kind: PartKind, layout: Layout, which: Offsets) -> None:
         """Move to the end of the parts of one layout, and read the size of the next part."""
         formula = kind.node.following
-        spots = self._ends[which]
-        self._ends[which] = spots + layout.size
+        offsets = self._ends[which]
+        self._ends[which] = offsets + layout.size
         if formula is None:
             return
         if isinstance(formula, tree.Ref) and formula.path in layout.leaves:
-            announced = layout.leaves[formula.path].read(self._buffer, spots)[1].astype(np.int64)
+            announced = layout.leaves[formula.path].read(self._buffer, offsets)[1].astype(np.int64)
         else:
             announced = np.array(
-                [self._evaluate(kind, layout, formula, spot) for spot in spots.tolist()], np.int64
+                [self._evaluate(kind, layout, formula, offset) for offset in offsets.tolist()],
+                np.int64,
             )
         self._announced[which] = announced
         self._status[which[announced < 0]] = LENGTH
 
-    def _evaluate(self, kind: PartKind, layout: Layout, formula: tree.Formula, spot: int) -> int:
+    def _evaluate(self, kind: PartKind, layout: Layout, formula: tree.Formula, offset: int) -> int:
         """Return the value of a formula in one part, -1 if it fails."""
-        part = self._buffer[spot : spot + layout.size].tobytes()
+        part = self._buffer[offset : offset + layout.size].tobytes()
 
         def read(path: str) -> int | None:
             if path.startswith("_."):
@@ -422,7 +423,7 @@ class _PartWalk:
 
 def match_constants_at(
     buffer: NDArray[np.uint8],
-    spots: Offsets,
+    offsets: Offsets,
     constants: tuple[Word, ...],
     stops: Offsets | None = None,
 ) -> NDArray[np.bool_] | None:
@@ -431,24 +432,24 @@ def match_constants_at(
     In a truncated candidate, the constants are compared up to its end.
 
     Args:
-        spots: the offsets of the candidates.
+        offsets: the offsets of the candidates.
         stops: the offset after the last byte of each candidate; by default the end of the buffer.
     """
     matches: NDArray[np.bool_] | None = None
     for word in constants:
-        spot, dtype, _, _ = word
-        room = len(buffer) - spot - dtype.itemsize
-        if bool((spots <= (room if stops is None else stops - spot - dtype.itemsize)).all()):
-            windows: NDArray[Any] = np.ndarray((room + 1,), dtype, buffer.data, spot, (1,))
-            each = match_word(windows[spots], word)
+        position, dtype, _, _ = word
+        room = len(buffer) - position - dtype.itemsize
+        if bool((offsets <= (room if stops is None else stops - position - dtype.itemsize)).all()):
+            windows: NDArray[Any] = np.ndarray((room + 1,), dtype, buffer.data, position, (1,))
+            each = match_word(windows[offsets], word)
         else:
             if stops is None:
-                ends = [len(buffer)] * len(spots)
+                ends = [len(buffer)] * len(offsets)
             else:
                 ends = stops.tolist()
             parts = (
-                buffer[start + spot : min(start + spot + dtype.itemsize, end)]
-                for start, end in zip(spots.tolist(), ends, strict=True)
+                buffer[start + position : min(start + position + dtype.itemsize, end)]
+                for start, end in zip(offsets.tolist(), ends, strict=True)
             )
             each = np.array([_is_start_of(part.tobytes(), word) for part in parts], np.bool_)
         if np.count_nonzero(each) < len(each):

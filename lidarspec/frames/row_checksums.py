@@ -224,11 +224,11 @@ def load_words(
         rows = np.ascontiguousarray(np.pad(rows, ((0, 0), (0, 8))))
     count, size = rows.shape
     number, runs, parts = _pieces(spans, size, zeros_first)
-    found = np.empty((number, count), "<u8")
+    columns = np.empty((number, count), "<u8")
     begun = -1
     for first, length, start in runs:
         first_words = rows[:, start : start + 8].view("<u8")[:, 0]
-        found[first : first + length] = np.lib.stride_tricks.as_strided(
+        columns[first : first + length] = np.lib.stride_tricks.as_strided(
             first_words, (length, count), (8, rows.strides[0])
         )
     for word, start, right, mask, left in parts:
@@ -236,11 +236,11 @@ def load_words(
         if mask is not None:
             part &= mask
         if word == begun:
-            found[word] |= np.left_shift(part, left, out=part)
+            columns[word] |= np.left_shift(part, left, out=part)
         else:
-            np.left_shift(part, left, out=found[word])
+            np.left_shift(part, left, out=columns[word])
         begun = word
-    return found
+    return columns
 
 
 @lru_cache(maxsize=1024)
@@ -385,13 +385,13 @@ def make_place_tables(
     table = np.array(
         byte_table(width, poly, refin), f"<u{REGISTER_BYTES[width] if width > 8 else 1}"
     )
-    found = [table]
-    while len(found) < length:
-        found.append(table[found[-1] & 0xFF] ^ (found[-1] >> 8 if width > 8 else 0))
+    tables = [table]
+    while len(tables) < length:
+        tables.append(table[tables[-1] & 0xFF] ^ (tables[-1] >> 8 if width > 8 else 0))
     begun = table.dtype.type(start >> 8 * length)
     for place, byte in enumerate(start.to_bytes(8, "little")[:length]):
-        begun ^= found[length - 1 - place][byte]
-    return np.concatenate(found[::-1]), np.arange(length) * 256, begun
+        begun ^= tables[length - 1 - place][byte]
+    return np.concatenate(tables[::-1]), np.arange(length) * 256, begun
 
 
 def _narrow_registers(
@@ -526,9 +526,9 @@ def _jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
     return np.array([byte_table(width, poly, refin), *later_places], f"<u{REGISTER_BYTES[width]}")
 
 
-def _jump(found: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
+def _jump(values: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
     """Registers, shape (k,) and contiguous, each advanced by a jump table."""
-    places = found.view(np.uint8).reshape(len(found), -1).T
+    places = values.view(np.uint8).reshape(len(values), -1).T
     return np.asarray(
         np.bitwise_xor.reduce(
             [of_place.take(place) for of_place, place in zip(table, places, strict=True)]

@@ -72,10 +72,10 @@ class PathMapping(dict[str, _Field]):
 
     def __init__(
         self,
-        known: Mapping[str, _Field],
+        values: Mapping[str, _Field],
         element: Callable[[_Field, str, Mapping[str, int]], _Field | None],
     ) -> None:
-        super().__init__(known)
+        super().__init__(values)
         self._element = element
         self._elements = dict[str, _Field | None]()
 
@@ -95,10 +95,10 @@ class PathMapping(dict[str, _Field]):
             base, indices = without_indices(path)
             known = super().get(base)
             self._elements[path] = None if known is None else self._element(known, path, indices)
-        found = self._elements[path]
-        if found is None:
+        element = self._elements[path]
+        if element is None:
             return default
-        return found
+        return element
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,14 +145,14 @@ class Schema:
 
         A field of a kind follows the name of the kind: "tags.points.angle".
         """
-        found = dict(self.fields)
+        names = dict(self.fields)
         for axis, node in self.parts.items():
             for kind in node.kinds:
                 before = f"{axis}.{kind.name}".rstrip(".")
-                found |= {
+                names |= {
                     f"{before}.{path}": info for path, info in schema(kind.root).scan_names.items()
                 }
-        return found
+        return names
 
     def within(self, path: str) -> tuple[str, str, str] | None:
         """Return the axis, the kind and the remaining path of a path into parts.
@@ -253,15 +253,15 @@ def _element(
 
     The element is optional if the header determines the number of elements.
     """
-    found = element_of(info, path, indices)
+    element = element_of(info, path, indices)
     counts = [(arrays.get(axis), index) for axis, index in indices.items()]
-    if found is None or any(
+    if element is None or any(
         isinstance(count, int) and not -count <= index < count for count, index in counts
     ):
         return None
     if all(isinstance(count, int) for count, _ in counts):
-        return found
-    return replace(found, optional=True)
+        return element
+    return replace(element, optional=True)
 
 
 def _docs_around(path: str, structs: Mapping[str, str]) -> str:
@@ -333,30 +333,30 @@ def _count(
         arrays[axis] = None if isinstance(count, int) else count
 
 
-def _merge_fields(known: FieldInfo, other: FieldInfo) -> FieldInfo:
+def _merge_fields(first: FieldInfo, other: FieldInfo) -> FieldInfo:
     """One column for a field that several branches declare."""
-    kinds = {known.kind, other.kind}
+    kinds = {first.kind, other.kind}
     if (
-        known.axes != other.axes
+        first.axes != other.axes
         or "other" in kinds
         or kinds > {"bytes"}
-        or known.dtype is None
+        or first.dtype is None
         or other.dtype is None
     ):
-        return replace(known, dtype=None, kind="other")
-    dtype = np.promote_types(known.dtype, other.dtype)
-    if (known.bits, known.dtype) == (other.bits, other.dtype):
-        bits = known.bits
-    elif known.kind == "bytes":
+        return replace(first, dtype=None, kind="other")
+    dtype = np.promote_types(first.dtype, other.dtype)
+    if (first.bits, first.dtype) == (other.bits, other.dtype):
+        bits = first.bits
+    elif first.kind == "bytes":
         bits = 0
     else:
         bits = 8 * dtype.itemsize
-    const = known.const if known.const == other.const else None
-    labels = known.labels if known.labels == other.labels else {}
+    const = first.const if first.const == other.const else None
+    labels = first.labels if first.labels == other.labels else {}
     return replace(
-        known,
+        first,
         dtype=dtype,
-        kind="float" if dtype.kind == "f" else known.kind,
+        kind="float" if dtype.kind == "f" else first.kind,
         bits=bits,
         const=const,
         labels=labels,

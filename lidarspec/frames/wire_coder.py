@@ -364,10 +364,11 @@ def _places(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp
     return all_offsets, np.concatenate(owners)[first]
 
 
-def _run_of_bytes(known: dict[int, int]) -> bytes:
+def _run_of_bytes(bytes_by_offset: dict[int, int]) -> bytes:
     """Return the known bytes from the first one on, up to the first that is not known."""
     return bytes(
-        known[offset] for offset in itertools.takewhile(known.__contains__, itertools.count())
+        bytes_by_offset[offset]
+        for offset in itertools.takewhile(bytes_by_offset.__contains__, itertools.count())
     )
 
 

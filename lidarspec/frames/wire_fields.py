@@ -158,10 +158,10 @@ class ExaminedFrame:
 
     def broken_part(self, axis: str) -> ExaminedFrame | None:
         """Return the part at a path that is no valid part; None if all are there."""
-        found = self._examined_parts(axis)
-        if found.is_whole:
+        examined = self._examined_parts(axis)
+        if examined.is_whole:
             return None
-        return found.parts[-1]
+        return examined.parts[-1]
 
     def _examined_parts(self, axis: str) -> ExaminedParts:
         if axis not in self._parts:
@@ -207,11 +207,11 @@ def _examine_parts(around: ExaminedFrame, axis: str) -> ExaminedParts:
     data = np.frombuffer(around.data, np.uint8)
     walked = region.walk(data, np.zeros(1, np.intp))
     pieces = [piece for pieces in walked.rounds for piece in pieces]
-    found = list[ExaminedFrame]()
+    parts = list[ExaminedFrame]()
     for index, piece in enumerate(pieces):
-        start = int(piece.spots[0])
+        start = int(piece.offsets[0])
         stop = start + piece.layout.size
-        found.append(
+        parts.append(
             _examine_part(around, region, axis, index, region.kinds[piece.kind], start, stop)
         )
     end = region.start + int(walked.sizes[0])
@@ -221,8 +221,8 @@ def _examine_parts(around: ExaminedFrame, axis: str) -> ExaminedParts:
         stop = len(around.data)
         if region.rule.within is not None:
             stop = min(stop, region.start + region.rule.within)
-        found.append(_examine_part(around, region, axis, len(found), kind, end, stop))
-    return ExaminedParts(found, is_whole)
+        parts.append(_examine_part(around, region, axis, len(parts), kind, end, stop))
+    return ExaminedParts(parts, is_whole)
 
 
 def _examine_part(
@@ -251,9 +251,9 @@ def _likely_kind(region: Region, data: bytes) -> PartKind:
     """Return the kind of part that bytes begin like; the last one if they begin like none."""
     for kind in region.kinds:
         known = [
-            data[spot] & mask == value
-            for spot, (mask, value) in kind.prefix.items()
-            if spot < len(data)
+            data[offset] & mask == value
+            for offset, (mask, value) in kind.prefix.items()
+            if offset < len(data)
         ]
         if all(known):
             return kind

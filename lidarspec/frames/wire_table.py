@@ -191,8 +191,8 @@ def _rows(
                     kind.element, element, SizeFormula(0, (f"at({element})",)), said, seals
                 )
         case tree.When() | tree.Select():
-            for asked, branch in list_branches(node):
-                yield from _rows(branch, shown, start, asked, seals)
+            for condition_text, branch in list_branches(node):
+                yield from _rows(branch, shown, start, condition_text, seals)
         case tree.Check():
             yield WireRow(
                 str(start),
@@ -266,8 +266,8 @@ def _type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
 def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     """The alternatives of a part, each with its condition in words."""
     if isinstance(node, tree.When):
-        asked = format_formula(node.condition)
-        return [(f"if {asked}", node.then), (f"unless {asked}", node.otherwise)]
+        condition_text = format_formula(node.condition)
+        return [(f"if {condition_text}", node.then), (f"unless {condition_text}", node.otherwise)]
     key = format_formula(node.key)
     if isinstance(node.key, tree.Ref):
         labels = node.key.info.labels

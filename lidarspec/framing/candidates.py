@@ -183,12 +183,12 @@ def find_by_constants(buffer: Bytes1D, constants: Marks) -> Offsets:
     A constant behind the end of the buffer counts as matching.
     """
     match: NDArray[np.bool_] | None = None
-    for spot, mask, value in constants:
-        values = buffer[spot:]
+    for position, mask, value in constants:
+        values = buffer[position:]
         if mask != 0xFF:
             values = values & np.uint8(mask)
         is_right = values == np.uint8(value)
-        if match is None and spot == 0:
+        if match is None and position == 0:
             match = is_right
             continue
         if match is None:
@@ -214,8 +214,8 @@ class ConstantFilter:
         self._all_types = np.uint64((1 << len(constants)) - 1)
         self._tables: dict[int, NDArray[np.uint64]] = {}
         for number, marks in enumerate(constants):
-            for spot, mask, value in marks:
-                table = self._tables.setdefault(spot, np.full(256, self._all_types))
+            for offset, mask, value in marks:
+                table = self._tables.setdefault(offset, np.full(256, self._all_types))
                 table[np.arange(256) & mask != value] &= ~np.uint64(1 << number)
 
     def sort(self, buffer: Bytes1D, offsets: Offsets) -> dict[int, Offsets]:
@@ -229,9 +229,9 @@ class ConstantFilter:
         if not self._tables:
             return dict.fromkeys(range(int(self._all_types).bit_length()), offsets)
         types = np.full(len(offsets), self._all_types)
-        for spot, table in self._tables.items():
-            inside = int(offsets.searchsorted(len(buffer) - spot))
-            types[:inside] &= table[buffer[offsets[:inside] + spot]]
+        for position, table in self._tables.items():
+            inside = int(offsets.searchsorted(len(buffer) - position))
+            types[:inside] &= table[buffer[offsets[:inside] + position]]
         is_any = types != 0
         if not is_any.all():
             types = types[is_any]
@@ -287,11 +287,11 @@ class Candidates:
         self._live: dict[int, Frames] = {}
         self._waiting: dict[int, list[int]] = {}
         self._known: set[int] = set()
-        found = self._find(mode)
+        offsets_by_kind = self._find(mode)
         limit = min(
             (
                 int(offsets[MAX_CANDIDATES])
-                for offsets in found.values()
+                for offsets in offsets_by_kind.values()
                 if len(offsets) > MAX_CANDIDATES
             ),
             default=len(self.buffer),
@@ -299,20 +299,20 @@ class Candidates:
         if limit < len(self.buffer):
             self.buffer = self.buffer[: max(limit, framing.reach)]
             self._offsets_by_prefix.clear()
-            found = {
+            offsets_by_kind = {
                 kind: offsets[: int(np.searchsorted(offsets, len(self.buffer)))]
-                for kind, offsets in found.items()
+                for kind, offsets in offsets_by_kind.items()
             }
         self.is_whole = len(self.buffer) == len(buffer)
         self.final = final and self.is_whole
-        self._judge(found)
+        self._judge(offsets_by_kind)
 
     def find_live(self, mode: SearchState) -> LiveCandidates | None:
         """Return the candidates that may be taken; None if there are too many."""
-        found = self._find(mode)
-        if any(len(offsets) > MAX_CANDIDATES for offsets in found.values()):
+        offsets_by_kind = self._find(mode)
+        if any(len(offsets) > MAX_CANDIDATES for offsets in offsets_by_kind.values()):
             return None
-        self._judge(found)
+        self._judge(offsets_by_kind)
         parts = list[Frames]()
         all_runs = dict[int, WeakRuns]()
         active = self._framing.active_types(mode)
@@ -375,23 +375,25 @@ class Candidates:
         for kind in self._framing.active_types(mode):
             if kind not in self._known:
                 groups.setdefault(self._framing.marks[kind][:SHARED_MARKS], []).append(kind)
-        found: dict[int, Offsets] = {}
+        offsets_by_kind: dict[int, Offsets] = {}
         for begin, kinds in groups.items():
             if begin not in self._offsets_by_prefix:
                 self._offsets_by_prefix[begin] = find_by_constants(self.buffer, begin)
             offsets = self._offsets_by_prefix[begin]
             if not len(offsets):
-                found |= dict.fromkeys(kinds, offsets)
+                offsets_by_kind |= dict.fromkeys(kinds, offsets)
                 continue
             for first in range(0, len(kinds), MAX_TYPES):
                 some = kinds[first : first + MAX_TYPES]
                 matching = self._framing.filter(some).sort(self.buffer, offsets)
-                found |= {kind: matching.get(index, offsets[:0]) for index, kind in enumerate(some)}
-        return found
+                offsets_by_kind |= {
+                    kind: matching.get(index, offsets[:0]) for index, kind in enumerate(some)
+                }
+        return offsets_by_kind
 
-    def _judge(self, found: Mapping[int, Offsets]) -> None:
-        self._known |= found.keys()
-        for kind, offsets in found.items():
+    def _judge(self, offsets_by_kind: Mapping[int, Offsets]) -> None:
+        self._known |= offsets_by_kind.keys()
+        for kind, offsets in offsets_by_kind.items():
             number = self._count_arrived(kind, offsets)
             self._waiting[kind] = offsets[number:].tolist()
             if not number:

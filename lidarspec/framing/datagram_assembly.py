@@ -190,30 +190,30 @@ class FragmentAssembler:
             key for key, message in self._waiting.items() if 0 <= message.at < time - PATIENCE
         ]:
             self._lose(key)
-        known = self._waiting.get(fragment.key)
-        if known is not None and (
-            known.count != fragment.count
-            or known.parts.get(fragment.index, fragment.payload) != fragment.payload
+        partial = self._waiting.get(fragment.key)
+        if partial is not None and (
+            partial.count != fragment.count
+            or partial.parts.get(fragment.index, fragment.payload) != fragment.payload
         ):
             self._lose(fragment.key)  # a message of the same key has begun
-            known = None
-        elif fragment.index in known.parts if known is not None else fragment.key in self._done:
+            partial = None
+        elif fragment.index in partial.parts if partial is not None else fragment.key in self._done:
             self._stats.fragments_late += 1
             self._dropped += len(fragment.payload)
             return None
-        if known is None:
+        if partial is None:
             while len(self._waiting) >= WAITING:
                 self._lose(next(iter(self._waiting)))
-            known = self._waiting[fragment.key] = _PartialMessage(fragment.count, place, time)
-        known.parts[fragment.index] = fragment.payload
-        if known.size > self._longest:
+            partial = self._waiting[fragment.key] = _PartialMessage(fragment.count, place, time)
+        partial.parts[fragment.index] = fragment.payload
+        if partial.size > self._longest:
             self._lose(fragment.key)
             return None
-        if (known.size if self._rule.in_bytes else len(known.parts)) < known.count:
+        if (partial.size if self._rule.in_bytes else len(partial.parts)) < partial.count:
             return None
         del self._waiting[fragment.key]
         self._done.append(fragment.key)
-        return b"".join(part for _, part in sorted(known.parts.items())), known.place
+        return b"".join(part for _, part in sorted(partial.parts.items())), partial.place
 
     def _lose(self, key: Hashable) -> None:
         message = self._waiting.pop(key)

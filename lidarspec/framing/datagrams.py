@@ -93,16 +93,16 @@ class _DatagramBatch:
         if mode.after not in self._known:
             frames, reasons = self._judge(self._starts[position:], self._sizes[position:], mode)
             if self._framing.named:
-                spots = (
+                rows = (
                     np.flatnonzero(self._framing.switching(mode)[frames.kinds]) + position
                 ).tolist()
             else:
-                spots = []
-            self._known[mode.after] = position, frames, reasons, spots
-        first, frames, reasons, spots = self._known[mode.after]
-        index = bisect.bisect_left(spots, position)
-        if index < len(spots):
-            stop = spots[index] + 1
+                rows = []
+            self._known[mode.after] = position, frames, reasons, rows
+        first, frames, reasons, rows = self._known[mode.after]
+        index = bisect.bisect_left(rows, position)
+        if index < len(rows):
+            stop = rows[index] + 1
         else:
             stop = len(self._starts)
         frames = frames.select(slice(position - first, stop - first))
@@ -125,10 +125,10 @@ class _DatagramBatch:
             where each is to be judged alone.
         """
         number = len(starts)
-        known = broadcast_value(sizes)
-        if known is not None:
-            least = known
-            most = known
+        common_size = broadcast_value(sizes)
+        if common_size is not None:
+            least = common_size
+            most = common_size
         elif number:
             least = int(sizes.min())
             most = int(sizes.max())
@@ -259,17 +259,17 @@ class _DatagramBatch:
         marked = np.ones(len(starts), np.bool_)
         step = find_common_step(starts)
         for word in constants if len(starts) else ():
-            spot, dtype, _, _ = word
+            offset, dtype, _, _ = word
             if step:
                 values = np.ndarray(
-                    (len(starts),), dtype, self._buffer, starts.item(0) + spot, (step,)
+                    (len(starts),), dtype, self._buffer, starts.item(0) + offset, (step,)
                 )
             else:
                 values = np.ndarray(
-                    (len(self._buffer) - spot - dtype.itemsize + 1,),
+                    (len(self._buffer) - offset - dtype.itemsize + 1,),
                     dtype,
                     self._buffer,
-                    spot,
+                    offset,
                     (1,),
                 )[starts]
             marked &= match_word(values, word)

@@ -180,33 +180,33 @@ class Decoder:
             buffer = np.frombuffer(data if isinstance(data, bytes) else bytes(view), np.uint8)
             self.observer.observe_input(self, buffer, range(1), repeat(len(view), 1))
         self.stats.bytes_in += len(view)
-        found: list[Frames] = []
+        parts: list[Frames] = []
         start = 0
         lasting = isinstance(data, bytes)
         if self._pending:
             held = len(self._pending)
             head = b"".join((self._pending, view[: max(self._least, self._need)]))
-            start = self._cut(np.frombuffer(head, np.uint8), at, found) - held
+            start = self._cut(np.frombuffer(head, np.uint8), at, parts) - held
             if start < 0 or held + len(view) == len(head):
                 self._pending = head[start + held :]
                 start = len(view)
         if start < len(view):
             rest = np.frombuffer(view[start:], np.uint8)
-            self._pending = rest[self._cut(rest, at, found, lasting=lasting) :].tobytes()
+            self._pending = rest[self._cut(rest, at, parts, lasting=lasting) :].tobytes()
         self.stats.pending = len(self._pending)
-        return found
+        return parts
 
     def take_pending(self) -> list[Frames]:
         """The frames among the bytes that wait for others, as arrays: these will not come."""
-        found: list[Frames] = []
+        parts: list[Frames] = []
         self._need = 0
         if self._assembly is not None:
             self._drop(self._assembly.give_up())
         if self._pending:
-            self._cut(np.frombuffer(self._pending, np.uint8), None, found, final=True)
+            self._cut(np.frombuffer(self._pending, np.uint8), None, parts, final=True)
         self._pending = b""
         self.stats.pending = 0
-        return found
+        return parts
 
     def datagrams(
         self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None
@@ -327,7 +327,7 @@ class Decoder:
         self,
         buffer: NDArray[np.uint8],
         at: int | None,
-        found: list[Frames],
+        parts: list[Frames],
         *,
         lasting: bool = True,
         final: bool = False,
@@ -348,7 +348,7 @@ class Decoder:
             part = part if lasting else part.copy()
             piece = self._piece(part, final=final and last)
             frames = self._enter(part, piece, at)
-            found += [frames] if len(frames) else []  # none at all would keep its bytes
+            parts += [frames] if len(frames) else []  # none at all would keep its bytes
             start = start + piece.end
             self._base = self._base + piece.end
             self._need = piece.need if piece.waiting and last else 0

@@ -87,9 +87,9 @@ def random_frame(
         number = min(GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1))
         rows = _random(engine, layout, number, source)
         _store_drawn(layout, rows, chosen, drawn, source)
-        found = _plausible(sensor, frame, layout, _set_headers(rows, layout, chosen))
-        if found:
-            return found[0]
+        plausible_rows = _plausible(sensor, frame, layout, _set_headers(rows, layout, chosen))
+        if plausible_rows:
+            return plausible_rows[0]
     return _make_along_sweep(sensor, frame, engine, source, drawn)
 
 
@@ -291,9 +291,9 @@ def _make_along_sweep(
             if leaf is not None and path not in chosen:
                 _store_swept(leaf, rows, value)
         _store_drawn(layout, rows, chosen, drawn, source)
-        found = _plausible(sensor, frame, layout, _set_headers(rows, layout, chosen))
-        if found:
-            return found[0]
+        plausible_rows = _plausible(sensor, frame, layout, _set_headers(rows, layout, chosen))
+        if plausible_rows:
+            return plausible_rows[0]
     raise SpecError(
         "neither random frames nor those along `sweep` pass `plausible`",
         path=frame,
@@ -331,11 +331,11 @@ def _store_drawn(
 def _draw_stated(engine: Codec, values: Mapping[str, Any]) -> Drawn:
     """Return a function that draws the raw numbers of a sweep for header fields."""
     fields = engine.schema.fields
-    found: dict[str, Callable[[random.Random], Any]] = {}
+    draws: dict[str, Callable[[random.Random], Any]] = {}
     for path, value in values.items():
         if path in fields and np.ndim(value) == 0 and not isinstance(value, bytes):
-            found[path] = functools.partial(return_raw, fields[path].raw(float(value)))
-    return found
+            draws[path] = functools.partial(return_raw, fields[path].raw(float(value)))
+    return draws
 
 
 def return_raw(raw: int, _: random.Random) -> int:

@@ -285,14 +285,14 @@ def _partial(
     """
     status = np.full(len(offsets), SHORT, np.uint8)
     sizes = sizes.copy()
-    for verdict, known in ((LENGTH, layout.held), (CONSTANT, layout.constants)):
-        for spot in sorted(known, reverse=True):
-            mask, value = known[spot]
-            there = offsets + spot < stops
+    for verdict, bits in ((LENGTH, layout.held), (CONSTANT, layout.constants)):
+        for offset in sorted(bits, reverse=True):
+            mask, value = bits[offset]
+            there = offsets + offset < stops
             status[there] = np.where(
-                buffer[offsets[there] + spot] & mask == value, status[there], verdict
+                buffer[offsets[there] + offset] & mask == value, status[there], verdict
             )
-            sizes[~there] = np.minimum(sizes[~there], spot + 1)
+            sizes[~there] = np.minimum(sizes[~there], offset + 1)
     return status, sizes
 
 

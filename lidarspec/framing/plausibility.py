@@ -92,9 +92,9 @@ class CandidateChecker:
         self._constants = merge_constants(
             sort_constants(
                 {
-                    spot: known
-                    for spot, known in layout.constants.items()
-                    if prefix.get(spot) != known
+                    offset: bits
+                    for offset, bits in layout.constants.items()
+                    if prefix.get(offset) != bits
                 }
             )
         )
@@ -183,7 +183,7 @@ def _check_parts(
     status = OF_PARTS[walked.status]
     errors += walked.errors
     for piece in (piece for pieces in walked.rounds for piece in pieces):
-        parts = rows_at(buffer, piece.spots, piece.layout.size)
+        parts = rows_at(buffer, piece.offsets, piece.layout.size)
         verdicts = np.zeros(len(parts), np.uint8)
         _check_valid_parts(piece.layout, verdicts, parts, errors, sums)
         for seal in piece.layout.seals:

@@ -401,19 +401,19 @@ class Frames:
         ]
 
 
-def pack_found(found: Sequence[Found]) -> Frames:
+def pack_found(frames: Sequence[Found]) -> Frames:
     """Frames given one by one as arrays."""
-    names = tuple(dict.fromkeys(item.frame for item in found))
-    sizes = np.array([len(item.data) for item in found], np.intp)
+    names = tuple(dict.fromkeys(item.frame for item in frames))
+    sizes = np.array([len(item.data) for item in frames], np.intp)
     columns = [
         np.array(column, np.int64)
         for column in zip(
-            *((f.offset, f.gap, -1 if f.at is None else f.at) for f in found), strict=True
+            *((f.offset, f.gap, -1 if f.at is None else f.at) for f in frames), strict=True
         )
     ]
     offsets, gaps, at = columns or [np.empty(0, np.int64)] * 3
-    kinds = np.array([names.index(item.frame) for item in found], np.intp)
-    buffer = np.frombuffer(b"".join(item.data for item in found), np.uint8)
+    kinds = np.array([names.index(item.frame) for item in frames], np.intp)
+    buffer = np.frombuffer(b"".join(item.data for item in frames), np.uint8)
     return Frames(buffer, kinds, np.cumsum(sizes) - sizes, sizes).locate(names, offsets, gaps, at)
 
 

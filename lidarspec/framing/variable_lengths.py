@@ -104,8 +104,8 @@ class LayoutFamilies:
         """
         if self not in layout.notes:  # decoders of one frame type share its layouts
             layout.notes[self] = self._find(layout, judge)
-        known: LayoutFamily | None = layout.notes[self]
-        return known
+        family: LayoutFamily | None = layout.notes[self]
+        return family
 
     def _find(self, layout: Layout, judge: CandidateChecker) -> LayoutFamily | None:
         if layout.regions or not all(_is_extended(seal) for seal in layout.seals):

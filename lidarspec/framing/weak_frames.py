@@ -93,16 +93,16 @@ class WeakRuns:
         count = len(self.frames)
         rows = np.arange(count)
         further = self.following[:count]
-        found = list[Indices]()
+        jump_rows = list[Indices]()
         if self.is_single:
             jumps = rows
         else:
             jumps = np.where(further < count, further, rows)
         while (jumps != rows).any():
-            found.append(jumps)
+            jump_rows.append(jumps)
             rows = jumps
             jumps = jumps[jumps]
-        return found
+        return jump_rows
 
 
 def find_runs(

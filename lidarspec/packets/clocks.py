@@ -137,13 +137,13 @@ class ClockEpoch:
         if table is None or not len(rows):
             return repeat(0, len(times))
         frames = table.take(rows)
-        told = reported_seconds(self._clock, frames)
-        if not np.isfinite(told).any():
+        seconds = reported_seconds(self._clock, frames)
+        if not np.isfinite(seconds).any():
             return repeat(0, len(times))
-        row = int(np.isfinite(told).argmax())
+        row = int(np.isfinite(seconds).argmax())
         first = int(np.searchsorted(which, rows[row]))
         reading = reference_readings(self._sensor, frames).item(row)
-        complete = self._complete(reading, told.item(row))
+        complete = self._complete(reading, seconds.item(row))
         self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
         if whole or not first:
             return repeat(self.ns, len(times))
@@ -158,9 +158,9 @@ class ClockEpoch:
             passed += round((reference.host_ns - host - passed) / self._turn) * self._turn
         return self._complete(reference.reading_ns, reference.reported_s) - time - passed
 
-    def _complete(self, reading: int, told: float) -> int:
+    def _complete(self, reading: int, seconds: float) -> int:
         """Return the reading in the turn that is nearest to the seconds told."""
-        return reading + round((round(told * 1e9) - reading) / self._turn) * self._turn
+        return reading + round((round(seconds * 1e9) - reading) / self._turn) * self._turn
 
     def _short(self, step: int) -> int:
         """Return a step of the clock, the shorter way round."""
@@ -216,9 +216,9 @@ def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
 
     Packets before the first of them have the times `before`, (n,).
     """
-    spots = np.searchsorted(which, np.arange(len(before)), side="right") - 1
+    positions = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     if len(times):
-        return np.where(spots < 0, before, times[np.maximum(spots, 0)])
+        return np.where(positions < 0, before, times[np.maximum(positions, 0)])
     return before
 
 
@@ -333,7 +333,7 @@ def clock_terms(
     Raises:
         SpecError: for one that is no time, or not one of each packet.
     """
-    found = []
+    terms = []
     for path in fields:
         info = schema.fields.get(path)
         if info:
@@ -349,8 +349,8 @@ def clock_terms(
             )
         step, zero = scaling
         whole = isinstance(step, int) and isinstance(zero, int)
-        found.append((path, step, zero, _FURTHEST // len(fields) // max(step, 1) if whole else 0))
-    return found
+        terms.append((path, step, zero, _FURTHEST // len(fields) // max(step, 1) if whole else 0))
+    return terms
 
 
 def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:

@@ -113,11 +113,11 @@ def read_samples(
             [np.asarray(flat(array, shape, mask, len(batch)), np.float64) for array in arrays],
             axis=1,
         )
-    found = ImuSamples(time, values_of[:, :3], values_of[:, 3:])
+    own_samples = ImuSamples(time, values_of[:, :3], values_of[:, 3:])
     turn = vendor_turn(sensor)
     if turn is None:
-        return found
-    return found.turn(turn)
+        return own_samples
+    return own_samples.turn(turn)
 
 
 class WaitingSamples:
@@ -142,11 +142,11 @@ class WaitingSamples:
 
     def take_until(self, ns: int | None) -> ImuSamples:
         """Hand out what was felt before a time, in the order of time; of None all there is."""
-        found = join_samples(self._parts)
-        found = found[np.argsort(found.time_ns, kind="stable")]
+        samples = join_samples(self._parts)
+        samples = samples[np.argsort(samples.time_ns, kind="stable")]
         if ns is not None:
-            later = found.time_ns >= ns
+            later = samples.time_ns >= ns
         else:
-            later = np.zeros(len(found), np.bool_)
-        self._parts = [found[later]] if later.any() else []
-        return found[~later]
+            later = np.zeros(len(samples), np.bool_)
+        self._parts = [samples[later]] if later.any() else []
+        return samples[~later]

@@ -140,13 +140,13 @@ class Packets:
         Variable arrays are padded with 0.
         """
         columns = {path: self.table.raw(path) for path in self.table.schema.fields}
-        found = np.zeros(len(self), _nested_dtype(self.table.schema, columns, ""))
+        array = np.zeros(len(self), _nested_dtype(self.table.schema, columns, ""))
         for path, column in columns.items():
-            target = found
+            target = array
             for name in path.split("."):
                 target = target[name]
             target[...] = column
-        return found
+        return array
 
     def count(self, array: str) -> NDArray[np.intp]:
         """The length of an array in each packet, (n,).
@@ -295,13 +295,13 @@ def join_packets(parts: Sequence[Packets]) -> Packets:
     state = {}
     for name in head.state:
         tables = [part.state[name][0] for part in parts]
-        known = [table for table in tables if table is not None]
+        batches = [table for table in tables if table is not None]
         starts = np.cumsum([0] + [0 if table is None else len(table) for table in tables])
         which = [
             np.where(part.state[name][1] < 0, -1, part.state[name][1] + start)
             for part, start in zip(parts, starts[:-1], strict=True)
         ]
-        state[name] = (joined_tables(known) if known else None, np.concatenate(which))
+        state[name] = (joined_tables(batches) if batches else None, np.concatenate(which))
     columns: dict[str, Any] = {
         key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS
     }

@@ -94,14 +94,14 @@ class PacketStream:
             self._clock_order = ClockOrder(stats, loss_clock, MaskedGaps(sensor))
         self._arrival_order = ArrivalOrder(stats, loss_clock, self._type.loss_clock_step_ns)
 
-    def add(self, found: Sequence[Frames], *, whole: bool = False) -> Packets:
+    def add(self, batches: Sequence[Frames], *, whole: bool = False) -> Packets:
         """Return the packets among some frames.
 
         Args:
             whole: the frames are a whole input: packets before the first frame of another type see
                 that one as state.
         """
-        parts = [OwnFrames.of(frames, self._type.frame) for frames in found if len(frames)]
+        parts = [OwnFrames.of(frames, self._type.frame) for frames in batches if len(frames)]
         columns = _join([self._read(part) for part in parts])
         if columns is None:
             columns = self._no_columns()
@@ -239,15 +239,15 @@ class PacketStream:
         self, parts: Sequence[OwnFrames], number: int, *, whole: bool
     ) -> dict[str, StateOf]:
         """Return the frames of each other type, and which was the last before each packet."""
-        seen = self._others_in(parts)
+        earlier = self._others_in(parts)
         return {
-            name: self._state_of(name, seen.get(name, []), number=number, whole=whole)
+            name: self._state_of(name, earlier.get(name, []), number=number, whole=whole)
             for name in self._type.others
         }
 
     def _others_in(self, parts: Sequence[OwnFrames]) -> dict[str, list[Earlier]]:
         """Return the frames of other types, by name."""
-        seen: dict[str, list[Earlier]] = {}
+        earlier: dict[str, list[Earlier]] = {}
         number = 0
         for part in parts:
             if part.has_others:
@@ -261,24 +261,26 @@ class PacketStream:
                     if name in self._type.others:
                         which = kinds == kind
                         frames = part.piece.select(others[which])
-                        seen.setdefault(name, []).append((frames, before[which]))
+                        earlier.setdefault(name, []).append((frames, before[which]))
             number += len(part.frames)
-        return seen
+        return earlier
 
-    def _state_of(self, name: str, seen: Sequence[Earlier], *, number: int, whole: bool) -> StateOf:
+    def _state_of(
+        self, name: str, earlier: Sequence[Earlier], *, number: int, whole: bool
+    ) -> StateOf:
         """Return the frames of another type, and which of them was the last before each packet."""
         last_frame = self._last_frames.get(name)
-        if not seen:
+        if not earlier:
             return last_frame, repeat(-1 if last_frame is None else 0, number)
         engine = codec(self._type.sensor.frames[name])
-        tables: list[Table] = [engine.gather(frames) for frames, _ in seen]
-        before = np.concatenate([places for _, places in seen])
+        tables: list[Table] = [engine.gather(frames) for frames, _ in earlier]
+        before = np.concatenate([places for _, places in earlier])
         if last_frame is not None:
             tables = [last_frame, *tables]
             before = np.concatenate(([0], before))
         elif whole:
             before[0] = 0
-        newest, _ = seen[-1]
+        newest, _ = earlier[-1]
         self._last_frames[name] = engine.table([newest.data(len(newest) - 1)])
         which = np.repeat(np.arange(-1, len(before)), np.diff(before, prepend=0, append=number))
         return joined_tables(tables), which
@@ -390,7 +392,7 @@ class OwnFrames:
         return len(self.frames) < len(self.piece)
 
 
-def data_frame(sensor: SensorDescription, found: Sequence[Frames]) -> str | None:
+def data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> str | None:
     """Return the type of data frame that an input is read by if none is asked for.
 
     It is the configured one, or the first that arrived; None if the sensor has several, none is
@@ -399,7 +401,7 @@ def data_frame(sensor: SensorDescription, found: Sequence[Frames]) -> str | None
     names = sensor.data_frames
     if len(names) < 2 or sensor.options.get("answer") in names:
         return sensor.data_frame
-    for frames in found:
+    for frames in batches:
         kinds = [kind for kind, name in enumerate(frames.names) if name in names]
         own = frames.kinds[np.isin(frames.kinds, kinds)]
         if len(own):

@@ -85,20 +85,20 @@ def choose_appearance(
         UnknownName: for a column that the cloud does not have.
     """
     cloud = points[points.valid]
-    found = reach or find_reach(cloud)
-    if ramp not in (known := list_ramps(cloud)):
+    shown_reach = reach or find_reach(cloud)
+    if ramp not in (known_ramps := list_ramps(cloud)):
         if ramp != "intensity":
-            raise UnknownName(ramp, known, place="colours")
+            raise UnknownName(ramp, known_ramps, place="colours")
         ramp = "range"
     if ramp == "range":
-        return CloudAppearance("range", found, found, flat=is_flat(cloud))
+        return CloudAppearance("range", shown_reach, shown_reach, flat=is_flat(cloud))
     values = _shown(cloud, ramp)
     values = values[np.isfinite(values)]
     weak, strong = np.percentile(values, (100 - WITHIN, WITHIN)) if len(values) else (0.0, 0.0)
     low = -round_up(-float(weak)) if weak < 0 else 0.0
     return CloudAppearance(
         ramp,
-        found,
+        shown_reach,
         round_up(max(float(strong), 1e-3)),
         flat=is_flat(cloud),
         low=low,

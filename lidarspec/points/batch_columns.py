@@ -263,12 +263,12 @@ def spread_out(
 
     Index -1 leaves a packet out.
     """
-    kept = first >= 0
+    has_points = first >= 0
     rows = np.ascontiguousarray(values.reshape(len(first), width), column.dtype)
     starts = first
-    if not kept.all():
-        rows = rows[kept]
-        starts = first[kept]
+    if not has_points.all():
+        rows = rows[has_points]
+        starts = first[has_points]
     if rows.size:
         piece = np.dtype((np.void, rows.shape[1] * rows.itemsize))
         windows: NDArray[Any] = np.ndarray(

@@ -151,12 +151,12 @@ class PointCloud:
             UnknownName: for a column that the cloud has not.
         """
         self.load(*names)
-        found = {name: getattr(self, name) for name in names if name in (*COLUMNS, "valid")}
-        found |= {name: self.extra[name] for name in names if name in self.extra}
-        missing = next((name for name in names if found.get(name) is None), None)
+        columns = {name: getattr(self, name) for name in names if name in (*COLUMNS, "valid")}
+        columns |= {name: self.extra[name] for name in names if name in self.extra}
+        missing = next((name for name in names if columns.get(name) is None), None)
         if missing is not None:
             raise UnknownName(missing, [*self.columns, "valid"], place="columns of points")
-        return {name: found[name] for name in names}
+        return {name: columns[name] for name in names}
 
     @property
     def calibration(self) -> str:

@@ -87,11 +87,11 @@ class LazyColumns:
         missing = [name for name in names if name not in self.computed]
         if not missing:
             return
-        found = self.source.columns(missing, 0, self.source.size)
-        self.computed = dict.fromkeys(missing) | found | self.computed
+        columns = self.source.columns(missing, 0, self.source.size)
+        self.computed = dict.fromkeys(missing) | columns | self.computed
         if "z" in missing and self.source.is_level:
             self.computed["z"] = level_z(self._x())
-        if "valid" in missing and "valid" not in found:
+        if "valid" in missing and "valid" not in columns:
             self.computed["valid"] = ~np.isnan(self._x())  # x is nan unless a point is valid
 
     def read(self, name: str) -> NDArray[Any] | None:

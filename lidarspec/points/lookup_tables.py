@@ -74,12 +74,14 @@ def window(leaf: Leaf) -> FieldWindow | None:
     return None
 
 
-def raw_values(leaf: Leaf, seen: FieldWindow) -> NDArray[Any]:
+def raw_values(leaf: Leaf, field_window: FieldWindow) -> NDArray[Any]:
     """The raw values of a field for every value of its window: (256,) or (65536,)."""
-    codes = np.arange(1 << (8 * seen.size)).astype(seen.dtype)
+    codes = np.arange(1 << (8 * field_window.size)).astype(field_window.dtype)
     frames = np.zeros((len(codes), leaf.size), np.uint8)
-    start = seen.offset - leaf.offset
-    frames[:, start : start + seen.size] = codes.view(np.uint8).reshape(len(codes), seen.size)
+    start = field_window.offset - leaf.offset
+    frames[:, start : start + field_window.size] = codes.view(np.uint8).reshape(
+        len(codes), field_window.size
+    )
     single = Leaf(leaf.info, 0, (), (), leaf.size, leaf.wire, leaf.elements)
     return single.load(frames)
 
@@ -89,10 +91,10 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 
     The shape is (256,) or (65536,). Returns None if the field has no window.
     """
-    seen = window(leaf)
-    if seen is None:
+    field_window = window(leaf)
+    if field_window is None:
         return None
-    raw = raw_values(leaf, seen)
+    raw = raw_values(leaf, field_window)
     return Expression(node, (leaf.info,)).values({leaf.info.path: raw}).reshape(raw.shape)
 
 
@@ -122,9 +124,9 @@ def is_number(value: Any, leaves: Any) -> bool:
         return value.path in leaves
     if value.kind != "call":
         return False
-    found = possible(value, leaves)
-    if found is not None:
-        return bool(np.isfinite(found).all())
+    values = possible(value, leaves)
+    if values is not None:
+        return bool(np.isfinite(values).all())
     if value.function in _DIVISIONS:
         divisor = value.args[1]
         return (

@@ -105,18 +105,18 @@ class Plan:
         self.function = function
         self.layout = layout
         self.nominal = result.nominal
-        given = parts_of(result)
+        parts = parts_of(result)
         samples = {
             name: part.node.sample if isinstance(part, TracedColumn) else part
-            for name, part in given.items()
+            for name, part in parts.items()
         }
         arrays, self.axes, _, shape = align_points(samples, sample)
         self.extra = kinds_of(result, samples)
-        given = {
+        parts = {
             name: part if isinstance(part, TracedColumn) else array
-            for (name, part), array in zip(given.items(), arrays, strict=True)
+            for (name, part), array in zip(parts.items(), arrays, strict=True)
         }
-        self.parts = {name: graph.node_of(part) for name, part in given.items()}
+        self.parts = {name: graph.node_of(part) for name, part in parts.items()}
         self.shape = shape[1:]
         self.varying = {name for name, count in schema.arrays.items() if not isinstance(count, int)}
         self.tables = _TABLES.setdefault(function, {})
@@ -136,10 +136,10 @@ class Plan:
             name: part for name, part in parts_of(result).items() if isinstance(part, AlongAxis)
         }
         if self.exact:
-            expressions = self._by_coordinates(given)
+            expressions = self._by_coordinates(parts)
         else:
-            expressions = self._by_direction(given, named)
-        intensity = given.get("intensity")
+            expressions = self._by_direction(parts, named)
+        intensity = parts.get("intensity")
         if intensity is not None:
             if self._may_be_nan(intensity):
                 expressions["intensity"] = np.nan_to_num(intensity)
@@ -231,34 +231,34 @@ class Plan:
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
     def _by_direction(
-        self, given: Mapping[str, Any], named: Mapping[str, AlongAxis]
+        self, parts: Mapping[str, Any], named: Mapping[str, AlongAxis]
     ) -> dict[str, Any]:
         """Return the columns that back ends make from the parts of `Polar`.
 
         Args:
             named: the parts with named arrays.
         """
-        distance = mark(self._distance(given["range"]), given["invalid"])
+        distance = mark(self._distance(parts["range"]), parts["invalid"])
         azimuth, elevation, *origin = (
-            named.get(name, given[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz")
+            named.get(name, parts[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz")
         )
         places = coordinates(distance, azimuth, elevation, origin)
         columns = {
-            "range": shown_range(given["range"], given["invalid"]),
-            "azimuth": given["azimuth"],
+            "range": shown_range(parts["range"], parts["invalid"]),
+            "azimuth": parts["azimuth"],
         }
         return dict(zip("xyz", places, strict=True)) | columns
 
-    def _by_coordinates(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def _by_coordinates(self, parts: Mapping[str, Any]) -> dict[str, Any]:
         """The columns that back ends make, of the parts of `Cartesian`."""
-        places = given["x"], given["y"], given["z"]
+        places = parts["x"], parts["y"], parts["z"]
         measured, azimuth, elevation = direction_of(*places)
         columns = {
-            "range": shown_range(measured, given["invalid"]),
+            "range": shown_range(measured, parts["invalid"]),
             "azimuth": azimuth,
             "elevation": elevation,
         }
-        return dict(zip("xyz", place_points(places, given["invalid"]), strict=True)) | columns
+        return dict(zip("xyz", place_points(places, parts["invalid"]), strict=True)) | columns
 
     def _distance(self, measured: TracedColumn) -> Any:
         """Return the distance of a return, nan without a return.

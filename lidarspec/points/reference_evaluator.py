@@ -239,8 +239,8 @@ def make_cloud(
         distance, azimuth, elevation, xyz = (_by_coordinates if "x" in flat else _by_direction)(
             flat, flat["invalid"].astype(np.bool_)
         )
-        known = np.isfinite(azimuth) & np.isfinite(elevation) & np.isfinite(xyz).all(axis=0)
-        valid = known & (np.abs(distance) <= conventions.FARTHEST)
+        is_finite = np.isfinite(azimuth) & np.isfinite(elevation) & np.isfinite(xyz).all(axis=0)
+        valid = is_finite & (np.abs(distance) <= conventions.FARTHEST)
         if turn is not None:
             xyz = turn @ np.where(valid, xyz, 0)
             azimuth = conventions.turned_azimuth(azimuth, turn)

@@ -121,12 +121,12 @@ class Header:
                 if self.sensor
                 else "it names no sensor"
             )
-        found = named_sensor(self.sensor)
+        installed = named_sensor(self.sensor)
         try:
             return (
-                found.configure(**found.configure.options_of_file(self.options, folder))
+                installed.configure(**installed.configure.options_of_file(self.options, folder))
                 if self.options
-                else found
+                else installed
             )
         except UsageError as error:
             raise UsageError(
@@ -311,11 +311,11 @@ class Recording(ClosingContext):
             high = self._file.seek(0, os.SEEK_END)
             while high - low > 2 * (LARGEST + _BLOCK):
                 middle = (low + high) // 2
-                found = self._find_received(middle, high)
-                if found is None or found[0] >= at:
+                record = self._find_received(middle, high)
+                if record is None or record[0] >= at:
                     high = middle
                 else:
-                    low = found[1]
+                    low = record[1]
             self._move(low)
         return low > here
 
@@ -424,14 +424,14 @@ class Recording(ClosingContext):
         """Go to the next mark or the end; return the number of skipped bytes."""
         before = self.offset
         self._skip(1)
-        while (found := self._window.find(MARK, self._place)) < 0:
+        while (position := self._window.find(MARK, self._place)) < 0:
             left = len(self._window) - self._place
             keep = min(len(MARK) - 1, left)  # possible beginning of a mark
             self._skip(left - keep)
             if not self._holds(keep + 1):
                 self._skip(keep)
                 return self.offset - before
-        self._skip(found - self._place)
+        self._skip(position - self._place)
         return self.offset - before
 
     def _rest(self) -> int:
@@ -448,10 +448,12 @@ def _unpack_record(record: bytes) -> tuple[int, Record]:
     _, kind, flags, addresses, size, at = _HEAD.unpack_from(record)
     start = _HEAD.size + addresses
     sender, receiver = _endpoints(record[_HEAD.size : start]) or (None, None)
-    known = None if at == _UNKNOWN else at
+    arrival_ns = None if at == _UNKNOWN else at
     direction = DIRECTIONS.get(kind, "event")
     marks = (bool(flags & mark) for mark in (DATAGRAM, GAP, QUIET))
-    return kind, Record(direction, record[start : start + size], known, sender, receiver, *marks)
+    return kind, Record(
+        direction, record[start : start + size], arrival_ns, sender, receiver, *marks
+    )
 
 
 @lru_cache(maxsize=256)
@@ -472,14 +474,14 @@ def _endpoints(data: bytes) -> list[Address | None] | None:
     Returns:
         None unless there are exactly two, which fill the bytes.
     """
-    found: list[Address | None] = []
+    addresses: list[Address | None] = []
     place = 0
-    while len(found) < 2 and place < len(data):
+    while len(addresses) < 2 and place < len(data):
         length = data[place]
         host = data[place + 1 : place + 1 + length].decode("utf-8", "replace")
         end = place + 1 + length + 2 * bool(length)
-        found.append((host, int.from_bytes(data[end - 2 : end], "little")) if length else None)
+        addresses.append((host, int.from_bytes(data[end - 2 : end], "little")) if length else None)
         place = end
-    if place == len(data) and len(found) != 1:
-        return found or [None, None]
+    if place == len(data) and len(addresses) != 1:
+        return addresses or [None, None]
     return None

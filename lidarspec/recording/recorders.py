@@ -194,12 +194,12 @@ class FrameRecorder(BackgroundWriter):
             self._held += chunk.data
             self._cut(self._decoder.feed(chunk.data, self._at))
 
-    def _cut(self, found: list[Found]) -> None:
+    def _cut(self, frames: list[Found]) -> None:
         """Write the frames found and the skipped bytes before them.
 
         Bytes that may still become a frame are kept.
         """
-        for item in found:
+        for item in frames:
             self._skip(item.offset - self._base)
             self._packet(len(item.data), item.at or self._at)
         self._skip(len(self._held) - self._decoder.stats.pending)

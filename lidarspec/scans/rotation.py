@@ -139,15 +139,15 @@ class WrapDetector:
         self, passed: NDArray[np.intp], behind: Floats, full: float
     ) -> NDArray[np.intp]:
         """Return the rows, of those that pass, before which the angle was away."""
-        found = list[int]()
+        armed = list[int]()
         start = 0
         for row in passed.tolist():
             if self._is_armed or _was_away(behind[start:row], full):
-                found.append(row)
+                armed.append(row)
                 self._is_armed = False
                 start = row
         self._is_armed = self._is_armed or _was_away(behind[start:], full)
-        return np.array(found, np.intp)
+        return np.array(armed, np.intp)
 
 
 class PassDetector:
@@ -190,13 +190,13 @@ class PassDetector:
         steps[steps > 1 - JITTER] = 0
         behind = (self._direction * (before - self._at)) % 1
         turned = self._turned + np.cumsum(steps)
-        found = list[int]()
+        rows = list[int]()
         for row in np.flatnonzero(behind + steps >= 1).tolist():
             if turned[row] >= MIN_TURNS_AWAY:
-                found.append(row)
+                rows.append(row)
                 turned -= turned[row]
         self._turned = turned.item(-1)
-        return np.array(found, np.intp)
+        return np.array(rows, np.intp)
 
 
 def previous_values(values: Floats, first: float | None) -> Floats:

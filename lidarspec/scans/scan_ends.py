@@ -114,10 +114,10 @@ class EndFinder:
             column = _read_field(points, path)
             values, starts = _read_rows(column, points)
             full = _full_turn(packets, path) or 2 * np.pi
-            found, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
-            ends = starts[found]
+            wrap_rows, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
+            ends = starts[wrap_rows]
             if _is_per_packet(column):
-                rows = found
+                rows = wrap_rows
         return _make_ends(ends, rows, map(self._is_leap, steps.tolist()))
 
     def _cut_angle(self, rule: OnWrap, full: float) -> float:
@@ -272,13 +272,13 @@ def first_points(points: EvaluatedPoints) -> Indices:
     return np.cumsum(points_per_packet) - points_per_packet
 
 
-def _sum_axes(counts: NDArray[Any], kept: int) -> Indices:
-    """Return the sums over all axes but the first `kept`.
+def _sum_axes(counts: NDArray[Any], axis_count: int) -> Indices:
+    """Return the sums over all axes but the first `axis_count`.
 
     Along axes that repeat one number, sums are computed as products.
     """
     times = 1
-    while counts.ndim > kept:
+    while counts.ndim > axis_count:
         if counts.strides[-1] == 0 and counts.shape[-1] > 0:
             times *= counts.shape[-1]
             counts = counts[..., 0]

@@ -235,9 +235,14 @@ class _Stream:
     """
 
     def __init__(
-        self, made: FrameSimulation, frame: str, scene: Scene, began: float, shake: float
+        self,
+        frame_simulation: FrameSimulation,
+        frame: str,
+        scene: Scene,
+        began: float,
+        shake: float,
     ) -> None:
-        self._made = made
+        self._made = frame_simulation
         self._scene = scene
         self.frame = frame
         self._shake = shake
@@ -504,14 +509,14 @@ class SimulatedDevice:
         self._stream = _Stream(self._simulation(frame), frame, self._scene, at, self.faults.shake)
 
     def _simulation(self, frame: str) -> FrameSimulation:
-        made = frame_simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
-        if not made.interval:
+        stream_simulation = frame_simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
+        if not stream_simulation.interval:
             raise SpecError(
                 "nothing says how often it is sent: declare its `rate`",
                 path=frame,
                 sensor=self.sensor.id,
             )
-        return made
+        return stream_simulation
 
     def _put(self, at: float, link: str, frame: str, data: bytes) -> None:
         self._planned += 1

@@ -97,11 +97,11 @@ class FrameMaker:
             SpecError: if a value is given for a field that the frame does not have.
         """
         members: dict[int, tuple[Layout, list[int]]] = {}
-        given = [self._with_counts(values) for values in frames] if self._counts else frames
+        counted = [self._with_counts(values) for values in frames] if self._counts else frames
         if self.schema.parts:
-            filled = [self._with_parts(values) for values in given]
+            filled = [self._with_parts(values) for values in counted]
         else:
-            filled = [(values, {}) for values in given]
+            filled = [(values, {}) for values in counted]
         for index, (values, _) in enumerate(filled):
             layout = self._layout(values)
             members.setdefault(id(layout), (layout, []))[1].append(index)
@@ -145,22 +145,22 @@ class FrameMaker:
             for axis, count_path in self._counts.items()
             if axis in values and count_path not in values
         ]
-        given = dict(values) if missing else values
+        counted = dict(values) if missing else values
         for axis in missing:
-            self._fill_in(self.schema.arrays[axis], given, len(values[axis]), axis)  # type: ignore[arg-type]  # a dict by now
-        return given
+            self._fill_in(self.schema.arrays[axis], counted, len(values[axis]), axis)  # type: ignore[arg-type]  # a dict by now
+        return counted
 
     def _with_parts(self, values: Values) -> tuple[Values, dict[str, bytes]]:
         """Return the values of a frame with its parts replaced by their sizes and counts.
 
         The second result has the bytes of the parts, by axis.
         """
-        given = dict(values)
-        made = dict[str, bytes]()
+        result = dict(values)
+        parts_by_axis = dict[str, bytes]()
         for axis, node in self.schema.parts.items():
-            parts = [dict(part) for part in given.pop(axis, ())]
+            parts = [dict(part) for part in result.pop(axis, ())]
             kinds = [find_kind(node, part) for part in parts]
-            around = {ref.path: self._raw(given, ref.path) for ref in node.outer}
+            around = {ref.path: self._raw(result, ref.path) for ref in node.outer}
             makers = [self._maker(kind, around) for kind in kinds]
             sizes = [
                 maker._layout(maker._with_parts(part)[0]).size
@@ -175,12 +175,12 @@ class FrameMaker:
                 (node.size, sizes[0] if sizes else 0),
                 (node.within, sum(sizes)),
             ):
-                self._fill_in(formula, given, number, axis)
-            made[axis] = b"".join(
+                self._fill_in(formula, result, number, axis)
+            parts_by_axis[axis] = b"".join(
                 maker.frame(part) for maker, part in zip(makers, parts, strict=True)
             )
-            given[node.total.path] = len(made[axis])
-        return given, made
+            result[node.total.path] = len(parts_by_axis[axis])
+        return result, parts_by_axis
 
     def _maker(self, kind: Kind, around: Mapping[str, int]) -> FrameMaker:
         key = (kind, *around.items())

@@ -161,18 +161,18 @@ class Room:
         return ranges
 
 
-def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value) -> None:
+def _meet(ranges: Floats, body: Box | Mover, beams: Vector, origin: Vector, time: Value) -> None:
     """Shorten, in place, the beams that hit a body from outside."""
     low, high = body.at(time)
     near = _near(body, low, high, beams, origin)
-    where = np.flatnonzero(np.broadcast_to(near, found.shape))
+    where = np.flatnonzero(np.broadcast_to(near, ranges.shape))
     if not len(where):
         return
 
     def select(value: Value) -> Any:
         if np.ndim(value) == 0:
             return value
-        return np.broadcast_to(value, found.shape).reshape(-1)[where]
+        return np.broadcast_to(value, ranges.shape).reshape(-1)[where]
 
     enter = np.full(len(where), -np.inf)
     leave = np.full(len(where), np.inf)
@@ -182,7 +182,7 @@ def _meet(found: Floats, body: Box | Mover, beams: Vector, origin: Vector, time:
         np.fmax(enter, np.fmin(first, second), out=enter)
         np.fmin(leave, np.fmax(first, second), out=leave)
     hit = (enter > 0) & (enter <= leave)
-    flat = found.reshape(-1)
+    flat = ranges.reshape(-1)
     flat[where[hit]] = np.minimum(flat[where[hit]], enter[hit])
 
 

@@ -397,20 +397,20 @@ class PointPlacement(Measurement):
         with plugin_errors(f"directions of {self._frame}", self._sensor.id, declared):
             for index, number in enumerate(numbers):
                 azimuth, elevation = np.broadcast_arrays(*declared(number))
-                given = np.stack([azimuth, elevation]).reshape(
+                stacked = np.stack([azimuth, elevation]).reshape(
                     2, *(1,) * (len(shape) - azimuth.ndim), *azimuth.shape
                 )
                 if any(
-                    own > length for own, length in zip(given.shape[1:], shape, strict=False)
-                ) or given.ndim > 1 + len(shape):
+                    own > length for own, length in zip(stacked.shape[1:], shape, strict=False)
+                ) or stacked.ndim > 1 + len(shape):
                     raise SpecError(
                         f"azimuth and elevation {azimuth.shape} do not broadcast to the points of"
                         f" frame {number}, {shape}"
                     )
                 corner: Any = tuple(
-                    slice(0, length if length > 1 else None) for length in given.shape[1:]
+                    slice(0, length if length > 1 else None) for length in stacked.shape[1:]
                 )
-                directions[:, index][(slice(None), *corner)] = given
+                directions[:, index][(slice(None), *corner)] = stacked
         return directions[0], directions[1]
 
     def _values(
@@ -571,7 +571,7 @@ class PartRows(CompiledTable):
             ):
                 destinations += [
                     (int(group.where[owner]), int(offset), buffer)
-                    for owner, offset in zip(piece.owners, piece.spots, strict=True)
+                    for owner, offset in zip(piece.owners, piece.offsets, strict=True)
                 ]
         for _, offset, buffer in sorted(destinations, key=lambda found: found[:2]):
             part = next(left)
@@ -920,8 +920,8 @@ def simulate(
         UsageError: if the sensor declares no `sweep`.
         SpecError: if its ranges cannot be traced back to fields.
     """
-    made = frame_simulation(sensor, sensor.data_frame)
-    return made.block(start, packets, scene or Room(), start * made.interval / 1e9).frames
+    stream = frame_simulation(sensor, sensor.data_frame)
+    return stream.block(start, packets, scene or Room(), start * stream.interval / 1e9).frames
 
 
 def make_opening_frame(sensor: Sensor) -> bytes:

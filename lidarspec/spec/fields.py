@@ -430,17 +430,17 @@ class Parts(layer.Partition):
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         start = stream.tell()
-        found = layer.ParsedParts()
+        parsed = layer.ParsedParts()
         goes_on = self._rule(context, path)
-        while (announced := goes_on(found)) != 0:
-            place = f"{path}[{len(found)}]"
+        while (announced := goes_on(parsed)) != 0:
+            place = f"{path}[{len(parsed)}]"
             spot = stream.tell()
             kind = self._kind(stream, context, place)
             part = self.cases[kind]._parsereport(stream, context, place)
-            self._take(found, kind, part, (spot, stream.tell()), announced, place)
+            self._take(parsed, kind, part, (spot, stream.tell()), announced, place)
             if stream.tell() - start > self.limit:
                 raise RangeError("parts longer than the frame can be", path=place)
-        return found
+        return parsed
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, list | tuple):
@@ -479,20 +479,20 @@ class Parts(layer.Partition):
         )
         count, size, within = bounds
 
-        def goes_on(found: layer.ParsedParts) -> int:
+        def goes_on(parsed: layer.ParsedParts) -> int:
             if count is not None:
-                if len(found) < count:
+                if len(parsed) < count:
                     return -1
                 return 0
             if within is not None:
-                if found.size < within:
+                if parsed.size < within:
                     return -1
-                return layer.check_bound(found.size, within, "length of parts", path) - within
+                return layer.check_bound(parsed.size, within, "length of parts", path) - within
             assert size is not None
-            if not found:
+            if not parsed:
                 return size
             return layer.check_bound(
-                evaluate(self.following, Container({**found[-1], "_": context})),
+                evaluate(self.following, Container({**parsed[-1], "_": context})),
                 self.limit,
                 "length",
                 path,
@@ -502,7 +502,7 @@ class Parts(layer.Partition):
 
     @staticmethod
     def _take(
-        found: layer.ParsedParts,
+        parsed: layer.ParsedParts,
         kind: str,
         part: Any,
         span: tuple[int, int],
@@ -515,8 +515,8 @@ class Parts(layer.Partition):
                 announced, f"{announced} bytes"
             )
             raise RangeError(f"expected {wanted}, found {size} bytes", path=place)
-        found.append(part)
-        found.spans.append((kind, *span))
+        parsed.append(part)
+        parsed.spans.append((kind, *span))
 
     def _kind(self, stream: Any, context: Any, path: str) -> str:
         """Return the first kind with matching constants, as far as there are bytes.

@@ -797,8 +797,8 @@ def formulas(node: Node) -> tuple[Formula, ...]:
         case Repeat():
             return (node.count,)
         case PartSequence():
-            found = (node.count, node.size, node.within, *map(node.following, node.kinds))
-            return tuple(formula for formula in found if formula is not None)
+            own = (node.count, node.size, node.within, *map(node.following, node.kinds))
+            return tuple(formula for formula in own if formula is not None)
         case When():
             return (node.condition,)
         case Select():
@@ -848,10 +848,10 @@ def size(node: Node) -> Formula | None:
 
 def total(sizes: Iterable[Formula | None]) -> Formula | None:
     """Return the sum of sizes, None if one of them is None."""
-    found: Formula | None = 0
+    sum_: Formula | None = 0
     for each in sizes:
-        found = combine("+", found, each)
-    return found
+        sum_ = combine("+", sum_, each)
+    return sum_
 
 
 def combine(symbol: str, one: Formula | None, other: Formula | None) -> Formula | None:
@@ -969,13 +969,13 @@ class OuterScope(Scope):
         self._scope = scope
 
     def __getitem__(self, name: str) -> Any:
-        found = self._scope[name]
-        if isinstance(found, Scope):
-            return OuterScope(found, self.asked)
-        if isinstance(found, Symbol) and isinstance(found.formula, Ref):
-            self.asked.append(Ref(f"_.{found.formula.path}", found.formula.info))
+        value = self._scope[name]
+        if isinstance(value, Scope):
+            return OuterScope(value, self.asked)
+        if isinstance(value, Symbol) and isinstance(value.formula, Ref):
+            self.asked.append(Ref(f"_.{value.formula.path}", value.formula.info))
             return Symbol(self.asked[-1])
-        return found
+        return value
 
 
 class UntraceableExpressionError(Exception):

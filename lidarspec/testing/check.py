@@ -103,26 +103,28 @@ def target(text: str | Path) -> CheckTarget:
 
 
 def _file(file: Path, wanted: str) -> CheckTarget:
-    found = CheckTarget(files=[file], vectors=_vectors([file]))
+    found_target = CheckTarget(files=[file], vectors=_vectors([file]))
     try:
-        found.sensors = _load_sensors(file_module(file), str(file))
-        found.family = tuple(sensor.id for sensor in found.sensors[1:] and found.sensors)
-        found.findings += _holders(found.sensors, file)
-        if not found.sensors:
+        found_target.sensors = _load_sensors(file_module(file), str(file))
+        found_target.family = tuple(
+            sensor.id for sensor in found_target.sensors[1:] and found_target.sensors
+        )
+        found_target.findings += _holders(found_target.sensors, file)
+        if not found_target.sensors:
             raise SpecError(
                 "there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor"
             )
     except SourceError:
         raise
     except (Exception, SystemExit) as error:
-        found.findings.append(loading(error, [file]))
-        found.files = found.files if _readable(file) else []
-        return found
-    ids = [sensor.id for sensor in found.sensors]
-    found.sensors = [sensor for sensor in found.sensors if wanted in ("", sensor.id)]
-    if not found.sensors:
+        found_target.findings.append(loading(error, [file]))
+        found_target.files = found_target.files if _readable(file) else []
+        return found_target
+    ids = [sensor.id for sensor in found_target.sensors]
+    found_target.sensors = [sensor for sensor in found_target.sensors if wanted in ("", sensor.id)]
+    if not found_target.sensors:
         raise UnknownSensor(wanted, ids, place=str(file))
-    return found
+    return found_target
 
 
 def _folder(folder: Path) -> CheckTarget:
@@ -161,31 +163,37 @@ def _entries(distribution: str) -> list[EntryPoint]:
 
 
 def _distribution(entries: list[EntryPoint]) -> CheckTarget:
-    found = CheckTarget()
+    found_target = CheckTarget()
     for entry in entries:
         try:
             sensors = _load_sensors(entry.load(), entry.value)
         except (Exception, SystemExit) as error:
             finding = loading(error, module_files(entry.value))
-            found.findings.append(
+            found_target.findings.append(
                 replace(finding, path=finding.path or f"{entry.name} = {entry.value}")
             )
             continue
-        found.files += [file for file in module_files(entry.value) if file not in found.files]
-        found.sensors += [
-            sensor for sensor in sensors if sensor.id not in {one.id for one in found.sensors}
+        found_target.files += [
+            file for file in module_files(entry.value) if file not in found_target.files
         ]
-    found.vectors = _vectors(found.files)
-    found.family = tuple(sensor.id for sensor in found.sensors)
+        found_target.sensors += [
+            sensor
+            for sensor in sensors
+            if sensor.id not in {one.id for one in found_target.sensors}
+        ]
+    found_target.vectors = _vectors(found_target.files)
+    found_target.family = tuple(sensor.id for sensor in found_target.sensors)
     names = {_normal(entry.distribution) for entry in entries}
     failing = [
         plugin
         for plugin in registry().plugins
         if _normal(plugin.distribution) in names and _strip_markup(plugin.error) == "LS010"
     ]
-    found.findings += [Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing]
-    found.findings += _rivals(found.sensors)
-    return found
+    found_target.findings += [
+        Finding("LS010", plugin.error, plugin.entry_point) for plugin in failing
+    ]
+    found_target.findings += _rivals(found_target.sensors)
+    return found_target
 
 
 def _rivals(sensors: list[Sensor]) -> list[Finding]:
@@ -353,11 +361,11 @@ class SourceTexts:
         """Return the finding with its file and line, if they can be found."""
         if finding.file:
             return finding
-        spot = self._spot(finding.path, sensor) or (
+        location = self._spot(finding.path, sensor) or (
             self._others.get(("sensor", sensor.id)) if sensor else None
         )
-        if spot:
-            return replace(finding, file=spot[0], line=spot[1])
+        if location:
+            return replace(finding, file=location[0], line=location[1])
         return finding
 
     def _spot(self, path: str, sensor: Sensor | None) -> Spot | None:
@@ -374,7 +382,9 @@ class SourceTexts:
     def _field(self, parts: tuple[str, ...]) -> Spot | None:
         """Return the location of the field with the longest match of the end of the path."""
         fitting = [
-            (len(chain), spot) for chain, spot in self._fields if parts[-len(chain) :] == chain
+            (len(chain), location)
+            for chain, location in self._fields
+            if parts[-len(chain) :] == chain
         ]
         if fitting:
             return max(fitting, key=lambda found: found[0])[1]
@@ -672,9 +682,9 @@ def _report(
         if reason:
             report.skipped[one.name] = reason
             continue
-        found = one.findings(subject, functools.partial(_watch_case, watch, sensor.id, done))
-        report.held += not found
-        report.findings += found
+        findings = one.findings(subject, functools.partial(_watch_case, watch, sensor.id, done))
+        report.held += not findings
+        report.findings += findings
         if any(finding.code in FATAL for finding in report.findings):
             report.skipped[ELSE] = "nothing can be tried before what is found is mended"
             break

@@ -60,10 +60,10 @@ def a_command_parses_back(subject: SensorUnderTest, name: str) -> None:
             raise ViolationError("LS601", str(error), f"commands.{name}") from error
 
 
-def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
+def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -> None:
     """Fail unless the command's frame parses back to its fixed values and arguments."""
     command = sensor.commands[name]
-    data = sensor.command(name, **given)
+    data = sensor.command(name, **arguments_given)
     if command.frame is None:
         assert data == b"", "a command without a frame has bytes"
         return
@@ -73,7 +73,7 @@ def _parses_back(sensor: Sensor, name: str, given: dict[str, float]) -> None:
         assert get_nested(parsed, path) == value, (
             f"{path} is {get_nested(parsed, path)}, and {value} is meant"
         )
-    for argument, value in given.items():
+    for argument, value in arguments_given.items():
         slot = argument_slot(sensor, name, argument)
         declared = command.arguments[argument]
         read = get_nested(parsed, declared.path)

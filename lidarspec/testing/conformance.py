@@ -43,12 +43,12 @@ def assert_conformance(
     """
     __tracebackhide__ = True
     if isinstance(sensor, Sensor):
-        found = CheckTarget([sensor])
+        check_target = CheckTarget([sensor])
     else:
-        found = target(sensor)
+        check_target = target(sensor)
     made = list(
         reports(
-            found,
+            check_target,
             str(sensor),
             examples=examples,
             strategies=strategies,

@@ -106,26 +106,28 @@ class Property:
         Args:
             watch: called with the name of each case before it begins.
         """
-        found = []
+        findings = []
         for case in self.cases(subject):
             watch(" ".join((self.name, *case)))
             try:
                 self.function(subject, *case)
             except ViolationError as error:
                 file = str(subject.vectors) if error.code == "LS702" else ""  # a fault of that file
-                found.append(Finding(error.code, error.what, error.path, subject.sensor.id, file))
+                findings.append(
+                    Finding(error.code, error.what, error.path, subject.sensor.id, file)
+                )
             except AssertionError as error:
                 code = "LS414" if "Traceback" in str(error) else self.rule
-                found.append(Finding(code, _gist(error), ".".join(case), subject.sensor.id))
+                findings.append(Finding(code, _gist(error), ".".join(case), subject.sensor.id))
             except SpecError as error:
                 place = ".".join(case)
                 path = error.path if error.path.startswith(place) else place
-                found.append(
+                findings.append(
                     Finding(error.rule or _rule_of(error), error.reason, path, subject.sensor.id)
                 )
             except Exception as error:
-                found.append(_unexpected_error(error, ".".join(case), subject))
-        return found
+                findings.append(_unexpected_error(error, ".".join(case), subject))
+        return findings
 
 
 #: Rules that are violated by a plugin that fails on valid frames.

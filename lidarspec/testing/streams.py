@@ -30,9 +30,9 @@ def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
     """Check that frames back to back are found unchanged, with every byte."""
     sent = subject.conversation()
     data = material.make_input(subject.sensor, sent)
-    found = [(item.frame, item.data) for item in subject.sensor.split(data)]
-    if found != sent:
-        raise _loss(sent, found)
+    received = [(item.frame, item.data) for item in subject.sensor.split(data)]
+    if received != sent:
+        raise _loss(sent, received)
     stats = subject.sensor.decode(data).stats
     require(not stats.plugin_errors, "LS414", str(stats.failure("")))
     require(
@@ -42,17 +42,19 @@ def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
     )
 
 
-def _loss(sent: list[tuple[str, bytes]], found: list[tuple[str, bytes]]) -> ViolationError:
+def _loss(sent: list[tuple[str, bytes]], received: list[tuple[str, bytes]]) -> ViolationError:
     """Return the violation for the first frame that is not found as it was sent."""
     equal = 0
-    for one, other in zip(sent, found, strict=False):
+    for one, other in zip(sent, received, strict=False):
         if one != other:
             break
         equal += 1
     name = sent[min(equal, len(sent) - 1)][0]
     text = f"of {len(sent)} frames, number {equal} is not found"
-    if equal < len(found) and found[equal][0] != name:
-        return ViolationError("LS306", f"{text}; a {found[equal][0]!r} frame is found there", name)
+    if equal < len(received) and received[equal][0] != name:
+        return ViolationError(
+            "LS306", f"{text}; a {received[equal][0]!r} frame is found there", name
+        )
     return ViolationError("LS401", text, name)
 
 
@@ -95,12 +97,12 @@ def scans_do_not_depend_on_batches(subject: SensorUnderTest) -> None:
             assert_same_places(part.points, other.points)
 
 
-def _scans_in_batches(sensor: Sensor, found: list[Found], size: int) -> list[Scan]:
+def _scans_in_batches(sensor: Sensor, frames: list[Found], size: int) -> list[Scan]:
     """Return the scans of frames that arrive `size` at a time."""
     stats = Decoder(sensor, stream=True).stats
     stream = PacketStream(sensor, sensor.data_frame, stats)
-    starts = range(0, len(found), size)
-    batches = [stream.add([pack_found(found[start : start + size])]) for start in starts]
+    starts = range(0, len(frames), size)
+    batches = [stream.add([pack_found(frames[start : start + size])]) for start in starts]
     scans = list(iter_scans(sensor, batches))
     require(not stats.plugin_errors, "LS414", str(stats.failure("")))
     return scans

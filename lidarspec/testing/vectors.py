@@ -397,13 +397,13 @@ def _read_entries(subject: SensorUnderTest) -> dict[str, Any]:
     if subject.vectors is None:
         return {}
     try:
-        found = read_document(Path(subject.vectors), "JSON")
+        content = read_document(Path(subject.vectors), "JSON")
     except LidarSpecError as error:
         raise ViolationError("LS702", str(error), str(subject.vectors)) from None
-    if not isinstance(found, list):
+    if not isinstance(content, list):
         raise ViolationError("LS702", "the file is no list of vectors", str(subject.vectors))
     own_entries: dict[str, Any] = {}
-    for index, vector in enumerate(found):
+    for index, vector in enumerate(content):
         place = f"vectors[{index}]"
         try:
             if _check_entry(subject, vector, place):

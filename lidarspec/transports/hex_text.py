@@ -125,10 +125,10 @@ class HexText:
 
     def _frame(self, text: str) -> Chunk | None:
         """Return the bytes of a line of `FORMS`; all lines need the same sender."""
-        found = next((match for form in FORMS if (match := form.fullmatch(text))), None)
-        if found is None:
+        matched = next((match for form in FORMS if (match := form.fullmatch(text))), None)
+        if matched is None:
             return None
-        facts = found.groupdict()
+        facts = matched.groupdict()
         data = bytes.fromhex(facts["digits"].replace(".", ""))
         bus = " ".join((facts.get("bus") or "").split())
         if self._bus and bus != self._bus:
@@ -166,12 +166,12 @@ class HexText:
 
         Its offset is marked, or equals the number of bytes before it.
         """
-        found = _ROW.fullmatch(text)
-        if found is None:
+        match = _ROW.fullmatch(text)
+        if match is None:
             return None
-        offset = found["offset"]
-        rest = found["rest"].strip()
-        if found["mark"] == ":":
+        offset = match["offset"]
+        rest = match["rest"].strip()
+        if match["mark"] == ":":
             return _shown(rest)
         if not int(offset, 16) and rest and len(offset) > 3:
             self._position = 0
@@ -224,22 +224,22 @@ class HexText:
 
 def _split_time(text: str) -> tuple[int | None, str]:
     """Return the time at the beginning of a line in ns, and the rest of the line."""
-    if found := _SECONDS.match(text):
-        return _nanoseconds(found["at"]), text[found.end() :]
-    found = _CLOCK.match(text)
-    if found is None or not text[found.end() :].strip():
+    if match := _SECONDS.match(text):
+        return _nanoseconds(match["at"]), text[match.end() :]
+    match = _CLOCK.match(text)
+    if match is None or not text[match.end() :].strip():
         return None, text
-    if not (found["bracket"] or found["date"] or found["fraction"]):
+    if not (match["bracket"] or match["date"] or match["fraction"]):
         raise ValueError(
-            f"{found['clock']} is a time of the day or three bytes; [{found['clock']}] is a time"
+            f"{match['clock']} is a time of the day or three bytes; [{match['clock']}] is a time"
         )
-    if found["date"]:
-        days = date.fromisoformat(found["date"]).toordinal() - date(1970, 1, 1).toordinal()
+    if match["date"]:
+        days = date.fromisoformat(match["date"]).toordinal() - date(1970, 1, 1).toordinal()
     else:
         days = 0
-    hours, minutes, seconds = map(int, found["clock"].split(":"))
+    hours, minutes, seconds = map(int, match["clock"].split(":"))
     whole = ((days * 24 + hours) * 60 + minutes) * 60 + seconds
-    return _nanoseconds(f"{whole}.{found['fraction'] or 0}"), text[found.end() :]
+    return _nanoseconds(f"{whole}.{match['fraction'] or 0}"), text[match.end() :]
 
 
 def _nanoseconds(seconds: str | None) -> int | None:

@@ -348,9 +348,9 @@ class UdpTransport(LiveTransport):
         for one in self._sockets:
             one.socket.close()
 
-    def _fetch(self, one: _Socket, found: list[Chunk]) -> None:
-        """Append the datagrams that wait in a socket, up to a limit, to `found`."""
-        start = len(found)
+    def _fetch(self, one: _Socket, chunks: list[Chunk]) -> None:
+        """Append the datagrams that wait in a socket, up to a limit, to `chunks`."""
+        start = len(chunks)
         try:
             own = self._origin
             for data, sender, at in one.datagrams(*self.clock.now_and_wall()):
@@ -358,31 +358,31 @@ class UdpTransport(LiveTransport):
                     self.foreign = self.foreign + 1
                     self.other_sender = sender
                     continue
-                found.append(Chunk(data, at, sender, one.address))
+                chunks.append(Chunk(data, at, sender, one.address))
         except ConnectionRefusedError:
             return  # an ICMP reply to a sent datagram; the socket still receives
         except OSError as error:
             if not self.closed:
                 raise SourceError(f"{self.label}: {system_reason(error)}") from None
-        _order_times(found, start)
+        _order_times(chunks, start)
 
     def _open_socket(self, host: str, port: int, group: str | None) -> socket.socket:
         if ":" in host or ":" in (group or ""):
             family = socket.AF_INET6
         else:
             family = socket.AF_INET
-        found = socket.socket(family, socket.SOCK_DGRAM)
+        opened = socket.socket(family, socket.SOCK_DGRAM)
         try:
             if group is not None:
-                found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            found.bind(("" if group is not None else host, port))
+                opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            opened.bind(("" if group is not None else host, port))
             if group is not None:
-                _join(found, group, host)
+                _join(opened, group, host)
         except OSError as error:
-            found.close()
+            opened.close()
             raise self._open_error(error, host, port, group) from None
-        found.setblocking(False)
-        return found
+        opened.setblocking(False)
+        return opened
 
     def _open_error(self, error: OSError, host: str, port: int, group: str | None) -> SourceError:
         doctor = f"lidarspec doctor {quote(self.label)}{sensor_option(self._sensor)}"
@@ -421,16 +421,16 @@ class _Socket:
         drops: number of datagrams that the kernel dropped because the buffer was full.
     """
 
-    def __init__(self, found: socket.socket, slots: ReceiveSlots | None) -> None:
-        self.socket = found
+    def __init__(self, opened: socket.socket, slots: ReceiveSlots | None) -> None:
+        self.socket = opened
         self._slots = slots
         self.drops = 0
-        self.address: tuple[str, int] = found.getsockname()[:2]
-        self.buffer = _enlarge_buffer(found)
+        self.address: tuple[str, int] = opened.getsockname()[:2]
+        self.buffer = _enlarge_buffer(opened)
         self.is_timed = False
         for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL) if slots is not None else ():
             with contextlib.suppress(OSError):
-                found.setsockopt(socket.SOL_SOCKET, option, 1)
+                opened.setsockopt(socket.SOL_SOCKET, option, 1)
                 self.is_timed |= option == SO_TIMESTAMPNS
 
     def datagrams(self, now: int, wall: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
@@ -552,31 +552,31 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
     )
 
 
-def warn_of_small_buffer(asked: int, granted: int) -> list[str]:
+def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
     """Return a warning with a fix if the kernel granted a smaller buffer than requested."""
-    if granted >= asked:
+    if granted >= requested:
         return []
     text = (
-        f"the system gave a receive buffer of {granted >> 10} KiB of {asked >> 10}: a busy computer"
-        " will lose packets"
+        f"the system gave a receive buffer of {granted >> 10} KiB of {requested >> 10}: a busy"
+        " computer will lose packets"
     )
-    return [f"{text}; next: sudo sysctl -w net.core.rmem_max={asked}"]
+    return [f"{text}; next: sudo sysctl -w net.core.rmem_max={requested}"]
 
 
-def _enlarge_buffer(found: socket.socket) -> int:
+def _enlarge_buffer(opened: socket.socket) -> int:
     """Request a larger receive buffer, and return the size that the kernel granted."""
     for option in (
         (socket.SO_RCVBUF, SO_RCVBUFFORCE) if sys.platform == "linux" else (socket.SO_RCVBUF,)
     ):
-        if _buffer_size(found) < BUFFER:
+        if _buffer_size(opened) < BUFFER:
             with contextlib.suppress(OSError):
-                found.setsockopt(socket.SOL_SOCKET, option, BUFFER)
-    return _buffer_size(found)
+                opened.setsockopt(socket.SOL_SOCKET, option, BUFFER)
+    return _buffer_size(opened)
 
 
-def _buffer_size(found: socket.socket) -> int:
+def _buffer_size(opened: socket.socket) -> int:
     # Linux reports twice the size that was set.
-    return found.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // (
+    return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // (
         2 if sys.platform == "linux" else 1
     )
 
@@ -599,15 +599,15 @@ def _is_multicast(host: str) -> bool:
         return False
 
 
-def _join(found: socket.socket, group: str, interface: str) -> None:
-    if found.family == socket.AF_INET6:
-        found.setsockopt(
+def _join(opened: socket.socket, group: str, interface: str) -> None:
+    if opened.family == socket.AF_INET6:
+        opened.setsockopt(
             socket.IPPROTO_IPV6,
             socket.IPV6_JOIN_GROUP,
             socket.inet_pton(socket.AF_INET6, group) + struct.pack("@I", 0),
         )
         return
-    found.setsockopt(
+    opened.setsockopt(
         socket.IPPROTO_IP,
         socket.IP_ADD_MEMBERSHIP,
         socket.inet_aton(group) + socket.inet_aton(interface or "0.0.0.0"),

@@ -163,16 +163,16 @@ class CellGrid:
 
     def text(self) -> Text:
         """Return the picture as coloured text for rich."""
-        found = Text(no_wrap=True)
+        text = Text(no_wrap=True)
         for number, (line, inks) in enumerate(zip(self.lines(), self.inks.tolist(), strict=True)):
             start = 0
             for ink, run in groupby(inks):
                 end = start + sum(1 for _ in run)
-                found.append(line[start:end], style(ink))
+                text.append(line[start:end], style(ink))
                 start = end
             if number < len(self.codes) - 1:
-                found.append("\n")
-        return found
+                text.append("\n")
+        return text
 
     def ascii(self) -> CellGrid:
         """Return the picture in ASCII, for terminals without Unicode."""

@@ -189,9 +189,9 @@ def _values(column: NDArray[np.float64], info: FieldInfo) -> list[str]:
 
 
 def _span(values: NDArray[np.float64]) -> str:
-    known = values[np.isfinite(values)]
-    if len(known):
-        return f"{len(known)} x {_number(float(known.min()))} to {_number(float(known.max()))}"
+    finite = values[np.isfinite(values)]
+    if len(finite):
+        return f"{len(finite)} x {_number(float(finite.min()))} to {_number(float(finite.max()))}"
     return "-"
 
 

@@ -193,7 +193,7 @@ class _ViewDrawer:
         labels = _Labels(side, 0, height)
         for mark in marks:
             labels.write(f"z {mark:.4g} m", [(2, level - mark * steep - 3)])
-        told = f"from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
+        title = f"from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
         dots, paths = self._dots(
             across + self.cloud.x * scale, level - self.cloud.z * steep, height
         )
@@ -203,7 +203,7 @@ class _ViewDrawer:
             f"<g {_style_of('text')}>{''.join(labels.parts)}</g>",
             f'<path d="M{across + 9:.1f} {level:.1f}l-15 6v-12z" {_style_of("head")}/>',
         ]
-        return _View(told, parts, 0, height, dots)
+        return _View(title, parts, 0, height, dots)
 
     def _dots(
         self, across: NDArray[np.float32], down: NDArray[np.float32], height: float

@@ -175,15 +175,17 @@ class _ByteShares:
 
     def values(self, rows: Bytes2D) -> NDArray[np.uint64]:
         """The checksums of frames, (n,)."""
-        found = np.empty(len(rows), np.int64)
+        checksums = np.empty(len(rows), np.int64)
         flat = rows.reshape(-1)
         if self.is_plain:
             function_of(_XORED)(
-                flat, rows.shape[1], self.words, self.lows, self.highs, self.start, found
+                flat, rows.shape[1], self.words, self.lows, self.highs, self.start, checksums
             )
         else:
-            function_of(_SHARES)(flat, rows.shape[1], self.words, self.tables, self.start, found)
-        return found.view(np.uint64)
+            function_of(_SHARES)(
+                flat, rows.shape[1], self.words, self.tables, self.start, checksums
+            )
+        return checksums.view(np.uint64)
 
 
 _KNOWN: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()

@@ -79,13 +79,13 @@ class Kernel(ColumnMaker):
         self.compile()
         count = rows.shape[0]
         stride = rows.strides[0]
-        given: list[Any] = []
+        arguments: list[Any] = []
         for node in self._text.wanted.nodes:
-            given += _flat(values(node), node.shape)
+            arguments += _flat(values(node), node.shape)
         rest = (
             self._numbers,
             *self._text.wanted.arrays,
-            *given,
+            *arguments,
             *(columns[name] for name in self._text.columns),
         )
         data = span(rows)

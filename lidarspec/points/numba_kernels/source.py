@@ -133,11 +133,11 @@ class Expressions(KernelWriter):
         if node.kind == "call" and not self.is_shared(node):
             source = only_field(node)
             if source is not None and is_full(source, self.width) and not is_cheap(node):
-                found = self.looked_up(node, source, np.float64, 1.0)
-                if found is not None:
+                text = self.looked_up(node, source, np.float64, 1.0)
+                if text is not None:
                     if node.sample.array.dtype.kind == "b":
-                        return self.let(found.level, f"{found.text} != 0")
-                    return found
+                        return self.let(text.level, f"{text.text} != 0")
+                    return text
             return self._call(node)
         if node.kind == "rows" and not self.is_shared(node.args[0]):
             return self._row(node, "float64")
@@ -229,9 +229,9 @@ class Expressions(KernelWriter):
                 np.logical_not: "(not {})",
             }
             return logical.get(node.function)
-        found = TEMPLATES.get(node.function)
-        if found is not None and found.count("{}") == len(node.args):
-            return found
+        template = TEMPLATES.get(node.function)
+        if template is not None and template.count("{}") == len(node.args):
+            return template
         return None
 
     def _where(
@@ -269,12 +269,12 @@ class Expressions(KernelWriter):
         )
 
     def _single(self, node: Node, *, exact: bool, root: bool) -> Any:
-        found = self._of_field(node, exact=exact)
-        if found is not None:
-            return found
-        found = None if exact else self._mark(node)
-        if found is not None:
-            return found
+        value = self._of_field(node, exact=exact)
+        if value is not None:
+            return value
+        value = None if exact else self._mark(node)
+        if value is not None:
+            return value
         if is_full(node, self.width) and node.kind == "call" and not exact:
             beam = beam_of(node, self.layout.leaves) if root else None
             along = self._along(beam) if beam is not None else None
@@ -493,42 +493,44 @@ class KernelAssembly:
         self._kept: dict[str, str] = {}
         self.scratch: list[str] = []
 
-    def column(self, name: str, made: Any) -> None:
+    def column(self, name: str, value: Any) -> None:
         """Return the text of the array of a column."""
-        if isinstance(made, KernelValue):
-            self.writer.lines[-1].append(f"put(out_{name}, o, {made.text})")
+        if isinstance(value, KernelValue):
+            self.writer.lines[-1].append(f"put(out_{name}, o, {value.text})")
         else:
-            self.flat.append(f"put(out_{name}, o, {self.text(made)})")
+            self.flat.append(f"put(out_{name}, o, {self.text(value)})")
 
-    def together(self, made: Mapping[str, Any]) -> None:
+    def together(self, values: Mapping[str, Any]) -> None:
         """Coordinates that are nan all or none."""
-        if all(isinstance(value, KernelValue) for value in made.values()):
+        if all(isinstance(value, KernelValue) for value in values.values()):
             lines = self.writer.lines[-1]
-            texts = {name: value.text for name, value in made.items()}
+            texts = {name: value.text for name, value in values.items()}
         else:
             lines = self.flat
-            texts = {name: self.text(value) for name, value in made.items()}
+            texts = {name: self.text(value) for name, value in values.items()}
         lines += [f"{name} = {text}" for name, text in texts.items()]
-        lines.append(f"bad = np.float32({' + '.join(f'{name} * np.float32(0)' for name in made)})")
-        lines += [f"put(out_{name}, o, {name} + bad)" for name in made]
+        lines.append(
+            f"bad = np.float32({' + '.join(f'{name} * np.float32(0)' for name in values)})"
+        )
+        lines += [f"put(out_{name}, o, {name} + bad)" for name in values]
 
-    def text(self, made: Any) -> str:
+    def text(self, value: Any) -> str:
         """An expression in the flat loop."""
-        if isinstance(made, DeferredFloat):
-            return f"({f' {made.sign} '.join(map(self.text, made.parts))})"
-        if isinstance(made, Trig):
-            return f"{made.name}{made.angle}"
-        if made.level == 0:
-            return str(made.text)
-        return self._store(made, "float32")
+        if isinstance(value, DeferredFloat):
+            return f"({f' {value.sign} '.join(map(self.text, value.parts))})"
+        if isinstance(value, Trig):
+            return f"{value.name}{value.angle}"
+        if value.level == 0:
+            return str(value.text)
+        return self._store(value, "float32")
 
-    def _store(self, made: KernelValue, kind: str) -> str:
+    def _store(self, value: KernelValue, kind: str) -> str:
         """A value of the loops, kept for the flat one."""
-        if made.text not in self._kept:
-            name = self._kept[made.text] = f"h{len(self.scratch)}"
+        if value.text not in self._kept:
+            name = self._kept[value.text] = f"h{len(self.scratch)}"
             self.scratch.append(f"{name} = np.empty(held, np.{kind})")
-            self.writer.lines[-1].append(f"put({name}, k, {made.text})")
-        return f"at({self._kept[made.text]}, k)"
+            self.writer.lines[-1].append(f"put({name}, k, {value.text})")
+        return f"at({self._kept[value.text]}, k)"
 
     def turns(self) -> list[str]:
         """The cosines and sines that the flat loop begins with."""

@@ -132,11 +132,11 @@ class LinearTable:
     def text(self, raw: str) -> str:
         """The value as an expression of the raw one."""
         if self.exact:
-            found = f"np.float32({raw} * {self.slope!r} + {self.start!r})"
+            expression = f"np.float32({raw} * {self.slope!r} + {self.start!r})"
         elif self.slope == 1 and self.start == 0:
-            found = f"np.float32(np.int32({raw}))"
+            expression = f"np.float32(np.int32({raw}))"
         else:
-            found = f"(np.float32(np.int32({raw})) * np.float32({self.slope!r})" + (
+            expression = f"(np.float32(np.int32({raw})) * np.float32({self.slope!r})" + (
                 f" + np.float32({self.start!r}))" if self.start else ")"
             )
         tests = [
@@ -146,10 +146,10 @@ class LinearTable:
         ]
         if tests:
             return (
-                f"({found} if {' and '.join(tests)} else"
+                f"({expression} if {' and '.join(tests)} else"
                 f" np.float32({'nan' if np.isnan(self.other) else 'inf'}))"
             )
-        return found
+        return expression
 
 
 def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None:
@@ -157,9 +157,9 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None
 
     It is equal if `exact`, else within a unit in the last place.
     """
-    seen = window(leaf)
-    assert seen is not None
-    raw = raw_values(leaf, seen).astype(np.int64)
+    field_window = window(leaf)
+    assert field_window is not None
+    raw = raw_values(leaf, field_window).astype(np.int64)
     good = np.isfinite(values)
     if not good.any():
         return None
@@ -454,21 +454,21 @@ class KernelWriter:
     def looked_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
         """An expression of one field from a table; None where the field has too many values."""
         leaf = self.layout.leaves.get(source.path)
-        seen = window(leaf) if leaf is not None else None
-        if leaf is None or seen is None:
+        field_window = window(leaf) if leaf is not None else None
+        if leaf is None or field_window is None:
             return None
         table = self._table(node, leaf, kind, factor)
         return self.let(self.inner, f"at({self.array(table)}, {self._code(leaf)})")
 
     def _table(self, node: Node, leaf: Leaf, kind: Any, factor: float) -> NDArray[Any]:
-        seen = window(leaf)
-        assert seen is not None
+        field_window = window(leaf)
+        assert field_window is not None
         name = (
             "kernel",
             np.dtype(kind).name,
             factor,
-            seen.offset - leaf.offset,
-            seen.size,
+            field_window.offset - leaf.offset,
+            field_window.size,
             leaf.size,
             leaf.info,
             make_key(node),
@@ -480,12 +480,12 @@ class KernelWriter:
         return self._tables[name]
 
     def _code(self, leaf: Leaf) -> str:
-        seen = window(leaf)
-        assert seen is not None
-        first = self.byte(leaf, seen.offset).text
-        if seen.size == 1:
+        field_window = window(leaf)
+        assert field_window is not None
+        first = self.byte(leaf, field_window.offset).text
+        if field_window.size == 1:
             return first
-        return f"({first} | {self.byte(leaf, seen.offset + 1).text} << 8)"
+        return f"({first} | {self.byte(leaf, field_window.offset + 1).text} << 8)"
 
     def beside(self, node: Node, leaf: Leaf) -> KernelValue:
         """Return a cosine or sine from a table that has both side by side.

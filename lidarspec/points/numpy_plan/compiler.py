@@ -216,19 +216,19 @@ class Compiler:
         leaf = self._layout.leaves.get(source.path)
         if leaf is None:
             return None
-        seen = window(leaf)
-        is_long = seen is None or (self._is_exact and seen.size > 1)
+        field_window = window(leaf)
+        is_long = field_window is None or (self._is_exact and field_window.size > 1)
         if node is source and (is_long or not leaf.info.scaled):
             return self._load_whole(leaf, kind)
-        if seen is None or (is_long and node.function in _FASTER_THAN_TABLE):
+        if field_window is None or (is_long and node.function in _FASTER_THAN_TABLE):
             return None
         index = RegisterRead(
             self._once(
-                ("index", seen, leaf.strides),
-                lambda: self._load(leaf, seen.dtype, seen.offset, "index"),
+                ("index", field_window, leaf.strides),
+                lambda: self._load(leaf, field_window.dtype, field_window.offset, "index"),
             )
         )
-        table = self._table(node, leaf, seen, kind)
+        table = self._table(node, leaf, field_window, kind)
         bits = (len(table) - 1).bit_length()
         return self.program.step(
             f"{node.path or source.path}: table of {len(table)} by {bits} bits",
@@ -237,9 +237,16 @@ class Compiler:
             index,
         )
 
-    def _table(self, node: Node, leaf: Leaf, seen: FieldWindow, kind: str) -> NDArray[Any]:
+    def _table(self, node: Node, leaf: Leaf, field_window: FieldWindow, kind: str) -> NDArray[Any]:
         """Return the values of an expression for each value of its window."""
-        name = (kind, seen.offset - leaf.offset, seen.size, leaf.size, leaf.info, make_key(node))
+        name = (
+            kind,
+            field_window.offset - leaf.offset,
+            field_window.size,
+            leaf.size,
+            leaf.info,
+            make_key(node),
+        )
         if name not in self._tables:
             values = every_value(node, leaf)
             self._tables[name] = np.ascontiguousarray(values, TYPES[kind])

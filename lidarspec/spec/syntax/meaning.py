@@ -351,14 +351,14 @@ class _Builder:
                 default = info.default.get(child.name)
             else:
                 default = None
-            said = tree.FieldInfo(
+            described = tree.FieldInfo(
                 path,
                 info.axes,
                 docs=info.docs if place.in_bits else "",
                 optional=info.optional,
                 default=default,
             )
-            inside = _Context(said, scope, child.name or "", place.in_bits)
+            inside = _Context(described, scope, child.name or "", place.in_bits)
             part = unwrap(child)
             if isinstance(
                 filler := (

@@ -224,7 +224,7 @@ def _check_measures(
     con: Construct,
     path: str,
     measure: tuple[float, float, str],
-    found: dict[str, tuple[float, float, str]],
+    measures_by_path: dict[str, tuple[float, float, str]],
 ) -> None:
     """Refuse a field that branches measure in different steps or units: it is one column, and has
     one of each.
@@ -236,18 +236,18 @@ def _check_measures(
             path = str(con.name)
         measure = (1, 0, "")
     if isinstance(con, DescribedField):
-        said = con.describe(tree.FieldInfo(""))
-        measure = (said.scale, said.offset, said.unit)
+        described = con.describe(tree.FieldInfo(""))
+        measure = (described.scale, described.offset, described.unit)
     is_number = isinstance(
         con, construct.FormatField | construct.BytesInteger | construct.BitsInteger
     )
-    if is_number and found.setdefault(path, measure) != measure:
+    if is_number and measures_by_path.setdefault(path, measure) != measure:
         raise SpecError(
             "its branches have different scales or units: give each a name of its own", path=path
         )
     for child in children(con):
         if not isinstance(con, Struct) or child.name is not None:
-            _check_measures(child, path, measure, found)
+            _check_measures(child, path, measure, measures_by_path)
 
 
 def _walk(con: Construct, path: str, *, in_bits: bool) -> Iterator[tuple[str, Construct, bool]]:

@@ -173,18 +173,18 @@ class IndexedArray(Array):  # type: ignore[misc]
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
         count = check_bound(construct.evaluate(self.count, context), self.limit, "count", path)
-        found = construct.ListContainer()
+        elements = construct.ListContainer()
         for index in range(count):
             context._index = index
             start = stream.tell()
             place = f"{path}[{index}]"
             element = self.subcon._parsereport(stream, context, place)
-            found.append(element)
+            elements.append(element)
             if stream.tell() == start and not self.in_bits:
                 context._params["_empty"] = check_bound(
                     context._params.get("_empty", 0) + 1, self.limit, "count", path
                 )
-        return found
+        return elements
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         count = construct.evaluate(self.count, context)
@@ -202,16 +202,16 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
     """
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
-        found = construct.ListContainer()
+        elements = construct.ListContainer()
         while stream.read(1):
             stream.seek(-1, io.SEEK_CUR)
-            context._index = len(found)
+            context._index = len(elements)
             start = stream.tell()
-            place = f"{path}[{len(found)}]"
-            found.append(self.subcon._parsereport(stream, context, place))
+            place = f"{path}[{len(elements)}]"
+            elements.append(self.subcon._parsereport(stream, context, place))
             if stream.tell() == start:
                 raise construct.RangeError("an element without a byte never ends", path=place)
-        return found
+        return elements
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
         if not isinstance(obj, list | tuple):
@@ -423,14 +423,14 @@ class SizeField(Subconstruct):  # type: ignore[misc]
         self._enter(context, (path, 0, obj))
         return self.subcon._build(sizes.get(path, obj or 0), stream, context, path)
 
-    def _enter(self, context: Any, said: tuple[str, int, Any]) -> None:
+    def _enter(self, context: Any, entry: tuple[str, int, Any]) -> None:
         """Register the value with the struct that contains the part.
 
         A bit block that is probed on its own has no such struct.
         """
         for _ in range(self.out):
             context = context.get("_", {})
-        context.get("_sizings", []).append((self, *said))
+        context.get("_sizings", []).append((self, *entry))
 
 
 class CountField(Subconstruct):  # type: ignore[misc]

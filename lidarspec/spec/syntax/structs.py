@@ -372,8 +372,8 @@ def children(con: Construct) -> list[Construct]:
     """The constructs directly below one, branches included."""
     if isinstance(con, Struct):
         return list(con.subcons)
-    found = [getattr(con, name) for name in _INNER if name in vars(con)]
-    return found + (list(con.cases.values()) if "cases" in vars(con) else [])
+    below = [getattr(con, name) for name in _INNER if name in vars(con)]
+    return below + (list(con.cases.values()) if "cases" in vars(con) else [])
 
 
 def seals(con: Construct) -> Iterator[SealedStruct]:
@@ -513,17 +513,17 @@ def _random_parts(
     con: Partition, source: random.Random, drawn: Drawn, scope: Any, path: str
 ) -> ParsedParts:
     """Some parts, with how long each is, which what stands behind them may ask for."""
-    found = ParsedParts()
+    parts = ParsedParts()
     around = Container(
         {**scope, "_params": Container(), "_parsing": False, "_building": True, "_sizing": False}
     )
     for _ in range(source.randint(0, 4)):
         name = source.choice(list(con.cases))
         stream = io.BytesIO()
-        found.append(_random_part(con.cases[name], source, drawn, scope, path))
-        con.cases[name]._build(found[-1], stream, around, path)
-        found.spans.append((name, 0, stream.tell()))
-    return found
+        parts.append(_random_part(con.cases[name], source, drawn, scope, path))
+        con.cases[name]._build(parts[-1], stream, around, path)
+        parts.spans.append((name, 0, stream.tell()))
+    return parts
 
 
 def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any, path: str) -> Any:

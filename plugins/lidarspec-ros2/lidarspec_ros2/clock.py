@@ -94,8 +94,8 @@ class MessageStamps:
             device_ns, host_ns: as of `DeviceClock.observe`; a packet of whose arrival nobody knows
                 has 0 and tells nothing.
         """
-        known = host_ns > 0
-        self.clock.observe(device_ns[known], host_ns[known])
+        is_known = host_ns > 0
+        self.clock.observe(device_ns[is_known], host_ns[is_known])
         ahead = None if self._wall is None else self._wall.find_step()
         self._ahead = self._ahead if ahead is None else ahead
 
@@ -275,16 +275,16 @@ class DeviceClock:
             self._known = self._line.slope
 
 
-def fit_line(least: Sequence[ClockSample], known: float) -> ClockLine:
+def fit_line(least: Sequence[ClockSample], slope_before: float) -> ClockLine:
     """The line under some samples that is as near to them as can be, of a slope that they are sure
     of.
 
     Args:
         least: in order, one or more.
-        known: the slope before; the result's is the nearest to it of those that they allow.
+        slope_before: the slope before; the result's is the nearest to it of those that they allow.
     """
     hull, last = lower_hull(least), least[-1]
-    slope, middle = known, (len(least) - 1) / 2
+    slope, middle = slope_before, (len(least) - 1) / 2
     if len(least) >= SLOPED:
         slope = min(
             max(slope, slope_over(middle - SURE, least, hull)),

@@ -15,17 +15,21 @@ LOST = ("disconnected", "silent")
 
 
 def make_status(
-    name: str, device: Device, reading: MeterReading, said: Sequence[str], more: Mapping[str, str]
+    name: str,
+    device: Device,
+    reading: MeterReading,
+    device_warnings: Sequence[str],
+    more: Mapping[str, str],
 ) -> DiagnosticStatus:
     """How a device is doing.
 
     Args:
         name: of the node.
         reading: the figures of the last second.
-        said: what is to be said of it besides the device's own warnings.
+        device_warnings: what is to be said of it besides the device's own warnings.
         more: further values.
     """
-    warnings = [*device.warnings, *said]
+    warnings = [*device.warnings, *device_warnings]
     figures = {f"{name} [{unit}]": text(reading) for name, unit, _, text in FIGURES}
     values = {
         "state": device.state,

@@ -254,11 +254,11 @@ class LidarNode(LifecycleNode):
             "clock drift [ppm]": f"{clock.drift_ppm:+.1f}",
             "clock set": f"{clock.jumps} times",
         }
-        found = make_status(
+        status = make_status(
             self.get_name(), device, reading, [*filter(None, (clock.jump, topics.fault))], more
         )
         self._diagnostics.publish(
-            DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[found])
+            DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[status])
         )
 
     def _call_in_executor(self, callback: Callable[[], Any]) -> None:

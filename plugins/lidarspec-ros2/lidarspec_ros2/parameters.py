@@ -241,10 +241,10 @@ class Settings:
 
     def make_planar_scans(self) -> PlanarScans:
         """What makes planar scans."""
-        first, seen = self["angle_min"], (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
+        first, width = self["angle_min"], (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
         low, high = self["scan_z_min"], self["scan_z_max"]
         return PlanarScans(
-            field=(first, first + seen) if seen else None,
+            field=(first, first + width) if width else None,
             ring=self["scan_ring"] if self["scan_ring"] >= 0 else None,
             heights=(low, high) if low < high else None,
         )

@@ -148,13 +148,13 @@ class Topics:
         if self._time is not None and self.active:
             self._time.publish(Clock(clock=Time(nanoseconds=at).to_msg()))
 
-    def publish_imu(self, felt: ImuSamples) -> None:
+    def publish_imu(self, samples: ImuSamples) -> None:
         """Publish what the IMU felt."""
-        for index in range(len(felt)) if len(felt) and self._has_subscribers(IMU) else ():
+        for index in range(len(samples)) if len(samples) and self._has_subscribers(IMU) else ():
             at = self.stamps.at(
-                int(felt.time_ns[index]), self._settings, by_clock=self._is_imu_by_clock
+                int(samples.time_ns[index]), self._settings, by_clock=self._is_imu_by_clock
             )
-            self._send(self._messages.imu(felt, index, at, self._settings["frame_id"]))
+            self._send(self._messages.imu(samples, index, at, self._settings["frame_id"]))
 
     def publish_packet(self, chunk: Chunk) -> None:
         """Publish what the sensor sent."""
