@@ -25,9 +25,17 @@ from lidarspec.cli.root import SPOKEN, VERBS, main as root
 
 DOCS = Path(__file__).parent
 PAGE, NODE = "reference/command-line.md", "reference/ros2.md"
-BEGIN, END = "<!-- generated -->", "<!-- end -->"
+BEGIN, END = "<!--generated-->", "<!--end-->"
 SHARED = "Shared options"
-MIN_SHARING_VERBS = 3
+#: Options with one meaning in all verbs; they are described once. "output" belongs to verbs that
+#: print a result: `-o` of the others has a row of its own.
+SHARED_OPTIONS = {
+    "sensor": ("-s", "-O", "--calibration"),
+    "selection": ("--slice", "--scans", "--every", "--range", "--time"),
+    "output": ("--json", "-o"),
+}
+#: Limits that need no mention: the smallest number that makes sense.
+OBVIOUS_LIMIT = re.compile(r"; x>=?[01](?=\])| \[x>=?[01]\]")
 
 
 def context(verb: str) -> click.Context:
@@ -62,33 +70,68 @@ def options(verb: str) -> list[tuple[str, str]]:
     return [(typed, " ".join(text.split())) for typed, text in filter(None, records)]
 
 
-def shared_options() -> list[tuple[str, str]]:
-    """Return the options that at least `MIN_SHARING_VERBS` verbs have, with the same text."""
-    verbs = Counter(option for verb in VERBS for option in options(verb))
-    return [option for option, count in verbs.items() if count >= MIN_SHARING_VERBS]
+def option_name(option: tuple[str, str]) -> str:
+    """Return the first name of an option: `-o` of `-o, --output FILE`."""
+    return re.split("[ ,]", option[0])[0]
 
 
-def option_table(rows: list[tuple[str, str]]) -> list[str]:
-    """Return the lines of a table of options; none without options."""
-    if not rows:
-        return []
-    escaped = [(typed.replace("|", "\\|"), text.replace("|", "\\|")) for typed, text in rows]
-    return ["| option | |", "|---|---|", *(f"| `{typed}` | {text} |" for typed, text in escaped)]
+def shared_options() -> dict[str, tuple[str, str]]:
+    """Return the options of `SHARED_OPTIONS` by name, with the text that most verbs have."""
+    names = {name for group in SHARED_OPTIONS.values() for name in group}
+    counts = Counter(option for verb in VERBS for option in options(verb))
+    shared: dict[str, tuple[str, str]] = {}
+    for option, _ in counts.most_common():
+        if option_name(option) in names:
+            shared.setdefault(option_name(option), option)
+    return shared
+
+
+def is_shared(option: tuple[str, str]) -> bool:
+    """Return whether the shared options describe this option of a verb."""
+    name = option_name(option)
+    return name == "--json" or shared_options().get(name) == option
+
+
+def option_list(rows: list[tuple[str, str]]) -> list[str]:
+    """Return one line for each option."""
+    return [f"* `{typed}`: {OBVIOUS_LIMIT.sub('', text)}" for typed, text in rows]
+
+
+def shared_lists() -> list[str]:
+    """Return the lines that describe the shared options, by group."""
+    shared = shared_options()
+    lines = []
+    for group, names in SHARED_OPTIONS.items():
+        lines += [f"{group.capitalize()}:", "", *option_list([shared[name] for name in names]), ""]
+    return lines[:-1]
+
+
+def shared_names(names: list[str]) -> list[str]:
+    """Return names of shared options, with the name of a group for all of its options."""
+    words = []
+    for group, members in SHARED_OPTIONS.items():
+        present = [name for name in members if name in names]
+        is_whole = len(present) == len(members)
+        words += [group] if is_whole else [f"`{name}`" for name in present]
+    return words
 
 
 def section(verb: str) -> str:
     """Return the generated part of a verb's section.
 
-    Shared options are named only, and of the help the first paragraph is printed.
+    Shared options are named only, of the help the first paragraph is printed, and the usage only
+    if it has arguments.
     """
-    shared = shared_options()
-    lines = ["", f"`{usage(verb).replace(' [OPTIONS]', '')}`", "", paragraphs(verb)[0]]
-    names = [re.split("[ ,]", option[0])[0] for option in options(verb) if option in shared]
+    lines = ["", paragraphs(verb)[0]]
+    typed = usage(verb).replace(" [OPTIONS]", "")
+    if typed != f"lidarspec {verb}":
+        lines = ["", f"`{typed}`", *lines]
+    names = [option_name(option) for option in options(verb) if is_shared(option)]
     if names:
-        lines += ["", f"[Shared](#shared-options): {', '.join(f'`{name}`' for name in names)}"]
-    table = option_table([option for option in options(verb) if option not in shared])
-    if table:
-        lines += ["", *table]
+        lines += ["", f"[Shared](#shared-options): {', '.join(shared_names(names))}"]
+    own = [option for option in options(verb) if not is_shared(option)]
+    if own:
+        lines += ["", *option_list(own)]
     return "\n".join([BEGIN, *lines, "", END])
 
 
@@ -98,7 +141,7 @@ def page(text: str) -> str:
     A verb without a generated part gets one below its heading.
     """
     generated = {verb: section(verb) for verb in VERBS}
-    generated[SHARED] = "\n".join([BEGIN, "", *option_table(shared_options()), "", END])
+    generated[SHARED] = "\n".join([BEGIN, "", *shared_lists(), "", END])
     for title, part in generated.items():
         before, heading, after = text.partition(f"## {title}\n\n")
         rest = re.sub(rf"\A{re.escape(BEGIN)}.*?{re.escape(END)}\n\n?", "", after, flags=re.DOTALL)

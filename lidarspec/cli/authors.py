@@ -147,6 +147,7 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
 @click.option(
     "--max-examples",
     type=click.IntRange(1),
+    metavar="N",
     default=EXAMPLES,
     show_default=True,
     help="Number of examples of each frame type.",

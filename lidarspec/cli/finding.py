@@ -128,9 +128,16 @@ def _udp(port: int, users: tuple[PortUser, ...] | None) -> dict[str, Any]:
 @click.option(
     "--period",
     type=click.IntRange(min=3),
+    metavar="N",
     help="Length of the frames in bytes, for a file of consecutive frames.",
 )
-@click.option("--offset", type=click.IntRange(min=0), default=0, help="Offset of the first frame.")
+@click.option(
+    "--offset",
+    type=click.IntRange(min=0),
+    metavar="N",
+    default=0,
+    help="Offset of the first frame.",
+)
 @output_options
 def crc(
     words: Sequence[str], period: int | None, offset: int, as_json: bool, output: str | None

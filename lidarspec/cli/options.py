@@ -119,6 +119,7 @@ def count_option(what: str, **more: Any) -> Callable[[Function], Function]:
         "-n",
         "--count",
         type=click.IntRange(min=1),
+        metavar="N",
         help=f"Stop after this many {what}.",
         **more,
     )

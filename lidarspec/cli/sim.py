@@ -78,6 +78,7 @@ PLACES = (
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
+    metavar="N",
     default=0,
     show_default=True,
     help="Random seed of the room and of the errors.",
@@ -99,6 +100,7 @@ PLACES = (
 @click.option(
     "--reorder",
     type=click.IntRange(0, 1000),
+    metavar="N",
     default=0,
     show_default=True,
     help="Delay datagrams by up to this many places.",

@@ -75,7 +75,7 @@ def test_the_generated_parts_of_the_reference_are_up_to_date() -> None:
         path for path, text in pages.items() if text != (DOCS / path).read_text(encoding="utf-8")
     ]
     assert not stale, f"out of date, run `make reference`: {', '.join(stale)}"
-    assert "| `--scan NUMBER` |" in pages["reference/command-line.md"]
+    assert "* `--scan NUMBER`: " in pages["reference/command-line.md"]
 
 
 def test_every_verb_has_a_manual_page() -> None:
