@@ -40,19 +40,19 @@ from lidarspec.spec.sensor import SensorDescription
 
 Integers = NDArray[np.int64]
 #: frames of another type, and the number of packets before each, (k,).
-Earlier = tuple[Frames, NDArray[np.intp]]
+OtherFrames = tuple[Frames, NDArray[np.intp]]
 
 
 class PacketStream:
     """Makes packets of one type from the frames that a decoder finds.
 
     Args:
-        sensor: that sends them.
-        frame: their type.
+        sensor: the sensor that sends the packets.
+        frame: the frame type of the packets.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
-        backend: what makes points of the packets, "auto", "numpy" or "jit".
+        backend: calculates points from the packets: "auto", "numpy" or "jit".
         state: frames of other types, by name, that count as seen before the first packet.
-        reference: tells the turn of the clock from the first packet on.
+        reference: dates the clock from the first packet on.
 
     Raises:
         UnknownFrame: if the sensor has no such type.
@@ -71,7 +71,7 @@ class PacketStream:
         self._type = packet_type(sensor, frame)
         self.stats = stats
         self._backend = backend
-        self._last_frames: dict[str, Table] = {}  # of other types: the last one, by its name
+        self._last_frames: dict[str, Table] = {}  # last frame of each other type, by name
         for name in self._type.others:
             if state and name in state:
                 self._last_frames[name] = codec(sensor.frames[name]).table([state[name]])
@@ -79,8 +79,8 @@ class PacketStream:
 
         clock = self._type.clock
         self._clock = Unwrapper(clock.wraps_at) if clock else None
-        self._time: int | None = None  # of the last packet with parts that have the clock
-        self._turn = repeat(0, 0)  # completes the times of the packets at hand
+        self._time: int | None = None  # time of the last packet that had a clock reading
+        self._epoch_offset_ns = repeat(0, 0)  # added to the times of one `add` to date them
         self._epoch: ClockEpoch | None = None
         if clock is not None and clock.reference is not None and sensor.frames[frame].data:
             self._epoch = ClockEpoch(self._type.timed_sensor, clock, reference)
@@ -95,20 +95,21 @@ class PacketStream:
         self._arrival_order = ArrivalOrder(stats, loss_clock, self._type.loss_clock_step_ns)
 
     def add(self, batches: Sequence[Frames], *, whole: bool = False) -> Packets:
-        """Return the packets among some frames.
+        """Return the packets among some frames, and remember what the next call needs.
 
         Args:
-            whole: the frames are a whole input: packets before the first frame of another type see
-                that one as state.
+            batches: frames of all types, in stream order.
+            whole: whether the frames are a whole input. Packets before the first frame of another
+                type then use that frame as their state.
         """
         parts = [OwnFrames.of(frames, self._type.frame) for frames in batches if len(frames)]
         columns = _join([self._read(part) for part in parts])
         if columns is None:
-            columns = self._no_columns()
+            columns = self._make_empty_columns()
         table = columns.table
         state: dict[str, StateOf] = {}
         if self._type.others:
-            state = self._states(parts, len(table), whole=whole)
+            state = self._find_states(parts, len(table), whole=whole)
         host = _host_times(columns.at)
         breaks = np.zeros(len(table), np.bool_)
         if broadcast_value(columns.skipped) != 0:
@@ -120,14 +121,14 @@ class PacketStream:
             batch = Batch(table, breaks, state, self._type.sensor.state)
             with np.errstate(all="ignore"):
                 if self._clock is not None:
-                    time = self._call_plugin("clock", self._times, None, batch, host, whole)
+                    time = self._call_plugin("clock", self._read_times, None, batch, host, whole)
                 index, breaks, order = self._judge(batch, time, columns.skipped)
         return Packets(
             self._type.sensor,
             self._type.frame,
             table,
             offset=columns.offset,
-            time_ns=host if time is None else self._complete(time),
+            time_ns=host if time is None else self._date_times(time),
             host_ns=host,
             index=index,
             breaks=breaks,
@@ -138,7 +139,7 @@ class PacketStream:
         )
 
     def interrupt(self) -> None:
-        """Mark a break before the next packet: input was lost here."""
+        """Mark a break before the next packet because input was lost."""
         self._skipped = max(self._skipped, 1)
         for judge in (self._counter_order, self._clock_order, self._arrival_order):
             if judge is not None:
@@ -149,39 +150,57 @@ class PacketStream:
     ) -> tuple[Index, NDArray[np.bool_], Integers | None]:
         """Return the index of packets, the breaks before them, and their order.
 
-        The order is None if the clock does not show it.
+        This also counts lost, late and duplicate packets. The order is None if the packets are not
+        ordered by their clock. If the plugin raises, the packets keep the order of arrival.
         """
-        unjudged = (range(len(batch)), batch.breaks)
+        fallback = (range(len(batch)), batch.breaks)
         if self._clock_order is not None and time is not None:
             push = self._clock_order.push
-            index, order = self._call_plugin("clock", push, (unjudged[0], None), batch, time)
+            index, order = self._call_plugin("clock", push, (fallback[0], None), batch, time)
             return index, batch.breaks, order
         if self._counter_order is not None:
             push_counted = self._counter_order.push
-            index, breaks = self._call_plugin("sequence", push_counted, unjudged, batch, time)
+            index, breaks = self._call_plugin("sequence", push_counted, fallback, batch, time)
         else:
             push_arrived = self._arrival_order.push
-            index, breaks = self._call_plugin("clock", push_arrived, unjudged, batch, time, skipped)
+            index, breaks = self._call_plugin("clock", push_arrived, fallback, batch, time, skipped)
         return index, breaks, None
 
     def _call_plugin(
-        self, place: str, function: Callable[..., Any], otherwise: Any, batch: Batch, *args: Any
+        self,
+        declaration: str,
+        function: Callable[..., Any],
+        fallback: Any,
+        batch: Batch,
+        *args: Any,
     ) -> Any:
-        """Return the result of a function that calls a plugin; count its errors."""
+        """Call a function that runs plugin code and return its result.
+
+        If it raises, the error is counted and `fallback` is returned.
+
+        Args:
+            declaration: the name of the plugin's declaration, for the error.
+        """
         try:
             return function(batch, *args)
         except Exception as error:
-            self.stats.error(PluginError.of(error, place), len(batch))
-            return otherwise
+            self.stats.error(PluginError.of(error, declaration), len(batch))
+            return fallback
 
-    def _times(self, batch: Batch, host: Integers, whole: bool) -> Integers:
-        """Return the times of packets by their clock, (n,) ns."""
+    def _read_times(self, batch: Batch, host: Integers, whole: bool) -> Integers:
+        """Return the unwrapped clock times of packets, (n,) ns, and remember the last one.
+
+        A packet without a clock reading has the time of the last packet that has one.
+
+        Args:
+            host: arrival times, (n,) ns; 0 if unknown.
+        """
         assert self._clock is not None
         which, readings = read_clock(self._type.timed_sensor, batch)
         if which is None:
             times = self._clock.push(readings, host)
             if self._epoch is not None:
-                self._turn = self._epoch.push(batch, readings, times, host, whole=whole)
+                self._epoch_offset_ns = self._epoch.push(batch, readings, times, host, whole=whole)
             return times
         times = self._clock.push(readings, host[which])
         if self._time is None:
@@ -192,8 +211,11 @@ class PacketStream:
             self._time = times.item(-1)
         return hold_values(which, times, before)
 
-    def _complete(self, times: Integers) -> Integers:
-        """Return times with the turn of the clock that other frames have told, if they have."""
+    def _date_times(self, times: Integers) -> Integers:
+        """Return times made absolute, if a frame has reported the date.
+
+        Otherwise set `stats.undated`, which warns the user.
+        """
         if self._epoch is None or not len(times):
             return times
         if self._epoch.ns is None:
@@ -203,16 +225,19 @@ class PacketStream:
             )
             return times
         self.stats.undated = ""
-        return times + self._turn
+        return times + self._epoch_offset_ns
 
-    def _bytes_skipped(self, part: OwnFrames) -> Integers:
-        """Return the bytes in no frame between each of our frames and the one before, (n,)."""
+    def _count_skipped_bytes(self, part: OwnFrames) -> Integers:
+        """Return the number of bytes outside frames before each own frame, (n,).
+
+        The bytes after the last own frame are remembered for the next piece of input.
+        """
         gaps = part.piece.gaps
         rows = part.rows
-        number = len(part.frames)
+        count = len(part.frames)
         if broadcast_value(gaps) == 0 and not self._skipped:
-            return repeat(0, number)
-        if isinstance(rows, slice) and number:
+            return repeat(0, count)
+        if isinstance(rows, slice) and count:
             skipped = gaps[rows].copy()
             skipped[0] += self._skipped + int(gaps[: rows.start].sum())
             self._skipped = int(gaps[rows.stop :].sum())
@@ -220,82 +245,91 @@ class PacketStream:
         sums = self._skipped + np.cumsum(gaps)
         own_sums = sums[rows]
         self._skipped = int(sums[-1])
-        if number:
+        if count:
             self._skipped -= int(own_sums[-1])
         return np.diff(own_sums, prepend=0)
 
     def _read(self, part: OwnFrames) -> _Columns:
-        """Return what a piece of input says of its packets."""
+        """Return the columns of one piece of input, and count its skipped bytes."""
         frames = part.frames
-        skipped = self._bytes_skipped(part)
+        skipped = self._count_skipped_bytes(part)
         return _Columns(self._type.codec.gather(frames), frames.places, frames.at, skipped)
 
-    def _no_columns(self) -> _Columns:
-        """Return what an input without packets says of them."""
-        nothing = repeat(0, 0)
-        return _Columns(self._type.codec.table([]), range(0), nothing, nothing)
+    def _make_empty_columns(self) -> _Columns:
+        empty = repeat(0, 0)
+        return _Columns(self._type.codec.table([]), range(0), empty, empty)
 
-    def _states(
-        self, parts: Sequence[OwnFrames], number: int, *, whole: bool
+    def _find_states(
+        self, parts: Sequence[OwnFrames], packet_count: int, *, whole: bool
     ) -> dict[str, StateOf]:
-        """Return the frames of each other type, and which was the last before each packet."""
-        earlier = self._others_in(parts)
+        """Return the frames of each other type, and the last of them before each packet."""
+        others = self._select_others(parts)
         return {
-            name: self._state_of(name, earlier.get(name, []), number=number, whole=whole)
+            name: self._find_state(
+                name, others.get(name, []), packet_count=packet_count, whole=whole
+            )
             for name in self._type.others
         }
 
-    def _others_in(self, parts: Sequence[OwnFrames]) -> dict[str, list[Earlier]]:
-        """Return the frames of other types, by name."""
-        earlier: dict[str, list[Earlier]] = {}
-        number = 0
+    def _select_others(self, parts: Sequence[OwnFrames]) -> dict[str, list[OtherFrames]]:
+        """Return the frames of the types that packets depend on, by name."""
+        selected: dict[str, list[OtherFrames]] = {}
+        packet_count = 0
         for part in parts:
             if part.has_others:
                 mask = np.ones(len(part.piece), np.bool_)
                 mask[part.rows] = False
                 others = np.flatnonzero(mask)
                 kinds = part.piece.kinds[others]
-                before = number + others - np.arange(len(others))
+                before = packet_count + others - np.arange(len(others))
                 for kind in np.unique(kinds).tolist():
                     name = part.piece.names[kind]
                     if name in self._type.others:
                         which = kinds == kind
                         frames = part.piece.select(others[which])
-                        earlier.setdefault(name, []).append((frames, before[which]))
-            number += len(part.frames)
-        return earlier
+                        selected.setdefault(name, []).append((frames, before[which]))
+            packet_count += len(part.frames)
+        return selected
 
-    def _state_of(
-        self, name: str, earlier: Sequence[Earlier], *, number: int, whole: bool
+    def _find_state(
+        self, name: str, others: Sequence[OtherFrames], *, packet_count: int, whole: bool
     ) -> StateOf:
-        """Return the frames of another type, and which of them was the last before each packet."""
+        """Return the frames of another type, and the last of them before each packet.
+
+        The newest frame is remembered for the next packets.
+
+        Args:
+            name: the other type.
+            others: its frames in this input.
+        """
         last_frame = self._last_frames.get(name)
-        if not earlier:
-            return last_frame, repeat(-1 if last_frame is None else 0, number)
+        if not others:
+            return last_frame, repeat(-1 if last_frame is None else 0, packet_count)
         engine = codec(self._type.sensor.frames[name])
-        tables: list[Table] = [engine.gather(frames) for frames, _ in earlier]
-        before = np.concatenate([places for _, places in earlier])
+        tables: list[Table] = [engine.gather(frames) for frames, _ in others]
+        before = np.concatenate([counts for _, counts in others])
         if last_frame is not None:
             tables = [last_frame, *tables]
             before = np.concatenate(([0], before))
         elif whole:
             before[0] = 0
-        newest, _ = earlier[-1]
+        newest, _ = others[-1]
         self._last_frames[name] = engine.table([newest.data(len(newest) - 1)])
-        which = np.repeat(np.arange(-1, len(before)), np.diff(before, prepend=0, append=number))
+        packets_between = np.diff(before, prepend=0, append=packet_count)
+        which = np.repeat(np.arange(-1, len(before)), packets_between)
         return joined_tables(tables), which
 
 
 class ImuStream:
-    """Makes IMU samples from the frames that a decoder finds, of every type that has them.
+    """Makes IMU samples from the frames that a decoder finds, of all types with an IMU.
 
     Args:
-        sensor: that sends them.
-        stats, backend, state: as of `PacketStream`.
+        sensor: the sensor that sends the frames.
+        stats, backend, state: the same as for `PacketStream`.
 
     Attributes:
-        waiting: for samples until the scan that they belong to ends; None if there is no IMU, or
-            not by the clock of the points.
+        waiting: the samples of scans that have not ended. None if there is no IMU, or if only some
+            of the IMU and data frames have a clock: their times are not comparable.
     """
 
     def __init__(
@@ -316,20 +350,22 @@ class ImuStream:
     def add(
         self, found: Sequence[Frames], data: Packets | None, *, whole: bool = False
     ) -> ImuSamples:
-        """Return the samples among some frames, and add them to those that wait.
+        """Return the IMU samples among some frames, and add them to `waiting`.
 
         Errors of a plugin are counted.
 
         Args:
-            data: the packets of the data among them.
-            whole: the frames are a whole input.
+            found: frames of all types, in stream order.
+            data: the data packets among them; None if there are none.
+            whole: whether the frames are a whole input.
         """
         batches = list[Packets]()
         if data is not None and data.sensor.frames[data.frame].imu is not None:
             batches.append(data)
         for name in self._names:
+            # A whole input without frames of the type has no samples, so it need not be searched.
             if not whole or any(len(OwnFrames.of(frames, name).frames) for frames in found):
-                batches.append(self._stream(name).add(found, whole=whole))
+                batches.append(self._find_stream(name).add(found, whole=whole))
         parts = list[ImuSamples]()
         for packets in batches:
             if not len(packets):
@@ -344,12 +380,12 @@ class ImuStream:
         return samples
 
     def interrupt(self) -> None:
-        """Mark a break before the next sample: input was lost here."""
+        """Mark a break before the next sample because input was lost."""
         for name in self._names:
-            self._stream(name).interrupt()
+            self._find_stream(name).interrupt()
 
-    def _stream(self, name: str) -> PacketStream:
-        """Return the packets of one type; made when the first ones arrive."""
+    def _find_stream(self, name: str) -> PacketStream:
+        """Return the stream of one type; create it on first use."""
         if name not in self._streams:
             self._streams[name] = self._make_stream(name)
         return self._streams[name]
@@ -360,9 +396,9 @@ class OwnFrames:
     """The frames of one type in a piece of input.
 
     Attributes:
-        frames: those of the type.
+        frames: the frames of the type.
         piece: all frames of the piece.
-        rows: the rows of `frames` in the piece, as a slice if they follow one another.
+        rows: the indices of `frames` in `piece`; a slice if they are consecutive.
     """
 
     frames: Frames
@@ -393,10 +429,10 @@ class OwnFrames:
 
 
 def data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> str | None:
-    """Return the type of data frame that an input is read by if none is asked for.
+    """Return the default data frame type of an input.
 
-    It is the configured one, or the first that arrived; None if the sensor has several, none is
-    configured, and none has arrived yet.
+    It is the configured type, or else the type of the first data frame that arrived. None if the
+    sensor has several types, none is configured, and no data frame has arrived yet.
     """
     names = sensor.data_frames
     if len(names) < 2 or sensor.options.get("answer") in names:
@@ -414,9 +450,9 @@ class _Columns(NamedTuple):
 
     Attributes:
         table: the raw columns.
-        offset: of each in the input; a range if they have one size and follow one another.
+        offset: offsets in the input; a range if the frames are consecutive and of one size.
         at: arrival times, ns; -1 if unknown.
-        skipped: bytes in no frame before each.
+        skipped: number of bytes outside frames before each.
     """
 
     table: Table
@@ -426,7 +462,7 @@ class _Columns(NamedTuple):
 
 
 def _join(parts: Sequence[_Columns]) -> _Columns | None:
-    """Return the columns of all packets, in this order; None if there are none."""
+    """Return the columns of all parts, in this order; None if there are no packets."""
     parts = [part for part in parts if len(part.table)]
     if len(parts) < 2:
         return parts[0] if parts else None
@@ -439,7 +475,7 @@ def _join(parts: Sequence[_Columns]) -> _Columns | None:
 
 
 def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
-    """Return offsets joined; as a range, if they are in equal steps."""
+    """Return the offsets of all parts; a range if all steps are equal."""
     first = parts[0]
     if not isinstance(first, range):
         return np.concatenate([array_of(part) for part in parts])
@@ -452,7 +488,7 @@ def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
 
 
 def _join_values(parts: Sequence[Integers]) -> Integers:
-    """Return arrays joined; as one `repeat` value, if all of them are of it."""
+    """Return the values of all parts; one `repeat` if all have the same repeated value."""
     values = {broadcast_value(part) for part in parts}
     if len(values) == 1:
         only = values.pop()
@@ -462,7 +498,7 @@ def _join_values(parts: Sequence[Integers]) -> Integers:
 
 
 def _host_times(at: Integers) -> Integers:
-    """Return arrival times, 0 if unknown."""
+    """Return arrival times with 0 in place of -1 for unknown times."""
     only = broadcast_value(at)
     if only is not None:
         return repeat(max(only, 0), len(at))
