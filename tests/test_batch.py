@@ -103,7 +103,7 @@ def test_pieces_have_the_points_of_one_pass_and_a_bad_file_stops_no_other(
 
 
 @pytest.mark.slow
-def test_a_second_run_does_what_is_missing_only(drives: Path, tmp_path: Path) -> None:
+def test_a_second_run_converts_only_missing_files(drives: Path, tmp_path: Path) -> None:
     mine = tmp_path / "drives"
     mine.mkdir()
     for name in ("long.bin", "north/a.bin"):
@@ -294,7 +294,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path
     assert (taken / "bad.csv").read_text() == "mine"
 
 
-def test_a_missing_library_is_said_before_a_file_is_read(
+def test_a_missing_library_is_reported_before_reading(
     drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
@@ -317,7 +317,7 @@ def test_a_missing_library_is_said_before_a_file_is_read(
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_is_not_there_is_said(drives: Path, tmp_path: Path) -> None:
+def test_an_unreachable_scheduler_is_reported(drives: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     import dask
 
@@ -328,7 +328,7 @@ def test_a_scheduler_that_is_not_there_is_said(drives: Path, tmp_path: Path) -> 
         run(drives / "*.bin", tmp_path / "out", scheduler="tcp://127.0.0.1:9")
 
 
-def test_what_became_of_all_is_said_in_the_end(drives: Path, tmp_path: Path) -> None:
+def test_the_result_of_a_batch_is_summarized(drives: Path, tmp_path: Path) -> None:
     words = (
         "convert",
         drives / "north" / "*.bin",

@@ -100,7 +100,7 @@ def test_frames_with_counts_and_parts_are_measured_beside_fixed_places(tmp_path:
     assert all(row["amount"] > 5000 and row["bytes"] > row["amount"] for row in rows)
 
 
-def test_conversions_are_measured_beside_a_copy_and_what_a_user_would_write(tmp_path: Path) -> None:
+def test_conversions_are_compared_with_a_copy_and_plain_code(tmp_path: Path) -> None:
     names = ("to-vlp16.npz", "to-stl27l.mcap", "to-many.parquet")
     only = [word for name in names for word in ("--only", name)]
     rows = {
@@ -168,7 +168,7 @@ def test_one_library_that_cannot_be_installed_does_not_stop_the_others(
         ("", "no message"),
     ],
 )
-def test_the_reason_is_taken_from_what_the_installer_prints(
+def test_the_reason_comes_from_the_installer(
     stderr: str, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert load_module("environments", monkeypatch).find_reason(stderr) == reason
@@ -205,7 +205,7 @@ def test_an_unknown_work_is_refused_with_the_names_there_are() -> None:
     assert "stl27l-stream" in done.stderr
 
 
-def test_what_is_written_by_hand_gives_the_same_points(tmp_path: Path) -> None:
+def test_handwritten_decoders_give_the_same_points(tmp_path: Path) -> None:
     """The decoders that the engine is measured beside do the same work: in a process of its own,
     where they can be imported.
     """

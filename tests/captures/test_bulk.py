@@ -126,7 +126,7 @@ def test_a_stream_comes_in_few_batches() -> None:
 
 
 @pytest.mark.parametrize("sizes", [[47], [47, 9, 130]], ids=["one size", "sizes"])
-def test_a_byte_stream_in_batches_is_what_it_is_packet_by_packet(sizes: list[int]) -> None:
+def test_a_byte_stream_in_batches_equals_single_packets(sizes: list[int]) -> None:
     packets = [bytes([index & 0xFF]) * sizes[index // 40 % len(sizes)] for index in range(900)]
     records = [
         made.record(data, seconds=made.SECONDS + index // 9) for index, data in enumerate(packets)
@@ -228,7 +228,7 @@ def test_more_senders_than_are_remembered() -> None:
     assert len({source for _, _, source in found}) == 100
 
 
-def test_an_ipv4_packet_that_turns_into_a_fragment_is_not_taken_for_the_one_before() -> None:
+def test_an_ipv4_fragment_does_not_match_the_previous_kind() -> None:
     frames = stream(50, 104)
     frames[25] = frames[25][:20] + b"\x20\x00" + frames[25][22:]
     found, stats = check(made.pcap(*frames))
@@ -369,7 +369,7 @@ def address(batch: CapturedDatagrams) -> int:
     return int(batch.buffer.__array_interface__["data"][0])
 
 
-def test_buffers_are_used_again_once_nobody_holds_them(
+def test_unreferenced_buffers_are_reused(
     long_capture: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(CaptureBatches, "largest", 1 << 21)

@@ -85,7 +85,7 @@ def read(source: Path | str) -> list[Chunk]:
 
 
 @pytest.mark.parametrize("packing", PACKED)
-def test_what_is_compressed_is_read_as_it_was(packing: str) -> None:
+def test_compressed_files_are_read_unchanged(packing: str) -> None:
     if packing == "zstd":
         pytest.importorskip(ZSTD)
     Path("plain.pcap").write_bytes(capture())
@@ -170,7 +170,7 @@ def test_one_file_of_an_archive_is_named_where_several_are_captures() -> None:
 
 
 @pytest.mark.parametrize("packing", COMPRESSIONS)
-def test_what_came_before_the_end_of_a_cut_file_is_read(packing: str) -> None:
+def test_a_truncated_compressed_file_is_read_to_its_end(packing: str) -> None:
     if packing == "zstd":
         pytest.importorskip(ZSTD)
     sent = [np.random.default_rng(number).bytes(1200) for number in range(2000)]
@@ -186,7 +186,7 @@ def test_what_came_before_the_end_of_a_cut_file_is_read(packing: str) -> None:
 
 
 @pytest.mark.parametrize("packing", COMPRESSIONS)
-def test_what_came_before_damage_is_read_and_it_is_said_once(packing: str) -> None:
+def test_data_before_damage_is_read_with_one_warning(packing: str) -> None:
     if packing == "zstd":
         pytest.importorskip(ZSTD)
     sent = [np.random.default_rng(number).bytes(1200) for number in range(2000)]
@@ -233,7 +233,9 @@ def test_files_of_other_kinds_are_named_whatever_they_are_called_and_packed_in(w
                 )
 
 
-def test_a_missing_library_is_said_with_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_reported_with_its_installation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     Path("it.zst").write_bytes(b"\x28\xb5\x2f\xfd")
     monkeypatch.setitem(sys.modules, ZSTD, None)
     assert (

@@ -238,7 +238,7 @@ def test_malformed_packets(packet: bytes) -> None:
     assert read(packet) == ([], CaptureStats(packets=1, malformed=1))
 
 
-def test_what_the_snap_length_leaves() -> None:
+def test_datagrams_cut_at_the_snap_length() -> None:
     def snapped(packet: bytes, kept: int) -> tuple[list[bytes], CaptureStats]:
         return made.payloads(
             made.pcap_head(link=101) + made.record(packet[:kept], original=len(packet))
@@ -281,7 +281,7 @@ def test_datagram_of_fragments_bears_the_time_of_the_last_to_come() -> None:
     assert made.read(capture)[0] == [Datagram(BODY[8:], at, made.SOURCE, made.DESTINATION)]
 
 
-def test_interleaved_datagrams_are_told_apart() -> None:
+def test_interleaved_fragments_are_reassembled() -> None:
     def from_elsewhere(packet: bytes) -> bytes:
         return packet[:15] + b"\x63" + packet[16:]
 

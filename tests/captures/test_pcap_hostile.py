@@ -175,7 +175,7 @@ def test_bytes_missing_from_a_file_and_a_hole_in_it_cost_the_packets_they_touch(
     assert (len(found), stats.damaged, stats.stopped_at) == (197, 1, None)
 
 
-def test_packets_cut_by_a_tool_that_does_not_say_so_in_the_head_are_no_damage() -> None:
+def test_cut_packets_without_a_snap_length_are_not_damage() -> None:
     cut = [
         made.record(made.frame(bytes(400))[: 100 + number], original=442) for number in range(50)
     ]
@@ -192,7 +192,7 @@ def test_long_files_tell_where_they_are_cut() -> None:
 
 
 @pytest.mark.parametrize("head", [b"", b"\xd4\xc3\xb2", b"PK\x03\x04 and more", b"# .PCD v0.7\n"])
-def test_foreign_file_is_refused_with_what_it_begins_with(head: bytes) -> None:
+def test_another_file_is_refused_with_its_first_bytes(head: bytes) -> None:
     assert not is_capture(head)
     with pytest.raises(SourceError, match=head[:4].hex(" ") or "empty"):
         CaptureReader(io.BytesIO(head))

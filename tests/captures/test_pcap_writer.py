@@ -95,9 +95,7 @@ def test_ipv6_is_written_with_its_checksum() -> None:
         (Datagram(b"", 10**9 << 32, made.SOURCE, made.DESTINATION), "2106"),
     ],
 )
-def test_writer_refuses_what_no_record_can_hold(
-    datagram: Datagram, reason: str, tmp_path: Path
-) -> None:
+def test_writer_refuses_too_large_packets(datagram: Datagram, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "it.pcap"
     with recorder(path, datagrams=True) as writer:
         with pytest.raises(UsageError, match=reason):

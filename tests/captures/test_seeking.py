@@ -88,7 +88,7 @@ def rest(source: CaptureTransport, to: int, *, in_batches: bool) -> list[int]:
 @pytest.mark.parametrize("name", ["drive.pcap", "drive.pcapng"])
 @pytest.mark.parametrize("link", [ETHERNET, USER0])
 @pytest.mark.parametrize("number", [NUMBER * 3 // 4, 10 * NUMBER])
-def test_what_follows_a_time_is_all_there_and_what_lies_before_is_not_read(
+def test_seeking_reads_everything_after_a_time_and_little_before(
     tmp_path: Path, name: str, link: int, number: int, in_batches: bool
 ) -> None:
     with contextlib.closing(opened(written(tmp_path / name, link=link))) as source:
@@ -127,7 +127,7 @@ def test_damage_that_was_passed_over_is_not_counted(tmp_path: Path) -> None:
         assert source.unread == 0
 
 
-def test_it_goes_on_and_never_back(tmp_path: Path) -> None:
+def test_seeking_never_goes_back(tmp_path: Path) -> None:
     with contextlib.closing(opened(written(tmp_path / "drive.pcap"))) as source:
         batches = source.batches()
         next(batches)
@@ -215,7 +215,7 @@ def test_a_slice_of_a_capture_has_the_scans_that_reading_all_of_it_gives(
     assert read[0] < read[1] / 2
 
 
-def test_no_scan_goes_on_behind_what_was_passed_over(captured: Path) -> None:
+def test_no_scan_continues_across_a_seek(captured: Path) -> None:
     with ls.open(captured, "velodyne-vlp16") as device:
         scans = device.scans()
         next(scans)
@@ -229,7 +229,7 @@ def test_no_scan_goes_on_behind_what_was_passed_over(captured: Path) -> None:
     assert all(scan.points.time.max() < 0.2 for scan in left)
 
 
-def test_no_frame_goes_on_behind_what_was_passed_over(tmp_path: Path) -> None:
+def test_no_frame_continues_across_a_seek(tmp_path: Path) -> None:
     """Of a byte stream, whose pieces end anywhere."""
     sensor, path = ls.sensor("ldrobot-stl27l"), tmp_path / "stream.pcap"
     data = b"".join(ls.simulate(sensor, 40_000))
@@ -252,7 +252,7 @@ def test_no_frame_goes_on_behind_what_was_passed_over(tmp_path: Path) -> None:
     assert stats.pending == 0
 
 
-def test_a_stream_reader_goes_on_as_well(tmp_path: Path) -> None:
+def test_a_stream_reader_seeks_as_well(tmp_path: Path) -> None:
     with written(tmp_path / "stream.pcap", link=USER0).open("rb") as file:
         reader = StreamReader(file)
         assert not reader.skip(START)  # nothing was read

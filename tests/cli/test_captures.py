@@ -46,7 +46,7 @@ def capture(path: Path, *records: bytes, link: int = ETHERNET) -> Path:
 @pytest.mark.parametrize(
     "verb", ["convert", pytest.param("read", marks=pytest.mark.slow), "stats", "plot"]
 )
-def test_a_damaged_capture_is_read_on_and_said_to_be_damaged(verb: str, tmp_path: Path) -> None:
+def test_a_damaged_capture_is_read_with_a_warning(verb: str, tmp_path: Path) -> None:
     some = records(1300)
     some[700] = some[700][:10] + b"\x7f" + some[700][11:]
     path = capture(tmp_path / "it.pcap", *some)
@@ -90,7 +90,7 @@ ARP = made.ethernet(bytes(28), ethertype=0x0806)
     ],
     ids=lambda value: value[0] + str(len(value)) if isinstance(value, tuple) else "",
 )
-def test_every_verb_says_what_is_in_a_capture_of_which_nothing_is_read(
+def test_every_verb_describes_a_capture_without_datagrams(
     words: tuple[str, ...], code: int, tmp_path: Path
 ) -> None:
     path = capture(tmp_path / "tcp.pcap", *(made.record(each) for each in (TCP, ARP, TCP)))
@@ -142,7 +142,7 @@ def test_editcap_makes_raw_ip_of_unsupported_link_layers(
     assert done.stdout.count("\n") == 2
 
 
-def test_what_is_beside_the_datagrams_is_said_where_it_is_the_most(tmp_path: Path) -> None:
+def test_other_packets_are_reported_if_they_are_the_majority(tmp_path: Path) -> None:
     some, empty = records(2), capture(tmp_path / "empty.pcap")
     background = capture(tmp_path / "some.pcap", *some, *(made.record(ARP) for _ in range(2)))
     assert "packets" not in ran("parse", background, "-s", M1).stderr
@@ -163,7 +163,7 @@ def test_what_is_beside_the_datagrams_is_said_where_it_is_the_most(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_senders_of_one_address_are_told_apart_by_their_ports(tmp_path: Path) -> None:
+def test_senders_of_one_address_are_separated_by_port(tmp_path: Path) -> None:
     path = capture(tmp_path / "two.pcap", *records(40, ("10.0.0.1", 40001), ("10.0.0.1", 40002)))
     recording = tmp_path / "two.lsr"
     ran("record", path, "-o", recording)
@@ -231,7 +231,7 @@ def container(name: str, path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["SQLite", "tar", "NumPy", "ROS 1 bag", "MCAP", "points"])
-def test_files_of_other_kinds_are_named_and_not_taken_for_bytes(name: str, tmp_path: Path) -> None:
+def test_unsupported_kinds_of_files_are_named(name: str, tmp_path: Path) -> None:
     if name in ("SQLite", "ROS 1 bag", "MCAP"):  # which is looked into for packets
         pytest.importorskip("rosbags")
     path = container(name, tmp_path / "other.bin")
@@ -296,7 +296,7 @@ def test_captures_and_recordings_on_standard_input_are_read_as_from_files(tmp_pa
     assert done.stdout.decode() == ran("read", path, "--packets", "--json", "-s", M1).stdout
 
 
-def test_what_is_cut_off_on_standard_input_is_said(tmp_path: Path) -> None:
+def test_truncated_standard_input_is_reported(tmp_path: Path) -> None:
     path = capture(tmp_path / "it.pcap", *records(3))
     assert (
         "standard input is cut off in its last record"

@@ -33,7 +33,7 @@ def test_a_clean_file_says_so() -> None:
 
 
 @pytest.mark.slow
-def test_a_finding_says_what_where_why_and_how_to_fix_it(tmp_path: Path) -> None:
+def test_a_finding_has_a_place_a_reason_and_a_fix(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     text = STRANGER.read_text(encoding="utf-8")
     bare = text.replace(
@@ -63,7 +63,7 @@ def test_json_has_the_same(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
+def test_measured_values_are_listed_beside_references() -> None:
     lines = ran("check", "ldrobot-stl27l", "--max-examples", "3").output.splitlines()
     assert lines == [
         lines[0],
@@ -85,7 +85,7 @@ def test_what_was_measured_stands_beside_what_it_is_held_against() -> None:
 
 
 @pytest.mark.slow
-def test_a_file_with_the_id_of_an_installed_sensor_is_told_whose_it_is(tmp_path: Path) -> None:
+def test_a_file_with_the_id_of_an_installed_sensor_names_its_plugin(tmp_path: Path) -> None:
     installed = ROOT / "plugins" / "lidarspec-camsense" / "lidarspec_camsense" / "__init__.py"
     shutil.copy(installed, tmp_path / "mine.py")
     shutil.copy(installed.with_name("vectors.json"), tmp_path)

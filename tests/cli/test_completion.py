@@ -53,7 +53,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("nonsense fr", set()),
     ],
 )
-def test_what_can_stand_there_is_offered(
+def test_possible_words_are_completed(
     words: str, offered: set[str], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("_LIDARSPEC_COMPLETE", "bash_complete")
@@ -67,7 +67,7 @@ def test_what_can_stand_there_is_offered(
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_bash_takes_what_is_printed(folder: Path) -> None:
+def test_bash_accepts_the_completion(folder: Path) -> None:
     script = """eval "$(_LIDARSPEC_COMPLETE=bash_source lidarspec)"
         COMP_WORDS=(lidarspec build ldrobot-ld06 data sp); COMP_CWORD=4
         _lidarspec_completion lidarspec 2>/dev/null; echo "${COMPREPLY[@]}"; complete -p lidarspec; declare -f _lidarspec_completion"""
@@ -86,7 +86,7 @@ def test_bash_takes_what_is_printed(folder: Path) -> None:
     assert "compopt -o nospace" in done.stdout  # which stands in for a line of click's own script
 
 
-def test_the_command_alone_is_a_guide_to_what_is_here(folder: Path) -> None:
+def test_the_command_alone_prints_a_guide(folder: Path) -> None:
     lines = ran().stdout.splitlines()
     assert len(lines) <= 16
     assert all(len(line) <= 80 for line in lines if not line.startswith("serial ports"))
@@ -118,7 +118,7 @@ def test_every_command_of_the_guide_runs(folder: Path) -> None:
     assert len((folder / "points.csv").read_text(encoding="ascii").splitlines()) > 1
 
 
-def test_the_guide_without_sensors_says_what_to_install(bare_registry: Registry) -> None:
+def test_the_guide_without_sensors_names_an_installation_command(bare_registry: Registry) -> None:
     assert "no sensor is installed: pip install " in ran().stdout
 
 

@@ -139,7 +139,7 @@ def test_several_sensors_with_the_same_frames_have_to_be_chosen_from(tmp_path: P
     )
 
 
-def test_points_of_a_sensor_that_the_frames_contradict_come_with_a_word(tmp_path: Path) -> None:
+def test_points_of_a_contradicted_sensor_have_a_warning(tmp_path: Path) -> None:
     (tmp_path / "vlp16.bin").write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)))
     told = ran(
         "convert", tmp_path / "vlp16.bin", tmp_path / "out.csv", "-s", "velodyne-hdl32e"
@@ -278,7 +278,7 @@ def test_files_of_options_and_standard_input_are_inputs_too(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("suffix", ["csv", "npz"])
-def test_a_file_is_overwritten_when_it_is_asked_for_alone(tmp_path: Path, suffix: str) -> None:
+def test_a_file_is_overwritten_only_with_force(tmp_path: Path, suffix: str) -> None:
     source, target = tmp_path / "in.bin", tmp_path / f"out.{suffix}"
     source.write_bytes(EXAMPLE)
     target.write_bytes(b"a week of work")
@@ -290,7 +290,7 @@ def test_a_file_is_overwritten_when_it_is_asked_for_alone(tmp_path: Path, suffix
     assert target.stat().st_size > 100
 
 
-def test_files_for_each_scan_are_overwritten_when_it_is_asked_for_alone(tmp_path: Path) -> None:
+def test_files_for_each_scan_are_overwritten_only_with_force(tmp_path: Path) -> None:
     source, target = tmp_path / "00001.bin", tmp_path / "%05d.bin"
     source.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 300)))
     before = source.read_bytes()
@@ -385,7 +385,7 @@ def test_files_of_packets_are_of_packets_alone_and_of_files(tmp_path: Path) -> N
     assert not [file for file in tmp_path.iterdir() if file.name.startswith(".")]
 
 
-def test_more_and_less_is_said(tmp_path: Path) -> None:
+def test_verbose_and_quiet_output(tmp_path: Path) -> None:
     path = tmp_path / "drive.bin"
     path.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
     words = ["convert", path, tmp_path / "out.npz", "-s", "ldrobot-stl27l", "--force"]
@@ -425,7 +425,7 @@ def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path
     )
 
 
-def test_what_an_imu_felt_is_written_in_place_of_the_points(tmp_path: Path) -> None:
+def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
     plugin, bytes_ = tmp_path / "inertia.py", tmp_path / "in.bin"
     hook = [
         "from lidarspec.spec import hookimpl",

@@ -142,7 +142,7 @@ RAISES = Path(points_fail.__file__)
     ],
     ids=lambda words: words[0],
 )
-def test_a_plugin_that_raises_is_named_alike_by_every_verb(
+def test_every_verb_names_a_failing_plugin_in_the_same_way(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its id, what raised, the file and line, the number of packets where some were read; exit code
@@ -191,7 +191,7 @@ def test_a_plugin_that_raises_now_and_then_ends_with_its_message_and_in_python_i
     assert [warning for warning in device.warnings if f"({file}:7), at" in warning]
 
 
-def test_what_a_sweep_raises_is_the_plugins(tmp_path: Path) -> None:
+def test_an_exception_of_a_sweep_is_a_plugin_error(tmp_path: Path) -> None:
     text = SOMETIMES.replace("points=points", "simulation=Simulation(lambda i: 1 / 0)").replace(
         "import hookimpl", "import Simulation, hookimpl"
     )

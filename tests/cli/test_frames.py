@@ -88,7 +88,7 @@ def test_the_sensors_that_fit_are_found_and_listed() -> None:
     )
 
 
-def test_a_stream_is_parsed_frame_by_frame_and_gaps_are_told() -> None:
+def test_a_stream_is_parsed_and_gaps_are_counted() -> None:
     data = b"\x00\x54" + EXAMPLE + b"\x54\x2c" + EXAMPLE
     result = ran("parse", data.hex(), *SENSOR)
     assert "4 bytes outside frames" in result.stderr
@@ -133,7 +133,7 @@ def test_explain_takes_the_frame_type_where_bytes_do_not_tell() -> None:
     ran("explain", damaged.hex(), "--frame", "dat", *SENSOR, code=2)
 
 
-def test_explain_shows_what_is_damaged_alone(tmp_path: Path) -> None:
+def test_explain_can_show_damaged_frames_only(tmp_path: Path) -> None:
     frames = ls.simulate(ls.sensor("ldrobot-stl27l"), 30)
     frames[20] = frames[20][:30] + frames[20][31:]
     (tmp_path / "drive.bin").write_bytes(b"".join(frames))
@@ -159,7 +159,7 @@ def test_explain_shows_what_is_damaged_alone(tmp_path: Path) -> None:
     assert (clean.stdout, clean.stderr) == ("", "1 frame, 0 damaged, 0 bytes outside frames\n")
 
 
-def test_explain_shows_what_stands_at_some_bytes_alone(tmp_path: Path) -> None:
+def test_explain_can_show_some_bytes_only(tmp_path: Path) -> None:
     path = tmp_path / "drive.bin"
     path.write_bytes(b"".join(ls.simulate(ls.sensor("ldrobot-stl27l"), 300)))
     assert ran("explain", path, "--at", "0x3b2", *SENSOR).stdout.startswith(
@@ -198,7 +198,7 @@ def test_explain_takes_one_frame_type_out_of_a_stream() -> None:
 
 
 @pytest.mark.slow
-def test_explain_answers_while_its_input_goes_on_and_stops_with_its_reader() -> None:
+def test_explain_prints_while_input_arrives_and_stops_with_its_reader() -> None:
     command = [sys.executable, "-m", "lidarspec", "explain", "-", *SENSOR]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE

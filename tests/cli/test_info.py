@@ -86,7 +86,7 @@ def test_a_capture_of_a_byte_stream_is_called_so(tmp_path: Path) -> None:
     assert told["contents"][0]["sensors"] == ["ldrobot-stl27l"]
 
 
-def test_a_file_without_times_and_one_of_nobody(tmp_path: Path) -> None:
+def test_a_file_without_times_and_one_without_sensor(tmp_path: Path) -> None:
     raw, noise, empty = tmp_path / "raw.bin", tmp_path / "noise.bin", tmp_path / "empty.bin"
     raw.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 100)))
     noise.write_bytes(bytes(range(256)) * 4)

@@ -43,7 +43,9 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @posix
 @pytest.mark.parametrize("words", VERBS, ids=lambda words: words[0])
-def test_no_permission_is_said(capture: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
+def test_missing_permission_is_reported(
+    capture: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
     path = tmp_path / "secret.bin"
     path.write_bytes(b"x")
     path.chmod(0)

@@ -42,11 +42,11 @@ def test_every_verb_says_the_same_of_itself_as_the_list_of_verbs() -> None:
         assert text in ran(verb, "--help").stdout.replace("\n ", "")
 
 
-def test_the_version_is_told() -> None:
+def test_the_version_is_printed() -> None:
     assert ran("--version").stdout == f"lidarspec {ls.__version__}\n"
 
 
-def test_sensors_lists_what_is_installed() -> None:
+def test_sensors_lists_installed_sensors() -> None:
     known = {item["id"]: item for item in printed("sensors")}
     assert list(known) == list(ls.sensors())
     stl = known["ldrobot-stl27l"]
@@ -72,7 +72,7 @@ def test_show_draws_the_wire_table_of_every_frame() -> None:
     assert "46 1 uint8 crc CRC-8 poly 0x4d over all other bytes" in rows
 
 
-def test_show_tells_commands_and_their_bytes() -> None:
+def test_show_prints_commands_and_their_bytes() -> None:
     found = printed("show", "cspc-m1c1-mini")
     assert found["commands"]["start"] == {
         "frame": "command",
@@ -138,7 +138,7 @@ def test_demo_reads_a_stream_without_a_serial_link_over_tcp() -> None:
 
 
 @pytest.mark.parametrize("sensor", ["ldrobot-stl27l", "velodyne-vlp16"])
-def test_demo_counts_what_the_line_did(sensor: str) -> None:
+def test_demo_counts_the_faults_of_the_line(sensor: str) -> None:
     found = printed("demo", "-s", sensor, "-n", 3, "--errors", 0.005)
     assert found["rate_hz"] == pytest.approx(10, rel=0.1)
     under_way = found["intact"] - sum(found["stats"]["frames"].values())
@@ -169,7 +169,7 @@ def test_demo_counts_what_the_line_did(sensor: str) -> None:
         (("replay", "x.bin", "-s", "ld06"), 2),
     ],
 )
-def test_without_sensors_every_verb_says_what_to_install(
+def test_without_sensors_every_verb_names_an_installation_command(
     words: tuple[str, ...],
     code: int,
     bare_registry: Registry,
@@ -214,7 +214,7 @@ def test_the_limits_of_a_command_are_printed_with_every_digit() -> None:
 @pytest.mark.parametrize(
     "words", [("explain", EXAMPLE.hex()), ("view", "x.bin", "--color", "range")]
 )
-def test_colours_go_through_a_pipe_where_that_is_asked_for(
+def test_colours_can_be_forced_in_a_pipe(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "x.bin").write_bytes(b"".join(ls.simulate(ls.sensor("ldrobot-stl27l"), 400)))

@@ -228,7 +228,7 @@ def test_it_has_the_files_and_facts_that_the_projects_own_distributions_have(mad
     assert not model.keys() - about.keys() - {"authors", "urls"}
 
 
-def test_what_is_there_is_not_overwritten(tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "lidarspec-acme-x1").mkdir()
     assert "exists already" in ran("new", "acme-x1", "--into", tmp_path, code=2).stderr
     assert not list((tmp_path / "lidarspec-acme-x1").iterdir())

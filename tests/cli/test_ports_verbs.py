@@ -42,7 +42,7 @@ class TestSend:
         assert (told["confirmed"], told["frame"], told["fields"]["mode"]) == (True, "ack", 0x55)
         assert told["hex"] == "a5 5a 55 07 00 00 00 00 00 00 00 ad"
 
-    def test_what_is_not_documented_is_said(self) -> None:
+    def test_undocumented_replies_are_reported(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
             assert (
                 "no reply is documented"
@@ -95,7 +95,7 @@ class TestSend:
         assert f"next: lidarspec doctor {made.name} -s cspc-m1c1-mini" in found.stderr
 
     @pytest.mark.slow
-    def test_what_cannot_be_sent_to(self, tmp_path: Path) -> None:
+    def test_sources_that_accept_no_commands(self, tmp_path: Path) -> None:
         ran("send", "/dev/ttyNONE7", "start", "-s", "cspc-m1c1-mini", code=3)
         (tmp_path / "raw.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 9)))
         ran("send", tmp_path / "raw.bin", "start", "-s", "cspc-m1c1-mini", code=2)
@@ -207,7 +207,7 @@ class TestDetect:
 
 
 class TestPorts:
-    def test_udp_ports_of_sensors_and_who_has_them(self) -> None:
+    def test_udp_ports_of_sensors_and_their_users(self) -> None:
         told = printed("ports")
         known = {one["port"]: one for one in told["udp"]}
         assert "robosense-m1" in known[6699]["sensors"]
@@ -277,7 +277,7 @@ class TestDoctor:
             said = ran("doctor", tmp_path / "line.bin", "-s", "ldrobot-stl27l", code=code).stdout
             assert said.startswith("wrong" if code else "ok")
 
-    def test_one_that_waits_to_be_started(self) -> None:
+    def test_a_sensor_that_waits_for_a_start_command(self) -> None:
         with virtual_port("cspc-m1c1-mini") as made:
             found = ran("doctor", made.path, "-s", "cspc-m1c1-mini", "-t", "300ms", code=1).stdout
             assert f"next: lidarspec send {made.path} start -s cspc-m1c1-mini" in found
@@ -310,7 +310,7 @@ class TestDoctor:
         assert f"(process {other.pid})" in texts[f"kill {other.pid}"]
 
     @pytest.mark.slow
-    def test_bytes_of_nobody(self, tmp_path: Path) -> None:
+    def test_bytes_of_no_sensor(self, tmp_path: Path) -> None:
         source = random.Random(8)
         with (
             port(tmp_path) as made,

@@ -132,7 +132,7 @@ def test_a_simulated_sensor_is_known_and_started(tmp_path: Path) -> None:
     assert printed("stats", target)["packets"] >= 20
 
 
-def test_nothing_is_sent_to_a_simulated_sensor_where_that_is_asked_for(tmp_path: Path) -> None:
+def test_no_start_sends_nothing_to_a_simulated_sensor(tmp_path: Path) -> None:
     ran(
         "record",
         "sim:slamtec-rplidar-a1",
@@ -259,7 +259,7 @@ def test_standard_input_gets_the_times_of_its_arrival(tmp_path: Path) -> None:
         ]
 
 
-def test_damaged_recordings_are_mended(stream: Path, tmp_path: Path) -> None:
+def test_damaged_recordings_are_salvaged(stream: Path, tmp_path: Path) -> None:
     whole = bytearray(stream.read_bytes())
     whole[len(whole) // 2] ^= 1
     stream.write_bytes(whole)
@@ -301,7 +301,7 @@ def test_nothing_is_overwritten_without_force(
     assert received(target) == received(stream)
 
 
-def test_what_cannot_be_recorded_says_why(stream: Path, datagrams: Path, tmp_path: Path) -> None:
+def test_unrecordable_sources_give_a_reason(stream: Path, datagrams: Path, tmp_path: Path) -> None:
     ran("record", stream, "-o", tmp_path / "raw.bin")
     assert (
         "byte stream"
@@ -372,7 +372,7 @@ def test_a_full_disk_ends_it_with_one_line_and_a_whole_file(tmp_path: Path, stre
         subprocess.run(["umount", "-l", disk], check=True)
 
 
-def test_replays_say_what_they_cannot_do(stream: Path, datagrams: Path, tmp_path: Path) -> None:
+def test_impossible_replays_give_a_reason(stream: Path, datagrams: Path, tmp_path: Path) -> None:
     assert "datagrams were recorded" in ran("replay", datagrams, "--to", "pty", code=2).stderr
     assert (
         "a byte stream was recorded"

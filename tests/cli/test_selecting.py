@@ -26,7 +26,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_convert_writes_what_is_selected(drive: Path, tmp_path: Path) -> None:
+def test_convert_writes_the_selection(drive: Path, tmp_path: Path) -> None:
     target = tmp_path / "out.csv"
     words = (
         "--slice",

@@ -112,7 +112,7 @@ def test_a_file_is_written_at_once_and_can_be_read(tmp_path: Path) -> None:
     ran("sim", STL, "--to", path, "-t", "1s", "--force")
 
 
-def test_the_plug_is_pulled_and_said_to_be(tmp_path: Path) -> None:
+def test_an_unplugged_simulation_is_reported(tmp_path: Path) -> None:
     result = ran(
         "sim",
         "velodyne-vlp16",
@@ -135,7 +135,7 @@ def test_the_plug_is_pulled_and_said_to_be(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @posix
-def test_a_link_that_stands_already_is_the_systems_fault(tmp_path: Path) -> None:
+def test_an_existing_link_is_a_source_error(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("")
     done = process("sim", STL, "--link", taken)
@@ -153,7 +153,7 @@ def test_a_duration_reads_the_same_as_an_option_and_in_a_source(text: str) -> No
     ).device.faults.unplug == duration(text)
 
 
-def test_a_blocked_rotor_is_simulated_and_said_at_the_end_of_its_file(tmp_path: Path) -> None:
+def test_a_blocked_rotor_is_simulated_and_reported(tmp_path: Path) -> None:
     path = tmp_path / "blocked.bin"
     ran("sim", "ldrobot-ld06", "--rotor", "blocked", "--to", path, "-t", "1.5s")
     done = ran("convert", path, tmp_path / "points.csv", "-s", "ldrobot-ld06")

@@ -56,7 +56,7 @@ def test_names_of_files_are_spelled_out(folder: Path) -> None:
         assert r"a\x1b]0;b\x07\u202e.bin" in said
 
 
-def test_what_plugins_call_their_sensors_is_spelled_out(folder: Path) -> None:
+def test_control_characters_in_sensor_names_are_escaped(folder: Path) -> None:
     (folder / "acme.py").write_text(PLUGIN)
     shown = ran("show", "./acme.py").stdout
     assert r"A\x1b[31mB C\u202eD" in shown

@@ -126,7 +126,9 @@ def test_no_capture_is_left_out() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in ALIKE if name.startswith("sick/")])
-def test_captures_of_others_are_nobodys(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_captures_of_other_devices_fit_no_sensor(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     theirs = {sensor.vendor for sensor in map(ls.sensor, ALIKE[name])}
     rest = {other: sensor for other, sensor in ls.sensors().items() if sensor.vendor not in theirs}
     monkeypatch.setattr("lidarspec.detect.identification.sensors", lambda: rest)
@@ -136,7 +138,7 @@ def test_captures_of_others_are_nobodys(name: str, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ALIKE)
-def test_the_same_frames_without_a_difference_are_said_to_be_the_same(name: str) -> None:
+def test_identical_frames_are_reported_as_ambiguous(name: str) -> None:
     for found in (
         one for one in identify_senders(capture(name)) if one.scores
     ):  # an IMU sends on a port of its own
@@ -187,7 +189,7 @@ def swapped(data: list[bytes]) -> list[bytes]:
     ],
     ids=["a tenth lost", "doubled", "swapped"],
 )
-def test_a_network_does_not_change_what_the_clock_says(
+def test_the_clock_identifies_a_model_on_a_bad_network(
     as_it_comes: Callable[[list[bytes]], list[bytes]],
 ) -> None:
     found = identify_sample(SampleBytes("", tuple(as_it_comes(old_firmware(200))), datagrams=True))
@@ -207,7 +209,7 @@ def test_the_pace_of_a_clock_is_that_of_the_mode_that_the_packets_name() -> None
 
 
 @pytest.mark.slow
-def test_a_name_that_is_not_to_be_trusted_tells_nothing() -> None:
+def test_an_unreliable_name_is_not_used() -> None:
     found = identify_sample(SampleBytes("", tuple(old_firmware(2)), datagrams=True))
     assert (found.sensor, {score.sensor.id for score in found.candidates}) == (
         None,
@@ -296,7 +298,7 @@ def test_the_middle_of_a_scan_is_read_with_the_answer_that_began_it() -> None:
 
 
 @pytest.mark.usefixtures("few_installed")
-def test_what_is_no_fit_for_one_question_is_none_for_another() -> None:
+def test_scores_and_fitting_sensors_agree() -> None:
     packed = gzip.compress(b"".join(b"%d\n" % number for number in range(40_000)))
     assert rate_sensors([packed], datagrams=False)
     assert identify_sample(SampleBytes("", (packed,))).scores == ()
@@ -314,7 +316,7 @@ def firmware_bug(number: int) -> list[bytes]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_installed")
-def test_frames_whose_checksums_are_never_right_are_found_and_answered(tmp_path: Path) -> None:
+def test_frames_with_only_wrong_checksums_are_reported(tmp_path: Path) -> None:
     data, path = b"".join(firmware_bug(60)), tmp_path / "bug.bin"
     found = identify_sample(SampleBytes("", (data,)))
     assert (found.scores, found.sensor) == ((), None)
@@ -396,7 +398,7 @@ def test_a_sensor_that_has_to_be_started_first() -> None:
 
 
 @pytest.mark.usefixtures("few_installed", "patient")
-def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
+def test_udp_datagrams_of_two_senders_are_separated() -> None:
     vlp, xt = simulate(ls.sensor("velodyne-vlp16"), 40), simulate(ls.sensor("hesai-xt32"), 40)
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first,
@@ -428,7 +430,7 @@ def test_udp_datagrams_of_two_senders_are_told_apart() -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_installed", "patient")
-def test_bytes_at_the_wrong_rate_fit_nobody(tmp_path: Path) -> None:
+def test_bytes_at_a_wrong_baud_rate_fit_no_sensor(tmp_path: Path) -> None:
     source = random.Random(6)
     with port(tmp_path) as made, working(lambda stop: _noise(made, source, stop)) as stop:
         with pytest.raises(WireError, match="no frame of an installed sensor"):
@@ -442,7 +444,7 @@ def _noise(made: Port, source: random.Random, stop: threading.Event) -> None:
         made.send(source.randbytes(100))
 
 
-def test_what_cannot_be_opened_is_the_systems_fault(tmp_path: Path) -> None:
+def test_a_source_that_cannot_be_opened_is_a_source_error(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="no such port"):
         detect("/dev/ttyNONE7")
     with pytest.raises(UsageError, match="standard input"):
@@ -452,7 +454,7 @@ def test_what_cannot_be_opened_is_the_systems_fault(tmp_path: Path) -> None:
         detect(tmp_path / "empty.bin")
 
 
-def test_what_is_listened_to() -> None:
+def test_declared_bauds_and_ports_are_tried() -> None:
     assert {115_200, 150_000, 230_400, 921_600} <= set(list_bauds())
     assert {2368, 6699, 7788} <= set(list_udp_ports())
 
@@ -518,7 +520,7 @@ def make_bodies(size: int, number: int) -> list[bytes]:
 class TestStructure:
     """What unknown bytes are made of."""
 
-    def test_bytes_that_are_alike_by_chance_are_no_frames(self) -> None:
+    def test_accidental_similarity_is_no_structure(self) -> None:
         assert find_structure([random.Random(1).randbytes(10_000)], datagrams=False) is None
         few = b"".join(
             b"\xde\xad\xbe\xef" + random.Random(seed).randbytes(996) for seed in range(3)
@@ -567,7 +569,7 @@ class TestStructure:
             59,
         )
 
-    def test_frames_that_say_how_long_they_are(self) -> None:
+    def test_frames_with_a_length_field(self) -> None:
         found = find_structure(
             [b"\xfe" + b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 60))], datagrams=False
         )

@@ -14,7 +14,7 @@ from tests.cli.running import ran
 from tests.made_captures import frame, pcap
 
 
-def test_texts_bytes_and_numbers_with_units_are_told() -> None:
+def test_texts_bytes_and_numbers_with_units_are_formatted() -> None:
     helios = ls.sensor("robosense-helios16p")
     difop = helios.parse(helios.example("difop"))
     difop.serial_number, difop.top_firmware = b"\x11\x22\x33\x44\x55\x66", b"v1.2\0"
@@ -26,7 +26,7 @@ def test_texts_bytes_and_numbers_with_units_are_told() -> None:
     assert told.endswith(" degC")
 
 
-def test_a_device_and_doctor_tell_what_was_said_last(tmp_path: Path) -> None:
+def test_device_and_doctor_report_the_last_values(tmp_path: Path) -> None:
     helios = ls.sensor("robosense-helios16p")
     difop = helios.parse(helios.example("difop"))
     serials = []
@@ -43,7 +43,7 @@ def test_a_device_and_doctor_tell_what_was_said_last(tmp_path: Path) -> None:
     assert any("serial 112233445566" in finding.text for finding in examine(path, helios))
 
 
-def test_show_says_where_it_stands_and_in_which_unit() -> None:
+def test_show_prints_path_and_unit() -> None:
     assert (
         "reports temperature (position.top_board_temperature, degC)"
         in ran("show", "velodyne-vlp16").stdout

@@ -53,7 +53,7 @@ def test_scans_packets_and_commands_are_awaited(line: Port) -> None:
         until(lambda: device.heard[-1] == STOP)
 
 
-def test_the_loop_goes_on_while_nothing_comes(line: Port) -> None:
+def test_the_event_loop_continues_without_data(line: Port) -> None:
     async def use() -> int:
         turns = 0
         async with ls.open_async(f"serial://{line.name}", TURNING) as opened:
@@ -126,7 +126,7 @@ def test_it_has_to_be_opened() -> None:
         _ = ls.open_async("udp://", TURNING).stats
 
 
-def test_what_cannot_be_opened_raises_in_the_loop() -> None:
+def test_errors_of_opening_are_raised_in_the_loop() -> None:
     async def use() -> None:
         async with ls.open_async("/dev/ttyNONE9", TURNING):
             pass

@@ -103,7 +103,7 @@ def test_without_start_nothing_is_sent(line: Port) -> None:
     assert device.heard == []
 
 
-def test_what_was_started_by_hand_is_stopped(line: Port) -> None:
+def test_a_sensor_started_by_a_command_is_stopped(line: Port) -> None:
     device = Obedient(line)
     with working(device.work):
         with ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
@@ -395,7 +395,7 @@ def test_a_command_waits_for_the_first_datagram_that_says_where_the_sensor_is() 
         )
 
 
-def test_a_command_goes_to_the_sensor_and_a_strangers_answer_is_none() -> None:
+def test_a_reply_of_another_sender_is_ignored() -> None:
     number = free_port()
     frames, ack = turning(SENSOR, 2), SENSOR.build("ack", code=SPEED, result=0)
     with (
@@ -424,7 +424,7 @@ def test_a_command_goes_to_the_sensor_and_a_strangers_answer_is_none() -> None:
             other.recv(100)
 
 
-def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
+def test_no_command_is_sent_before_the_address_is_known() -> None:
     number = free_port()
     with ls.open(f"udp://127.0.0.1:{number}", datagram_sensor(number), start=False) as opened:
         began = time.monotonic()
@@ -433,7 +433,7 @@ def test_a_sensor_that_nothing_was_heard_of_cannot_be_sent_to() -> None:
         assert time.monotonic() - began >= 0.2
 
 
-def test_an_unknown_control_address_is_asked_for() -> None:
+def test_an_unknown_control_address_is_an_error() -> None:
     commands = {
         "start": dataclasses.replace(
             SENSOR.commands["start"], link="control", timeout=0.2, retries=0
@@ -448,7 +448,7 @@ def test_an_unknown_control_address_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize("source", ["sim:", "sim:?rate=max"])
-def test_a_simulated_sensor_is_asked_over_its_control_link(source: str) -> None:
+def test_commands_use_the_control_link_of_a_simulated_sensor(source: str) -> None:
     start = Command(
         "order", {"code": 1}, reply="ack", echoes=("code",), link="control", starts=True
     )

@@ -125,7 +125,7 @@ def angles(device: ls.Device) -> list[float]:
     return [round(float(angle), 3) % 360 for angle in found]
 
 
-def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: Path) -> None:
+def test_reported_values_configure_the_sensor_and_its_recording(tmp_path: Path) -> None:
     sensor, path = teaching(), tmp_path / "taught.lsr"
     with virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port:
         with ls.open(port.path, sensor, record=path) as device:
@@ -168,7 +168,7 @@ def test_what_a_sensor_says_of_itself_configures_it_and_its_recording(tmp_path: 
         (b"", lambda reply: {"frame": b"rep103"}, "frame is one of rep103, vendor"),
     ],
 )
-def test_what_cannot_be_learned_is_the_sensors_fault(said: bytes, learns: Any, error: str) -> None:
+def test_an_invalid_reported_value_is_a_command_error(said: bytes, learns: Any, error: str) -> None:
     asked = SENSOR.commands["get_table"]
     commands = {"get_table": dataclasses.replace(asked, learns=learns or asked.learns)}
     simulation = dataclasses.replace(
@@ -191,7 +191,7 @@ def of_no_type(sensor: Sensor, *, table) -> Sensor:  # type: ignore[no-untyped-d
 
 
 @pytest.mark.parametrize("configure", [path_alone, of_no_type])
-def test_what_is_learned_is_no_path(configure: Any) -> None:
+def test_a_learned_value_is_not_a_path(configure: Any) -> None:
     sensor = teaching(configure=configure)
     refused = pytest.raises(CommandError, match=r"table is .*, not Learned\(11 bytes\)")
     with (
@@ -201,7 +201,7 @@ def test_what_is_learned_is_no_path(configure: Any) -> None:
         ls.open(port.path, sensor)
 
 
-def test_what_learns_has_a_reply_and_somewhere_to_go() -> None:
+def test_a_learning_command_needs_a_reply_and_an_option() -> None:
     with pytest.raises(SpecError, match="learns needs a reply to learn from"):
         dataclasses.replace(SENSOR, configure=None)
 
@@ -322,7 +322,7 @@ def test_a_plugin_opens_a_link_of_its_own_kind() -> None:
             assert device.send("hello").confirmed
 
 
-def test_a_port_that_is_taken_is_replaced_and_said(server: socket.socket) -> None:
+def test_a_port_in_use_is_replaced_with_a_warning(server: socket.socket) -> None:
     taken = server.getsockname()[1]
     sensor = linked(Tcp(taken))
     with (
@@ -343,7 +343,7 @@ def server() -> Iterator[socket.socket]:
 @pytest.mark.skipif(
     sys.platform != "linux", reason="other systems have no broadcast on the loopback"
 )
-def test_a_sensor_is_found_by_a_broadcast_and_told_our_address() -> None:
+def test_a_sensor_found_by_broadcast_gets_our_address() -> None:
     sensor = linked(Udp(broadcast=free_port()))
     data = sensor.links["data"].ports[0]
     with (
@@ -458,7 +458,7 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
         (b"", Http(1, timeout=0.1), "/status: "),
     ],
 )
-def test_what_a_web_server_does_wrong_is_said(
+def test_errors_of_a_web_server_are_reported(
     server: socket.socket, sent: bytes, link: Http, said: str
 ) -> None:
     def answer(stop: threading.Event) -> None:
@@ -478,7 +478,7 @@ def test_what_a_web_server_does_wrong_is_said(
         assert device.state != "closed"
 
 
-def test_a_web_server_that_is_not_there_is_said() -> None:
+def test_a_missing_web_server_is_reported() -> None:
     sensor = with_pages({})
     said = pytest.raises(
         ReplyTimeout,

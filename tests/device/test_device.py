@@ -75,7 +75,7 @@ def wait_for_chunks(device: ls.Device, number: int) -> None:
     until(lambda: device._input.queue.produced >= number)  # type: ignore[union-attr]
 
 
-def test_what_comes_over_a_line_is_what_the_bytes_hold(line: Port) -> None:
+def test_live_scans_equal_decoded_bytes(line: Port) -> None:
     frames = turning(TURNING, 40)
     with ls.open(f"serial://{line.name}", TURNING) as device:
         assert device.state == "waiting"
@@ -244,7 +244,7 @@ def test_a_blocking_queue_loses_nothing(line: Port) -> None:
         assert device.stats.queue_dropped == 0
 
 
-def test_what_ends_the_thread_that_reads_is_raised_as_the_end_of_the_source(line: Port) -> None:
+def test_an_exception_of_the_capture_thread_ends_the_source(line: Port) -> None:
     class Forgetful:
         error = None
 
@@ -276,7 +276,7 @@ def points(batches: list[ls.Packets]) -> np.ndarray:
 TILTED = WHOLE.build("info", elevation=[20.0, 21.0, 22.0])
 
 
-def test_strangers_change_no_cloud_and_end_nothing(tmp_path: Path) -> None:
+def test_other_senders_change_no_cloud(tmp_path: Path) -> None:
     number, frames, recording = free_port(), turning(WHOLE, 60), tmp_path / "all.lsr"
     calibration = WHOLE.build("info", elevation=[1.0, 2.0, 3.0])
     with (
@@ -315,7 +315,7 @@ def test_strangers_change_no_cloud_and_end_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("impatient")
-def test_the_one_that_is_named_is_read_and_others_count_for_nothing() -> None:
+def test_only_the_named_sender_is_read() -> None:
     number, frames = free_port(), turning(WHOLE, 4)
     with (
         udp("127.0.0.2") as other,
@@ -338,7 +338,7 @@ def test_the_one_that_is_named_is_read_and_others_count_for_nothing() -> None:
 
 
 @pytest.mark.usefixtures("impatient")
-def test_a_sensor_that_falls_silent_is_not_replaced_by_a_stranger() -> None:
+def test_a_silent_sensor_is_not_replaced_by_another_sender() -> None:
     number, frames = free_port(), turning(WHOLE, 4)
     with (
         udp("127.0.0.2") as own,
@@ -361,7 +361,7 @@ def test_a_sensor_that_falls_silent_is_not_replaced_by_a_stranger() -> None:
         assert device.state == "streaming"
 
 
-def test_two_senders_of_one_address_are_told_apart_by_their_ports() -> None:
+def test_two_senders_of_one_address_are_separated_by_port() -> None:
     number, frames = free_port(), turning(WHOLE, 30)
     with (
         udp("127.0.0.2") as own,
@@ -557,7 +557,7 @@ def test_a_file_is_not_recorded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [5, 300])
-def test_a_sensor_that_the_frames_contradict_is_told_of(tmp_path: Path, number: int) -> None:
+def test_frames_of_another_sensor_are_a_warning(tmp_path: Path, number: int) -> None:
     path = tmp_path / "vlp16.bin"
     path.write_bytes(b"".join(ls.simulate(ls.sensor("velodyne-vlp16"), number)))
     with ls.open(path, "velodyne-hdl32e") as device:
@@ -573,14 +573,14 @@ def test_a_sensor_that_the_frames_contradict_is_told_of(tmp_path: Path, number: 
         assert not any("read as" in warning for warning in device.warnings)
 
 
-def test_a_live_sensor_that_the_frames_contradict_is_told_of() -> None:
+def test_live_frames_of_another_sensor_are_a_warning() -> None:
     with virtual_port("ldrobot-stl27l") as made, ls.open(made.path, "ldrobot-ld06") as device:
         for _ in zip(range(3), device.scans(), strict=False):
             pass
         assert any("those of ldrobot-stl27l" in warning for warning in device.warnings)
 
 
-def test_a_nominal_calibration_is_told_of_once_with_the_way_to_give_the_units_own(
+def test_a_nominal_calibration_is_one_warning_with_a_command(
     tmp_path: Path,
 ) -> None:
     path, angles = tmp_path / "xt32.bin", tmp_path / "angles.csv"
@@ -646,7 +646,7 @@ def test_packets_and_scans_of_a_file_go_on_where_its_scan_was_found(tmp_path: Pa
         assert sum(len(packets) for packets in device.packets("data")) == len(frames)
 
 
-def test_a_long_file_goes_on_behind_what_was_read_before(
+def test_a_second_iterator_continues_in_a_long_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lidarspec.transports.files, "BLOCK", 1 << 13)
@@ -686,7 +686,7 @@ def test_a_device_that_is_forgotten_gives_its_port_back(line: Port) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts descriptors as Linux does")
-def test_what_fails_while_opening_leaves_nothing_behind(tmp_path: Path, line: Port) -> None:
+def test_a_failed_open_releases_everything(tmp_path: Path, line: Port) -> None:
     before, threads = len(os.listdir("/dev/fd")), threading.active_count()
     (tmp_path / "there.lsr").touch()
     with pytest.raises(UsageError):
@@ -716,7 +716,7 @@ def test_the_caller_has_its_turn_though_something_else_comes_all_the_time(given:
             device.latest(0.05)
 
 
-def test_a_blocked_rotor_is_said() -> None:
+def test_a_blocked_rotor_is_reported() -> None:
     with ls.open("sim:ldrobot-ld06?rotor=blocked&rate=max") as device:
         scans = list(itertools.islice(device.scans(wait=1.0), 3))
         assert [scan is not None and scan.complete for scan in scans] == [False] * 3

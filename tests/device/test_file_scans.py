@@ -153,7 +153,7 @@ def test_pieces_have_the_scans_of_one_pass(
 
 
 @pytest.mark.slow
-def test_another_process_goes_on_behind_a_bookmark(tmp_path: Path) -> None:
+def test_another_process_continues_at_a_bookmark(tmp_path: Path) -> None:
     name, path, mark = "velodyne-vlp16", tmp_path / "made.pcap", tmp_path / "mark"
     sensor = ls.sensor(name)
     made(sensor, path, most=9_000_000)

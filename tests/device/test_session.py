@@ -133,7 +133,7 @@ def test_requests_go_out_one_at_a_time_and_after_the_settling() -> None:
     assert third.result()["code"] == 3
 
 
-def test_silence_ends_in_a_timeout_and_the_link_goes_on() -> None:
+def test_a_timeout_frees_the_link() -> None:
     session = Session(SENSOR)
     first = session.request("start", 0)
     second = session.request("stop", 0)
@@ -169,7 +169,7 @@ def test_the_caller_can_wait_longer_or_shorter() -> None:
     assert session.deadline == 150_000_000  # not sent a third time
 
 
-def test_what_may_be_repeated_is_sent_again_and_then_given_up() -> None:
+def test_a_repeatable_command_is_retried_then_fails() -> None:
     session = Session(
         with_commands(
             ask=Command(
@@ -218,7 +218,7 @@ def test_an_answer_that_never_comes_holds_the_next_one_back_no_longer_than_it_co
     assert session.late == 0
 
 
-def test_an_answer_that_can_be_told_apart_holds_nothing_back() -> None:
+def test_distinguishable_replies_do_not_delay_commands() -> None:
     session = Session(SENSOR)
     session.request("start", 0)
     session.tick(SECOND)
@@ -231,7 +231,7 @@ def test_an_answer_that_can_be_told_apart_holds_nothing_back() -> None:
     assert other.done
 
 
-def test_the_second_answer_to_what_was_sent_twice_is_nobodys() -> None:
+def test_the_second_reply_to_a_retried_command_is_ignored() -> None:
     session = Session(
         with_commands(ask=Command("order", SENSOR.commands["start"].values, reply="ack", retries=1))
     )
@@ -257,7 +257,7 @@ def test_a_frame_that_came_before_the_request_is_no_answer_to_it() -> None:
     assert pending.done
 
 
-def test_another_answer_than_expected_is_told() -> None:
+def test_an_unexpected_reply_is_reported() -> None:
     session = Session(SENSOR)
     pending = session.request("speed", 0, rate=10.0, trim=0.0)
     session.receive([ack(3, result=7)], 1)
@@ -304,7 +304,7 @@ def test_one_of_several_frames_may_answer() -> None:
     assert pending.result().frame == "dense_descriptor"
 
 
-def test_what_the_reply_repeats_of_the_request_tells_answers_apart() -> None:
+def test_echoed_fields_distinguish_replies() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     session = Session(sensor)
     session.request("get_config", 0, key=0x70, timeout=1)
@@ -320,7 +320,7 @@ def test_what_the_reply_repeats_of_the_request_tells_answers_apart() -> None:
     assert session.late == 1
 
 
-def test_a_heartbeat_goes_on_until_it_is_abandoned() -> None:
+def test_a_heartbeat_continues_until_it_is_abandoned() -> None:
     session = Session(
         with_commands(beat=Command("order", SENSOR.commands["start"].values, every=1.0))
     )
@@ -448,7 +448,7 @@ def conversed(session: Session) -> list[tuple[int, list[int]]]:
     return [(one.head.number, list(one.host)) for one in sent]
 
 
-def test_a_running_number_goes_on_and_tells_the_reply() -> None:
+def test_a_running_number_identifies_the_reply() -> None:
     hello = dataclasses.replace(CONVERSATION.commands["hello"], retries=1)
     counting = {**hello.values, "head.number": Count(3, 6)}
     sensor = dataclasses.replace(
@@ -482,7 +482,7 @@ def test_a_running_number_goes_on_and_tells_the_reply() -> None:
     assert [number for number, _ in conversed(session)] == [0], "it has three bits"
 
 
-def test_what_is_found_out_can_be_given() -> None:
+def test_values_that_are_found_out_can_be_given() -> None:
     assert CONVERSATION.parse(CONVERSATION.command("hello"), "order").head.number == 7
     given = CONVERSATION.parse(
         CONVERSATION.command("hello", **{"head.number": 9, "host": "1.2.3.4"}), "order"
@@ -492,7 +492,7 @@ def test_what_is_found_out_can_be_given() -> None:
         CONVERSATION.command("hello", host="::1")
 
 
-def test_a_refusal_is_told_in_words_and_a_late_one_is_not_the_next_commands() -> None:
+def test_a_late_refusal_does_not_fail_the_next_command() -> None:
     refused = Command(
         "order",
         {"code": 3, "motor.speed": 0, "motor.trim": 0},

@@ -145,9 +145,7 @@ def test_a_file_with_a_mistake_takes_away_its_own_devices_alone(folder: Path, te
 
 
 @pytest.mark.parametrize("whose", ["another's", "everybody's", "everybody's folder"])
-def test_a_file_that_is_not_the_users_is_passed_over_and_said_once(
-    folder: Path, whose: str
-) -> None:
+def test_a_file_of_another_user_is_skipped_with_one_warning(folder: Path, whose: str) -> None:
     file = folder / "deep" / "lidarspec.toml"
     file.write_text('[device.front]\nsource = "sim:velodyne-vlp16"\n', encoding="utf-8")
     if whose == "another's":
@@ -280,7 +278,7 @@ def test_a_path_is_no_name(folder: Path) -> None:
     assert settings.find_device("other") is None
 
 
-def test_a_word_that_is_nothing_gets_a_suggestion(folder: Path) -> None:
+def test_an_unknown_word_gets_a_suggestion(folder: Path) -> None:
     with pytest.raises(
         ls.UsageError,
         match=r"'frnt' is no file, and no device of .*lidarspec.toml; did you mean 'front'\?",
@@ -404,6 +402,6 @@ def test_no_return_stays_none_and_keeps_its_direction() -> None:
     assert not found.valid[0]
 
 
-def test_a_mount_says_what_it_is() -> None:
+def test_the_text_of_a_mount() -> None:
     assert str(Mount(x=0.2, yaw_deg=90, inverted=True)) == "x=0.2, yaw_deg=90, inverted"
     assert str(Mount()) == "as the sensor stands"

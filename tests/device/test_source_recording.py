@@ -31,7 +31,7 @@ def fails(f: Fields) -> object:
     raise SystemExit("nothing that a plugin should do")
 
 
-def test_a_recording_goes_on_whatever_decoding_says_and_whoever_sends(tmp_path: Path) -> None:
+def test_recording_is_independent_of_decoding_and_senders(tmp_path: Path) -> None:
     good, number, path = SHAPES["shape-datagrams"], free_port(), tmp_path / "all.lsr"
     frames = {**good.frames, "data": replace(good.frames["data"], plausible=fails)}
     task = SourceRecording(f"udp://:{number}", str(path), replace(good, frames=frames))
@@ -66,9 +66,7 @@ def test_a_recording_goes_on_whatever_decoding_says_and_whoever_sends(tmp_path: 
 
 
 @pytest.mark.parametrize("knows", [True, False])
-def test_what_it_says_is_what_is_in_the_file_and_it_ends_at_the_time_asked(
-    tmp_path: Path, knows: bool
-) -> None:
+def test_a_recording_ends_in_time_and_reports_its_content(tmp_path: Path, knows: bool) -> None:
     sensor, number, path = SHAPES["shape-datagrams"], free_port(), tmp_path / "all.lsr"
     frames = turning(sensor, 50)
     task = SourceRecording(f"udp://:{number}", str(path), sensor if knows else None, seconds=0.3)
@@ -88,7 +86,7 @@ def test_what_it_says_is_what_is_in_the_file_and_it_ends_at_the_time_asked(
     assert task.elapsed == (times[-1] - times[0]) / 1e9 < 0.3
 
 
-def test_strangers_are_told_of_once_while_a_recording_goes_on(tmp_path: Path) -> None:
+def test_other_senders_are_reported_once_while_recording(tmp_path: Path) -> None:
     sensor, number, path = SHAPES["shape-datagrams"], free_port(), tmp_path / "all.lsr"
     task, said = SourceRecording(f"udp://:{number}", str(path), sensor, count=60), list[str]()
     with (

@@ -75,7 +75,7 @@ def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
         pages.assert_printed(block("text", "a\n", pages.OUTPUT), "a\nb\n")
 
 
-def test_the_python_of_the_readme_prints_what_it_says(tmp_path: Path) -> None:
+def test_the_python_of_the_readme_prints_its_output(tmp_path: Path) -> None:
     code, output = pages.blocks(README)[:2]
     pages.assert_printed(output, pages.python(code, tmp_path, {}))
 
@@ -143,7 +143,7 @@ def public_errors() -> set[str]:
 @pytest.mark.parametrize(
     "value", [ls.Sensor, Frame, Command, Scaled, Checksummed, Clock, Sequence, Polar]
 )
-def test_what_authors_write_says_what_each_argument_is(value: type) -> None:
+def test_every_argument_of_the_authors_api_is_documented(value: type) -> None:
     arguments = (inspect.getdoc(value) or "").partition("Args:")[2]
     named = set(re.findall(r"\w+", " ".join(re.findall(r"^ +([\w, ]+):", arguments, re.MULTILINE))))
     assert set(inspect.signature(value).parameters) <= named
@@ -178,7 +178,7 @@ HOUSE = Path(ls.__file__).parent
     "package",
     sorted(path.parent.relative_to(HOUSE).as_posix() for path in HOUSE.glob("*/**/__init__.py")),
 )
-def test_a_package_says_what_comes_in_and_out_and_names_its_modules(package: str) -> None:
+def test_a_package_docstring_lists_its_modules(package: str) -> None:
     text = (
         ast.get_docstring(ast.parse((HOUSE / package / "__init__.py").read_text(encoding="utf-8")))
         or ""
@@ -220,5 +220,5 @@ def opened(section: str) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("module", "name"), opened("Where things are"))
-def test_what_contributing_says_to_open_is_there(module: str, name: str) -> None:
+def test_names_in_contributing_exist(module: str, name: str) -> None:
     assert operator.attrgetter(name)(importlib.import_module(f"lidarspec.{module}"))

@@ -27,7 +27,7 @@ def helper():
 '''
 
 
-def test_lists_what_a_user_reads_and_nothing_else() -> None:
+def test_lists_exactly_the_texts_for_users() -> None:
     texts = list(iter_texts(ast.parse(SOURCE)))
     assert texts == [
         (11, "", "Print one scan."),

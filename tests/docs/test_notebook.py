@@ -35,7 +35,7 @@ def shown(cell: Any) -> dict[str, str]:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="some cells are for a shell")
-def test_the_notebook_runs_to_its_end_and_shows_what_it_says(
+def test_the_notebook_runs_and_shows_its_outputs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
@@ -62,7 +62,7 @@ def test_the_notebook_runs_to_its_end_and_shows_what_it_says(
     assert [path.name for path in tmp_path.iterdir() if path.name != "ipython"] == []
 
 
-def test_what_is_kept_of_the_notebook_is_its_input() -> None:
+def test_the_tracked_notebook_has_no_outputs() -> None:
     notebook = nbformat.read(PAGE, as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert all(cell.outputs == [] and cell.execution_count is None for cell in code)

@@ -50,7 +50,7 @@ def test_pictures_are_small_and_all_of_them_are_shown() -> None:
     assert all((DOCS / name).is_file() for name in shown)
 
 
-def test_pictures_say_what_they_show_to_those_who_do_not_see_them() -> None:
+def test_pictures_have_descriptions() -> None:
     for page in (DOCS / "index.md", DOCS.parent / "README.md"):
         alts = re.findall(r"!\[([^\]]*)\]", page.read_text(encoding="utf-8"))
         assert alts

@@ -34,7 +34,7 @@ def test_every_verb_that_shows_something_has_its_screen() -> None:
         assert (PAGES / "screens" / name).read_text(encoding="utf-8").startswith("<svg")
 
 
-def test_explain_prints_what_the_page_shows() -> None:
+def test_explain_prints_the_listing_of_the_page() -> None:
     explained = {
         command: text for command, text in screens().items() if command.startswith("explain")
     }

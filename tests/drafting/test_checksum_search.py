@@ -133,7 +133,7 @@ def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
 
 
 @pytest.mark.slow
-def test_frames_of_one_length_leave_init_and_xorout_open_and_say_so() -> None:
+def test_init_and_xorout_are_undetermined_for_frames_of_one_length() -> None:
     crc = Crc(16, 0x755B, 0x1234, xorout=0x4321)
     frames = sealed(crc)
     match = found(frames)
@@ -145,7 +145,7 @@ def test_frames_of_one_length_leave_init_and_xorout_open_and_say_so() -> None:
 
 
 @pytest.mark.slow
-def test_what_the_checksum_leaves_out_in_front() -> None:
+def test_a_checksum_that_skips_the_first_bytes() -> None:
     match = found(sealed(CRCS["CRC-16/MODBUS"], skip=2))
     assert (match.name, match.span.head, match.span.describe(match.place, 34)) == (
         "CRC-16/MODBUS",
@@ -190,7 +190,7 @@ def test_plain_checksums(checksum: Checksum) -> None:
         ),
     ],
 )
-def test_what_is_pasted_computes_the_same(checksum: Checksum) -> None:
+def test_the_printed_python_computes_the_same_checksum(checksum: Checksum) -> None:
     frames = sealed(checksum, 40, 27)
     match = found(frames)
     scope: dict[str, Any] = vars(lidarspec) | {
@@ -208,7 +208,7 @@ def test_what_is_pasted_computes_the_same(checksum: Checksum) -> None:
 
 
 @pytest.mark.parametrize("number", [5, pytest.param(40, marks=pytest.mark.slow)])
-def test_words_in_groups_around_a_field_in_the_middle(number: int) -> None:
+def test_grouped_words_around_a_field(number: int) -> None:
     match = found(simulate(lidarspec.sensor("cspc-m1c1-mini"), 40)[-number:])
     assert (match.algorithm, match.place) == (WordXor(head=8, groups=(1, 2)), ChecksumPlace(8, 2))
     assert match.paste == "WordXor(head=8, groups=(1, 2))"

@@ -187,7 +187,7 @@ def transport_data(name: str) -> bytes | list[bytes]:
 
 
 @pytest.mark.slow
-def test_the_evidence_stands_beside_each_field(tmp_path: Path) -> None:
+def test_each_field_has_its_evidence_in_a_comment(tmp_path: Path) -> None:
     (tmp_path / "some.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 400)))
     sensor = module(tmp_path, tmp_path / "some.bin")
     text = (tmp_path / "lidarspec-acme-x9" / "lidarspec_acme_x9" / "__init__.py").read_text(
@@ -318,7 +318,7 @@ def test_an_index_that_starts_again_is_a_counter_with_its_limits(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_turns_of_an_index_are_not_taken_for_one_frame(tmp_path: Path) -> None:
+def test_a_wrapping_index_does_not_make_a_longer_frame(tmp_path: Path) -> None:
     """Ninety packets a turn that begin with one constant byte, over a scene that stands still: the
     format of old vacuum cleaners.
     """
@@ -378,7 +378,7 @@ def test_a_length_in_bytes_with_short_frames_of_another_kind_between(tmp_path: P
 
 @pytest.mark.parametrize("order", ["little", "big"])
 @pytest.mark.parametrize("circle", [3_600, 23_040, 36_000])
-def test_angles_are_told_by_what_they_wrap_at(circle: int, order: str) -> None:
+def test_angles_are_recognized_by_their_wrap(circle: int, order: str) -> None:
     source = random.Random(circle)
     turned = np.cumsum([circle // 40 + source.randrange(-1, 2) for _ in range(300)]) % circle
     rows = [
@@ -450,7 +450,7 @@ def written(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_fields_alike_at_equal_distances_are_an_array() -> None:
+def test_similar_fields_at_equal_distances_are_an_array() -> None:
     struct = written(simulate(ls.sensor("hesai-xt16"), 300), datagrams=True)["struct"]
     assert "# 8 blocks of 66 bytes that begin with the same field" in struct
     assert struct.count('Scaled(Int16ul, 0.01, "deg")') == 1

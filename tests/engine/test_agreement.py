@@ -26,12 +26,12 @@ COMPILED_SHAPES = [
 
 
 @pytest.mark.parametrize("name", COMPILED_SHAPES)
-def test_damaged_input_reads_alike(name: str) -> None:
+def test_engines_agree_on_damaged_input(name: str) -> None:
     assert_damaged_input_reads_alike(SHAPES[name])
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_values_at_the_edges_read_alike(name: str) -> None:
+def test_engines_agree_on_extreme_values(name: str) -> None:
     assert_edge_values_read_alike(SHAPES[name])
 
 
@@ -40,7 +40,7 @@ def test_values_at_the_edges_read_alike(name: str) -> None:
     "name",
     [*(pytest.param(name, marks=pytest.mark.soak) for name in COMPILED_SHAPES), *REPRESENTATIVES],
 )
-def test_much_damaged_input_reads_alike(name: str) -> None:
+def test_engines_agree_on_heavily_damaged_input(name: str) -> None:
     assert_damaged_input_reads_alike(load_sensor(name), count=2)
     assert_edge_values_read_alike(load_sensor(name), count=3)
 

@@ -138,7 +138,7 @@ class TestFiles:
             write(path, failing())
         assert (path.read_bytes(), list(tmp_path.iterdir())) == (b"of yesterday", [path])
 
-    def test_so_does_what_a_verb_prints(self, tmp_path: Path) -> None:
+    def test_so_does_the_output_of_a_verb(self, tmp_path: Path) -> None:
         target = tmp_path / "list.json"
         target.write_text("of yesterday")
         os.link(target, tmp_path / "before.json")

@@ -96,18 +96,18 @@ def numbers(quick: int, whole: int) -> list[Any]:
 
 
 @pytest.mark.parametrize("number", numbers(12, 35))
-def test_what_construct_reads_is_what_we_read(number: int) -> None:
+def test_random_structs_parse_as_by_construct(number: int) -> None:
     tried(number)
 
 
 @pytest.mark.parametrize("number", numbers(5, 15))
-def test_what_construct_alone_can_read_is_read_alike(number: int) -> None:
+def test_structs_without_layouts_parse_as_by_construct(number: int) -> None:
     tried(number, interpreted=True)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("block", range(20))
-def test_many_more_are_read_alike(block: int) -> None:
+def test_many_more_structs_parse_as_by_construct(block: int) -> None:
     for number in range(100 * block, 100 * block + 100):
         tried(number, backends=("numpy", "construct", *JIT))
         tried(number, interpreted=True)
@@ -139,7 +139,7 @@ def test_most_random_specs_are_compiled_and_have_frames() -> None:
         "RawCopy(Int8ub)",
     ],
 )
-def test_what_loses_bits_is_refused_and_not_drawn(part: str) -> None:
+def test_structs_that_lose_bits_are_refused(part: str) -> None:
     with pytest.raises(SpecError):
         sensor(made(f'Struct("a" / Int8ub, "b" / {part})'))
 
@@ -158,7 +158,7 @@ def test_a_frame_without_a_byte_is_never_found(text: str) -> None:
         assert len(reader(ours, backend).decode([b"", b"\0"])) == 0
 
 
-def test_constants_of_an_element_that_is_not_there_are_asked_of_no_frame() -> None:
+def test_constants_of_missing_elements_are_not_checked() -> None:
     element = (
         'Struct(Const(b"M"), "x" / Switch(this._.n, {7: Struct("y" / Int8ub)},'
         " default=Array(this._.n % 4, Const(5, Int16ul))))"

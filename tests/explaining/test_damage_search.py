@@ -48,7 +48,7 @@ def test_a_lost_and_an_inserted_byte_are_found(offset: int) -> None:
     assert {change.kind for change in find_changes(STL_FRAME, more)} == {"inserted byte"}
 
 
-def test_a_lost_and_an_inserted_byte_are_told() -> None:
+def test_a_lost_byte_and_an_inserted_byte_are_reported() -> None:
     assert explain(EXAMPLE[1:], STL, "data").notes == (
         "one lost byte would explain it: 0x54 before byte 0, in header",
     )
@@ -63,7 +63,7 @@ def test_a_lost_and_an_inserted_byte_are_told() -> None:
 
 
 @pytest.mark.parametrize("name", SHORT_SHAPES)
-def test_what_is_said_to_mend_a_frame_mends_it(name: str) -> None:
+def test_a_suggested_repair_makes_the_frame_valid(name: str) -> None:
     sensor = SHAPES[name]
     data = sensor.example("data")
     middle = len(data) // 2
@@ -74,7 +74,7 @@ def test_what_is_said_to_mend_a_frame_mends_it(name: str) -> None:
             sensor.parse(change.repair(damaged), "data")
 
 
-def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
+def test_a_flipped_bit_is_reported_with_its_field() -> None:
     notes = explain(flipped(46, 0).repair(EXAMPLE), STL).notes
     assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
     assert (
@@ -84,7 +84,7 @@ def test_damage_that_one_bit_explains_is_told_with_the_field() -> None:
     assert explain(EXAMPLE[:20], STL).notes == ()
 
 
-def test_where_any_bit_may_have_flipped_only_that_is_told() -> None:
+def test_damage_by_any_single_bit_is_summarized() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     data = max((sensor.example("data", seed=seed) for seed in range(9)), key=len)
     (note,) = explain(flipped(20, 2).repair(data), sensor, "data").notes

@@ -219,20 +219,20 @@ def test_text_is_as_the_conventions_say() -> None:
     )
 
 
-def test_a_wrong_checksum_is_told_with_the_right_one_and_gives_no_points() -> None:
+def test_a_wrong_checksum_shows_the_computed_one_and_gives_no_points() -> None:
     found = explain(EXAMPLE[:-1] + b"\x51", ls.sensor("ldrobot-stl27l"))
     assert found.rows[-1].meaning == "0x51 wrong, expected 0x50 (CRC-8 poly 0x4d over 46 bytes)"
     assert [row.right for row in found.rows] == [True] * (len(found.rows) - 1) + [False]
     assert not any(row.points for row in found.rows)
 
 
-def test_a_wrong_constant_is_told() -> None:
+def test_a_wrong_constant_is_reported() -> None:
     found = explain(b"\x54\x2d" + EXAMPLE[2:], ls.sensor("ldrobot-stl27l"))
     assert found.rows[0].remarks == ("wrong: 54 2d, expected 54 2c",)
     assert not found.rows[0].right
 
 
-def test_what_follows_the_frame_is_told_and_the_frame_still_gives_points() -> None:
+def test_trailing_bytes_are_reported_and_points_remain() -> None:
     found = explain(EXAMPLE + b"abc", ls.sensor("ldrobot-stl27l"))
     assert (found.rows[-1].data, found.rows[-1].meaning) == (b"abc", "after the end of the frame")
     assert sum(len(row.points) for row in found.rows) == 12
@@ -388,7 +388,7 @@ def test_a_checksum_within_a_frame_is_judged_over_its_own_bytes() -> None:
     assert rows["check"].remarks[0].endswith("ok (XOR-8 over 6 bytes)")
 
 
-def test_look_ahead_and_implausible_frames_are_told() -> None:
+def test_look_ahead_and_implausible_frames_are_noted() -> None:
     ahead = explain(SHAPES["shape-ahead"].example("data"), SHAPES["shape-ahead"])
     assert any("direction unknown without other frames" in row.meaning for row in ahead.rows)
     values = ls.sensor("ldrobot-stl27l").parse(EXAMPLE)

@@ -46,7 +46,7 @@ def sent(damaged: Iterable[bytes]) -> list[bytes]:
     return [*FRAMES[:5], *damaged, *FRAMES[5:20]]
 
 
-def test_a_flipped_bit_a_lost_and_an_inserted_byte_and_a_truncated_frame_are_told_apart() -> None:
+def test_kinds_of_damage_are_distinguished() -> None:
     data = FRAMES[30]
     flipped = data[:SPOT] + bytes([data[SPOT] ^ 4]) + data[SPOT + 1 :]
     headless = bytes([data[0] ^ 1]) + data[1:]
@@ -63,7 +63,7 @@ def test_a_flipped_bit_a_lost_and_an_inserted_byte_and_a_truncated_frame_are_tol
         assert verdict in said
 
 
-def test_damaged_frames_in_a_row_are_told_one_by_one() -> None:
+def test_consecutive_damaged_frames_are_listed_one_by_one() -> None:
     lost, flipped = (FRAMES[number][:SPOT] for number in (30, 31))
     lost, flipped = lost + FRAMES[30][SPOT + 1 :], flipped + b"\xfe" + FRAMES[31][SPOT + 1 :]
     assert [size for _, size, _ in told(sent([lost, flipped, lost, FRAMES[32][:11]]))] == [

@@ -24,7 +24,7 @@ def lines(sensor: str, data: bytes, frame: str | None = None) -> list[str]:
     return str(explain(data, load_sensor(sensor), frame)).splitlines()
 
 
-def test_parts_are_indented_below_what_holds_them() -> None:
+def test_parts_are_indented() -> None:
     data = ls.sensor("robosense-m1").example("data", seed=1)
     found = [
         re.sub(r"^([0-9a-f]{4})  .{23}  ", r"\1 ", line).split("  ")[0:3]
@@ -53,7 +53,7 @@ def test_a_picture_has_dots_for_other_bits() -> None:
     assert bit_picture(b"\xa5\xff\x81", b"\xf0\x00\xff") == "1010.... .. 10000001"
 
 
-def test_differences_are_told_field_by_field_and_to_the_bit() -> None:
+def test_differences_are_listed_by_field_and_bit() -> None:
     other = STL.build("data", {**STL.parse(EXAMPLE), "end_angle": 0x82BF})
     first, second = explain(EXAMPLE, STL), explain(other, STL)
     found = first.differences(second)
@@ -69,7 +69,7 @@ def test_differences_are_told_field_by_field_and_to_the_bit() -> None:
     )
 
 
-def test_fields_that_one_frame_alone_has_are_told_together() -> None:
+def test_fields_of_one_frame_only_are_listed_together() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     samples = [dict(distance=1000, intensity=9, exposure=2)] * 3
     head = dict(mt=dict(frequency=0, start=0), fsa=dict(angle=64), lsa=dict(angle=640))

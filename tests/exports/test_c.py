@@ -109,14 +109,14 @@ def test_a_header_has_a_function_for_every_field(name: str) -> None:
             assert re.search(rf"\b{prefix}_{_word(path)}{'_' * (path in OWN)}\(", text), path
 
 
-def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
+def test_python_conditions_are_refused_with_the_reason() -> None:
     for name, reason in REFUSED.items():
         with pytest.raises(ExportError, match=reason):
             export(SHAPED[name], "c")
 
 
 @pytest.mark.slow
-def test_installed_sensors_that_c_cannot_say_are_refused_with_the_reason() -> None:
+def test_sensors_that_c_cannot_express_are_refused() -> None:
     for name, reason in REFUSED_INSTALLED.items():
         with pytest.raises(ExportError, match=reason):
             export(lidarspec.sensor(name), "c")

@@ -23,7 +23,7 @@ def first(language: str) -> str:
 
 
 @judged
-def test_the_frame_on_the_page_is_what_tshark_prints(tmp_path: Path) -> None:
+def test_the_page_shows_the_output_of_tshark(tmp_path: Path) -> None:
     sensor = lidarspec.sensor(NAME)
     printed = tshark(
         captured(sensor, [EXAMPLE], tmp_path / "it.pcap"), "-V", scripts=[written(sensor, tmp_path)]

@@ -173,7 +173,7 @@ def assert_page_is_complete(sensor: Sensor) -> None:
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1
 
 
-def test_a_page_says_what_a_user_looks_for() -> None:
+def test_a_reference_page_has_all_facts() -> None:
     text = export(ls.sensor("cspc-m1c1-mini"), "md")
     assert "| link `data` | serial, 150 000 or 115 200 baud, 8N1" in text
     assert "| `start` | `aa 55 f0 0f` | `ack` | starts the data; sent on opening |" in text
@@ -250,7 +250,7 @@ def test_python_code_is_refused_with_the_reason(kind: str) -> None:
         export(SHAPES["shape-text"], kind)
 
 
-def test_an_unknown_kind_is_told() -> None:
+def test_an_unknown_kind_is_an_error() -> None:
     with pytest.raises(UnknownExport, match="did you mean 'json'"):
         export(ls.sensor("ldrobot-stl27l"), "jsn")
 
@@ -266,7 +266,7 @@ def test_the_verb_prints_and_writes_every_kind(kind: str, tmp_path: Path) -> Non
     assert "return_seq" not in alone
 
 
-def test_the_verb_says_what_is_wrong() -> None:
+def test_errors_of_the_verb() -> None:
     result = ran(
         "export",
         "json",

@@ -148,7 +148,7 @@ def test_wrong_constants_are_noticed(compiled: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", list(UNUSUAL))
-def test_unusual_structs_are_read_alike(compiled: Path, case: str) -> None:
+def test_unusual_structs_parse_equally_in_kaitai(compiled: Path, case: str) -> None:
     sensor = UNUSUAL[case]
     found = kaitai.module(sensor, compiled)
     for seed in range(6):
@@ -162,13 +162,13 @@ def test_unusual_structs_are_read_alike(compiled: Path, case: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(REFUSED))
-def test_what_kaitai_cannot_say_is_refused_with_the_reason(name: str) -> None:
+def test_structs_that_kaitai_cannot_express_are_refused(name: str) -> None:
     with pytest.raises(ExportError, match=REFUSED[name]):
         export(SHAPED[name], "ksy")
 
 
 @pytest.mark.slow
-def test_installed_sensors_that_kaitai_cannot_say_are_refused_with_the_reason() -> None:
+def test_sensors_that_kaitai_cannot_express_are_refused() -> None:
     for name, reason in (REFUSED_INSTALLED | recoded(installed_sensors().values())).items():
         with pytest.raises(ExportError, match=reason):
             export(lidarspec.sensor(name), "ksy")
@@ -188,7 +188,7 @@ def test_other_refusals_have_reasons_too() -> None:
         )
 
 
-def test_yaml_quotes_what_would_mean_something_else() -> None:
+def test_yaml_quotes_ambiguous_words() -> None:
     value = {
         "a": "yes",
         "b": "x: y",

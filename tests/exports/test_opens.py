@@ -68,7 +68,7 @@ def test_simulated_and_recorded_captures(name: str, time: str, tmp_path: Path) -
         assert all(len(kind) == 1 for (kind,) in kinds)
 
 
-def test_a_byte_stream_becomes_a_packet_for_each_frame_and_for_what_is_none(tmp_path: Path) -> None:
+def test_a_byte_stream_becomes_packets_of_frames_and_invalid_bytes(tmp_path: Path) -> None:
     sensor, capture = lidarspec.sensor("ldrobot-stl27l"), tmp_path / "it.pcap"
     frames = [sensor.example("data", seed=seed) for seed in range(4)]
     stream = b"\x01\x02" + frames[0] + frames[1] + b"\x54\x2c\x03" + frames[2] + frames[3][:30]

@@ -87,6 +87,6 @@ def test_a_function_that_only_calculates_is_written_down() -> None:
     assert [arg.path if isinstance(arg, Ref) else arg for arg in inner.args] == [2, "a"]
 
 
-def test_an_unknown_kind_is_told_with_a_suggestion() -> None:
+def test_an_unknown_kind_gets_a_suggestion() -> None:
     with pytest.raises(UnknownExport, match="'wireshark'"):
         export(SENSOR, "wiresark")

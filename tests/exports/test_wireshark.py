@@ -64,14 +64,14 @@ def test_a_dissector_has_a_field_for_every_field_of_every_frame(name: str) -> No
             assert f"{name.replace('-', '_')}.{frame}.{path}" in text, path
 
 
-def test_what_only_python_can_decide_is_refused_with_the_reason() -> None:
+def test_python_conditions_are_refused_with_the_reason() -> None:
     for name, reason in REFUSED.items():
         with pytest.raises(ExportError, match=reason):
             export(SHAPED[name], "wireshark")
 
 
 @pytest.mark.slow
-def test_installed_sensors_that_wireshark_cannot_be_told_are_refused_with_the_reason() -> None:
+def test_sensors_that_the_dissector_cannot_express_are_refused() -> None:
     for name, reason in recoded(installed_sensors().values()).items():
         with pytest.raises(ExportError, match=reason):
             export(installed_sensors()[name], "wireshark")
@@ -283,7 +283,7 @@ def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None
 
 
 @judged
-def test_a_frame_that_waits_for_another_is_told_by_it(tmp_path: Path) -> None:
+def test_a_frame_after_a_descriptor_is_recognized(tmp_path: Path) -> None:
     sensor = SHAPED["shape-modes"]
     frames = [
         (name, sensor.example(name, seed=1))
@@ -300,7 +300,7 @@ def test_a_frame_that_waits_for_another_is_told_by_it(tmp_path: Path) -> None:
 
 
 @judged
-def test_frames_that_nothing_announced_are_said_to_be_unsure(tmp_path: Path) -> None:
+def test_frames_without_a_descriptor_are_marked_uncertain(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("slamtec-rplidar-t1")
     capsule, announcement = (
         sensor.example("dense", seed=1),
@@ -316,7 +316,7 @@ def test_frames_that_nothing_announced_are_said_to_be_unsure(tmp_path: Path) -> 
 
 
 @judged
-def test_frames_of_one_size_are_told_by_their_conditions(tmp_path: Path) -> None:
+def test_frames_of_one_size_are_distinguished_by_conditions(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("robosense-m1")
     names = ["difop_guide", "difop", "difop_other", "difop_fov"]
     capture = captured(

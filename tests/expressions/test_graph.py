@@ -83,7 +83,7 @@ def test_the_one_field_that_an_expression_is_made_of(function: Any, path: str | 
     assert (source.path if source is not None else None) == path
 
 
-def test_conditions_that_hold_together_are_told_apart() -> None:
+def test_combined_conditions_are_split() -> None:
     node = graph_of(lambda f: (f.start_angle < 360) & ((f.end_angle < 360) & (f.speed > 0)))
     assert [only_field(part).path for part in split_condition(node)] == [
         "start_angle",

@@ -62,7 +62,7 @@ def test_units_stand_beside_the_arrays(tmp_path: Path) -> None:
     assert np.isnan(group["velocity"][-5:]).all()
 
 
-def test_no_scan_is_a_group_of_empty_arrays_that_replaces_what_was_there(tmp_path: Path) -> None:
+def test_no_scans_give_a_group_of_empty_arrays(tmp_path: Path) -> None:
     write(tmp_path / "a.zarr", [scan(0)])
     write(tmp_path / "a.zarr", [])
     group = zarr.open_group(tmp_path / "a.zarr", mode="r")

@@ -78,7 +78,7 @@ def test_tables_hold_the_columns_of_the_clouds(
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_tables_say_what_is_in_them(tmp_path: Path, name: str) -> None:
+def test_tables_have_metadata(tmp_path: Path, name: str) -> None:
     sensor = SHAPES["shape-extras"]
     scans = list(sensor.scans(simulate(sensor, 60)))
     write(tmp_path / name, scans, every_point=True)
@@ -99,7 +99,7 @@ def test_tables_say_what_is_in_them(tmp_path: Path, name: str) -> None:
         )
 
 
-def test_what_a_later_scan_lacks_is_nan_or_null(tmp_path: Path) -> None:
+def test_columns_missing_in_a_later_scan_are_nan_or_null(tmp_path: Path) -> None:
     sensor = SHAPES["shape-extras"]
     full = next(iter(sensor.scans(simulate(sensor, 60))))
     write(tmp_path / "a.parquet", [full, scan(1)], every_point=True)

@@ -142,7 +142,7 @@ def test_foxglove_has_its_own_messages(tmp_path: Path, name: str) -> None:
         np.testing.assert_array_equal(np.array(message.intensities, np.float32), same.intensities)
 
 
-def test_a_folder_is_one_that_ros_2_knows(tmp_path: Path) -> None:
+def test_a_folder_is_a_valid_ros_2_bag(tmp_path: Path) -> None:
     write(tmp_path / "a.rosbag2", [scan(0)])
     assert {path.name for path in (tmp_path / "a.rosbag2").iterdir()} == {
         "metadata.yaml",
@@ -246,7 +246,7 @@ def test_no_scan_and_no_point_are_no_message_and_an_empty_one(tmp_path: Path, su
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_what_fails_leaves_nothing_behind(
+def test_a_failed_write_leaves_no_file(
     tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def scans() -> Iterator[Scan]:

@@ -205,7 +205,7 @@ def test_a_full_disk_is_a_source_error_and_leaves_nothing(tmp_path: Path, name: 
 
 
 @pytest.mark.parametrize("name", EXTRAS)
-def test_a_library_that_is_missing_is_named_with_what_to_type(
+def test_a_missing_library_is_named_with_a_command(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, EXTRAS[name][0], None)
@@ -270,7 +270,7 @@ except UnknownFormat as error:
 
 
 @pytest.mark.slow
-def test_a_plugin_whose_hook_fails_is_a_spec_error() -> None:
+def test_a_failing_hook_is_a_spec_error() -> None:
     script = """
 import lidarspec as ls
 from lidarspec.formats import format_of

@@ -60,7 +60,7 @@ def expected(scans: Sequence[Scan], name: str, *, every_point: bool) -> np.ndarr
 
 @pytest.mark.parametrize("every_point", [False, True])
 @pytest.mark.parametrize(("name", "reader"), READERS)
-def test_what_is_read_is_what_was_written(
+def test_files_read_back_equal(
     tmp_path: Path, name: str, reader: Reader, every_point: bool
 ) -> None:
     scans = [scan(0, 7), scan(1, 0), scan(2, 1), scan(3, 30_001)]
@@ -117,9 +117,7 @@ def test_without_a_point_there_is_a_file_without_rows(
 
 
 @pytest.mark.parametrize(("name", "reader"), READERS)
-def test_what_a_sensor_lacks_is_left_out_and_what_a_later_scan_lacks_is_0(
-    tmp_path: Path, name: str, reader: Reader
-) -> None:
+def test_missing_columns_are_omitted_or_0(tmp_path: Path, name: str, reader: Reader) -> None:
     write(tmp_path / name, [scan(0, intensity=False)])
     found = reader(tmp_path / name)
     if name in ("a.npy", "a.bin"):  # of one layout always
@@ -158,7 +156,7 @@ def test_a_picture_keeps_its_width_and_height(tmp_path: Path, name: str, reader:
 @pytest.mark.parametrize(
     ("number", "every_point"), [(1, False), (2, True)], ids=["valid only", "two"]
 )
-def test_what_is_no_picture_is_one_row(tmp_path: Path, number: int, every_point: bool) -> None:
+def test_unorganized_points_are_one_row(tmp_path: Path, number: int, every_point: bool) -> None:
     scans = [picture()] * number
     write(tmp_path / "a.pcd", scans, every_point=every_point)
     header = pcd_header(tmp_path / "a.pcd")
@@ -198,7 +196,7 @@ def test_noise_is_compressed_too(tmp_path: Path, points: int) -> None:
 
 
 @pytest.mark.slow
-def test_compressed_points_of_more_than_the_format_can_say_are_refused(
+def test_too_many_compressed_points_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lidarspec.formats.point_cloud_files._MOST_COMPRESSED", 1000)
@@ -207,7 +205,7 @@ def test_compressed_points_of_more_than_the_format_can_say_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_without_its_library_a_compressed_file_says_what_to_install(
+def test_a_missing_compression_library_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "lzf", None)

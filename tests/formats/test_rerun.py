@@ -125,7 +125,7 @@ def test_a_device_hands_its_mount_on_with_its_scans(
     ] == pytest.approx(0.5)
 
 
-def test_view_writes_what_it_would_show_with_the_figures(tmp_path: Path) -> None:
+def test_view_writes_scans_and_figures(tmp_path: Path) -> None:
     ran("view", "sim:robosense-m1", "--rerun", "-o", tmp_path / "a.rrd", "-t", "2500ms")
     found = logged(tmp_path / "a.rrd")
     assert len(found["/robosense-m1/points"]["scan"]) > 3

@@ -184,7 +184,7 @@ def test_such_a_frame_keeps_every_promise(name: str) -> None:
     assert_damaged_input_reads_alike(subject.sensor, count=1)
 
 
-def test_numbers_are_taken_for_a_byte_string_and_nothing_else() -> None:
+def test_a_byte_string_accepts_numbers_only() -> None:
     ours = sensor(Struct("k" / Int8ub, "v" / Array(this.k, Bytes(2))))
     wanted = b"\x02abcd"
     for value in (
@@ -201,7 +201,7 @@ def test_numbers_are_taken_for_a_byte_string_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("value", [None, 1.5])
-def test_what_is_no_list_and_no_bytes_is_the_callers_fault(value: Any) -> None:
+def test_other_values_of_a_byte_string_are_usage_errors(value: Any) -> None:
     for part in (Array(this.k, Int8ub), Bytes(this.k), Bytes(2)):
         with pytest.raises(UsageError, match="v"):
             sensor(Struct("k" / Int8ub, "v" / part)).build("data", k=2, v=value)
@@ -240,7 +240,7 @@ def test_a_column_of_text_is_refused_by_name() -> None:
         ours.decode([b"\1ab\0"])["v"]
 
 
-def test_branches_that_no_column_can_hold_are_told() -> None:
+def test_branches_without_a_common_column_are_refused() -> None:
     struct = Struct(
         "k" / Int8ub,
         "v" / Switch(this.k, {1: Int8ub, 2: Bytes(3)}),
@@ -429,12 +429,12 @@ def test_of_a_greedy_array_no_byte_is_dropped() -> None:
         (Prefixed(Int8ub, NullStripped(GreedyBytes)), "Prefixed loses what its content leaves"),
     ],
 )
-def test_what_has_no_end_or_drops_bytes_is_refused(part: Any, reason: str) -> None:
+def test_structs_without_an_end_or_that_drop_bytes_are_refused(part: Any, reason: str) -> None:
     with pytest.raises(SpecError, match=reason):
         sensor(Struct("k" / Int8ub, "v" / part))
 
 
-def test_examples_hold_what_is_checked_and_see_the_whole_frame() -> None:
+def test_examples_pass_checks_of_the_whole_frame() -> None:
     checked = Struct("ok" / Check(this._.a < 200), "x" / Array(this._root.a % 3, Int8ub))
     ours = sensor(
         Struct("a" / Int8ub, "v" / Array(2, checked), "twice" / Computed(this._root.a * 2))
@@ -458,7 +458,7 @@ def test_examples_hold_what_is_checked_and_see_the_whole_frame() -> None:
         (Seek(4), "name the bytes between"),
     ],
 )
-def test_what_has_no_name_is_refused_with_what_to_write(part: Any, instead: str) -> None:
+def test_nameless_checks_are_refused_with_a_suggestion(part: Any, instead: str) -> None:
     with pytest.raises(SpecError) as caught:
         sensor(Struct("k" / Int8ub, part))
     assert instead in str(caught.value)
@@ -481,7 +481,7 @@ def test_what_has_no_name_is_refused_with_what_to_write(part: Any, instead: str)
         (Array(2, PrefixedArray(Int8ub, Int8ub)), "a named member of a Struct alone"),
     ],
 )
-def test_what_construct_alone_reads_says_what_to_write(part: Any, instead: str) -> None:
+def test_unsupported_constructs_get_a_suggestion(part: Any, instead: str) -> None:
     frame = sensor(Struct("k" / Int8ub, "v" / part)).frames["data"]
     assert not is_compiled(frame)
     assert instead in interpreted_reason(frame)
@@ -492,7 +492,7 @@ def test_a_text_in_a_part_of_fixed_size_has_examples() -> None:
     assert len(ours.example("data")) == 9
 
 
-def test_what_is_printed_in_hexadecimal_is_the_value_below() -> None:
+def test_hex_fields_equal_plain_ones() -> None:
     ours = sensor(Struct("h" / Hex(Int16ub), "b" / HexDump(Bytes(2))))
     assert is_compiled(ours.frames["data"])
     assert plain(ours.parse(b"\1\2ab")) == {"h": 258, "b": b"ab"}
@@ -500,7 +500,7 @@ def test_what_is_printed_in_hexadecimal_is_the_value_below() -> None:
     assert ours.decode([b"\1\2ab"])["h"].tolist() == [258]
 
 
-def test_an_element_decides_on_what_follows() -> None:
+def test_an_element_selects_the_following_part() -> None:
     ours = sensor(Struct("sizes" / Array(2, Int8ub), "v" / Array(this.sizes[1], Int8ub)))
     frames = [ours.build("data", sizes=[9, len(v)], v=v) for v in ([], [5], [6, 7])]
     assert frames == [b"\x09\0", b"\x09\1\5", b"\x09\2\6\7"]

@@ -152,7 +152,7 @@ def test_a_number_is_built_as_its_name_is() -> None:
 
 
 @pytest.mark.parametrize("inside", [False, True])
-def test_what_build_fills_in_is_not_asked_of_a_frame_that_comes(inside: bool) -> None:
+def test_default_values_are_not_required_when_parsing(inside: bool) -> None:
     """`Rebuild` applies to building only; parsing accepts and keeps any value.
 
     This holds for single frames and both decoders.
@@ -176,7 +176,7 @@ def test_examples_are_of_every_name() -> None:
     assert {len(ours.example("data", seed=seed)) for seed in range(40)} == {2, 3, 5}
 
 
-def test_examples_of_what_construct_alone_reads_know_the_number_of_a_named_constant() -> None:
+def test_plain_examples_use_the_number_of_a_named_constant() -> None:
     rows = Array(lambda found: int(found.kind) % 4, Int8ub)
     ours = sensor(
         Struct("kind" / Const("busy", KIND), "rows" / rows, "text" / NullTerminated(GreedyBytes))
@@ -214,7 +214,7 @@ def test_one_field_has_one_unit() -> None:
     assert kept.decode([b"\1\0\5", b"\2\0\1\0\0"])["far"].tolist() == [0.005, 65.536]
 
 
-def test_exports_leave_out_what_is_never_chosen() -> None:
+def test_exports_omit_unreachable_branches() -> None:
     (found,) = [
         node
         for node in nodes(messages(sensor(CHOICES["names and numbers"]))[0].root)

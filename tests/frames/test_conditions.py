@@ -88,7 +88,7 @@ def test_frames_are_judged_as_construct_judges_them(name: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_what_is_not_allowed_is_counted_shown_and_not_built(backend: str) -> None:
+def test_forbidden_values_are_counted_shown_and_not_built(backend: str) -> None:
     ours = sensor(Struct("a" / OneOf(Int8ub, [1, 2]), "b" / Int8ub, "ok" / Check(this.b < 9)))
     packets = reader(ours, backend).decode(b"\1\2\3\4\2\x09\2\3")
     assert packets["b"].tolist() == [2, 3]
@@ -153,7 +153,7 @@ def test_parts_meet_their_own_conditions() -> None:
         Check(this.a % this.b == 0),
     ],
 )
-def test_what_is_no_condition_on_integers_side_by_side_says_what_to_write(check: Any) -> None:
+def test_unsupported_conditions_get_a_suggestion(check: Any) -> None:
     struct = Struct(
         "a" / Int32ub, "b" / Int8ub, "f" / Float32b, "v" / Array(2, Int8ub), "ok" / check
     )

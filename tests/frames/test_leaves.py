@@ -50,7 +50,7 @@ def numbers_of(leaf: Leaf, source: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize(
     ("name", "layout"), layouts(), ids=lambda value: value if isinstance(value, str) else ""
 )
-def test_what_is_stored_is_loaded_and_no_other_field_changes(name: str, layout: Layout) -> None:
+def test_stored_values_load_back_and_no_other_field_changes(name: str, layout: Layout) -> None:
     source = np.random.default_rng(len(name))
     rows = source.integers(0, 256, (ROWS, layout.size), np.uint8)
     leaves = {path: leaf for path, leaf in layout.leaves.items() if leaf.info.kind == "int"}

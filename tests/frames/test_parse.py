@@ -204,7 +204,7 @@ def test_units_are_those_that_build_takes() -> None:
 
 
 @each_sensor
-def test_a_frame_is_built_from_what_was_parsed_of_it(name: str) -> None:
+def test_a_parsed_frame_builds_the_same_bytes(name: str) -> None:
     """P7: raw and in units, reserved bits and padding included."""
     sensor = load_sensor(name)
     for frame in sensor.frames:

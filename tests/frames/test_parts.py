@@ -39,7 +39,7 @@ def pair(distance: int, angle: int) -> dict[str, int]:
     return dict(distance=distance, angle=angle)
 
 
-def test_what_says_where_the_last_part_is_is_filled_in() -> None:
+def test_the_marker_of_the_last_part_is_filled_in() -> None:
     data = tags(dict(type=1, points=[pair(100, 0), pair(200, -1)]), dict(type=9, content=b"abc"))
     assert data[4:-1].hex(" ") == "01 02 01 08 64 00 00 00 c8 00 ff ff 09 03 61 62 63 00 00"
     parsed = TAGS.parse(data)
@@ -180,7 +180,7 @@ FRAMES = {
 
 
 @pytest.mark.parametrize("name", FRAMES)
-def test_frames_are_what_construct_takes_for_frames(name: str) -> None:
+def test_frames_are_valid_exactly_if_construct_parses_them(name: str) -> None:
     struct, good, bad = FRAMES[name]
     whole = list(map(bytes.fromhex, good))
     assert against_construct.agree(struct, [*whole, *map(bytes.fromhex, bad)]) == len(whole)
@@ -273,7 +273,7 @@ def test_a_wrong_length_in_a_part_is_reported_with_its_place() -> None:
     assert (found.path, found.offset, found.expected, found.got) == ("parts[1].size", 8, 4, 9)
 
 
-def test_a_part_of_no_kind_is_counted_alike_by_both_engines() -> None:
+def test_both_engines_count_unknown_parts_equally() -> None:
     sensor, data = against_construct.sensor(COUNTED), bytes.fromhex("01 09 00 09")
     assert_backends_agree(sensor, [data, bytes.fromhex("01 04 00 09")])
     assert (sensor.decode([data]).stats.bad_constant, sensor.decode([data]).stats.bad_length) == (
@@ -360,7 +360,7 @@ def test_numbers_of_parts_above_the_longest_frame_are_one_layout(
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 26, 27, 54, 55, 2**31, 2**32 - 1])
-def test_each_number_of_parts_is_told_as_construct_tells_it(count: int) -> None:
+def test_errors_in_part_counts_match_construct(count: int) -> None:
     sensor = numbered()
     for part in (b"\x01\x07", b"\x02\x00", b"\x03"):
         data = b"\xaa\x55" + count.to_bytes(4, "big") + part * 40

@@ -233,7 +233,7 @@ def declared(name: str) -> Any:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_lengths_are_filled_in_and_what_comes_is_built_as_it_came(name: str) -> None:
+def test_lengths_are_filled_in_and_round_trip(name: str) -> None:
     ours, (_, values, data, more) = declared(name), ALL[name]
     assert is_compiled(ours.frames["data"]) is (name in MEASURED)
     built = ours.build("data", values)
@@ -270,7 +270,7 @@ def test_frames_are_held_to_their_lengths_as_by_construct(name: str) -> None:
     )
 
 
-def test_a_wrong_length_is_told_with_what_it_should_be() -> None:
+def test_a_wrong_length_shows_the_expected_one() -> None:
     ours = declared("a part")
     with pytest.raises(WireError) as fault:
         ours.parse(bytes.fromhex(f"f15a 0009 02{POINTS}"))
@@ -296,7 +296,7 @@ def test_padding_is_kept_and_may_be_given() -> None:
         ours.build("data", v=dict(points=TWO), v_padding=b"\xab")
 
 
-def test_a_part_that_is_longer_than_its_length_can_say_is_no_frame() -> None:
+def test_a_part_too_long_for_its_length_field_is_refused() -> None:
     ours = sensor(
         Struct("length" / SizeOf(Int8ub, "v"), "n" / Int16ub, "v" / Array(this.n, Int8ub)),
         max_length=1000,

@@ -52,7 +52,7 @@ def test_a_number_is_read_and_built_as_it_was_spelled(text: bytes) -> None:
         b"1 1 1 ",
     ],
 )
-def test_what_is_no_number_of_its_slot_makes_no_frame(text: bytes) -> None:
+def test_an_invalid_number_makes_no_frame(text: bytes) -> None:
     data = b"\x02" + text + b"\x03"
     with pytest.raises(WireError):
         NUMBERS.parse(data)
@@ -162,7 +162,7 @@ def test_escapes_are_written_where_they_have_to_be_and_read_wherever_they_are() 
     assert made.decode(b"\x7e\x01\x7d\x7d\x5e\x7e" + data).stats.frames == {"data": 1}
 
 
-def test_a_text_behind_another_of_any_content_tells_what_is_a_candidate() -> None:
+def test_a_text_after_free_text_identifies_candidates() -> None:
     """What only begins with the same mark is not looked at any further, and so not counted as a
     frame of a wrong length.
     """

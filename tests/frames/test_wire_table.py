@@ -106,7 +106,7 @@ def test_a_part_begins_where_the_one_before_it_ends() -> None:
     assert rows["crc"].offset == "9 + size(segments)"
 
 
-def test_what_some_headers_leave_out_is_marked() -> None:
+def test_optional_fields_are_marked() -> None:
     rows = [
         row
         for row in wire_table(SHAPES["shape-options"].frames["data"])
@@ -176,7 +176,7 @@ def test_wide_integers_are_bytes_and_conditions_have_names() -> None:
     )
 
 
-def test_lengths_that_python_alone_calculates_are_said_as_written() -> None:
+def test_python_lengths_are_shown_as_source() -> None:
     struct = Struct(
         "a" / Int8ul,
         "inner" / Struct("x" / Bytes(this._.a / 2), "y" / Bytes(lambda c: 1 if c.x else 2)),

@@ -69,7 +69,7 @@ def test_messages_are_joined_in_any_order_of_their_fragments_and_others_pass() -
     assert not packets.stats.fragments_late
 
 
-def test_a_message_without_a_fragment_is_given_up_and_told() -> None:
+def test_an_incomplete_message_is_dropped_and_counted() -> None:
     sent = [*fragments(1), *fragments(2)[:-1], *fragments(3)]
     numbers, packets = counters(sent)
     assert numbers == [1, 3]
@@ -78,7 +78,7 @@ def test_a_message_without_a_fragment_is_given_up_and_told() -> None:
     assert "fragments_lost 1" in str(packets.stats)
 
 
-def test_what_comes_twice_or_late_is_dropped_and_counted() -> None:
+def test_duplicate_and_late_fragments_are_dropped_and_counted() -> None:
     doubled = [fragment for fragment in fragments(1) for _ in range(2)]
     numbers, packets = counters([*doubled, fragments(1)[0]])
     assert numbers == [1]
@@ -164,7 +164,7 @@ def test_fragments_by_their_place_in_bytes_are_joined() -> None:
     assert np.asarray(by_bytes().decode(sent)["counter"]).tolist() == [7]
 
 
-def test_what_a_fragment_has_to_say_is_there_when_it_is_declared() -> None:
+def test_declared_fragment_fields_must_exist() -> None:
     with pytest.raises(SpecError, match=r"links\.data\.assembled: .*'number'"):
         by_bytes(key="number")
     with pytest.raises(SpecError, match="stream"):

@@ -178,7 +178,7 @@ def test_a_frame_inside_a_frame_belongs_to_it() -> None:
     assert [data for _, _, data in decoded(sensor, broken)] == [inner]
 
 
-def test_a_false_header_whose_length_swallows_good_frames_gives_them_back() -> None:
+def test_a_false_header_does_not_cost_valid_frames() -> None:
     sensor = SHAPES["shape-count"]
     frames = [
         sensor.build(
@@ -262,7 +262,7 @@ def test_fillers_are_skipped_bytes_with_a_count_of_their_own() -> None:
     assert (stats.bytes_skipped, stats.bytes_filler) == (6, 5)
 
 
-def test_what_a_descriptor_announces_is_what_is_looked_for() -> None:
+def test_a_descriptor_selects_the_frame_type() -> None:
     sensor = SHAPES["shape-modes"]
     plain, express = sensor.example("plain", seed=1), sensor.example("express", seed=1)
     begin_plain, begin_express = sensor.example("begin_plain"), sensor.example("begin_express")
@@ -332,7 +332,7 @@ def test_a_frame_is_out_with_its_last_byte(name: str) -> None:
     assert decoder.stats.pending == 0
 
 
-def test_a_line_says_what_things_are() -> None:
+def test_frames_are_printed_in_one_line() -> None:
     sensor = ls.sensor("cspc-coin-d4")
     frame, decoder = sensor.frames["info"], sensor.decoder()
     data = sensor.example("info", seed=1)

@@ -66,7 +66,7 @@ def is_steady(frames: Frames) -> bool:
     ],
 )
 @pytest.mark.parametrize("rate", [0.0, pytest.param(1e-3, marks=pytest.mark.soak), 5e-3])
-def test_pieces_of_a_few_frames_give_what_the_whole_gives(name: str, rate: float) -> None:
+def test_small_pieces_give_the_same_frames(name: str, rate: float) -> None:
     sensor = STREAMS[name]
     size = min(frame.max_length for frame in sensor.incoming.values())
     for seed in range(1 if rate == 0 else 2):
@@ -155,7 +155,7 @@ def test_a_type_that_comes_first_is_looked_for_where_only_some_frames_begin_like
     assert decoder.stats.bad_checksum == 12
 
 
-def test_what_cannot_become_a_frame_is_not_waited_for() -> None:
+def test_impossible_candidates_do_not_wait() -> None:
     frame = TWINS.example("data", seed=1)
     decoder = TWINS.decoder()
     decoder.frames(frame * 3)

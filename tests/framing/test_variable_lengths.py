@@ -130,7 +130,7 @@ def test_the_frames_are_those_of_brute_force(name: str) -> None:
     assert decoded(SENSORS[name], data) == Oracle(SENSORS[name], data).frames()
 
 
-def test_what_computes_checksums_is_asked_for_all_lengths() -> None:
+def test_checksums_are_computed_for_all_lengths_at_once() -> None:
     """As `detect` does, which takes each checksum that stands in a frame for the right one."""
     sensor = SENSORS["behind"]
     data = false_headers(sensor, 6000)

@@ -129,7 +129,7 @@ def test_an_input_that_reaches_new_lines_is_mutated_further(
 
 
 @pytest.mark.slow
-def test_a_run_spreads_its_inputs_reports_them_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+def test_a_run_resumes_where_it_stopped(tmp_path: Path) -> None:
     assert spread({"frame a": 100.0, "frame b": 300.0, "hex": 1.0}, 1000) == {
         "frame a": 685,
         "frame b": 228,

@@ -23,7 +23,7 @@ def times(*seconds: float) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.array([round(second * SECOND) for second in seconds], np.int64)
 
 
-def test_whole_turns_that_nobody_saw_are_counted_by_the_host() -> None:
+def test_unseen_clock_turns_are_counted_by_arrival_times() -> None:
     clock = Unwrapper(30.0)
     first = clock.push(times(10, 11), NOW + times(0, 1))
     later = clock.push(times(12, 13), NOW + times(92, 93))
@@ -46,7 +46,7 @@ def test_a_pause_of_more_than_half_a_turn_goes_forward_where_the_host_says_so() 
 
 
 @pytest.mark.parametrize("arrivals", [[0, 0], [0, NOW], [NOW, 0]])
-def test_an_arrival_that_nobody_knows_counts_no_turns(arrivals: list[int]) -> None:
+def test_unknown_arrival_times_count_no_turns(arrivals: list[int]) -> None:
     clock = Unwrapper(30.0)
     found = np.concatenate(
         [

@@ -132,7 +132,7 @@ def test_packets_of_one_time_that_differ_are_not_doubles() -> None:
 
 
 @pytest.mark.parametrize("lost", [300, 629, 630, 631, 6300, 118_976])
-def test_what_the_counter_wraps_over_is_counted_by_the_clock(lost: int) -> None:
+def test_losses_beyond_a_counter_wrap_are_counted_by_the_clock(lost: int) -> None:
     sensor = ls.sensor("robosense-m1")
     packets = sensor.decode(simulate(sensor, 700) + simulate(sensor, 700, start=700 + lost))
     assert counted(packets) == (lost, 0, 0)
@@ -156,7 +156,7 @@ def test_a_counter_that_jumps_without_the_clock_is_damage_and_no_loss(counter: i
     assert not packets.breaks.any()
 
 
-def test_a_counter_that_starts_again_while_the_clock_goes_on_is_followed() -> None:
+def test_a_restarted_counter_with_a_continuing_clock() -> None:
     sensor = ls.sensor("robosense-helios16p")
     frames = simulate(sensor, 200) + [
         helios(number, number - 200) for number in range(200, 230) if number not in (210, 211)
@@ -225,7 +225,7 @@ def test_pieces_do_not_matter(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["robosense-m1", "hesai-xt32", "velodyne-vlp16"])
-def test_a_recording_that_is_played_in_a_loop_goes_on(name: str) -> None:
+def test_a_looped_recording_continues(name: str) -> None:
     sensor = ls.sensor(name)
     packets = sensor.decode(simulate(sensor, 630) * 4)
     assert counted(packets) == (0, 0, 0)

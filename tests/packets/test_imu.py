@@ -68,7 +68,7 @@ def test_values_are_in_si_and_the_axes_of_the_points() -> None:
 
 
 @pytest.mark.parametrize("frame", ["data", "imu"])
-def test_both_engines_and_single_packets_read_alike(frame: str) -> None:
+def test_both_engines_and_single_packets_agree(frame: str) -> None:
     data = [SENSOR.example(frame, seed=seed) for seed in range(30)]
     bulk = SENSOR.decode(data, frame).imu()
     ways = [
@@ -81,7 +81,7 @@ def test_both_engines_and_single_packets_read_alike(frame: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_simulated_sensor_is_at_rest_and_shakes_when_asked() -> None:
+def test_a_simulated_imu_is_at_rest_unless_shaken() -> None:
     for frame, number in (("imu", 2 * RATE), ("data", 400 * SAMPLES)):
         found = SENSOR.decode(sent(), frame).imu()
         assert number <= len(found) <= number + SAMPLES
@@ -108,7 +108,7 @@ def assert_in_their_scans(scans: list[ls.Scan], number: int) -> None:
 
 
 @pytest.mark.slow
-def test_scans_have_what_was_felt_during_them(tmp_path: Path) -> None:
+def test_scans_have_their_imu_samples(tmp_path: Path) -> None:
     data = sent()
     number = len(SENSOR.decode(data, "imu").imu()) + len(SENSOR.decode(data).imu())
     assert_in_their_scans(list(SENSOR.scans(data)), number)

@@ -83,7 +83,7 @@ def test_a_counter_that_no_data_frame_has_is_an_error_of_the_plugin() -> None:
     assert wrong.decode(simulate(PLAIN, 2)).stats.plugin_errors == 2  # packets
 
 
-def test_a_sweep_may_name_fields_of_the_other_form_but_none_that_do_not_exist() -> None:
+def test_a_sweep_may_name_fields_of_any_variant() -> None:
     assert [frame[-2:] for frame in simulate(COUNTED, 3)] == [b"\0\0", b"\1\0", b"\2\0"]
     wrong = replace(lengths.SENSOR, simulation=Simulation(lambda i: {"azimuth": 0, "countre": i}))
     with pytest.raises(SpecError, match="countre"):
@@ -100,7 +100,7 @@ def test_a_sweep_may_name_fields_of_the_other_form_but_none_that_do_not_exist() 
         ([7, 7, None], 0, 1, [7, 7, 8]),
     ],
 )
-def test_packets_whose_header_leaves_the_counter_out_follow_each_other(
+def test_packets_without_the_optional_counter_are_consecutive(
     numbers: list[int | None], lost: int, duplicates: int, index: list[int] | None
 ) -> None:
     for backend in ("auto", "construct"):
@@ -130,7 +130,7 @@ def test_distances_are_in_the_unit_of_the_header_also_when_simulated() -> None:
     assert fine.points().range.min() > 1
 
 
-def test_a_field_that_carries_no_range_keeps_what_the_sweep_gave_it() -> None:
+def test_other_fields_keep_the_values_of_the_sweep() -> None:
     parsed = headed.SENSOR.parse(simulate(headed.SENSOR, 1)[0])
     assert (parsed.unit, parsed.rows, parsed.counted) == (4, 2, 1)
 

@@ -151,7 +151,7 @@ def python(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_strangers_sensor_is_found_and_works(seen: dict[str, Any]) -> None:
+def test_a_third_party_sensor_is_found_and_works(seen: dict[str, Any]) -> None:
     assert ["acme-lidars", "3.2.1", "acme = acme_lidars", ["acme-x1"], "", False] in seen["plugins"]
     assert {"acme-x1", *lidarspec.sensors()} <= set(seen["good"])
 
@@ -197,7 +197,7 @@ def test_points_that_are_not_numbers_are_not_valid(seen: dict[str, Any]) -> None
     assert [case[:4] for case in said] == [[3, 0, 0, 12]] * 2
 
 
-def test_the_command_line_lists_what_is_broken(site: Path) -> None:
+def test_the_command_line_lists_broken_plugins(site: Path) -> None:
     done = python(site, "-m", "lidarspec", "plugins", "--json")
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
@@ -245,9 +245,7 @@ def test_a_broken_distribution_is_checked_to_its_end(site: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["acme-x1", "acme-lidars", "lidarspec-broken"])
-def test_of_two_with_one_id_both_are_named_and_the_one_that_is_meant_is_checked(
-    site: Path, name: str
-) -> None:
+def test_check_names_both_plugins_with_one_id(site: Path, name: str) -> None:
     done = python(site, "-m", "lidarspec", "check", name, "--max-examples", "3", "--json")
     reports = {report["name"]: report for report in json.loads(done.stdout)}
     (taken,) = [

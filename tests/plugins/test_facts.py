@@ -68,7 +68,7 @@ def test_related_models_name_each_other(module: str) -> None:
 
 
 @EACH_MODULE
-def test_packet_is_not_taken_for_one_of_a_related_model(module: str) -> None:
+def test_packet_does_not_match_related_models(module: str) -> None:
     for sensor in sensors_in(module):
         if not sensor.relatives:
             continue

@@ -61,7 +61,7 @@ def test_a_checksum_hook_replaces_the_algorithm_and_nothing_else(registry: Regis
     assert untouched.parse(untouched.example("data"))
 
 
-def test_a_checksum_hook_supplies_what_a_sensor_leaves_out(registry: Registry) -> None:
+def test_a_checksum_hook_supplies_a_missing_algorithm(registry: Registry) -> None:
     struct = Checksummed(
         Struct("header" / Const(b"\x99\x01"), "angle" / Int8ul, "sum" / Int8ul), field="sum"
     )
@@ -91,7 +91,7 @@ def test_a_checksum_hook_supplies_what_a_sensor_leaves_out(registry: Registry) -
     assert len(sensor.decode(sensor.build("data", angle=5) * 3)) == 3
 
 
-def test_a_points_hook_stands_in_for_the_sensors_own(registry: Registry) -> None:
+def test_a_points_hook_replaces_the_own_function(registry: Registry) -> None:
     plain = registry.sensor("shape-count")
     data = plain.example("data", seed=1)
     own = plain.decode(data).points()

@@ -81,7 +81,7 @@ def test_odd_installations_are_read_as_importlib_metadata_reads_them(
     assert found[0][2:] == ("Some.Lidars", "2.0")
 
 
-def test_an_import_hook_that_finds_distributions_is_asked(
+def test_distributions_of_an_import_hook_are_found(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     distribution(tmp_path, "hooked", "1", "[odd.group]\nh = hooked\n")
@@ -186,7 +186,7 @@ def registry(*entries: str, offered: str = "") -> Registry:
 OFFERED = "acme-x1 = acme, acme-x2 = acme, beta-x1 = beta, b-one = beta"
 
 
-def test_a_sensor_is_loaded_when_it_is_asked_for(plugins: dict[str, SimpleNamespace]) -> None:
+def test_a_sensor_is_loaded_on_first_use(plugins: dict[str, SimpleNamespace]) -> None:
     found = registry("plain = plain", offered=OFFERED)
     assert (plugins["plain"].asked, plugins["acme"].asked, plugins["beta"].asked) == (1, 0, 0)
     assert found.sensor("acme-x2").id == "acme-x2"
@@ -217,7 +217,7 @@ def test_names_of_entry_points_are_aliases(plugins: dict[str, SimpleNamespace]) 
     assert found.sensor("liar-x1b") is found.sensor("liar-x1")
 
 
-def test_an_unknown_id_is_told_with_the_ids_of_all_plugins(
+def test_an_unknown_id_gets_suggestions_from_all_plugins(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
     with pytest.raises(UnknownSensor, match="did you mean 'beta-x1'"):
@@ -252,7 +252,7 @@ def test_unknown_sensor_names_plugins_of_unknown_content_that_failed(
 
 
 @pytest.mark.parametrize("asked", [["acme-x1"], ["acme-x3"], ["other-x1"], ["acme-x2"], []])
-def test_of_two_with_one_id_the_first_wins_whichever_is_asked_for(
+def test_the_first_of_two_plugins_with_one_id_wins(
     plugins: dict[str, SimpleNamespace], asked: list[str]
 ) -> None:
     found = registry(offered="acme-x1 = acme, acme-x2 = acme, acme-x2 = again, acme-x3 = again")
@@ -417,7 +417,7 @@ def test_an_alias_goes_to_the_sensor_of_its_owner_also_where_no_entry_point_says
     assert sorted(found.sensors()) == ["acme-x3", "beta-x1"]
 
 
-def test_an_id_that_nobody_owns_is_an_error_when_it_is_used_and_no_other_is(
+def test_an_id_without_owner_is_an_error_only_when_used(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
     found = claimed(
@@ -436,7 +436,7 @@ def test_an_id_that_nobody_owns_is_an_error_when_it_is_used_and_no_other_is(
     assert "acme-x3" in found
 
 
-def test_an_owner_that_does_not_load_is_not_replaced_by_a_stranger(
+def test_a_broken_owner_is_not_replaced(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
     found = claimed(

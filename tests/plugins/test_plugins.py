@@ -47,7 +47,7 @@ class TestStranger(SensorConformance):
     examples = 4
 
 
-def test_the_stranger_uses_state_look_ahead_and_its_calibration_file(tmp_path: Path) -> None:
+def test_the_third_party_sensor_uses_all_mechanisms(tmp_path: Path) -> None:
     sensor = lidarspec.sensor(STRANGER)
     samples = [dict(distance=1000, row=row, quality=9) for row in range(4)]
     data = b"".join(sensor.build("data", start=start, samples=samples) for start in (0, 1000, 2000))

@@ -93,7 +93,7 @@ def test_a_scan_has_columns_of_its_own_packets_made_and_no_others() -> None:
         np.testing.assert_array_equal(np.concatenate(columns), whole.extra[name])
 
 
-def test_a_column_that_nobody_reads_is_not_made() -> None:
+def test_unread_columns_are_not_computed() -> None:
     cloud = packets().points()
     assert isinstance(cloud, LazyCloud)
     assert cloud.xyz.shape == (len(cloud), 3)
@@ -283,7 +283,7 @@ def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(
     assert all(column is one.read(*names)[name] for name, column in one.read(*names).items())
 
 
-def test_what_is_asked_for_by_a_wrong_name_is_said() -> None:
+def test_an_unknown_column_is_an_error() -> None:
     cloud = packets().points()
     with pytest.raises(UnknownName, match="unknown name 'velocty'; did you mean 'velocity'"):
         cloud.read("x", "velocty")

@@ -127,7 +127,7 @@ def test_a_file_of_another_user_is_not_read(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_folder_that_is_open_to_others_is_not_used_and_that_is_said_once(folder: Path) -> None:
+def test_a_shared_cache_folder_is_not_used_with_one_warning(folder: Path) -> None:
     _is_read()
     folder.chmod(0o777)
     with pytest.warns(

@@ -106,7 +106,7 @@ def packets_of(name: str, number: int) -> Packets:
 
 
 @pytest.mark.parametrize("name", SHAPED)
-def test_kernels_give_what_the_plain_evaluation_gives(name: str) -> None:
+def test_kernels_equal_the_reference_evaluator(name: str) -> None:
     for number in (1, 7, MANY):
         packets = packets_of(name, number)
         if len(packets):
@@ -343,7 +343,7 @@ def test_checksums_are_compiled_for_the_decoder_that_asks_and_no_other(
 
 
 @pytest.mark.slow
-def test_streams_are_cut_alike() -> None:
+def test_streams_are_cut_equally() -> None:
     sensor = lidarspec.sensor("ldrobot-stl27l")
     data = b"".join(b"".join(frames_of("ldrobot-stl27l")) + b"T,T" for _ in range(400))
     one, other = (sensor.decode(data, backend=backend) for backend in ("numpy", "jit"))

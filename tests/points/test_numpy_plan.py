@@ -60,7 +60,7 @@ def packets_of(sensor: Sensor, number: int) -> Packets:
 
 @pytest.mark.parametrize("number", [1, 4, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", SHAPED)
-def test_a_plan_gives_what_the_plain_evaluation_gives(name: str, number: int) -> None:
+def test_a_plan_equals_the_reference_evaluator(name: str, number: int) -> None:
     assert_planned_points_are_the_plain_ones(packets_of(SHAPES[name], number))
 
 
@@ -139,7 +139,7 @@ def indexing(f: Fields) -> Polar:
     ("points", "reason"),
     [(branching, ".array"), (reducing, "np.add.reduce"), (indexing, "made an array")],
 )
-def test_what_cannot_be_traced_says_so_and_runs_all_the_same(points: Any, reason: str) -> None:
+def test_untraceable_functions_are_reported_and_evaluated(points: Any, reason: str) -> None:
     sensor = dataclasses.replace(lidarspec.sensor("ldrobot-stl27l"), points=points)
     packets = sensor.decode(b"".join(sensor.example("data", seed=seed) for seed in range(4)))
     found = plan(packets)
@@ -173,7 +173,7 @@ def test_a_factor_that_is_zero_or_negative_leaves_no_point_behind() -> None:
         ),
     ],
 )
-def test_arrays_of_one_form_are_told_apart_and_elements_may_begin_with_anything(text: str) -> None:
+def test_arrays_with_equal_layouts_are_distinguished(text: str) -> None:
     """Blocks of elements had the offset of any field of this form, and ran past the frame."""
     struct = made(text)
     frames = [sensor(struct).example("data", seed=seed) for seed in range(5)]

@@ -47,7 +47,7 @@ def cloud_of(*frames: bytes, points: Any = SENSOR.points, backend: str = "auto")
 
 
 @EVERY_BACKEND
-def test_what_is_along_which_array(backend: str) -> None:
+def test_axes_of_values(backend: str) -> None:
     cloud = cloud_of(frame(16), backend=backend)
     assert cloud.shape == (COLUMNS, PIXELS)
     at = 5 * PIXELS + 7
@@ -109,7 +109,7 @@ def test_lost_columns_leave_gaps_in_the_place_of_their_numbers(backend: str) -> 
     assert straight.shape == (TURN, PIXELS)
 
 
-def test_what_cannot_be_a_picture_is_refused() -> None:
+def test_points_without_a_grid_are_refused() -> None:
     cloud = cloud_of(frame(0), frame(16))
     for wrong, said in (
         (lambda: cloud_of(frame(0), frame(0)).organise(TURN), "column 0 comes 2 times"),

@@ -226,7 +226,7 @@ def test_a_sealed_struct_parses_and_builds_without_a_sensor(name: str) -> None:
 
 
 @both
-def test_what_follows_reaches_over_packets_but_not_over_losses(backend: str) -> None:
+def test_following_reaches_across_packets_but_not_losses(backend: str) -> None:
     sensor = SHAPES["shape-ahead"]
 
     def frame(angle: int, lift: int, distance: int) -> bytes:
@@ -257,7 +257,7 @@ def test_what_follows_reaches_over_packets_but_not_over_losses(backend: str) -> 
 
 
 @both
-def test_state_of_another_packet_stands_on_the_axes_of_the_points(backend: str) -> None:
+def test_state_values_align_with_the_axes_of_points(backend: str) -> None:
     sensor = SHAPES["shape-state"]
     block = dict(azimuth=1000, channels=[dict(distance=500)] * 4)
     data = sensor.build(
@@ -296,7 +296,7 @@ def test_a_calibration_file_decides_the_frames() -> None:
 
 
 @both
-def test_options_of_the_header_change_what_follows(backend: str) -> None:
+def test_header_options_change_the_layout(backend: str) -> None:
     sensor = SHAPES["shape-options"]
 
     def frame(
@@ -441,7 +441,7 @@ def test_commands_take_arguments_in_units_and_name_their_reply() -> None:
 
 
 @both
-def test_a_sequence_counts_what_is_lost_doubled_and_late(backend: str) -> None:
+def test_a_sequence_counts_lost_duplicate_and_late_packets(backend: str) -> None:
     sensor = SHAPES["shape-datagrams"]
 
     def frame(number: int) -> bytes:
@@ -550,7 +550,7 @@ def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None
         parts.points()
 
 
-def test_what_a_sensor_in_a_scene_measures_is_refused_for_the_same_axes() -> None:
+def test_simulation_reports_the_same_axis_errors() -> None:
     sensor = replace(
         against_construct.sensor(
             Struct(

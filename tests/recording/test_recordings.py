@@ -97,7 +97,7 @@ def test_the_format_of_version_1_stays(path: Path) -> None:
     )
 
 
-def test_what_was_written_comes_back(path: Path) -> None:
+def test_written_records_are_read_back(path: Path) -> None:
     with Recorder(path, source="udp://:2368", datagrams=True) as recorder:
         for chunk in CHUNKS:
             recorder.write(chunk)
@@ -118,7 +118,7 @@ def test_what_was_written_comes_back(path: Path) -> None:
     )
 
 
-def test_the_header_tells_where_it_came_from(path: Path) -> None:
+def test_the_header_describes_the_source(path: Path) -> None:
     before = time.time_ns()
     sensor = ls.sensor(STREAM).configure(frame="vendor")
     with Recorder(path, sensor, "serial:///dev/ttyUSB0", baud=921600):
@@ -245,7 +245,7 @@ def test_hostile_files_cost_neither_memory_nor_exceptions(path: Path, *, salvage
     ],
     ids=["empty", "deep", "list", "sensor", "baud", "options", "datagrams", "bytes"],
 )
-def test_hostile_headers_are_told_as_such(text: bytes) -> None:
+def test_hostile_headers_are_refused(text: bytes) -> None:
     with pytest.raises(WireError, match="header"):
         read_header(text)
 
@@ -264,7 +264,7 @@ def test_a_header_opens_no_file(text: str) -> None:
         read_header(text.encode()).known_sensor(Path())
 
 
-def test_nothing_is_overwritten_unasked(path: Path) -> None:
+def test_nothing_is_overwritten_without_permission(path: Path) -> None:
     path.write_bytes(b"precious")
     with pytest.raises(UsageError, match="exists already"):
         Recorder(path)
@@ -299,7 +299,7 @@ def test_an_old_file_stays_where_the_disk_takes_no_new_one(path: Path) -> None:
     assert (path.read_bytes(), list(path.parent.iterdir())) == (b"precious", [path])
 
 
-def test_records_reach_the_file_by_themselves_and_at_once_when_asked(path: Path) -> None:
+def test_records_are_flushed_regularly_and_on_sync(path: Path) -> None:
     with Recorder(path) as recorder:
         recorder.write(Chunk(b"soon"))
         until(lambda: read(path))
@@ -409,7 +409,7 @@ def test_a_file_that_may_not_grow_is_whole_to_its_last_record(path: Path) -> Non
 @pytest.mark.skipif(
     not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may mount a small disk"
 )
-def test_a_full_disk_is_told_once_and_the_file_is_whole(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_once_and_the_file_is_intact(tmp_path: Path) -> None:
     made = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", tmp_path],
         capture_output=True,
@@ -430,9 +430,7 @@ def test_a_recording_that_cannot_even_begin_says_so() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a named pipe")
-def test_a_disk_that_does_not_keep_up_holds_up_nobody(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_disk_does_not_block_writers(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(background_writer, "BACKLOG", 300_000)
     os.mkfifo(path)
     taken = bytearray()
@@ -521,7 +519,7 @@ def test_recorded_datagrams_decode_as_the_capture_does(path: Path) -> None:
         assert found.tobytes() == expected.tobytes()
 
 
-def test_damage_is_told_when_a_recording_is_read(path: Path) -> None:
+def test_damage_of_a_recording_is_reported(path: Path) -> None:
     record(path, [Chunk(frame, 1) for frame in frames(3)], sensor=STREAM)
     with path.open("ab") as file:
         file.write(b"\xb5LS")
@@ -618,7 +616,7 @@ os.kill(os.getpid(), 9)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGKILL")
-def test_what_a_killed_recorder_left_is_removed_by_the_next(path: Path) -> None:
+def test_files_of_a_killed_recorder_are_removed(path: Path) -> None:
     record(path, CHUNKS[:1])
     assert (
         subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False).returncode

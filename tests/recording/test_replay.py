@@ -311,14 +311,14 @@ def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
         ("tcp://127.0.0.1", False, "name the port"),
     ],
 )
-def test_places_that_cannot_take_it_say_why(
+def test_impossible_destinations_give_a_reason(
     place: str, *, holds_datagrams: bool, reason: str
 ) -> None:
     with pytest.raises(UsageError, match=reason):
         replay_outlet(place, datagrams=holds_datagrams)
 
 
-def test_an_address_in_use_is_told() -> None:
+def test_an_address_in_use_is_reported() -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as taken,
         pytest.raises(SourceError, match="in use"),

@@ -30,7 +30,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("number", [2000, 3900, NUMBER, 10 * NUMBER])
-def test_what_follows_a_time_is_all_there_and_what_lies_before_is_not_read(
+def test_seeking_reads_everything_after_a_time_and_little_before(
     recording: Path, number: int
 ) -> None:
     with Recording(recording) as file:
@@ -45,7 +45,7 @@ def test_what_follows_a_time_is_all_there_and_what_lies_before_is_not_read(
     assert len(left) * 340 < (NUMBER - min(number, NUMBER)) * 340 + 4 * LARGEST + (1 << 17)
 
 
-def test_what_follows_is_no_continuation_of_what_was_read_before(recording: Path) -> None:
+def test_seeking_interrupts_the_stream(recording: Path) -> None:
     with contextlib.closing(RecordingTransport(recording)) as source:
         chunks = source.chunks()
         assert not next(chunks).gap
@@ -68,9 +68,7 @@ def test_a_damaged_place_in_the_middle_is_no_hindrance(recording: Path, tmp_path
     assert times[-1] == START + (NUMBER - 1) * STEP
 
 
-def test_a_time_that_was_passed_or_that_nobody_knows_moves_nothing(
-    recording: Path, tmp_path: Path
-) -> None:
+def test_seeking_to_a_passed_or_unknown_time_does_nothing(recording: Path, tmp_path: Path) -> None:
     with Recording(recording) as file:
         assert not file.seek(START - STEP)
         assert sum(record.direction == "in" for record in file) == NUMBER

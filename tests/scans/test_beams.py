@@ -87,7 +87,7 @@ def test_a_sensor_that_sees_less_than_a_turn_has_beams_where_it_sees() -> None:
     )
 
 
-def test_a_field_that_is_asked_for_has_its_share_of_the_beams() -> None:
+def test_a_requested_field_has_its_share_of_the_beams() -> None:
     scans = simulated("ldrobot-stl27l")
     (whole, *_), (half, *_) = (
         planar(PlanarScans(), scans),

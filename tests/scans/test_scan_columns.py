@@ -138,7 +138,7 @@ def test_large_scans_are_computed_without_the_rest_of_their_batch() -> None:
     assert middle.x is middle.x
 
 
-def test_small_scans_share_what_is_computed() -> None:
+def test_small_scans_share_computed_columns() -> None:
     sensor = small_scans()
     packets = sensor.decode(simulate(ls.sensor("velodyne-vlp16"), 700))
     scans = list(iter_scans(sensor, [packets]))
@@ -215,7 +215,7 @@ def test_a_scan_is_forgotten_once_it_was_given(opened: bool, tmp_path: Path) -> 
     assert len(given) > 5
 
 
-def test_a_sensor_that_turns_back_and_forth_is_cut_alike_in_any_batches() -> None:
+def test_an_oscillating_sensor_is_cut_equally_for_all_batch_sizes() -> None:
     sensor = dataclasses.replace(
         ls.sensor("velodyne-vlp16"), clock=None
     )  # by which packets that go back in time are late
@@ -286,7 +286,7 @@ def test_a_number_of_sectors_that_is_none_is_refused_by_name(number: Any) -> Non
 
 
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("construct", marks=pytest.mark.soak)])
-def test_a_scan_with_gaps_is_not_complete_and_one_whose_packets_are_mostly_lost_not_whole(
+def test_scans_with_gaps_are_incomplete_or_not_whole(
     backend: str,
 ) -> None:
     judged = reader(ls.sensor("cspc-m1c1-mini"), backend)

@@ -119,7 +119,7 @@ def test_ten_minutes_of_a_blocked_rotor_keep_no_more_than_one_scan() -> None:
     assert max(kept[5:]) < 1.2 * min(kept[5:])
 
 
-def test_what_a_spinning_up_rotor_left_open_is_not_complained_of_once_it_turns() -> None:
+def test_no_warning_about_a_spinning_up_rotor_once_it_turns() -> None:
     reading = Reading("ldrobot-ld06")
     still = frame_simulation(reading.sensor, "data", blocked=True).block(0, 375, Room()).frames
     assert [scan.complete for scan in reading.scans(still)] == [False, False]
@@ -378,9 +378,7 @@ def test_scans_end_where_an_angle_jumps_and_not_where_it_passes_0(size: int) -> 
     ("name", "falls"),
     [("ldrobot-stl27l", True), ("velodyne-vlp16", True), ("hokuyo-utm30lx", False)],
 )
-def test_a_laserscan_has_the_beams_that_are_asked_for_and_the_way_that_the_azimuth_goes(
-    name: str, falls: bool
-) -> None:
+def test_a_laserscan_has_the_requested_beams_and_direction(name: str, falls: bool) -> None:
     sensor = ls.sensor(name)
     for scan in list(sensor.scans(simulate(sensor, 400)))[:4]:
         for beams in (450, 7):

@@ -117,7 +117,7 @@ def test_a_slice_is_the_scans_of_that_time(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "share"), [("lsr", 0.4), ("pcap", 0.8)])
-def test_a_slice_of_a_long_file_is_read_without_what_lies_before_it(
+def test_a_slice_of_a_long_file_skips_earlier_data(
     tmp_path: Path, suffix: str, share: float
 ) -> None:
     path = tmp_path / f"drive.{suffix}"
@@ -179,7 +179,7 @@ def test_returns_from_elsewhere_are_none(recordings: dict[str, Path]) -> None:
         assert np.isin(planar.ranges[np.isfinite(planar.ranges)], ranges[inside]).all()
 
 
-def test_columns_are_those_that_are_asked_for_in_that_order(recordings: dict[str, Path]) -> None:
+def test_columns_have_the_requested_order(recordings: dict[str, Path]) -> None:
     for scan in scans(recordings["pcap"], Selection(scans=(3, 5), columns=("intensity", "y"))):
         cloud = scan.points
         for some in (cloud, cloud[:100], cloud[cloud.valid]):
@@ -204,7 +204,7 @@ def test_beams_and_frame_go_with_the_scan(recordings: dict[str, Path]) -> None:
         ("pcap", Selection(scans=(1000, None)), rf"{NUMBER_OF_SCANS} scans, from 0 to (99|100)"),
     ],
 )
-def test_what_lies_behind_the_end_is_an_error_that_says_what_there_is(
+def test_a_slice_past_the_end_is_an_error_with_the_duration(
     recordings: dict[str, Path], suffix: str, selection: Selection, message: str
 ) -> None:
     with pytest.raises(UsageError, match=message):

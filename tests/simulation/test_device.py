@@ -109,7 +109,7 @@ def test_half_a_command_is_forgotten_when_the_line_falls_silent() -> None:
     assert a1().parse(asked(device, "get_health", 200 * MS)).status == 0
 
 
-def test_an_rplidar_says_what_it_is_and_scans_in_the_mode_that_is_asked_for() -> None:
+def test_an_rplidar_reports_its_identity_and_scans_in_the_requested_mode() -> None:
     device = on(a1())
     info = a1().parse(asked(device, "get_info", 0))
     assert (info.model, info.firmware_major, info.firmware_minor, info.hardware) == (0x18, 1, 29, 7)
@@ -184,7 +184,7 @@ def test_other_frames_come_at_their_own_rate_with_the_defaults_of_the_spec() -> 
         pytest.param("slamtec-rplidar-s2", 1.0, marks=pytest.mark.slow),
     ],
 )
-def test_the_pace_does_not_depend_on_how_often_it_is_asked(name: str, rate: float) -> None:
+def test_the_pace_is_independent_of_polling(name: str, rate: float) -> None:
     sensor, numbers, streams = ls.sensor(name), [], []
     for step in (3 * MS, 50 * MS):
         device = on(sensor, rate=rate)
@@ -214,7 +214,7 @@ def test_a_deadline_is_when_something_comes() -> None:
     assert on(mini()).deadline is None
 
 
-def test_frames_that_are_sent_unasked_are_made_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_periodic_frames_are_made_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     filled = 0
     fill = RestingImu.fill
 
@@ -235,7 +235,7 @@ def test_frames_that_are_sent_unasked_are_made_together(monkeypatch: pytest.Monk
     assert filled * 20 < len(times)
 
 
-def test_a_device_that_nobody_asked_for_long_does_not_flood() -> None:
+def test_a_device_that_was_not_polled_does_not_flood() -> None:
     device = on(stl())
     device.outgoing(0)
     device.outgoing(3600 * SECOND)
@@ -244,7 +244,7 @@ def test_a_device_that_nobody_asked_for_long_does_not_flood() -> None:
     assert device.deadline > 3600 * SECOND
 
 
-def test_without_a_pace_it_gives_data_whenever_it_is_asked() -> None:
+def test_without_a_pace_data_is_always_available() -> None:
     device = on(mini(), rate=math.inf)
     device.receive(mini().command("start"), 0)
     out = b"".join(data for _ in range(12) for _, data in device.outgoing(0))
@@ -265,7 +265,7 @@ def test_the_same_seed_does_the_same_harm(name: str) -> None:
     assert first[:shorter] != other[:shorter]
 
 
-def test_damaged_bytes_are_as_many_as_asked_for_and_the_sound_frames_come_through() -> None:
+def test_the_error_rate_is_met_and_valid_frames_arrive() -> None:
     device = on(stl(), faults=Faults(errors=0.002))
     data = passing(device, 0, 3 * SECOND)
     line, stats = device.lines["data"], stl().decode(data).stats
@@ -376,7 +376,7 @@ def test_faults_by_text() -> None:
         {"matches": {"key": b"abc", "mode": "fast", "rates": [20, 30]}},
     ],
 )
-def test_a_reply_is_told_by_bytes_names_and_arrays(told: dict[str, Any]) -> None:
+def test_a_reply_matches_bytes_names_and_arrays(told: dict[str, Any]) -> None:
     fields = {
         "key": Bytes(3),
         "mode": Enum(Int8ul, slow=1, fast=7),

@@ -63,7 +63,7 @@ def scans(device: ls.Device, number: int) -> list[ls.Scan]:
 @pytest.mark.parametrize(
     "name", ["ldrobot-stl27l", "cspc-m1c1-mini", "slamtec-rplidar-a1", "velodyne-vlp16"]
 )
-def test_a_simulated_sensor_is_a_source_that_needs_no_other_word(name: str) -> None:
+def test_a_simulated_sensor_is_a_source(name: str) -> None:
     with ls.open(f"sim:{name}?rate=max") as device:
         assert device.sensor.id == name
         found = scans(device, 3)
@@ -140,7 +140,7 @@ def test_a_scene_is_seen(tmp_path: Path) -> None:
         ("sim:ldrobot-stl27l?errors=2", "errors = 2.0 is outside"),
     ],
 )
-def test_a_wrong_source_says_what_is_wrong(source: str, said: str) -> None:
+def test_an_invalid_source_gives_a_reason(source: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         ls.open(source)
 
@@ -169,7 +169,7 @@ def test_on_a_serial_port_nothing_is_lost_and_every_command_is_answered(name: st
 
 
 @posix
-def test_what_is_sent_while_nobody_listens_is_lost_as_on_a_wire() -> None:
+def test_data_sent_without_a_listener_is_lost() -> None:
     with virtual_port(stl()) as port:
         for _ in range(3):
             with ls.open(port.path, stl()) as device:
@@ -198,7 +198,7 @@ def test_the_port_goes_away_with_its_plug_and_the_link_leads_to_the_new_one(tmp_
 
 
 @posix
-def test_a_link_stands_on_no_file_of_somebody_else(tmp_path: Path) -> None:
+def test_a_link_replaces_no_other_file(tmp_path: Path) -> None:
     taken = tmp_path / "notes"
     taken.write_text("mine")
     with pytest.raises(SourceError, match="File exists"):
@@ -239,7 +239,7 @@ def test_over_udp_all_packets_arrive() -> None:
         assert device.stats.lost == 0
 
 
-def test_over_tcp_several_listen_and_a_slow_one_holds_nobody_up() -> None:
+def test_a_slow_tcp_client_does_not_delay_others() -> None:
     with virtual_port(stl(), to="tcp://127.0.0.1:0") as port:
         address = port.path.removeprefix("tcp://").split(":")
         with (
@@ -268,7 +268,7 @@ def test_over_tcp_several_listen_and_a_slow_one_holds_nobody_up() -> None:
         ("robosense-m1", "pcap", 0.1),
     ],
 )
-def test_a_file_holds_what_the_sensor_would_have_sent(
+def test_a_file_contains_the_bytes_of_the_live_sensor(
     name: str, suffix: str, seconds: float, tmp_path: Path
 ) -> None:
     path, device = tmp_path / f"made.{suffix}", SimulatedDevice(ls.sensor(name), scene=Room())
@@ -349,7 +349,7 @@ def test_a_destination_that_cannot_carry_the_sensor_is_refused(tmp_path: Path) -
 
 
 @posix
-def test_what_goes_wrong_in_the_thread_of_a_port_is_raised_at_its_end() -> None:
+def test_an_exception_of_the_serving_thread_is_raised_at_the_end() -> None:
     tried = threading.Event()
 
     class Broken(SimulatedDevice):
@@ -416,7 +416,7 @@ def test_many_simulators_take_turns_and_end() -> None:
     until(lambda: not ending.is_alive())
 
 
-def test_turns_come_in_the_order_of_asking_and_nobody_waits_who_is_to_end() -> None:
+def test_a_fair_lock_grants_turns_in_order_and_can_be_cancelled() -> None:
     turns, came = FairLock(), list[tuple[int, bool]]()
     stops = [threading.Event() for _ in range(4)]
 

@@ -165,7 +165,7 @@ def test_a_mirrored_or_turned_scene_would_show() -> None:
     assert distance_outside(room, hits * [-1, 1, 1]).max() > 0.1
 
 
-def test_beams_begin_where_they_are_said_to() -> None:
+def test_beams_begin_at_their_declared_origin() -> None:
     room, origin = Room(), (0.5, -0.25, 0.125)
     azimuth = np.linspace(-np.pi, np.pi, 400, endpoint=False)
     ranges = room.measure(azimuth, np.full(400, 0.1), origin)
@@ -194,7 +194,7 @@ def test_somebody_walks() -> None:
     assert np.isinf(scene.measure(azimuth, np.zeros(5), time=times + 1)).all()
 
 
-def test_what_a_device_sees_moves_with_its_own_time() -> None:
+def test_scenes_move_with_the_time_of_the_device() -> None:
     sensor, scene = (
         ls.sensor("ldrobot-stl27l"),
         Room(boxes=(), movers=(Mover((0.3, 0.3, 2), ((1.5, -1), (1.5, 1)), speed=1.0, floor=-1),)),
@@ -215,7 +215,7 @@ def test_a_seed_makes_a_room_and_the_same_one_each_time() -> None:
 
 
 @pytest.mark.parametrize("start", [0, 7, 1000])
-def test_packets_are_the_same_however_they_are_asked_for(start: int) -> None:
+def test_packets_are_independent_of_batch_sizes(start: int) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     assert simulate(sensor, 12, start=start)[4:] == simulate(sensor, 8, start=start + 4)
 
@@ -252,7 +252,7 @@ def test_a_sensor_without_time_on_datagrams_has_to_declare_its_rate() -> None:
     assert sum(len(device.outgoing(now)) for now in range(0, SECOND + 1, SECOND // 100)) == 51
 
 
-def test_what_cannot_be_simulated_says_why() -> None:
+def test_sensors_that_cannot_be_simulated_give_a_reason() -> None:
     sensor = SHAPE
     with pytest.raises(UsageError, match="declares no sweep"):
         simulate(replace(sensor, simulation=Simulation(None)), 1)
@@ -467,7 +467,7 @@ def test_a_mistake_in_a_scene_is_named_by_its_key(
         b"#" * (1 << 19),
     ],
 )
-def test_what_is_no_scene_is_a_fault_of_its_file(text: bytes, tmp_path: Path) -> None:
+def test_an_invalid_scene_is_an_error_of_its_file(text: bytes, tmp_path: Path) -> None:
     (path := tmp_path / "strange.toml").write_bytes(text)
     with pytest.raises(UsageError, match=r"strange\.toml: not TOML: "):
         read_scene(path)

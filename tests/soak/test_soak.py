@@ -26,7 +26,7 @@ def test_each_promise_is_held_by_something_that_is_there() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
-def test_what_is_promised_is_measured(name: str) -> None:
+def test_every_promise_is_measured(name: str) -> None:
     figure = soak.held(BY_NAME[name], 0.01, tests=False)
     assert "could not be measured" not in figure.words
     assert any(letter.isdigit() for letter in figure.words)

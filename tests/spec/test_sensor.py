@@ -102,7 +102,7 @@ def test_on_the_command_line_a_digit_can_be_the_name_of_a_file(
         assert said.startswith(f"{name}: ")
 
 
-def test_what_a_sensors_own_function_does_not_foresee_is_the_plugins_fault(tmp_path: Path) -> None:
+def test_an_exception_of_configure_is_a_plugin_error(tmp_path: Path) -> None:
     (tmp_path / "heads.json").write_text("{nonsense", encoding="utf-8")
     with pytest.raises(PluginError, match=r"shape-headed: .*JSONDecodeError"):
         SHAPES["shape-headed"].configure(calibration=tmp_path / "heads.json")

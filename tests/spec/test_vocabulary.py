@@ -46,7 +46,7 @@ def test_a_step_may_be_a_quarter_longer_than_the_fastest() -> None:
 
 
 @pytest.mark.parametrize("name", ["robosense-helios16p", "lslidar-c16", "velodyne-vlp16"])
-def test_a_lone_block_between_masked_sectors_has_directions(name: str) -> None:
+def test_a_single_block_between_masked_sectors_has_directions(name: str) -> None:
     """Block 8 of the last packet has a gap of 60 degrees before and behind it."""
     sensor = ls.sensor(name)
     packets = [data for data in ls.simulate(sensor, 4) if sensor.split(data)[0].frame == "data"]

@@ -255,7 +255,7 @@ def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> N
     ],
     ids=lambda value: value if isinstance(value, str) else value.__name__.rpartition(".")[2],
 )
-def test_what_contradicts_itself_is_named(plugin: Any, code: str) -> None:
+def test_contradictions_are_named(plugin: Any, code: str) -> None:
     def found(sensor: Sensor) -> set[str]:
         subject = SensorUnderTest(sensor)
         consistent = [
@@ -286,7 +286,7 @@ INFO = Checksummed(
 @pytest.mark.parametrize(
     "how", [st.just(0xBEEF), lambda source: 0xBEEF], ids=["strategy", "function"]
 )
-def test_what_cannot_be_derived_is_asked_for_by_name(how: object) -> None:
+def test_underivable_facts_are_requested_by_name(how: object) -> None:
     plain = sound.sensor()
     sensor = replace(
         plain, frames={**plain.frames, "info": Frame(INFO, max_length=6, plausible=rare)}
@@ -333,7 +333,7 @@ def left(sensor: Sensor) -> set[str]:
     }
 
 
-def test_what_is_meant_is_acknowledged_with_a_reason() -> None:
+def test_intended_findings_are_acknowledged_with_a_reason() -> None:
     far = sound.sensor(range_limits=(0.05, 100.0))
     assert left(far) == {"LS210"}
     assert left(replace(far, acknowledged={"LS210": "the next model reaches so far"})) == set()
@@ -350,7 +350,7 @@ def test_what_is_meant_is_acknowledged_with_a_reason() -> None:
 
 
 @pytest.mark.slow
-def test_what_is_acknowledged_keeps_nothing_from_being_tried() -> None:
+def test_acknowledged_findings_do_not_skip_checks() -> None:
     coded = sound.sealed(
         samples=Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul))
     )
@@ -360,7 +360,7 @@ def test_what_is_acknowledged_keeps_nothing_from_being_tried() -> None:
     assert "the_simulated_sensor_answers" not in report.skipped
 
 
-def test_what_only_looks_up_a_table_needs_no_unit() -> None:
+def test_table_indices_need_no_unit() -> None:
     def points(f: Fields) -> Polar:
         return Polar(f.samples.distance, take(np.linspace(0, 1, 256), f.number))
 
@@ -415,7 +415,7 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
     assert told(sound.sensor(status="capture"), None) == []
 
 
-def test_vectors_of_several_sensors_say_whose_they_are() -> None:
+def test_vectors_of_several_sensors_name_their_sensor() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     asked = told(sound.sensor(), known, "broken-one", "broken-two")
     assert (
@@ -477,7 +477,7 @@ def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(
     assert found.value.code == "LS511"
 
 
-def test_a_checksum_in_the_other_byte_order_is_told_with_the_right_one() -> None:
+def test_a_checksum_in_the_wrong_byte_order_is_reported() -> None:
     swapped = sound.frame(Checksummed(sound.struct(sum=Int16ub), field="sum", algorithm=Sum(16)))
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     assert (
@@ -610,7 +610,7 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
         ({"args": {"speed": 3}}, "unknown"),
     ],
 )
-def test_vectors_hold_commands_and_their_replies(
+def test_vectors_contain_commands_and_replies(
     changes: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
     vector = {

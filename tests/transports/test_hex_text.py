@@ -222,7 +222,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("text", REFUSED)
-def test_what_can_be_read_in_two_ways_is_refused_by_what_it_may_be(text: str) -> None:
+def test_ambiguous_hex_text_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=re.escape(REFUSED[text])):
         parse_hex(text)
 

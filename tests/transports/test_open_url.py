@@ -38,7 +38,7 @@ def registry() -> Iterator[None]:
         yield
 
 
-def test_a_transport_of_a_plugin_has_what_it_does_not_say() -> None:
+def test_a_minimal_transport_of_a_plugin_has_defaults() -> None:
     opened = transport("once:")
     assert [chunk.data for chunk in opened.chunks()] == [b"once"]
     assert (opened.datagrams, opened.baud, list(opened.warnings), opened.foreign) == (

@@ -77,7 +77,7 @@ def test_control_lines_are_taken_where_the_port_has_none(tmp_path: Path) -> None
         ("serial://?baud=9600", UsageError, "names no port", ""),
     ],
 )
-def test_what_cannot_be_opened_says_why(
+def test_a_port_that_cannot_be_opened_gives_a_reason(
     source: str, error: type[Exception], text: str, following: str
 ) -> None:
     with pytest.raises(error, match=text) as caught:

@@ -55,7 +55,7 @@ def test_a_stream_is_read_written_and_connected_again(server: socket.socket) -> 
         ("tcp://127.0.0.1:1?port=3", UsageError, "unknown option 'port'"),
     ],
 )
-def test_what_cannot_be_connected_says_why(
+def test_a_failed_connection_gives_a_reason(
     server: socket.socket, source: str, error: type[Exception], text: str
 ) -> None:
     port = server.getsockname()[1]

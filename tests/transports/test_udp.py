@@ -97,7 +97,7 @@ def test_a_sender_is_an_address_or_a_port_of_it(text: str, origin: Origin) -> No
 
 
 @pytest.mark.parametrize("name", ["localhost", "0:0:0:0:0:0:0:1", "[::1]:2368"])
-def test_a_sender_is_asked_for_by_any_name_of_its_address(name: str) -> None:
+def test_a_sender_can_be_named_in_any_notation(name: str) -> None:
     assert parse_origin(name).host in ("127.0.0.1", "::1")
 
 
@@ -110,14 +110,14 @@ def test_a_sender_is_asked_for_by_any_name_of_its_address(name: str) -> None:
         "udp://:{port}?src=%00",
     ],
 )
-def test_a_host_that_nobody_knows_is_refused(source: str) -> None:
+def test_an_unknown_host_is_refused(source: str) -> None:
     with pytest.raises(
         UsageError, match=r"there is no host '(localhots.invalid|192.168.1|10.0.0.256|\\x00)'"
     ):
         opened(source.format(port=free_port()))
 
 
-def test_what_is_sent_goes_to_the_sender_that_is_asked_for_and_no_other() -> None:
+def test_data_is_sent_to_the_requested_sender_only() -> None:
     port = free_port()
     with udp("127.0.0.2") as wanted, udp("127.0.0.3") as other:
         one = opened(f"udp://:{port}?src=127.0.0.2:{wanted.getsockname()[1]}")
@@ -135,7 +135,7 @@ def test_a_port_that_is_none_is_refused() -> None:
         opened("udp://:2368?src=10.0.0.1:0")
 
 
-def test_other_senders_are_foreign_where_one_is_asked_for() -> None:
+def test_other_senders_count_as_foreign() -> None:
     port = free_port()
     one = opened(f"udp://:{port}?src=127.0.0.2")
     with udp("127.0.0.2") as wanted, udp("127.0.0.3") as other:
@@ -217,7 +217,7 @@ def test_a_datagram_arrives_no_later_than_the_one_queued_behind_it() -> None:
 
 
 @LINUX
-def test_what_the_kernel_drops_is_counted_exactly() -> None:
+def test_kernel_drops_are_counted_exactly() -> None:
     port = free_port()
     one = opened(f"udp://127.0.0.1:{port}")
     (inner,) = one._sockets
@@ -247,7 +247,7 @@ def test_a_multicast_group_is_joined() -> None:
     second.close()
 
 
-def test_a_buffer_that_is_too_small_is_told_with_the_line_that_mends_it() -> None:
+def test_a_small_buffer_is_a_warning_with_a_command() -> None:
     assert warn_of_small_buffer(BUFFER, BUFFER) == []
     (text,) = warn_of_small_buffer(8 << 20, 212_992)
     assert text.endswith("next: sudo sysctl -w net.core.rmem_max=8388608")
@@ -285,7 +285,7 @@ def test_the_buffer_is_read_back() -> None:
         ("udp://:2368?source=10.0.0.1", UsageError, "unknown option 'source'", ""),
     ],
 )
-def test_what_cannot_be_opened_says_why(
+def test_a_port_that_cannot_be_opened_gives_a_reason(
     source: str, error: type[Exception], text: str, following: str
 ) -> None:
     with udp() as busy:

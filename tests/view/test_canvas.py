@@ -51,7 +51,7 @@ def test_the_canvas_sets_single_dots_and_labels_around_them() -> None:
 
 
 @pytest.mark.parametrize("where", [(-1, 0), (0, -1), (1, 0), (0, 2)])
-def test_what_is_outside_is_left_out(where: tuple[int, int]) -> None:
+def test_points_outside_are_not_drawn(where: tuple[int, int]) -> None:
     canvas = Canvas(2, 1)
     canvas.plot(np.array([where[1] * 2.0]), np.array([where[0] * 4.0]), np.array([0.0]))
     assert not canvas.label(*where, "x")
@@ -122,7 +122,7 @@ def test_only_what_changed_is_written() -> None:
     assert encode_changes(after, recoloured, "none") == "\x1b[4;8H\x1b[0mx"
 
 
-def test_colours_are_what_the_terminal_can_show() -> None:
+def test_colours_match_the_terminal() -> None:
     assert sgr(FIRST_STEP, "truecolor") == "\x1b[0;38;2;99;92;173m"
     assert sgr(FIRST_STEP, "256") == "\x1b[0;38;5;61m"
     assert sgr(FIRST_STEP, "standard") == "\x1b[0;94m"

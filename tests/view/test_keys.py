@@ -31,7 +31,7 @@ def test_keys_of_a_terminal(text: str, keys: list[str]) -> None:
     assert decode_keys(text) == keys
 
 
-def test_keys_change_what_is_shown() -> None:
+def test_keys_change_the_view() -> None:
     begin = ViewSettings()
     assert begin.after_key("c", 6).ramp == "intensity"
     assert begin.after_key("c", 6).after_key("c", 6) == begin
@@ -50,7 +50,7 @@ def test_keys_change_what_is_shown() -> None:
     assert begin.after_key("x", 6) is begin
 
 
-def test_screens_of_the_docs_hold_every_dot_and_word() -> None:
+def test_screens_of_the_docs_are_complete() -> None:
     path = Path(__file__).parents[2] / "docs" / "screens.py"
     spec = importlib.util.spec_from_file_location("screens", path)
     assert spec is not None

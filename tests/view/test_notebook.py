@@ -139,7 +139,7 @@ def test_tables_and_diagrams_are_bounded(sensor_id: str) -> None:
     assert diagrams.count("<svg") >= len(sensor.data_frames)
 
 
-def test_what_is_wrong_is_marked() -> None:
+def test_errors_are_marked() -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     frame = bytearray(sensor.example("data"))
     good = str(ls.explain(bytes(frame), sensor)._repr_html_())
@@ -149,7 +149,7 @@ def test_what_is_wrong_is_marked() -> None:
     assert re.search(r"hsl\(0 90%[^>]*>[0-9a-f]{2}</code>.*<b>[^<]* wrong, expected", bad)
 
 
-def test_words_of_the_wire_and_of_a_spec_are_text() -> None:
+def test_text_of_frames_and_specs_is_escaped() -> None:
     sensor = dataclasses.replace(ls.sensor("ldrobot-stl27l"), model=SCRIPT, source=SCRIPT)
     scan = next(ls.sensor("ldrobot-stl27l").scans(sensor.example("data")))
     marked = dataclasses.replace(scan, sensor=dataclasses.replace(sensor, id="ldrobot-stl27l"))

@@ -18,7 +18,7 @@ def entry_point(module: str) -> EntryPoint:
     return EntryPoint("web", module, "other-page", "1.0")
 
 
-def test_without_a_plugin_the_message_says_what_to_install(
+def test_a_missing_page_plugin_is_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(page_server, "entry_points", lambda group: [])

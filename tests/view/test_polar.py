@@ -215,7 +215,7 @@ def test_the_side_view_has_the_same_scale_and_up_is_up() -> None:
     assert abs(max(tall) // 4 - level) <= 1  # the wall stands on the height of the sensor
 
 
-def test_small_heights_are_drawn_larger_and_that_is_said() -> None:
+def test_small_heights_are_enlarged_with_a_note() -> None:
     lines = drawn(cloud(*((x, 0, 0.2) for x in np.linspace(-5, 5, 50))), TALL, 60, 30)
     assert any("heights x10" in line for line in lines)
 

@@ -49,7 +49,7 @@ def test_a_sensor_is_drawn_and_q_leaves_the_terminal_clean(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_keys_do_what_the_help_says(tmp_path: Path) -> None:
+def test_keys_match_the_help(tmp_path: Path) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         terminal.wait_for("6 m")
         terminal.type("?")
@@ -75,7 +75,7 @@ def test_keys_do_what_the_help_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_paused_picture_stands_while_the_sensor_goes_on(tmp_path: Path) -> None:
+def test_a_paused_picture_stays_while_data_arrives(tmp_path: Path) -> None:
     with Terminal("view", "sim:ldrobot-stl27l", *SENSOR, cwd=tmp_path) as terminal:
         terminal.wait_for("Hz")
         terminal.type("r ")
@@ -137,7 +137,7 @@ def test_whatever_ends_it_leaves_the_terminal_clean(
 
 
 @pytest.mark.slow
-def test_a_failure_is_told_on_a_clean_terminal(tmp_path: Path) -> None:
+def test_an_error_is_printed_on_a_restored_terminal(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text(_FAILING, encoding="utf-8")
     (tmp_path / "raw.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 2000)))
     with Terminal("view", "raw.bin", "-s", "./failing.py", cwd=tmp_path) as terminal:

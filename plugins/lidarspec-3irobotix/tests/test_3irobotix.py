@@ -43,7 +43,7 @@ def test_the_packets_of_a_delta_2a() -> None:
     assert (speed.version, speed.speed) == (0, 201)  # 10.05 Hz
 
 
-def test_a_packet_whose_lengths_disagree_is_none() -> None:
+def test_a_packet_with_contradictory_lengths_is_invalid() -> None:
     data = bytearray(vector_bytes(FILE, "delta_2a_data_capture"))
     data[7] -= 3
     data[-2:] = (sum(data[:-2]) & 0xFFFF).to_bytes(2, "big")
@@ -51,7 +51,7 @@ def test_a_packet_whose_lengths_disagree_is_none() -> None:
 
 
 @pytest.mark.slow
-def test_a_2g_is_told_by_where_its_packets_start_and_the_others_not_at_all() -> None:
+def test_only_a_2g_is_identified_by_its_packet_start() -> None:
     assert identify_sample(SampleBytes("", tuple(simulate(DELTA_2G, 60)))).sensor is DELTA_2G
     found = identify_sample(SampleBytes("", tuple(simulate(DELTA_2A, 60))))
     assert found.sensor is None

@@ -51,7 +51,7 @@ def test_a_command_is_the_manuals(name: str) -> None:
     assert TFMINI.command(command, **arguments) == vector_bytes(FILE, name)
 
 
-def test_what_is_unreliable_is_no_point() -> None:
+def test_unreliable_measurements_are_not_points() -> None:
     cloud = decoded(
         TFMINI, frame(300) + frame(300, 99) + frame(300, 0xFFFF) + frame(0xFFFF) + frame(0)
     ).points()
@@ -60,7 +60,7 @@ def test_what_is_unreliable_is_no_point() -> None:
     assert decoded(TFMINI, frame(4000)).stats.frames == {}
 
 
-def test_millimetres_are_read_where_they_were_asked_for() -> None:
+def test_the_millimetre_option_is_applied() -> None:
     assert TFMINI.configure(unit="mm").decode(frame(300)).points().range.tolist() == [
         pytest.approx(0.3)
     ]

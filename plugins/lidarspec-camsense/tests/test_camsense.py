@@ -30,7 +30,7 @@ def test_every_vector_of_the_family_is_used() -> None:
 
 
 @pytest.mark.parametrize("name", PACKETS)
-def test_a_packet_is_what_it_is_published_as(name: str) -> None:
+def test_a_published_packet_decodes_to_its_published_values(name: str) -> None:
     sensor, data, expected = (
         PACKETS[name],
         vector_bytes(FILE, name),
@@ -50,7 +50,7 @@ def test_a_packet_is_what_it_is_published_as(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_packets_of_an_lds08rr_are_told_from_those_of_an_x1() -> None:
+def test_lds08rr_and_x1_packets_are_distinguished() -> None:
     expected = json.loads(capture("camsense/packets.json").read_text())
     data = b"".join(bytes.fromhex(one["hex"]) for one in expected)
     cloud = decoded(LDS08RR, data).points()
@@ -65,7 +65,7 @@ def test_packets_of_an_lds08rr_are_told_from_those_of_an_x1() -> None:
     )
 
 
-def test_a_packet_that_crosses_360_degrees_goes_on_forward() -> None:
+def test_azimuths_advance_across_360_degrees() -> None:
     angles = clockwise(decoded(X1, vector_bytes(FILE, "camsense_x1_wrap_capture")).points())
     np.testing.assert_allclose(
         angles, (354.03125 + np.arange(8) * (360.5625 - 354.03125) / 7) % 360, atol=1e-4

@@ -175,7 +175,7 @@ def test_the_samples_of_the_older_generation_have_two_bytes() -> None:
     ) == pytest.approx(19.055532 + 12, abs=1e-4)
 
 
-def test_an_older_one_is_told_from_a_ydlidar_by_name_or_by_start_packets_with_a_speed() -> None:
+def test_an_older_model_is_distinguished_from_a_ydlidar() -> None:
     """Its packets are those of a YDLIDAR with two bytes a sample; started, it says its name, and a
     YDLIDAR tells how fast it turns.
     """

@@ -542,7 +542,7 @@ def on_free_ports(sensor: ls.Sensor, said: bytes) -> ls.Sensor:
 
 
 @pytest.mark.slow
-def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> None:
+def test_angles_are_requested_on_opening(tmp_path: Path) -> None:
     said = "Laser id,Elevation,Azimuth\n" + "".join(f"{i},{16.5 - i},0.25\n" for i in range(1, 33))
     unit, file = on_free_ports(XT32, said.encode()), angles(tmp_path / "own.csv", 32)
     data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
@@ -574,7 +574,7 @@ def test_a_unit_is_asked_for_its_angles_when_it_is_opened(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_unit_that_does_not_say_its_angles_is_read_all_the_same() -> None:
+def test_a_unit_that_does_not_report_angles_is_read() -> None:
     unit = on_free_ports(XT16, b"")
     refusing = {"get_calibration": [("answer", {"result": 5, "payload": b""})]}
     unit = dataclasses.replace(
@@ -610,7 +610,7 @@ STATED = {
 
 
 @pytest.mark.parametrize("name", STATED)
-def test_points_and_times_by_hand_of_those_whose_status_tells_the_model(name: str) -> None:
+def test_points_and_times_by_hand_of_models_named_in_the_status(name: str) -> None:
     sensor = ls.sensor(f"hesai-{name}")
     parsed = sensor.parse(simulate(sensor, 1)[0], "data")
     for block in parsed.body.blocks:
@@ -639,7 +639,7 @@ def test_points_and_times_by_hand_of_those_whose_status_tells_the_model(name: st
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", STATED)
-def test_those_whose_status_tells_the_model_are_told_from_all_others(name: str) -> None:
+def test_models_named_in_the_status_are_identified(name: str) -> None:
     sensor = ls.sensor(f"hesai-{name}")
     assert (
         identify_sample(SampleBytes("", tuple(simulate(sensor, 20)), datagrams=True)).sensor
@@ -662,7 +662,7 @@ def test_channels_have_the_further_bytes_that_the_header_says() -> None:
 
 
 @pytest.mark.slow
-def test_a_bad_network_does_not_damage_what_a_unit_says_of_its_angles() -> None:
+def test_reported_angles_survive_a_bad_network() -> None:
     unit = on_free_ports(XT32, TABLE_32.told())
     data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
     with (
@@ -767,7 +767,7 @@ def test_a_file_that_is_none_of_an_at128_is_refused(
         AT128.configure(calibration=file)
 
 
-def test_a_scan_of_an_at128_is_what_one_face_of_the_mirror_sees() -> None:
+def test_an_at128_scan_is_one_mirror_face() -> None:
     scans = list(AT128.scans(simulate(AT128, 1300)))
     assert [(len(scan), scan.complete) for scan in scans[:2]] == [
         (600 * 256, False),

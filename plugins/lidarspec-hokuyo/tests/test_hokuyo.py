@@ -72,7 +72,7 @@ def test_a_wrong_check_character_anywhere_is_a_wrong_checksum() -> None:
         assert (stats.frames["distances"], stats.bad_checksum) == (1, 1)
 
 
-def test_scans_of_some_steps_and_clusters_stand_where_they_were_asked_for() -> None:
+def test_partial_and_clustered_scans_have_the_requested_directions() -> None:
     asked = URG.configure(first=128, last=640, cluster=4, content="short")
     assert asked.command("start") == b"MS0128064004000\n"
     cloud = asked.decode(b"".join(ls.simulate(asked, 2))).points()
@@ -120,7 +120,7 @@ def test_a_cluster_of_00_is_one_step_and_the_numbers_of_errors_are_no_points() -
     assert (len(cloud), cloud.valid[2:5].tolist()) == (1081, [True, False, True])
 
 
-def test_models_are_told_by_their_steps_and_by_what_they_answer() -> None:
+def test_models_are_identified_by_steps_and_replies() -> None:
     scans = b"".join(ls.simulate(UST, 3))
     assert not URG.decode(scans).stats.frames
     assert {one.sensor.id for one in identify_sample(SampleBytes("", (scans,))).candidates} | {

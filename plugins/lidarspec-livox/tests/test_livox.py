@@ -183,7 +183,7 @@ def test_a_counter_that_starts_again_with_each_frame_is_no_loss() -> None:
 
 
 @pytest.mark.parametrize("sensor", [MID360, AVIA], ids=["second", "first"])
-def test_what_an_imu_feels_is_in_si(sensor: ls.Sensor) -> None:
+def test_imu_samples_are_in_si_units(sensor: ls.Sensor) -> None:
     felt = sensor.decode([sensor.example("imu", seed=seed) for seed in range(3)], "imu")
     first = felt.raw[0]
     assert felt.imu().linear_acceleration[0].tolist() == pytest.approx(
@@ -196,7 +196,7 @@ def test_what_an_imu_feels_is_in_si(sensor: ls.Sensor) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [MID360.id, HAP.id, *FIRST])
-def test_a_model_is_not_taken_for_a_relative(name: str) -> None:
+def test_a_model_is_not_confused_with_related_models(name: str) -> None:
     found = identify_sample(
         SampleBytes("a wire", tuple(ls.simulate(ls.sensor(name), 40)), datagrams=True)
     )
@@ -207,7 +207,7 @@ def test_a_model_is_not_taken_for_a_relative(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIRST)
-def test_what_it_broadcasts_names_the_model(name: str) -> None:
+def test_broadcasts_name_the_model(name: str) -> None:
     sensor = ls.sensor(name)
     who = {"mid40": 1, "tele15": 2, "horizon": 3, "mid70": 6, "avia": 7}[
         name.removeprefix("livox-")

@@ -35,7 +35,7 @@ def test_the_returns_of_an_n10p_share_their_direction() -> None:
     assert cloud.azimuth[0] == cloud.azimuth[1] != cloud.azimuth[2]
 
 
-def test_packets_of_an_m10p_are_as_long_as_they_say_and_run_on_over_midnight() -> None:
+def test_m10p_packets_have_their_declared_length_and_cross_midnight() -> None:
     sweep = M10P.simulation.sweep
     assert sweep is not None
     sample = {"bright": 0, "distance": 1.0}

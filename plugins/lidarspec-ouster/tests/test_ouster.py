@@ -197,7 +197,7 @@ def test_bits_of_every_profile_stand_where_the_table_has_them() -> None:
         assert spots[-1] == 8 * table[profile]["bytes_per_pixel"]
 
 
-def test_a_wrong_crc_is_refused_and_one_that_is_not_filled_passes() -> None:
+def test_a_wrong_crc_is_rejected_and_an_absent_one_accepted() -> None:
     sealed = vector_bytes(FILE, "ouster_crc64_rng15")
     sensor = OS0.configure(rows=128, turn=512, profile="RNG15_RFL8_NIR8")
     damaged = sealed[:100] + bytes([sealed[100] ^ 1]) + sealed[101:]
@@ -243,7 +243,7 @@ def test_packets_alone_tell_their_layout() -> None:
 
 
 @pytest.mark.parametrize("name", VECTORS)
-def test_one_packet_tells_its_layout(name: str) -> None:
+def test_one_packet_identifies_its_layout(name: str) -> None:
     params = vectors(FILE)[f"ouster_{name}"]["params"]
     assert recognise([vector_bytes(FILE, f"ouster_{name}")]) == {
         "profile": params["profile"],
@@ -253,7 +253,7 @@ def test_one_packet_tells_its_layout(name: str) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", bytes(8448), b"\x01" + bytes(8447), bytes(6464)])
-def test_what_only_has_the_length_is_not_recognised(data: bytes) -> None:
+def test_length_alone_does_not_identify_a_packet(data: bytes) -> None:
     assert recognise([data]) == {}
 
 
@@ -276,7 +276,7 @@ def test_metadata_are_learned_from_the_web_server_of_a_simulated_sensor() -> Non
         assert device.sensor.on_open == ()
 
 
-def test_older_and_newer_metadata_say_the_same(tmp_path: Path) -> None:
+def test_older_and_newer_metadata_are_equivalent(tmp_path: Path) -> None:
     made = dataclasses.replace(nominal("OS1", 16, 512, "LEGACY"), nominal=False, serial="7")
     sections = json.loads(made.told())
     flat = {key: value for section in sections.values() for key, value in section.items()}

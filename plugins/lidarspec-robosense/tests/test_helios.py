@@ -359,7 +359,7 @@ def _nearest(scan: ls.PointCloud, published: Any) -> tuple[Any, Any]:
 
 
 @pytest.mark.slow
-def test_a_packet_that_names_another_model_is_told_of(tmp_path: Path) -> None:
+def test_a_packet_of_another_model_is_a_warning(tmp_path: Path) -> None:
     """Lidar type 6 is a Helios-5515: what is read as a 16P all the same is told of."""
     path, frames = tmp_path / "other.bin", simulate(SENSOR, 100)
     path.write_bytes(

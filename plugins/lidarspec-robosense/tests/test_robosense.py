@@ -221,7 +221,7 @@ def test_the_device_information() -> None:
     assert SENSOR.links["data"] == Udp(parsed.msop_port, parsed.difop_port)
 
 
-def test_each_layout_of_the_device_information_is_told_from_the_others() -> None:
+def test_device_information_layouts_are_distinguished() -> None:
     """Layouts are distinguished by the values at the offsets of modes and time.
 
     A frame that fits none of them keeps its bytes.

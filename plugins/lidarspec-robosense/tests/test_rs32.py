@@ -157,7 +157,7 @@ def test_the_steps_of_the_angles_of_an_rs16_and_the_end_of_an_e1_are_those_of_th
     assert all(tail[name] == expected[name] for name in ("data_length", "counter", "data_id"))
 
 
-def test_the_date_is_taken_for_utc() -> None:
+def test_the_date_is_read_as_utc() -> None:
     moment = datetime.datetime(2021, 10, 1, 1, 2, 3, tzinfo=datetime.UTC)
     data = msop([0] * 12, {})
     assert vector_bytes(FILE, "rs_time_ymd") in data
@@ -167,7 +167,7 @@ def test_the_date_is_taken_for_utc() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor_id", sensor_ids("lidarspec-robosense"))
-def test_every_model_is_told_from_the_others(sensor_id: str) -> None:
+def test_every_model_is_identified(sensor_id: str) -> None:
     sensor = ls.sensor(sensor_id)
     assert (
         identify_sample(SampleBytes("", tuple(simulate(sensor, 20)), datagrams=True)).sensor
@@ -176,7 +176,7 @@ def test_every_model_is_told_from_the_others(sensor_id: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_helios_of_16_lasers_and_one_of_32_are_told_apart_with_dual_return_too() -> None:
+def test_helios_16_and_32_are_distinguished_also_in_dual_return() -> None:
     """They have one type byte, and 16 lasers with two returns are as quick as 32 with one: what is
     there twice tells.
     """

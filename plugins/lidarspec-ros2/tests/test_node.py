@@ -66,7 +66,7 @@ def test_without_ros_one_line_says_both_ways_to_have_it(tmp_path: Path) -> None:
     assert "pip install 'lidarspec-ros2[ros2]'" in first
 
 
-def test_the_lifecycle_is_the_managers_where_it_is_asked_for(run: Any, client: Client) -> None:
+def test_a_manager_can_control_the_lifecycle(run: Any, client: Client) -> None:
     scans = client.listen("scan", LaserScan)
     process = run(
         ros=given(source=STL[0], sensor=STL[2], autostart=False, qos="reliable"),
@@ -102,7 +102,7 @@ def test_a_command_may_be_called_as_a_service_of_every_node(run: Any, client: Cl
     assert (answered.success, client.state) == (True, "active")
 
 
-def test_it_cannot_be_configured_with_what_cannot_be_opened_and_then_can(
+def test_configuring_fails_until_the_source_can_be_opened(
     run: Any, client: Client, tmp_path: Path
 ) -> None:
     run(
@@ -137,7 +137,7 @@ def test_it_cannot_be_configured_with_what_cannot_be_opened_and_then_can(
         ),
     ],
 )
-def test_what_cannot_be_is_refused_as_on_the_command_line(
+def test_invalid_arguments_give_the_errors_of_the_command_line(
     run: Any, tmp_path: Path, words: list[str], parameters: dict[str, Any]
 ) -> None:
     stats = [sys.executable, "-m", "lidarspec", "stats", *words]
@@ -194,7 +194,7 @@ def test_parameters_are_described_and_changed_where_that_makes_sense(
     assert newest().angle_max == pytest.approx(1.0 + 2 * math.pi)
 
 
-def test_a_parameter_that_is_none_is_said(run: Any, client: Client) -> None:
+def test_an_unknown_parameter_is_reported(run: Any, client: Client) -> None:
     process = run(
         *STL,
         ros=[*given(beam=720, qos="reliable"), "-p", "qos_overrides./points.publisher.depth:=5"],
@@ -210,9 +210,7 @@ def test_a_parameter_that_is_none_is_said(run: Any, client: Client) -> None:
     ) == (0, True)
 
 
-def test_quality_is_sensor_datas_unless_it_is_asked_for_or_overridden(
-    run: Any, client: Client
-) -> None:
+def test_qos_is_sensor_data_unless_overridden(run: Any, client: Client) -> None:
     client.listen("/points", PointCloud2, reliable=False)
     for words, is_reliable in (
         ([], False),
@@ -269,7 +267,7 @@ def test_commands_are_services_with_arguments_as_parameters(run: Any, client: Cl
     assert client.trigger("stop").success
 
 
-def test_a_reply_stands_in_the_message(run: Any, client: Client) -> None:
+def test_the_message_contains_the_reply(run: Any, client: Client) -> None:
     run("sim:slamtec-rplidar-a1", "-s", "slamtec-rplidar-a1")
     client.until(lambda: client.diagnostics)
     assert client.trigger("stop").success
@@ -279,7 +277,7 @@ def test_a_reply_stands_in_the_message(run: Any, client: Client) -> None:
     assert "status" in found.message
 
 
-def test_diagnostics_say_how_the_sensor_is_doing(run: Any, client: Client) -> None:
+def test_diagnostics_report_the_state_of_the_sensor(run: Any, client: Client) -> None:
     run("sim:ldrobot-stl27l?errors=0.001", "-s", "ldrobot-stl27l")
     client.until(lambda: len(client.diagnostics) > 3)
     (status,) = client.diagnostics[-1].status

@@ -19,7 +19,7 @@ from lidarspec.formats.messages import SCAN
 from lidarspec.transports.robotics_logs import RAW, raw_chunk
 
 
-def test_a_node_decodes_what_another_one_publishes(run: Any, client: Client) -> None:
+def test_a_node_decodes_packets_of_another_node(run: Any, client: Client) -> None:
     first, again = client.listen("scan", LaserScan), client.listen("again", LaserScan)
     client.diagnostics.clear()
     grid = given(qos="reliable", **GRID)

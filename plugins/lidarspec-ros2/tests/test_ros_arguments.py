@@ -79,7 +79,7 @@ def test_a_file_that_ros_refuses_is_ignored(tmp_path: Path, content: str | None)
     assert read_parameters(words, "lidar") == {"source": "udp://"}
 
 
-def test_words_that_are_not_for_ros_are_ignored() -> None:
+def test_other_arguments_are_ignored() -> None:
     words = [
         "-p",
         "sensor:=before",

@@ -76,7 +76,7 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
     ("sensor", "topic", "kind", "message_class"),
     [("ldrobot-stl27l", "scan", SCAN, LaserScan), ("robosense-m1", "points", CLOUD, PointCloud2)],
 )
-def test_messages_are_what_the_library_makes_of_the_same_bytes(
+def test_messages_equal_those_of_the_library(
     run: Callable[..., Any],
     client: Client,
     tmp_path: Path,
@@ -113,7 +113,7 @@ def test_messages_are_what_the_library_makes_of_the_same_bytes(
     )
 
 
-def test_what_an_imu_felt_is_what_the_library_makes_of_the_same_bytes(
+def test_imu_messages_equal_those_of_the_library(
     run: Callable[..., Any], client: Client, tmp_path: Path
 ) -> None:
     packets = client.listen("packets", UInt8MultiArray)
@@ -186,7 +186,7 @@ def test_bytes_are_those_of_ros_itself(sensor: str, every_point: bool) -> None:
         assert alike(bytes(known.data), serialize_message(read))
 
 
-def test_what_an_imu_felt_is_told_as_rep_145_asks() -> None:
+def test_imu_messages_follow_rep_145() -> None:
     felt = ImuSamples(
         np.array([STAMP]), np.array([[0.1, -0.2, np.nan]]), np.array([[0.0, 0.5, 9.81]])
     )

@@ -143,7 +143,7 @@ def commands() -> list[list[str]]:
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
-def test_what_the_page_has_typed_starts_a_node(
+def test_commands_on_the_page_start_a_node(
     run: Callable[..., Any], client: Client, tmp_path: Path, words: list[str]
 ) -> None:
     place = words.index("--ros-args") if "--ros-args" in words else len(words)

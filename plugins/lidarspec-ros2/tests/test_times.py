@@ -124,7 +124,7 @@ def test_a_clock_that_is_set_is_reported(
 @pytest.mark.parametrize(
     "sensor", ["livox-avia", "ouster-os0"]
 )  # whose samples have no clock, and that of the points
-def test_what_an_imu_felt_is_stamped_beside_the_points(
+def test_imu_samples_and_points_have_consistent_stamps(
     run: Callable[..., Any], client: Client, sensor: str
 ) -> None:
     felt, clouds = client.listen("imu", Imu), client.listen("points", PointCloud2)

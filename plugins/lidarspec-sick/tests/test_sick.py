@@ -52,7 +52,7 @@ def test_every_scan_of_a_tim871s_is_read() -> None:
     assert named == {"sick-tim561", "sick-tim571", "sick-tim781", "sick-tim781s", "sick-tim871s"}
 
 
-def test_headers_are_counted_alike_however_the_stream_is_cut() -> None:
+def test_bad_headers_are_counted_equally_for_all_chunk_sizes() -> None:
     source = np.random.default_rng(1)
     data = b"".join(b"\x02\x02\x02\x02" + source.bytes(4) + b"sAN LMCstopmeas " for _ in range(40))
     counted = list[ls.Counters]()
@@ -79,7 +79,7 @@ def test_a_telegram_in_text_is_read_and_built_again() -> None:
     ]
 
 
-def test_a_telegram_without_strengths_beside_one_that_has_them() -> None:
+def test_telegrams_with_and_without_strengths() -> None:
     data = vector_bytes("vectors_serial2d.json", "sick_tim_sra")
     values = TIM551.parse(data)
     bare = TIM551.build("text", {**values, "channels8": 0, "rssi1_8bit": None})
@@ -162,7 +162,7 @@ def test_strengths_come_in_8_or_16_bits_or_not_at_all(echoes: int, bits: int, co
 
 
 @pytest.mark.parametrize("cola", ["A", "B"])
-def test_a_refusal_is_told_at_once_and_in_words(cola: str) -> None:
+def test_a_refusal_is_reported_at_once_in_words(cola: str) -> None:
     sensor = TIM551.configure(cola=cola)
     if cola == "A":
         assert sensor.parse(b"\x02sFA 3\x03", "refused").error == "variable_unknown"
@@ -194,7 +194,7 @@ def test_every_telegram_of_a_multiscan_is_read() -> None:
     )
 
 
-def test_what_the_imu_of_a_multiscan_felt_is_that_published() -> None:
+def test_multiscan_imu_samples_equal_published_values() -> None:
     expected = vectors("vectors_udp3d.json")["sick_imu"]["expected"]
     packets = MULTISCAN.decode([vector_bytes("vectors_udp3d.json", "sick_imu")], "imu")
     samples, orientation = packets.imu(), [packets[f"orientation_{axis}"][0] for axis in "wxyz"]
@@ -240,7 +240,7 @@ def test_a_turn_of_an_mrs1000_is_four_layers() -> None:
     ]
 
 
-def test_a_scanner_in_cola_a_is_asked_in_text() -> None:
+def test_a_cola_a_scanner_gets_text_requests() -> None:
     text = TIM551.configure(cola="A")
     assert text.command("start") == b"\x02sEN LMDscandata 1\x03"
     assert text.command("login") == b"\x02sMN SetAccessMode 3 F4724744\x03"

@@ -105,7 +105,7 @@ def test_joining_in_the_middle_of_a_node_finds_the_true_ones() -> None:
     assert wrong[CONFIRM] == 0
 
 
-def test_a_short_run_of_nodes_is_not_believed() -> None:
+def test_a_short_run_of_nodes_is_rejected() -> None:
     sensor, data = A1.configure(answer="node"), turns(CONFIRM)
     assert len(nodes_in(sensor, data)) == CONFIRM
     assert not nodes_in(sensor, data[5:])
@@ -126,7 +126,7 @@ def test_scans_begin_where_the_azimuth_passes_zero(answer: str) -> None:
         assert len(scan) == {"node": 360, "express": 720, "dense": 800, "hq": 960}[answer]
 
 
-def test_the_start_bit_stands_where_scans_begin() -> None:
+def test_the_start_bit_marks_scan_starts() -> None:
     packets = believing(1).decode(turns(1600))
     flags = np.flatnonzero(packets["head.start"])
     lengths = [len(scan) for scan in believing(1).scans(turns(1600))]

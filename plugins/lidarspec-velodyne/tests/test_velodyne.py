@@ -316,7 +316,7 @@ def test_directions_run_on_over_packet_borders_and_over_zero(each: int, mode: in
     np.testing.assert_allclose(turned, 0.4 * np.arange(len(turned))[:, None] + within, atol=5e-5)
 
 
-def test_the_sector_that_is_masked_is_not_bridged() -> None:
+def test_points_are_not_interpolated_across_a_masked_sector() -> None:
     masked = packet([*steps(8900)[:6], *steps(27000)[:6]], {(5, 16): (500, 1)})
     assert clockwise(decoded(VLP16, [masked]).points())[spot(5, 16)] == pytest.approx(
         91.2, abs=1e-4
@@ -324,7 +324,7 @@ def test_the_sector_that_is_masked_is_not_bridged() -> None:
 
 
 @pytest.mark.parametrize("jump_deg", [20, 116, 200, 350])
-def test_a_lone_block_behind_a_masked_sector_turns_as_the_sensor_does(jump_deg: int) -> None:
+def test_a_single_block_after_a_masked_sector_uses_the_rotor_speed(jump_deg: int) -> None:
     """The last block of the packet is alone: the step to it is no turn, and none follows it."""
     starts = steps(10_000)
     starts[-1] = (starts[-2] + 100 * jump_deg) % 36_000
@@ -360,7 +360,7 @@ def test_the_clock_runs_on_over_the_hour() -> None:
     assert np.diff(packets.time_ns).tolist() == [1_327_000, 1_327_000]
 
 
-def test_azimuths_of_up_to_a_whole_turn_and_flags_are_believed() -> None:
+def test_azimuths_up_to_a_whole_turn_are_valid() -> None:
     wrong_flag = bytearray(filled(0))
     wrong_flag[300] = 0xFE
     packets = decoded(
@@ -412,7 +412,7 @@ def test_the_position_packet() -> None:
         position(b"") + b"\0",
     ],
 )
-def test_what_is_no_position_packet(data: bytes) -> None:
+def test_invalid_position_packets_are_rejected(data: bytes) -> None:
     assert len(decoded(VLP16, [data], "position")) == 0
 
 
@@ -483,9 +483,7 @@ def test_the_hour_is_that_of_the_position_packets() -> None:
     ],
     ids=["no sentence", "not valid", "without a date", "no day", "no pulse"],
 )
-def test_without_a_date_times_count_from_the_top_of_the_hour_and_that_is_said(
-    nmea: bytes, pps: int
-) -> None:
+def test_without_a_date_times_start_at_the_hour_with_a_warning(nmea: bytes, pps: int) -> None:
     packets = decoded(VLP16, [position(nmea, pps=pps), packet(steps(0), {}, time_us=2_000_000)])
     assert packets.time_ns.tolist() == [2_000_000_000]
     assert (

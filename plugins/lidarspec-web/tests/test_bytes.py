@@ -224,7 +224,7 @@ def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, wh
             )
 
 
-def test_what_is_damaged_in_a_file_is_what_explain_finds(tmp_path: Path) -> None:
+def test_damage_in_a_file_equals_that_of_explain(tmp_path: Path) -> None:
     path = recorded(tmp_path, suffix=".bin", faults=Faults(errors=0.0005))
     data, sensor = path.read_bytes(), ls.sensor(FLAT)
     decoder, gaps, end = sensor.decoder(), [], 0

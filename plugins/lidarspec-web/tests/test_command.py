@@ -62,7 +62,7 @@ def ended(
 @pytest.mark.parametrize(
     "by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
-def test_it_prints_its_link_and_ends_when_it_is_told_to(tmp_path: Path, by: signal.Signals) -> None:
+def test_it_prints_its_link_and_ends_on_a_signal(tmp_path: Path, by: signal.Signals) -> None:
     with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{32}", link)
         page.scan()
@@ -89,7 +89,7 @@ def test_a_file_that_has_ended_is_still_shown(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_recording_is_told_of_at_the_end(tmp_path: Path) -> None:
+def test_recordings_are_listed_at_the_end(tmp_path: Path) -> None:
     with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
         page.say("record")
         name = page.state(lambda state: state["recording"] and state["recording"]["bytes"])[
@@ -175,7 +175,7 @@ def test_a_source_that_fails_ends_it_with_its_code(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_port_that_vanishes_and_comes_back_goes_on(tmp_path: Path) -> None:
+def test_reading_continues_when_a_port_returns(tmp_path: Path) -> None:
     """The simulator on a pty is stopped and started again, behind the same link."""
     port = tmp_path / "port"
     command = [sys.executable, "-m", "lidarspec", "sim", FLAT, "--to", "pty", "--link", str(port)]

@@ -327,7 +327,7 @@ def test_text_of_the_sensor_is_never_part_of_the_page(browser: Any, tmp_path: Pa
         assert not visit.errors
 
 
-def test_a_page_whose_server_is_started_again_says_so(browser: Any) -> None:
+def test_a_page_reports_a_restarted_server(browser: Any) -> None:
     """The new server has a new token: its printed link shows the page."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -349,9 +349,7 @@ def test_a_page_whose_server_is_started_again_says_so(browser: Any) -> None:
         visit.context.close()
 
 
-def test_a_page_whose_connection_is_lost_connects_again(
-    browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_reconnects(browser: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The network fails briefly: the same server is there again, with the same token."""
     monkeypatch.setattr("lidarspec_web.server.make_token", lambda: "token" * 6)
     source = "sim:ldrobot-stl27l?rate=0.5"

@@ -38,7 +38,7 @@ def test_the_commands_of_the_spec_are_forms(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_arguments_that_are_no_numbers_say_what_they_take(tmp_path: Path) -> None:
+def test_other_arguments_show_their_accepted_values(tmp_path: Path) -> None:
     with Station(f"sim:{TEXT}", tmp_path) as station, station.page() as page:
         (value,) = forms(page)["set_baud"]["arguments"]
         assert (value["low"], value["high"]) == (None, None)
@@ -63,7 +63,7 @@ WRONG_ARGUMENTS: list[tuple[str, dict[str, str]]] = [
 ]
 
 
-def test_what_the_sensor_does_not_take_is_refused(tmp_path: Path) -> None:
+def test_invalid_arguments_are_refused(tmp_path: Path) -> None:
     with Station(f"sim:{SPINNING}", tmp_path) as station, station.page() as page:
         for command, words in WRONG_ARGUMENTS:
             for word in ("compose", "send"):
@@ -76,7 +76,7 @@ def test_what_the_sensor_does_not_take_is_refused(tmp_path: Path) -> None:
                 assert command in refused["text"]
 
 
-def test_a_reply_is_told_in_words_while_the_picture_goes_on(tmp_path: Path) -> None:
+def test_a_reply_is_shown_while_scans_continue(tmp_path: Path) -> None:
     with Station(f"sim:{ANSWERING}", tmp_path) as station, station.page() as page:
         first, _ = page.scan()
         replied = page.asked("send", command="get_version", arguments={})

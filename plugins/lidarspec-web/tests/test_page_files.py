@@ -30,7 +30,7 @@ def saved(visit: Visit, kind: str) -> tuple[str, bytes]:
     return download.value.suggested_filename, Path(download.value.path()).read_bytes()
 
 
-def test_what_comes_is_recorded_until_the_next_click(browser: Any, tmp_path: Path) -> None:
+def test_data_is_recorded_until_the_next_click(browser: Any, tmp_path: Path) -> None:
     with served("sim:ldrobot-stl27l", folder=tmp_path) as link:
         visit = Visit(browser, link)
         assert visit.text("#recording") == "Record"
@@ -118,7 +118,7 @@ def check_picture(visit: Visit, data: bytes) -> None:
     assert np.mean(spread[down, across] > 60) > 0.9, "the wall ahead is not in the picture"
 
 
-def test_a_sensor_that_is_unplugged_is_said_and_comes_back(browser: Any) -> None:
+def test_an_unplugged_sensor_is_reported_until_it_returns(browser: Any) -> None:
     with virtual_port("ldrobot-stl27l") as port, served(port.path, "-s", "ldrobot-stl27l") as link:
         visit = Visit(browser, link)
         assert visit.until(lambda: visit.text("#status"), "no state is shown") == "streaming"

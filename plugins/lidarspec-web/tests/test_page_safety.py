@@ -92,7 +92,7 @@ def test_other_pages_get_no_scan(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/nothing.js", "/save/0.pcd"])
-def test_browsers_are_told_to_keep_to_the_page_itself(shared: Station, path: str) -> None:
+def test_a_content_security_policy_is_sent(shared: Station, path: str) -> None:
     _, headers, _ = shared.answered(path)
     policy = dict(
         part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";")
@@ -215,7 +215,7 @@ def test_all_addresses_and_its_own_name_reach_a_server_at_all_interfaces(tmp_pat
         assert station.answered("/", Host=f"evil.example:{port}")[0] == 403
 
 
-def test_a_port_that_is_taken_is_told_of(tmp_path: Path) -> None:
+def test_a_port_in_use_is_reported(tmp_path: Path) -> None:
     with (
         Station(f"sim:{FLAT}", tmp_path) as station,
         pytest.raises(SourceError, match=rf"127\.0\.0\.1:{station.port}"),

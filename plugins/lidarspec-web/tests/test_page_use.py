@@ -269,9 +269,7 @@ def test_a_damaged_packet_is_counted_once(browser: Any, tmp_path: Path) -> None:
         assert not visit.errors
 
 
-def test_a_sensor_that_is_unplugged_is_said_and_its_picture_dimmed(
-    browser: Any, tmp_path: Path
-) -> None:
+def test_an_unplugged_sensor_is_reported_and_dimmed(browser: Any, tmp_path: Path) -> None:
     """The line can be dismissed, and does not repeat the path of the port."""
     sensor = ls.sensor("ldrobot-stl27l")
     frames = list(ls.simulate(sensor, packets=1800))

@@ -41,7 +41,7 @@ def test_a_message_is_the_points_with_a_return(sensor: str) -> None:
     assert ("ring" in columns) == (scan.points.ring is not None)
 
 
-def test_the_header_tells_of_the_scan() -> None:
+def test_the_header_describes_the_scan() -> None:
     scan = scan_of(FLAT)
     header, columns = parsed(sent(scan))
     assert (header["scan"], header["position"], header["sent"]) == (12, 1.5, 1.7e9)
@@ -69,7 +69,7 @@ def test_a_scan_without_returns_is_empty() -> None:
 
 
 @pytest.mark.parametrize("most", [1, 100, 5000])
-def test_points_are_thinned_to_what_is_asked(most: int) -> None:
+def test_points_are_thinned_to_the_requested_number(most: int) -> None:
     scan = scan_of(SOLID)
     header, columns = parsed(sent(scan, most))
     assert header["of"] == scan.points.valid.sum()

@@ -21,7 +21,7 @@ from .pages import DEADLINE, FLAT, SOLID, Station, masked, recorded
 @pytest.mark.parametrize(
     ("sensor", "planar"), [(FLAT, True), pytest.param(SOLID, False, marks=pytest.mark.slow)]
 )
-def test_a_page_is_told_what_it_shows(tmp_path: Path, sensor: str, planar: bool) -> None:
+def test_the_first_message_describes_the_source(tmp_path: Path, sensor: str, planar: bool) -> None:
     with Station(f"sim:{sensor}", tmp_path) as station, station.page() as page:
         hello = page.until("hello")
         assert (hello["sensor"], hello["source"], hello["live"], hello["planar"]) == (
@@ -46,7 +46,7 @@ def test_a_page_is_told_what_it_shows(tmp_path: Path, sensor: str, planar: bool)
 
 
 @pytest.mark.slow
-def test_the_figures_of_the_last_minute_are_told_to_who_comes_later(tmp_path: Path) -> None:
+def test_later_pages_get_the_figures_of_the_last_minute(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as first:
         first.state(lambda state: state["figures"])
         with station.page() as second:
@@ -68,7 +68,7 @@ def test_scans_are_those_of_the_sensor_and_always_the_newest(tmp_path: Path) -> 
         assert header["position"] > first["position"]
 
 
-def test_a_scan_is_sent_only_where_one_was_asked_for(tmp_path: Path) -> None:
+def test_scans_are_sent_only_on_request(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
         page.scan()
         page.scan(most=100)
@@ -79,7 +79,7 @@ def test_a_scan_is_sent_only_where_one_was_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_scan_is_made_once_for_pages_that_ask_alike(tmp_path: Path) -> None:
+def test_equal_requests_share_one_message(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     with Station(path, tmp_path) as station, station.page() as one, station.page() as other:
         one.scan()
@@ -106,7 +106,7 @@ def test_ten_pages_see_one_source(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_page_that_goes_and_one_that_comes_are_told_of(tmp_path: Path) -> None:
+def test_connecting_and_leaving_pages_are_announced(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station:
         with station.page() as page:
             page.until("hello")
@@ -120,7 +120,7 @@ def test_a_page_that_goes_and_one_that_comes_are_told_of(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_live_source_that_a_page_pauses_goes_on_for_the_others(tmp_path: Path) -> None:
+def test_pausing_a_live_source_affects_one_page_only(tmp_path: Path) -> None:
     with (
         Station(f"sim:{FLAT}", tmp_path) as station,
         station.page() as paused,
@@ -239,7 +239,7 @@ def test_behind_the_end_of_a_file_is_its_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_selected_of_a_file_is_not_moved_through(tmp_path: Path) -> None:
+def test_a_selection_of_a_file_cannot_be_sought(tmp_path: Path) -> None:
     path = recorded(tmp_path)
     with (
         Station(path, tmp_path, select=Selection(times=(1.0, 2.0))) as station,
@@ -250,7 +250,7 @@ def test_what_is_selected_of_a_file_is_not_moved_through(tmp_path: Path) -> None
         page.until("ended")
 
 
-def test_a_failing_source_is_told_of(tmp_path: Path) -> None:
+def test_a_failing_source_is_reported(tmp_path: Path) -> None:
     with (
         Station(recorded(tmp_path), tmp_path, select=Selection(times=(100.0, 200.0))) as station,
         station.page() as page,
@@ -276,7 +276,7 @@ NONSENSE = (
 )
 
 
-def test_nonsense_is_refused_with_a_word_and_ends_nothing(tmp_path: Path) -> None:
+def test_invalid_requests_are_refused_and_end_nothing(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
         for message in NONSENSE:
             page.socket.send(message)

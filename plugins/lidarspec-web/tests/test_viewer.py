@@ -132,7 +132,7 @@ def test_a_sensor_of_one_plane_is_seen_from_above(page: Any) -> None:
     cell.until(lambda: "sim:ldrobot-stl27l is closed" in cell.text)
 
 
-def test_a_file_is_played_stands_still_and_ends(page: Any, tmp_path: Path) -> None:
+def test_a_file_is_played_paused_and_ended(page: Any, tmp_path: Path) -> None:
     ran("sim", "ldrobot-stl27l", "--to", tmp_path / "a.pcap", "-t", "4s")
     with Viewer(tmp_path / "a.pcap", "ldrobot-stl27l") as viewer:
         cell = Cell(page, viewer)
@@ -144,7 +144,7 @@ def test_a_file_is_played_stands_still_and_ends(page: Any, tmp_path: Path) -> No
         assert cell.scans > 10
 
 
-def test_what_is_wrong_with_a_source_stands_in_the_cell_in_one_line(page: Any) -> None:
+def test_a_cell_shows_the_error_of_a_source_in_one_line(page: Any) -> None:
     cell = Cell(page, Viewer("/dev/ttyUSB99"))
     cell.until(lambda: "no such port" in cell.text)
     assert (

@@ -45,7 +45,7 @@ def test_every_vector_of_the_family_is_used() -> None:
 
 
 @pytest.mark.parametrize("name", PACKETS)
-def test_a_packet_is_what_it_is_published_as(name: str) -> None:
+def test_a_published_packet_decodes_to_its_published_values(name: str) -> None:
     sensor, data, expected = (
         PACKETS[name],
         vector_bytes(FILE, name),
@@ -73,7 +73,7 @@ def test_a_packet_is_what_it_is_published_as(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ANSWERS)
-def test_an_answer_is_what_it_is_published_as(name: str) -> None:
+def test_a_published_reply_decodes_to_its_published_values(name: str) -> None:
     sensor, data, expected = (
         ANSWERS[name],
         vector_bytes(FILE, name),
@@ -149,7 +149,7 @@ def test_packets_of_a_tmini_pro() -> None:
 
 
 @pytest.mark.slow
-def test_a_tmini_is_told_from_other_makes_and_models_by_what_its_packets_say_of_its_state() -> None:
+def test_a_tmini_is_identified_by_its_state_field() -> None:
     tminis = {"ydlidar-tmini", "ydlidar-tmini-plus", "ydlidar-tmini-pro"}
     heard = SampleBytes("", (capture("ydlidar/packets_checksum_ok_concat.bin").read_bytes(),))
     assert {score.sensor.id for score in identify_sample(heard).candidates} == tminis
@@ -167,7 +167,7 @@ def test_a_tmini_is_told_from_other_makes_and_models_by_what_its_packets_say_of_
     ).sensor is ls.sensor("ydlidar-tmini-plus-sh")
 
 
-def test_a_relative_whose_other_frames_differ_contradicts_nothing() -> None:
+def test_a_related_model_with_other_frames_is_no_contradiction() -> None:
     coin = ls.sensor("cspc-coin-d4")
     info = coin.build(
         "info",
