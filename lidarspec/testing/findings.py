@@ -31,77 +31,77 @@ _TABLE = """
 LS001 the plugin cannot be imported | none of its sensors can be used | fix the error that is printed
 LS002 the hook does not exist | pluggy ignores misspelt names without a message | use a name of the hook reference
 LS003 the hook is not marked | lidarspec never calls it | put @hookimpl above it
-LS004 the hook has a wrong signature | lidarspec cannot call it | use the arguments of the hook reference, or fewer
-LS005 another sensor has this id | lidarspec can select only one of the two | choose another id: vendor-model
+LS004 the hook has a wrong signature | lidarspec cannot call it | use the arguments of the hook reference
+LS005 another sensor has this id | lidarspec can select only one of the two | choose another id
 LS006 the list of sensors cannot be read | all sensors of this hook are missing | return a list of Sensor values
-LS007 the declaration is invalid | the sensor is refused when it is declared | do what the message asks for
+LS007 the declaration is invalid | the sensor is refused when it is declared | correct it as the message says
 LS008 sizeof is used on an optional part | construct raises KeyError for If and Switch | write the longest length as a number
 LS009 the frame has no longest length | a damaged length would block the decoder | declare max_length= of the Frame, in bytes
 LS010 the hook raises an error | its result is missing | return None for unknown arguments
-LS101 construct hides this field name | `parsed.items` is a method of the Container | choose another name: samples, points
+LS101 construct hides this field name | `parsed.items` is a method of the Container | choose another name
 LS102 the field name is reserved | `f.state` and `column.on` have another meaning in `points` | choose another name
-LS103 the field name is not a public identifier | == ignores names that begin with _ | choose a Python identifier without a leading _
+LS103 the field name is not a public identifier | == ignores names that begin with _ | choose an identifier without a leading _
 LS104 two fields have the same name | the last one replaces the others | number the names: reserved_1, reserved_2
 LS105 the field has no name | its bytes are lost on a round trip | declare "reserved" / Bytes(n)
 LS106 the struct contains Padding | its bits come back as zeros
-      | declare "reserved" / Bytes(n), or "reserved" / BitsInteger(n) among bits
-LS107 Flag is used for a whole byte | seven of its bits are lost on a round trip | use Int8ul, or a BitStruct with all eight bits
-LS108 the struct contains FlagsEnum | bits without a name are lost on a round trip | use a BitStruct with a field for every bit
+      | declare "reserved" / Bytes(n); among bits, BitsInteger(n)
+LS107 Flag is used for a whole byte | seven of its bits are lost on a round trip | declare all eight bits in a BitStruct
+LS108 the struct contains FlagsEnum | bits without a name are lost on a round trip | use a BitStruct
 LS109 the struct contains RawCopy, Union or construct's Checksum | they ignore edits when the frame is built
-      | use Checksummed(Struct(...), field=...), and one reading of the bytes
+      | use Checksummed(Struct(...), field=...), and declare the bytes once
 LS110 the struct contains Pickled | it runs code from the wire | declare the fields
 LS111 a field is greedy | it has no end on a stream, or if its elements are empty | declare a count, a length or a terminator
-LS112 the struct contains Pointer or Seek | they read bytes outside the frame | declare the fields in the order of the wire
+LS112 the struct contains Pointer or Seek | they read bytes outside the frame | declare fields in the order of the wire
 LS113 the struct contains Select or Optional | damaged bytes would select another alternative | use If or Switch on a header field
 LS114 the frame is not a Struct | Const(...).build({}) fails | use Struct("header" / Const(...))
-LS115 an expression of the struct fails | it raises an undocumented exception | write an expression that is valid for every header
+LS115 an expression of the struct fails | it raises an undocumented exception | make it valid for every header
 LS116 the frame is not compiled | construct parses it, hundreds of times slower | declare fields whose offsets follow from the header
-LS201 a measured value has no unit | users cannot tell metres from millimetres | use Scaled(Int16ul, 0.001, "m"), with "" for a pure number
-LS202 the sensor has no source | readers cannot verify its numbers | declare source="manual, revision, section" on the Sensor
+LS201 a measured value has no unit | users cannot tell metres from millimetres | use Scaled(Int16ul, 0.001, "m"); "" is a pure number
+LS202 the sensor has no source | readers cannot verify its numbers | declare source="manual, revision, section"
 LS203 max_length is not the longest length | valid frames are refused, or the decoder waits too long | declare the size of the longest frame
 LS204 the sync pattern is common | false candidates cost time and valid frames | declare more constant bytes or bits
-LS205 the checksum does not cover a field | a flipped bit in the field is not detected | add the field to over=, or omit over= to cover all bytes
+LS205 the checksum does not cover a field | a flipped bit in the field is not detected | add it to over=, or omit over=
 LS206 noise passes as a weak frame | it becomes false points | declare plausible= or confirm=
 LS207 `plausible` does not test columns | an expression of construct is always true | use plausible=lambda f: f.angle < 360
-LS208 `points` cannot be traced | it runs as ordinary NumPy, ten times slower | use ufuncs and the functions of lidarspec.spec
+LS208 `points` cannot be traced | it runs as ordinary NumPy, ten times slower | use ufuncs and functions of lidarspec.spec
 LS209 an acknowledgement has no finding or no reason | it would hide the next such finding | remove it, or give a reason
-LS210 the field cannot hold the range limit | the scale or the limit is wrong | use the manual's scale, and its limit in metres
+LS210 the field cannot hold the range limit | the scale or the limit is wrong | compare both with the manual
 LS211 the declaration is incomplete | lidarspec cannot open, decode or detect the sensor | declare vendor, model, a data frame and a data link
 LS212 the checksum is not verified | damaged frames are accepted
-      | use Checksummed(Struct(...), field="crc", algorithm=...), found by `lidarspec crc`; or "crc" / Int16ul * "not checked: ..."
+      | use Checksummed (`lidarspec crc` finds the algorithm), or "crc" / Int16ul * "not checked: ..."
 LS213 a column is used as a condition of Python | a column has one truth value for each packet
-      | use (f.a < 1) & (f.b < 2), with | and ~, and np.where in place of `if`
+      | use & | ~ and np.where: (f.a < 1) & (f.b < 2)
 LS214 columns have different shapes | a point needs one value of each
-      | use arrays of the frame's length, with along(...) for their axis; or one value for each packet
+      | give one value for each point or packet; along(...) sets an axis
 LS215 `spread` gives all samples one value | all points of a packet get the same angle or time
-      | set full= to the circle in the angle's unit; use steps(count) for the index of a sample
+      | set full= to the circle in the angle's unit, or use steps(count)
 LS216 no data frame has this field | the scans, the clock or the counter need it | use a path that `lidarspec show` prints
 LS217 the option changes nothing | users who set it get the same points | use it in `configure`, or remove it
 LS218 the intensity comes from another field | users expect the intensity that the sensor measured
-      | use the field with this name as intensity=, or as a further column
+      | use the field with this name
 LS219 the range comes from a code | errors become points | use the distance field
 LS301 no example can be generated | the frame cannot be tested
-      | declare simulation=Simulation(sweep=...) on the Sensor or Frame, or strategies = {"frame.field": ...} in the test class
+      | declare Simulation(sweep=...), or strategies = {"frame.field": ...} in the test class
 LS302 parsing and building change the bytes | a replayed or edited frame differs | use fields that keep every bit
-LS303 a value is truncated, not rounded | int() loses a step if the float is slightly too small | use Scaled, or round() in place of int()
+LS303 a value is truncated, not rounded | int() loses a step if the float is slightly too small | use Scaled or round()
 LS304 building from values in units changes the bytes | the values cannot be written back | use Scaled with the correct scale and offset
 LS305 a field does not keep a written value | the value read differs from the value set | use the width and sign of the wire
-LS306 a frame is parsed as another type | its fields get another meaning | declare constants that distinguish the types, or another order
+LS306 a frame is parsed as another type | its fields get another meaning | declare constants that differ, or another order
 LS307 a truncated frame is accepted | missing values are invented | declare the length of every field
-LS308 an undocumented exception is raised | callers catch LidarSpecError only | use the engine's parse, and lambdas that are valid for all values
-LS310 the checksum misses a flipped bit | damaged frames are accepted | use a checksum that depends on every byte it covers
-LS311 examples are not repeatable or too long | a failure cannot be reproduced | declare structs without random values or a clock
+LS308 an undocumented exception is raised | callers catch LidarSpecError only | make lambdas valid for all values
+LS310 the checksum misses a flipped bit | damaged frames are accepted | use one that depends on every byte
+LS311 examples are not repeatable or too long | a failure cannot be reproduced | use no random values and no clock
 LS312 a field that `Rebuild` fills in is not checked | a frame with another value is accepted, and built differently
       | compare it in `plausible`: f.length == f.size + 5
 LS401 a clean stream loses bytes | valid frames are lost without any damage | declare all parts of the frames
 LS404 scans depend on the split into packets | the same revolution is cut elsewhere | keep no state in `points`
-LS414 a function of the plugin raises an error | its packets are lost, and only counted | write functions that are valid for every valid frame
-LS415 the same bytes give different results | results cannot be reproduced | use the fields only, no clock or random values
-LS501 a cloud breaks the conventions | users expect other axes and units | return metres and radians, and 0 for no return
+LS414 a function of the plugin raises an error | its packets are lost, and only counted | make it valid for every valid frame
+LS415 the same bytes give different results | results cannot be reproduced | use the fields only
+LS501 a cloud breaks the conventions | users expect other axes and units | return metres and radians; 0 is no return
 LS502 angles are in degrees | radians are expected, so directions are wrong | use np.deg2rad(...)
 LS503 a single point has no direction | a count of 1 divides by count - 1 | use spread(start, end, count, full=360.0)
 LS504 angles run backwards across the full circle | one packet a turn is spread over the whole circle
-      | use spread(..., full=360.0), or wrap the difference
+      | use spread(..., full=360.0)
 LS505 an angle of exactly the full circle is not folded | sensors send 360.00 degrees for 0
       | use wrap(angle, 360.0), or reject it in `plausible`
 LS506 angles are not in order | scans are cut in the wrong places | use the manual's direction, and spread or wrap
@@ -110,37 +110,37 @@ LS508 `sweep` cannot be simulated | sim, demo and virtual_port fail | return the
 LS509 the clock runs backwards when it wraps | durations become negative | declare Clock(..., wraps_at=) in seconds
 LS510 a wrap of the counter counts as loss | every wrap adds lost or late packets | declare Sequence(field, first=, last=)
 LS511 points turn the other way | left and right are exchanged, or vendor_axes differ from the manual
-      | use azimuth=-np.deg2rad(clockwise), or the vendor_axes of the manual's figure
+      | compare azimuth= and vendor_axes= with the manual's figure
 LS512 the clock exceeds wraps_at | it seems to wrap when it does not | declare Clock(..., wraps_at=) in seconds
 LS513 the times of points do not fit the clock | points of one packet get times of other scans | return time= in seconds
-LS601 a command does not parse back | the sensor receives another command | use values and args with the paths of its frame
+LS601 a command does not parse back | the sensor receives another command | use paths of its frame in values and args
 LS602 an argument is not limited to its range | the sensor receives invalid requests
-      | declare args={name: (path, lowest, highest)}, or (path, Text(size))
+      | declare args={name: (path, lowest, highest)}
 LS603 a reply cannot match | the command waits until its timeout | use fields of the reply in matches= and echoes=
-LS604 the simulated sensor does not send the documented reply | simulated commands time out | declare answers=, or matches= that the reply can have
+LS604 the simulated sensor does not send the documented reply | simulated commands time out | declare answers=, or other matches=
 LS605 a command or reply differs from its vector | the sensor expects or sends other bytes
-      | use the manual's values, args, matches and echoes
-LS701 a vector has no source | readers cannot verify it | add "source": "manual, section" to each entry
-LS702 a vector cannot be read | it tests nothing | write [{"frame": ..., "hex": ..., "values": {...}, "source": ...}]
-LS703 the checksum covers the wrong bytes | all frames of a real sensor are rejected | use over= and the algorithm that fit the vectors
-LS704 the byte order is wrong | 0x1234 is read as 0x3412 | use Int16ub for big-endian, Int16ul for little-endian
-LS705 a signed number is read as unsigned | -1 becomes 65535 | use Int16sl in place of Int16ul
-LS706 a vector has another value | the field reads these bytes differently | declare the field as the manual does
-LS707 a vector is not a valid frame | bytes of a real sensor are rejected | declare the struct as the manual does
-LS708 a vector has its point elsewhere | coordinates are wrong | write `points` as the manual does
+      | compare values, args, matches and echoes
+LS701 a vector has no source | readers cannot verify it | add "source": "manual, section"
+LS702 a vector cannot be read | it tests nothing | write {"frame": ..., "hex": ..., "values": {...}, "source": ...}
+LS703 the checksum covers the wrong bytes | all frames of a real sensor are rejected | compare over= and the algorithm with the manual
+LS704 the byte order is wrong | 0x1234 is read as 0x3412 | Int16ub is big-endian, Int16ul little-endian
+LS705 a signed number is read as unsigned | -1 becomes 65535 | use Int16sl
+LS706 a vector has another value | the field reads these bytes differently | compare the field with the manual
+LS707 a vector is not a valid frame | bytes of a real sensor are rejected | compare the struct with the manual
+LS708 a vector has its point elsewhere | coordinates are wrong | compare `points` with the manual
 LS709 a point is mirrored | left and right are exchanged | use azimuth=-np.deg2rad(clockwise)
 LS710 the status requires vectors | no frame of a real sensor has been tested
       | add vectors.json with frames of the manual or a capture, or declare status="manual"
 LS711 no vector gives the value of this field | a wrong byte order, scale or offset would not be noticed
-      | add it to `values` or `units`, in one vector at least with a value other than 0
+      | add it to `values` or `units`, once with a value other than 0
 LS712 all points of the vectors are in one quadrant | a mirrored or rotated cloud would pass
-      | add x and y of points in two quadrants, calculated by hand, to `points`
+      | add points in two quadrants, calculated by hand
 LS713 a vector exceeds the range limits | its byte order, its scale or the limit is wrong
-      | use the manual's byte order and scale, and its range_limits in metres
-LS801 an exception is swallowed | errors are neither reported nor counted | remove the try: the engine counts errors
-LS802 the wall clock is used | it jumps, and two runs differ | use the sensor's clock, or a time from the caller
-LS803 a short write is ignored | the rest of a command is never sent | use sendall, or write until all is sent
-LS804 `this` is used as a condition of Python | `this.a == this.b` is an expression, and true | use If(this.a == this.b, ...), or f.a == f.b
+      | compare byte order, scale and range_limits with the manual
+LS801 an exception is swallowed | errors are neither reported nor counted | remove the try
+LS802 the wall clock is used | it jumps, and two runs differ | use the sensor's clock
+LS803 a short write is ignored | the rest of a command is never sent | use sendall
+LS804 `this` is used as a condition of Python | `this.a == this.b` is an expression, and true | use If(this.a == this.b, ...)
 LS805 hasattr(this, ...) is used | it is always true | test a header field
 """
 RULES = {
