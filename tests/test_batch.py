@@ -138,9 +138,7 @@ def test_processes_make_the_same_files(drives: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is POSIX")
-def test_a_run_that_is_killed_is_gone_on_with(
-    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
-) -> None:
+def test_a_killed_run_is_resumed(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
     drives = tmp_path_factory.mktemp("long-drives")
     made(ls.sensor(SENSOR), drives / "long.bin", most=4_000_000, longest=10**6)
     (drives / "bad.bin").write_bytes(b"no capture at all" * 100)

@@ -328,7 +328,7 @@ class Pieces(io.RawIOBase):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_however_the_file_is_read(seed: int) -> None:
+def test_gaps_are_equal_for_every_way_of_reading(seed: int) -> None:
     capture = made.pcap(*MIXED)
     assert in_batches(Pieces(capture, seed)) == one_by_one(io.BytesIO(capture))  # type: ignore[arg-type]
 
@@ -378,7 +378,7 @@ def test_unreferenced_buffers_are_reused(
     assert len(set(places)) <= 3
 
 
-def test_a_reader_that_is_done_is_gone_at_once_with_its_buffers(long_capture: Path) -> None:
+def test_a_finished_reader_releases_its_buffers(long_capture: Path) -> None:
     gc.disable()
     try:
         reader = CaptureBatches(long_capture)
@@ -504,7 +504,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_claimed_lengths_take_no_memory(case: str, tmp_path: Path) -> None:
+def test_declared_lengths_allocate_no_memory(case: str, tmp_path: Path) -> None:
     path = tmp_path / "hostile"
     path.write_bytes(HOSTILE[case])
     assert peak_memory(path) < 400_000

@@ -127,7 +127,7 @@ def test_verbs_take_compressed_files_and_pipes() -> None:
 
 
 @pytest.mark.slow
-def test_one_file_of_an_archive_is_named_where_several_are_captures() -> None:
+def test_one_of_several_captures_in_an_archive_is_named() -> None:
     Path("one.zip").write_bytes(
         zipped(capture(), "read.md", "__MACOSX/drives/a.pcap", "drives/a.pcap", "notes.md")
     )

@@ -362,13 +362,13 @@ def test_reassembled_packets_can_be_other_than_udp() -> None:
     assert read(*packets) == ([], CaptureStats(packets=2, fragments=2, other=1))
 
 
-def test_an_identification_that_comes_round_meets_no_old_fragment() -> None:
+def test_a_reused_identification_meets_no_old_fragment() -> None:
     stale, fresh = fragment4(0, 24, body=bytes(48)), [fragment4(0, 24), fragment4(24, 48)]
     assert read_at([(10, stale), *((16, packet) for packet in fresh)])[0] == [BODY[8:]]
     assert read_at([(10, stale), *((12, packet) for packet in fresh)])[0] == []
 
 
-def test_oldest_packet_is_given_up_where_too_many_wait() -> None:
+def test_the_oldest_packet_is_dropped_if_too_many_wait() -> None:
     crowd = [fragment4(0, 24, ident=ident) for ident in range(257)]
     data, stats = read(*crowd, fragment4(24, 48, ident=0), fragment4(24, 48, ident=2))
     assert data == [BODY[8:]]
@@ -396,7 +396,7 @@ def test_waiting_fragments_take_bounded_memory(size: int, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("inputs", [1500, pytest.param(20_000, marks=pytest.mark.slow)])
-def test_mutations_raise_nothing(inputs: int) -> None:
+def test_mutations_raise_no_exception(inputs: int) -> None:
     draw = random.Random(14)
     frames = [(link, frame) for link, frame in LINKS] + [
         (101, fragment(*cut)) for fragment in (fragment4, fragment6) for cut in CUTS

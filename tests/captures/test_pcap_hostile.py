@@ -137,7 +137,7 @@ def test_record_too_long_for_a_packet_ends_the_reading_where_none_follows() -> N
 
 
 @pytest.mark.parametrize("is_pcapng", [False, True], ids=["pcap", "pcapng"])
-def test_a_damaged_length_costs_its_own_packet_alone(is_pcapng: bool) -> None:
+def test_a_damaged_length_costs_one_packet(is_pcapng: bool) -> None:
     frames = [made.frame(bytes([number]) * 1200) for number in range(200)]
     records = [made.packet(each) if is_pcapng else made.record(each) for each in frames]
     head = made.section() + made.interface() if is_pcapng else made.pcap_head()
@@ -183,7 +183,7 @@ def test_cut_packets_without_a_snap_length_are_not_damage() -> None:
     assert stats == CaptureStats(packets=101, datagrams=1, snapped=100)
 
 
-def test_long_files_tell_where_they_are_cut() -> None:
+def test_long_files_are_split_at_reported_offsets() -> None:
     capture = made.pcap(*[made.frame(bytes(1248))] * 300)
     expected = CaptureStats(
         packets=299, datagrams=299, truncated_tail=True, stopped_at=24 + 299 * 1306
@@ -297,7 +297,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("case", HOSTILE)
 @pytest.mark.parametrize("buffering", [0, -1])
-def test_claimed_lengths_take_no_memory(case: str, buffering: int, tmp_path: Path) -> None:
+def test_declared_lengths_allocate_no_memory(case: str, buffering: int, tmp_path: Path) -> None:
     path = tmp_path / "hostile"
     path.write_bytes(HOSTILE[case])
     with open(path, "rb", buffering) as file:

@@ -131,7 +131,7 @@ def test_full_disk_leaves_whole_records_and_one_clear_error(tmp_path: Path, room
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a named pipe")
-def test_pipe_that_takes_half_a_record_takes_no_more(tmp_path: Path) -> None:
+def test_a_partial_write_ends_writing_to_a_pipe(tmp_path: Path) -> None:
     path = tmp_path / "pipe.pcap"
     os.mkfifo(path)
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", 0) as reading:

@@ -139,7 +139,7 @@ def test_seeking_never_goes_back(tmp_path: Path) -> None:
     assert times[-1] == START + (NUMBER - 1) * STEP
 
 
-def test_nothing_is_passed_over_where_times_are_counted_otherwise(tmp_path: Path) -> None:
+def test_no_seek_with_other_time_bases(tmp_path: Path) -> None:
     """In a second section, whose interface has another clock than the first."""
     path = written(tmp_path / "drive.pcapng", number=NUMBER * 2 // 3)
     ticks = made.interface(options=made.option(9, bytes([6])))

@@ -149,7 +149,7 @@ def test_points_of_a_contradicted_sensor_have_a_warning(tmp_path: Path) -> None:
     )
 
 
-def test_every_verb_that_shows_points_says_where_their_angles_are_nominal(tmp_path: Path) -> None:
+def test_every_verb_with_points_warns_of_nominal_angles(tmp_path: Path) -> None:
     path = tmp_path / "xt32.bin"
     path.write_bytes(b"".join(simulate(ls.sensor("hesai-xt32"), 300)))
     picture, table = tmp_path / "out.svg", tmp_path / "out.csv"
@@ -330,7 +330,7 @@ def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
         assert ("out.npz: 10800 points of" in shown) is not bool(more)
 
 
-def test_how_far_a_file_was_read_is_known_where_it_is_stored(tmp_path: Path) -> None:
+def test_reading_a_stored_file_reports_progress(tmp_path: Path) -> None:
     plain, packed = tmp_path / "drive.bin", tmp_path / "drive.bin.gz"
     plain.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 900)))
     packed.write_bytes(gzip.compress(plain.read_bytes()))
@@ -368,7 +368,7 @@ def test_packets_go_from_container_to_container_as_they_are(name: str, tmp_path:
     assert max(times) - min(times) < 100_000_000
 
 
-def test_files_of_packets_are_of_packets_alone_and_of_files(tmp_path: Path) -> None:
+def test_packet_files_need_a_packet_source(tmp_path: Path) -> None:
     ran("sim", "ldrobot-stl27l", "--to", tmp_path / "drive.lsr", "-t", "100ms")
     out = tmp_path / "out.pcapng"
     assert (

@@ -60,7 +60,7 @@ def test_files(tmp_path: Path, words: tuple[str, ...], monkeypatch: pytest.Monke
     assert text.count("paste:") == 1
 
 
-def test_a_checksum_without_a_name_comes_as_a_class() -> None:
+def test_an_unnamed_checksum_is_printed_as_a_class() -> None:
     source = random.Random(1)
     bodies = [b"\x5a" + source.randbytes(9) for _ in range(12)]
     text = ran("crc", *((body + bytes([~sum(body) & 0xFF])).hex() for body in bodies)).stdout
@@ -77,7 +77,7 @@ def test_few_frames_are_weak() -> None:
 
 
 @pytest.mark.slow
-def test_none_is_found_and_nothing_is_no_input(tmp_path: Path) -> None:
+def test_input_without_frames_and_empty_input(tmp_path: Path) -> None:
     source = random.Random(2)
     assert (
         "no checksum found in 9 frames"

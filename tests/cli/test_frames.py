@@ -296,7 +296,7 @@ def test_build_takes_the_length_of_an_array_from_its_count_or_its_elements() -> 
         ("header=5g", "expected bytes in hexadecimal"),
     ],
 )
-def test_a_value_that_a_field_cannot_take(word: str, told: str) -> None:
+def test_a_value_outside_the_range_of_a_field(word: str, told: str) -> None:
     words = ("points[*].distance=1m", "points[*].intensity=5")
     assert told in ran("build", "ldrobot-stl27l", "data", *FIELDS, *words, word, code=2).stderr
 

@@ -28,9 +28,7 @@ def frames() -> list[bytes]:
 
 
 @pytest.mark.slow
-def test_a_capture_of_two_sensors_of_which_one_lost_a_packet(
-    frames: list[bytes], tmp_path: Path
-) -> None:
+def test_a_capture_of_two_sensors_with_one_lost_packet(frames: list[bytes], tmp_path: Path) -> None:
     path, senders = tmp_path / "drive.pcap", [("10.0.0.1", 2368), ("10.0.0.2", 2368)]
     datagrams = [
         Datagram(data, START + number * STEP, sender, ("255.255.255.255", 2368))

@@ -240,7 +240,7 @@ class TestDoctor:
         return found
 
     @pytest.mark.slow
-    def test_a_sensor_that_is_well(self) -> None:
+    def test_a_sensor_without_problems(self) -> None:
         with virtual_port("ldrobot-stl27l") as made:
             found = ran("doctor", made.path, "-s", "ldrobot-stl27l", "-t", "500ms")
         assert "wrong" not in found.stdout
@@ -253,7 +253,7 @@ class TestDoctor:
         assert "received frames of ldrobot-stl27l, not of cspc-coin-d4" in found
         assert f"next: lidarspec view {made.path} -s ldrobot-stl27l" in found
 
-    def test_a_file_is_held_against_the_sensor_that_is_named(self, tmp_path: Path) -> None:
+    def test_a_file_is_compared_with_the_named_sensor(self, tmp_path: Path) -> None:
         path = tmp_path / "vlp16.bin"
         path.write_bytes(b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)))
         assert (
@@ -264,7 +264,7 @@ class TestDoctor:
             assert f", not of {name}\n" in ran("doctor", path, "-s", name, code=1).stdout
 
     @pytest.mark.parametrize(("damaged", "code"), [(0.03, 0), (0.3, 1), (0.6, 1)])
-    def test_a_line_is_bad_where_more_than_a_tenth_of_its_bytes_is_in_no_frame(
+    def test_a_line_is_bad_if_a_tenth_of_its_bytes_is_invalid(
         self, tmp_path: Path, damaged: float, code: int
     ) -> None:
         frames = simulate(ls.sensor("ldrobot-stl27l"), 60)

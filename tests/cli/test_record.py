@@ -274,7 +274,7 @@ def test_damaged_recordings_are_salvaged(stream: Path, tmp_path: Path) -> None:
         assert sum(len(packets) for packets in device.packets()) == 39
 
 
-def test_an_old_recording_stays_where_the_source_is_silent(tmp_path: Path) -> None:
+def test_an_old_recording_survives_a_silent_source(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         source = f"udp://127.0.0.1:{free.getsockname()[1]}"
@@ -418,6 +418,6 @@ def test_a_loop_serves_one_reader_after_another_until_ctrl_c(
     assert "stream.lsr to /dev/" in player.ended(130)
 
 
-def test_a_script_reads_where_a_replay_plays_to_on_standard_output(datagrams: Path) -> None:
+def test_a_replay_prints_its_destination_on_standard_output(datagrams: Path) -> None:
     done = ran("replay", datagrams, "--to", "udp://127.0.0.1:45672", "--speed", "10x")
     assert done.stdout == "udp://127.0.0.1:45672\n"

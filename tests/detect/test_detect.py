@@ -218,7 +218,7 @@ def test_an_unreliable_name_is_not_used() -> None:
 
 
 @pytest.mark.slow
-def test_relatives_that_are_not_installed_are_recognised(tmp_path: Path) -> None:
+def test_uninstalled_related_models_are_recognized(tmp_path: Path) -> None:
     xt32 = ls.sensor("hesai-xt32")
     xt32m = [
         xt32.build("data", xt32.parse(packet), block_count=6, blocks=xt32.parse(packet).blocks[:6])
@@ -257,7 +257,7 @@ def test_a_relative_that_only_its_start_would_tell_leaves_a_doubt() -> None:
 
 
 @pytest.mark.slow
-def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
+def test_the_baud_rate_decides_between_equal_candidates() -> None:
     sensor = ls.sensor("slamtec-rplidar-s2")
     data = (sensor.build("scan_descriptor"), *simulate(sensor, 300))
     assert {
@@ -279,7 +279,7 @@ def test_a_baud_rate_decides_where_the_bytes_do_not() -> None:
 
 
 @pytest.mark.usefixtures("few_installed")
-def test_a_scan_that_is_met_in_its_middle_is_known_all_the_same() -> None:
+def test_a_scan_is_recognized_from_its_middle() -> None:
     sensor = ls.sensor("slamtec-rplidar-a1")
     assert "slamtec-rplidar-a1" in {
         score.sensor.id
@@ -596,6 +596,6 @@ class TestStructure:
         "data",
         [b"", b"\x00" * 5000, random.Random(7).randbytes(20_000), b"a line of some text\n" * 3],
     )
-    def test_nothing_is_seen_where_nothing_is(self, data: bytes) -> None:
+    def test_no_structure_is_found_in_random_bytes(self, data: bytes) -> None:
         assert find_structure([data], datagrams=False) is None
         assert find_structure([data] if data else [], datagrams=True) is None

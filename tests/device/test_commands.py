@@ -131,7 +131,7 @@ def test_a_reply_among_data_and_the_data_go_on(line: Port, tmp_path: Path) -> No
     assert [SENSOR.parse(data, "order").code for data in sent] == [START, SPEED, STOP]
 
 
-def test_an_answer_that_has_come_is_taken_before_the_command_is_given_up(
+def test_an_arrived_reply_is_used_before_the_timeout(
     line: Port, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with (
@@ -208,7 +208,7 @@ def test_a_device_that_does_not_answer_does_not_open(line: Port) -> None:
     ls.open(f"serial://{line.name}", SENSOR, start=False).close()
 
 
-def test_a_device_that_was_left_streaming_opens_all_the_same(line: Port) -> None:
+def test_a_streaming_device_can_be_opened(line: Port) -> None:
     device = Obedient(line, deaf=True, streaming=True)
     with working(device.work), ls.open(f"serial://{line.name}", IMPATIENT) as opened:
         assert any("data come all the same" in warning for warning in opened.warnings)
@@ -238,7 +238,7 @@ def test_a_command_to_a_device_that_is_gone_fails_at_once(line: Port) -> None:
     assert not isinstance(caught.value, ReplyTimeout)
 
 
-def test_a_command_under_way_fails_when_the_device_goes_away(line: Port) -> None:
+def test_a_running_command_fails_when_the_device_disconnects(line: Port) -> None:
     device = Obedient(line, deaf=True)
     with working(device.work), ls.open(f"serial://{line.name}", SENSOR, start=False) as opened:
         timer = threading.Timer(0.1, line.unplug)
@@ -381,7 +381,7 @@ def datagram_sensor(number: int) -> ls.Sensor:
     return dataclasses.replace(SENSOR, links={"data": Udp(number)}, on_open=(), on_close=())
 
 
-def test_a_command_waits_for_the_first_datagram_that_says_where_the_sensor_is() -> None:
+def test_a_command_waits_for_the_address_of_the_sensor() -> None:
     number, heard = free_port(), list[str]()
     with (
         silent_at_first(number, 0.3, heard),

@@ -206,7 +206,7 @@ def test_a_learning_command_needs_a_reply_and_an_option() -> None:
         dataclasses.replace(SENSOR, configure=None)
 
 
-def test_a_sensor_that_comes_back_with_another_table_is_another_one() -> None:
+def test_a_sensor_that_returns_with_another_table_is_a_warning() -> None:
     said = [b"0.5 1 1.5 2", b"1 2 3 4"]
     answers = {
         "get_table": lambda request: [

@@ -381,7 +381,7 @@ def test_two_senders_of_one_address_are_separated_by_port() -> None:
         assert f"127.0.0.2:{other.getsockname()[1]} sends as well" in device.warnings[-1]
 
 
-def test_a_sensor_that_comes_back_with_another_port_is_read_on() -> None:
+def test_a_sensor_that_returns_with_another_port_is_read() -> None:
     number, frames = free_port(), turning(WHOLE, 4)
     with ls.open(f"udp://:{number}", WHOLE) as device:
         for _ in range(3):
@@ -622,7 +622,7 @@ def test_a_file_gives_one_scan_after_another(tmp_path: Path) -> None:
             device.latest()
 
 
-def test_packets_and_scans_of_a_file_go_on_where_its_scan_was_found(tmp_path: Path) -> None:
+def test_iterators_continue_after_latest(tmp_path: Path) -> None:
     path = tmp_path / "raw.bin"
     frames = turning(TURNING, 200)
     path.write_bytes(b"".join(frames))
@@ -675,7 +675,7 @@ def test_closing_from_another_thread_ends_the_iteration(line: Port) -> None:
         timer.join()
 
 
-def test_a_device_that_is_forgotten_gives_its_port_back(line: Port) -> None:
+def test_an_unreferenced_device_releases_its_port(line: Port) -> None:
     threads = threading.active_count()
     device: ls.Device | None = ls.open(f"serial://{line.name}", TURNING)
     assert threading.active_count() == threads + 1

@@ -204,7 +204,7 @@ def test_a_late_answer_is_not_the_next_ones() -> None:
     assert session.late == 1
 
 
-def test_an_answer_that_never_comes_holds_the_next_one_back_no_longer_than_it_could_take() -> None:
+def test_a_missing_reply_delays_the_next_command_for_a_limited_time() -> None:
     session = Session(SENSOR)
     session.request("start", 0)
     session.tick(SECOND)
@@ -377,7 +377,7 @@ def test_an_argument_cannot_be_called_like_the_time_to_wait() -> None:
 @pytest.mark.parametrize(
     "seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40))]
 )
-def test_however_late_and_lossy_the_device_each_reply_is_the_requests_own(seed: int) -> None:
+def test_late_and_lost_replies_never_match_another_request(seed: int) -> None:
     """The device numbers the requests that it has seen in its answers, so that a wrong pairing
     shows.
     """
@@ -429,7 +429,7 @@ def _next_event(
     return now, due
 
 
-def test_a_command_that_is_answered_only_while_the_sensor_is_stopped_says_so() -> None:
+def test_a_command_for_a_stopped_sensor_gives_that_reason() -> None:
     asking = dataclasses.replace(SENSOR.commands["start"], starts=False, only_stopped=True)
     session = Session(with_commands(ask=asking))
     pending = session.request("ask", 0)

@@ -131,7 +131,7 @@ def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: P
     "text",
     ["[device.front", "x = " + "[" * 10_000, "[" + "a." * 20_000 + "b]", "#" * (1 << 18) + "\n"],
 )
-def test_a_file_with_a_mistake_takes_away_its_own_devices_alone(folder: Path, text: str) -> None:
+def test_a_file_with_an_error_affects_its_own_devices_only(folder: Path, text: str) -> None:
     broken = folder / "lidarspec.toml"
     broken.write_text(text, encoding="utf-8")
     settings_of_the_user(

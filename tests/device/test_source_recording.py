@@ -122,7 +122,7 @@ def test_a_sensor_that_sends_over_ipv6_is_recorded_for_wireshark(tmp_path: Path)
         assert {datagram.source for datagram in CaptureReader(path)} == {sender.getsockname()[:2]}
 
 
-def test_a_clock_that_is_set_changes_no_time_and_is_recorded(tmp_path: Path) -> None:
+def test_a_clock_change_changes_no_time_and_is_recorded(tmp_path: Path) -> None:
     path, number, wall = tmp_path / "all.lsr", free_port(), [0]
     sensor = SHAPES["shape-datagrams"]
     frames, queue = turning(sensor, 4), BoundedQueue()

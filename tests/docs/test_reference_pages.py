@@ -55,7 +55,7 @@ def test_the_navigation_lists_the_pages_of_each_vendor() -> None:
     assert {"STL-27L": "reference/sensors/ldrobot-stl27l.md"} in entries[1]["LDROBOT"]
 
 
-def test_files_of_sensors_that_are_gone_are_removed(
+def test_files_of_removed_sensors_are_deleted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sensor = ls.sensor("ldrobot-stl27l")

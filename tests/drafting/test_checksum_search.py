@@ -248,7 +248,7 @@ def test_random_bytes_have_none(length: int) -> None:
     assert search([source.randbytes(length) for _ in range(20)]) == []
 
 
-def test_nothing_is_made_of_nothing() -> None:
+def test_empty_input_gives_empty_output() -> None:
     assert search([]) == []
     assert search([b"\x01"]) == []
     assert search([bytes(20)] * 30) == []

@@ -418,7 +418,7 @@ def test_bytes_without_frames_are_refused(tmp_path: Path, data: bytes) -> None:
     assert not (tmp_path / "lidarspec-acme-x9").exists()
 
 
-def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_missing_capture_is_named(tmp_path: Path) -> None:
     assert (
         "no.bin"
         in ran(
@@ -483,7 +483,7 @@ def test_other_checksums_that_fit_and_other_angles_are_offered() -> None:
     assert 'scan=OnWrap("angle_4"),  # or angle_42' in text["arguments"]
 
 
-def test_a_checksum_of_which_most_bits_never_change_is_none() -> None:
+def test_a_nearly_constant_field_is_not_a_checksum() -> None:
     draw = random.Random(1)
     bodies = [b"\x0f\x55\x07\x09\x01\x02" + bytes([draw.randrange(2)]) for _ in range(200)]
     frames = [body + Xor()(body).to_bytes(1) for body in bodies]

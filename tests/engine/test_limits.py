@@ -94,14 +94,14 @@ def test_garbage_and_the_worst_stream_take_little_memory_on_every_sensor(module:
 
 @pytest.mark.parametrize("times", [4, pytest.param(50, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", "shape-count"])
-def test_megabytes_of_garbage_take_no_memory(name: str, times: int) -> None:
+def test_garbage_needs_no_memory(name: str, times: int) -> None:
     sensor = load_sensor(name)
     data = garbage(MEGABYTE)
     assert peak(lambda: fed(sensor, data, times=times, chunk=MEGABYTE)) < MEGABYTE
 
 
 @pytest.mark.parametrize("name", STREAMS)
-def test_a_frame_is_out_before_one_longest_frame_more_has_come(name: str) -> None:
+def test_a_frame_is_returned_within_one_maximum_length(name: str) -> None:
     """Feed pieces of two percent of the longest frame, and see how many bytes after its own last
     one each frame is out.
     """

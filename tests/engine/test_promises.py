@@ -92,7 +92,7 @@ class TestQueue:
 
     @pytest.mark.parametrize("policy", ["drop_oldest", "block"])
     @pytest.mark.parametrize("number", [20_000, pytest.param(1_000_000, marks=pytest.mark.soak)])
-    def test_nothing_vanishes(self, policy: str, number: int) -> None:
+    def test_no_packet_disappears(self, policy: str, number: int) -> None:
         queue, source = BoundedQueue(policy, chunks=50, size=4000), random.Random(number)
 
         def produce() -> None:

@@ -182,7 +182,7 @@ def test_points_are_those_of_the_cloud(name: str) -> None:
     assert (distances < 1e-5 * (1 + np.abs(decoded).max())).all()
 
 
-def test_points_stand_in_the_rows_that_they_come_from() -> None:
+def test_points_are_in_the_rows_of_their_fields() -> None:
     sensor = ls.sensor("robosense-m1")
     data = bytearray(sensor.example("data", seed=1))
     values = sensor.parse(bytes(data))

@@ -75,7 +75,7 @@ def test_consecutive_damaged_frames_are_listed_one_by_one() -> None:
     assert told(sent([b"\x01\x02\x03", flipped]))[0] == ("", 3, "valid")
 
 
-def test_a_damaged_datagram_is_one_piece_whatever_is_in_it() -> None:
+def test_a_damaged_datagram_is_one_piece() -> None:
     sensor = ls.sensor("velodyne-vlp16")
     packets = ls.simulate(sensor, 4)
     ((frame, size, said),) = told(
@@ -104,7 +104,7 @@ def test_every_byte_of_a_damaged_stream_is_in_one_piece(sensor: str) -> None:
     told([bytes(stream[start : start + 50]) for start in range(0, len(stream), 50)], sensor=value)
 
 
-def test_pieces_come_before_the_input_ends() -> None:
+def test_pieces_are_yielded_before_the_input_ends() -> None:
     endless = map(Chunk, itertools.cycle(FRAMES))
     assert [
         piece.offset for piece in itertools.islice(iter_pieces(STL, endless, datagrams=False), 3)

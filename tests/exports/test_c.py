@@ -135,7 +135,7 @@ def test_every_header_compiles_without_a_warning(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @needs_gcc
-def test_an_id_that_begins_with_a_digit_makes_names_all_the_same(tmp_path: Path) -> None:
+def test_an_id_that_begins_with_a_digit_makes_valid_names(tmp_path: Path) -> None:
     (tmp_path / "it.h").write_text(export(replace(SHAPED["shape-count"], id="3acme-x1"), "c"))
     (tmp_path / "it.c").write_text(
         '#include "it.h"\nint main(void) { return lidar_3acme_x1_data_count((const uint8_t *)"abc")'
@@ -198,7 +198,7 @@ def test_every_field_reads_as_lidarspec_reads_it(reader: Path) -> None:
 
 @pytest.mark.slow
 @needs_gcc
-def test_damaged_frames_are_none_of_either_s(reader: Path) -> None:
+def test_damaged_frames_are_rejected_by_both(reader: Path) -> None:
     source = random.Random(1)
     frames = []
     for sensor, name in distinct_frames(subjects().values()):

@@ -31,7 +31,7 @@ def evil() -> Sensor:
 
 
 @pytest.mark.parametrize("kind", EXPORTS)
-def test_nothing_steers_a_terminal_or_begins_a_line(evil: Sensor, kind: str) -> None:
+def test_control_characters_and_line_breaks_are_escaped(evil: Sensor, kind: str) -> None:
     text = ls.export(evil, kind)
     assert text == printable(text)
     assert not any(line.startswith("]]") for line in text.splitlines())

@@ -93,7 +93,7 @@ def test_clocks_counters_and_cuts_are_elements_too_in_integers(engine: str) -> N
     assert [len(scan.points) for scan in reader(SENSOR, engine).scans(data)] == [2, 3, 2]
 
 
-def test_elements_that_are_not_there_are_named() -> None:
+def test_missing_elements_are_named() -> None:
     for points, named in (
         (lambda f: Polar(range=f.columns[4].time, azimuth=0), r"columns\[4\]"),
         (lambda f: Polar(range=f.columns[0:2].time, azimuth=0), "index"),

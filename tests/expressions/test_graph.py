@@ -50,7 +50,7 @@ def test_a_field_that_is_read_twice_is_one_node() -> None:
     assert list(traverse(node, into=lambda n: n.kind != "call")) == [node]
 
 
-def test_columns_and_arrays_come_to_the_same() -> None:
+def test_columns_and_arrays_give_equal_results() -> None:
     node = graph_of(
         lambda f: np.where(
             f.points.intensity > 100, f.points.distance + f.start_angle, f.end_angle % 7

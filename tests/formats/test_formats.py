@@ -239,7 +239,7 @@ def test_suffixes_are_known_in_capitals() -> None:
     assert format_of("A.CSV") is formats()[".csv"]
 
 
-def test_a_plugin_adds_a_format_and_takes_none_away(tmp_path: Path) -> None:
+def test_a_plugin_adds_a_format(tmp_path: Path) -> None:
     script = f"""
 from pathlib import Path
 import lidarspec as ls

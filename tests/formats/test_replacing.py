@@ -35,7 +35,9 @@ def test_folder_of_the_same_format_is_replaced(tmp_path: Path, output: str) -> N
 
 @pytest.mark.parametrize("output", OWN_FILES)
 @pytest.mark.parametrize("stranger", ["thesis.tex", "x/notes.txt", "raw/drive.pcap"])
-def test_folder_with_another_file_is_left_alone(tmp_path: Path, output: str, stranger: str) -> None:
+def test_folder_with_another_file_is_not_replaced(
+    tmp_path: Path, output: str, stranger: str
+) -> None:
     folder = tmp_path / output
     fill(folder, [*OWN_FILES[output], stranger])
     with pytest.raises(UsageError, match=stranger), replace_file(folder) as part:

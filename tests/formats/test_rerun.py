@@ -98,7 +98,7 @@ def test_colours_follow_the_range_on_one_scale(tmp_path: Path) -> None:
     ).tolist()
 
 
-def test_a_mounted_sensor_says_where_it_is(tmp_path: Path) -> None:
+def test_the_mount_of_a_sensor_is_reported(tmp_path: Path) -> None:
     mount = Mount(x=1.0, z=2.0, yaw_deg=90.0)
     write(tmp_path / "a.rrd", [dataclasses.replace(scan(0), mount=mount)])
     found = logged(tmp_path / "a.rrd")

@@ -75,9 +75,7 @@ def test_numbers_texts_addresses_and_bytes_go_to_their_places() -> None:
         (("key", bytes), ["abc", b"ab", 3]),
     ],
 )
-def test_a_value_that_an_argument_does_not_take_is_refused(
-    kind: Any, wrong_values: list[Any]
-) -> None:
+def test_an_invalid_argument_is_refused(kind: Any, wrong_values: list[Any]) -> None:
     sensor = commanded(rate=kind)
     for value in wrong_values:
         with pytest.raises(UsageError, match="start: rate"):

@@ -207,7 +207,7 @@ def test_other_values_of_a_byte_string_are_usage_errors(value: Any) -> None:
             sensor(Struct("k" / Int8ub, "v" / part)).build("data", k=2, v=value)
 
 
-def test_a_name_that_is_an_array_in_one_branch_alone_has_no_raw_form_and_its_columns_do() -> None:
+def test_a_name_with_two_forms_has_columns_but_no_raw_dtype() -> None:
     forms = {1: Struct("x" / Int8ub), 2: Array(2, Struct("y" / Int8ub))}
     packets = sensor(Struct("k" / Int8ub, "v" / Switch(this.k, forms))).decode([b"\1\5", b"\2\6\7"])
     np.testing.assert_array_equal(packets["v.x"], [5, np.nan])
@@ -257,7 +257,7 @@ def test_branches_without_a_common_column_are_refused() -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_length_that_is_no_number_is_the_plugins_fault_and_a_negative_one_is_the_bytes(
+def test_invalid_lengths_are_plugin_errors_or_wire_errors(
     backend: str,
 ) -> None:
     for part in (Array(this.k / 2, Int8ub), Bytes(this.k / 2)):
@@ -343,7 +343,7 @@ def test_elements_within_a_bit_block_are_no_elements_without_a_byte(backend: str
 
 
 @pytest.mark.parametrize("part", [Array(this.n, Struct()), Array(this.n, Int8ub), Bytes(this.n)])
-def test_examples_that_construct_alone_reads_have_counts_that_fit(part: Any) -> None:
+def test_plain_examples_have_consistent_counts(part: Any) -> None:
     ours = sensor(Struct("n" / Int32ub, "v" / part, "twice" / Computed(this.n * 2)), max_length=300)
     assert not is_compiled(ours.frames["data"])
     assert len({len(ours.parse(ours.example("data", seed=seed)).v) for seed in range(8)}) > 3

@@ -152,7 +152,7 @@ def test_marks_that_join_no_echoes_make_no_frame(steps: int, characters: bytes, 
     assert JOINED.decode(data + good).stats.frames == {"data": 1}
 
 
-def test_escapes_are_written_where_they_have_to_be_and_read_wherever_they_are() -> None:
+def test_escapes_are_minimal_and_read_everywhere() -> None:
     made = sensor(Struct("count" / Int8ub, "bytes" / Array(this.count, Int8ub)), Escaped())
     data = made.build("data", bytes=[0x7E, 0x11, 0x7D])
     assert data == b"\x7e\x03\x7d\x5e\x11\x7d\x5d\x7e"

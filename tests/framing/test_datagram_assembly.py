@@ -116,7 +116,7 @@ def test_memory_is_bounded_whatever_comes() -> None:
     assert decoder.stats.bytes_in == decoder.stats.bytes_skipped
 
 
-def test_a_message_is_waited_for_as_long_as_it_may_take_and_no_longer() -> None:
+def test_an_incomplete_message_times_out() -> None:
     decoder = SENSOR.decoder()
     first, *rest = fragments(1)
     decoder.feed(first, 0)

@@ -40,7 +40,7 @@ def conversation(sensor: Sensor, *, seed: int = 0, length: int = LENGTH) -> byte
 
 
 @pytest.mark.parametrize("sensor", SHAPES.values(), ids=SHAPES)
-def test_datagrams_of_any_size_raise_on_nothing(sensor: Sensor) -> None:
+def test_datagrams_of_any_size_raise_no_exception(sensor: Sensor) -> None:
     frame = sensor.example(sensor.data_frame, seed=3)
     data = [
         b"",
@@ -74,7 +74,7 @@ def test_datagrams_of_any_size_raise_on_nothing(sensor: Sensor) -> None:
     [sensor for sensor in SHAPES.values() if sensor.datagrams],
     ids=lambda sensor: sensor.id,
 )
-def test_each_datagram_is_judged_by_its_own_bytes_alone(sensor: Sensor) -> None:
+def test_each_datagram_is_judged_independently(sensor: Sensor) -> None:
     source = random.Random(sensor.id)
     examples = [sensor.example(name, seed=seed) for name in sensor.incoming for seed in range(4)]
     datagrams = []
@@ -304,7 +304,7 @@ def test_runs_of_weak_frames_count_whole_or_not_at_all() -> None:
         assert decoded(sensor, data) == Oracle(sensor, data).frames()
 
 
-def test_a_frame_that_comes_first_in_the_order_ends_a_run() -> None:
+def test_a_frame_of_an_earlier_type_ends_a_run() -> None:
     sensor = SHAPES["shape-weak"]
     node, info = (
         sensor.example("data", seed=1),

@@ -163,7 +163,7 @@ def test_impossible_candidates_do_not_wait() -> None:
     assert (decoder.stats.pending, decoder.stats.bytes_skipped) == (0, 10)
 
 
-def test_a_shorter_frame_behind_the_others_is_not_waited_for() -> None:
+def test_a_shorter_last_frame_is_returned_at_once() -> None:
     count = SHAPES["shape-count"]
     long, short = (
         count.build("data", first=0, last=9, samples=[dict(distance=1, quality=2)] * number)

@@ -102,7 +102,7 @@ def greedy(data: bytes) -> None:
 @pytest.mark.parametrize(
     ("run", "what"), [(raising, "ValueError"), (endless, "TooLong"), (greedy, "MemoryError")]
 )
-def test_harm_is_found_and_kept_for_another_look(
+def test_failures_are_found_and_stored(
     run: object, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trial, "BUSY", 0.05)

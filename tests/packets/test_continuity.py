@@ -53,7 +53,7 @@ def test_sensors_with_datagrams_that_count_no_losses_are_known() -> None:
 
 @pytest.mark.parametrize("name", ["shape-paced", *UNCOUNTED, "ldrobot-ld06", "robosense-m1"])
 @pytest.mark.parametrize("lost", [1, 50])
-def test_a_gap_of_the_clock_is_a_loss_where_nothing_is_counted(name: str, lost: int) -> None:
+def test_a_clock_gap_is_a_loss_without_a_counter(name: str, lost: int) -> None:
     sensor = load_sensor(name)
     frames = simulate(sensor, 600)
     packets = decoded(sensor, frames[:250] + frames[250 + lost :])
@@ -101,7 +101,7 @@ def doubled_late(frames: list[bytes]) -> list[bytes]:
 
 @pytest.mark.parametrize("name", UNCOUNTED)
 @pytest.mark.parametrize("disturbed", [swapped, doubled, doubled_late])
-def test_order_and_identity_are_those_of_the_clock_where_nothing_is_counted(
+def test_order_follows_the_clock_without_a_counter(
     name: str, disturbed: Callable[[list[bytes]], list[bytes]]
 ) -> None:
     sensor = ls.sensor(name)
@@ -174,7 +174,7 @@ def test_one_damaged_reading_of_the_clock_loses_nothing() -> None:
         assert np.flatnonzero(packets.breaks).tolist() == [300, 301]
 
 
-def test_a_clock_that_is_set_and_a_sensor_that_starts_again_lose_nothing() -> None:
+def test_clock_changes_and_restarts_are_no_loss() -> None:
     for name in ("robosense-m1", "hesai-pandar40p"):
         sensor = ls.sensor(name)
         frames = simulate(sensor, 2000)

@@ -106,7 +106,7 @@ def test_importing_the_package_imports_no_library() -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"frame": "vendor"}])
-def test_a_sensor_is_unpickled_where_nothing_was_imported_yet(options: dict[str, str]) -> None:
+def test_a_sensor_is_unpickled_in_a_new_process(options: dict[str, str]) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     packed = pickle.dumps(sensor.configure(**options) if options else sensor)
     code = (

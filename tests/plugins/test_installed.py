@@ -311,7 +311,7 @@ def test_threads_that_ask_at_once_get_the_same_sensor(plugins: dict[str, SimpleN
         assert not any(plugin.error for plugin in found.plugins)
 
 
-def test_a_hook_that_is_always_loaded_reaches_the_sensors_that_are_offered(
+def test_hooks_apply_to_sensors_of_entry_points(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
     found = registry("meddler = meddler", offered="acme-x1 = acme")
@@ -394,7 +394,7 @@ def test_owners_that_cannot_be_read_are_warned_of(
         assert named_owners() == {}
 
 
-def test_an_alias_goes_to_the_sensor_of_its_owner_also_where_no_entry_point_says_so(
+def test_an_alias_without_entry_point_belongs_to_its_owner(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
     plugins["liar"].by_name["liar_x1"] = replace(
@@ -590,7 +590,7 @@ def test_each_plugin_is_tried_in_a_process_of_its_own_if_anything_is_wrong(
 
 
 @pytest.mark.slow
-def test_plugins_with_which_nothing_is_wrong_are_tried_in_one_process(
+def test_working_plugins_are_tried_in_one_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("one", "other"):

@@ -142,7 +142,7 @@ def test_only_a_sensor_that_the_table_describes_is_listed_without_its_plugin(
 
 
 @pytest.mark.parametrize("name", ["velodyne-vlp16", "puck", "VLP-16"])
-def test_a_sensor_that_is_not_installed_is_named_with_its_distribution(name: str) -> None:
+def test_an_uninstalled_sensor_is_named_with_its_distribution(name: str) -> None:
     with pytest.raises(ls.UsageError) as caught:
         Registry().sensor(name)
     assert caught.value.distribution == "lidarspec-velodyne"  # type: ignore[attr-defined]

@@ -80,7 +80,7 @@ def test_columns_have_the_values_types_and_units_of_the_plain_evaluation(backend
     )
 
 
-def test_a_scan_has_columns_of_its_own_packets_made_and_no_others() -> None:
+def test_a_scan_computes_columns_of_its_own_packets_only() -> None:
     sensor = lidarspec.sensor("ouster-os1").configure(rows=32)
     frames = simulate(sensor, 3 * 64)
     scans, whole = list(sensor.scans(frames)), sensor.decode(frames).points()
@@ -265,9 +265,7 @@ def words() -> Sensor:
     [words(), SENSOR, SHAPES["shape-segments"], SHAPES["shape-bits"]],
     ids=lambda sensor: sensor.id,
 )
-def test_columns_that_are_read_together_are_those_that_are_read_one_by_one(
-    sensor: Sensor, backend: str
-) -> None:
+def test_columns_read_together_equal_columns_read_singly(sensor: Sensor, backend: str) -> None:
     read = (
         reader(sensor, backend)
         .decode([sensor.example(sensor.data_frame, seed=seed) for seed in range(9)])
@@ -291,7 +289,7 @@ def test_an_unknown_column_is_an_error() -> None:
         dataclasses.replace(cloud[[0, 1]], intensity=None).read("intensity")
 
 
-def test_asking_whether_there_is_a_column_makes_none() -> None:
+def test_checking_for_a_column_computes_nothing() -> None:
     cloud = packets().points()
     assert isinstance(cloud, LazyCloud)
     assert "velocity" in cloud.extra

@@ -83,7 +83,7 @@ def test_coordinates_are_the_same_bit_by_bit(name: str, points: Any, backend: st
 
 
 @BACKENDS
-def test_a_point_is_where_its_coordinates_say(backend: str) -> None:
+def test_a_point_is_drawn_at_its_coordinates(backend: str) -> None:
     sensor = SHAPES["shape-millimetres"]
     given = [(3000, 4000, -12000, 0), (0, 0, 0, 0), (0, -2000, 0, 200), (-1500, 0, 0, 199)]
     points = [dict(x=x, y=y, z=z, reflectivity=9, tag=tag) for x, y, z, tag in given]

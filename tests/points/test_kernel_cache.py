@@ -69,7 +69,7 @@ def test_a_kernel_is_read_in_the_next_run(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_names_tell_nothing_without_the_key(folder: Path) -> None:
+def test_names_are_hashed_with_the_key(folder: Path) -> None:
     _is_read()
     name = _file(folder).name
     assert _module_name(SOURCE).removeprefix("lidarspec_kernel_") not in name
@@ -157,7 +157,7 @@ print(function_of({source!r})(41))
 
 
 @pytest.mark.slow
-def test_a_full_disk_means_compiling_again_and_leaves_nothing_behind(folder: Path) -> None:
+def test_a_full_disk_stores_no_kernel(folder: Path) -> None:
     command = [
         sys.executable,
         "-B",

@@ -208,7 +208,7 @@ def test_any_number_of_threads_gives_the_same(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compiled", [False, True])
-def test_it_is_chosen_by_itself_once_enough_points_were_made(
+def test_kernels_are_chosen_after_enough_points(
     compiled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sensor = dataclasses.replace(
@@ -264,7 +264,7 @@ def test_the_environment_names_the_default_and_nothing_else_imports_numba() -> N
 
 
 @pytest.mark.slow
-def test_kernels_are_kept_between_runs_and_done_without_where_they_cannot_be(
+def test_kernels_are_cached_if_possible(
     tmp_path: Path,
 ) -> None:
     code = (
@@ -352,7 +352,7 @@ def test_streams_are_cut_equally() -> None:
 
 
 @pytest.mark.slow
-def test_a_checksum_over_no_bytes_is_right_where_it_is_that_of_none() -> None:
+def test_a_checksum_over_no_bytes() -> None:
     part = Checksummed(Struct("text" / Bytes(this._.size % 3), "sum" / Int8ub), "sum", Crc(8, 0x4D))
     sensor = against_construct.sensor(Struct("size" / Int8ub, "part" / part))
     packets = sensor.decode([b"\0\0", b"\3\0", b"\0\1"], backend="jit")

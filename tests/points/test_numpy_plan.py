@@ -148,7 +148,7 @@ def test_untraceable_functions_are_reported_and_evaluated(points: Any, reason: s
     assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
 
-def test_a_factor_that_is_zero_or_negative_leaves_no_point_behind() -> None:
+def test_a_zero_or_negative_factor_gives_no_points() -> None:
     sensor = lidarspec.sensor("hesai-xt32")
     frames = []
     for unit in (4, 0, 4):

@@ -81,7 +81,7 @@ def test_the_shape_is_columns_and_rows_for_two_returns_too(backend: str) -> None
     assert picture.range.reshape(TURN, PIXELS, 2)[33, 4].tolist() == pytest.approx([1.04, 2.04])
 
 
-def test_rows_of_tables_are_looked_at_where_they_are_or_gathered() -> None:
+def test_rows_are_viewed_or_gathered() -> None:
     in_order = [
         frame(first) for first in (*range(16, TURN, COLUMNS), 0, 16)
     ]  # round the end of the table, too

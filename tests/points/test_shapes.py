@@ -190,7 +190,7 @@ def test_bit_fields_in_both_orders(backend: str) -> None:
     assert cloud.return_index.tolist() == [0, 1] * 6  # type: ignore[union-attr]
 
 
-def test_checksums_stand_where_they_are_declared() -> None:
+def test_checksums_are_at_their_declared_positions() -> None:
     middle = SHAPES["shape-middle"].build(
         "data", angle=0x1234, samples=[dict(quality=1, distance=0x0203)] * 4
     )

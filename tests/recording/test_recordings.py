@@ -288,7 +288,7 @@ def test_an_old_file_stays_until_the_new_one_has_its_first_record(path: Path) ->
     assert sorted(path.parent.iterdir()) == sorted([path, link])
 
 
-def test_an_old_file_stays_where_the_disk_takes_no_new_one(path: Path) -> None:
+def test_an_old_file_survives_a_full_disk(path: Path) -> None:
     path.write_bytes(b"precious")
     with (
         file_size_limit(600),
@@ -595,7 +595,7 @@ NO_EVENTS = [
 ]
 
 
-def test_an_event_that_is_none_is_a_fault_of_its_recording(path: Path) -> None:
+def test_an_invalid_event_is_damage_of_the_recording(path: Path) -> None:
     record(path, CHUNKS[:2])
     with path.open("ab") as file:
         file.write(b"".join(pack_record(3, event) for event in NO_EVENTS))

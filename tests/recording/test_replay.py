@@ -124,7 +124,7 @@ def until_the_end(read: Callable[[], bytes]) -> Iterator[bytes]:
 
 @pytest.mark.parametrize("speed", SPEEDS)
 @pytest.mark.parametrize("kind", [pytest.param("pty", marks=posix), "tcp"])
-def test_a_stream_comes_out_as_it_went_in_at_every_speed(
+def test_a_replayed_stream_is_unchanged_at_every_speed(
     stream: Path, kind: str, speed: float | None
 ) -> None:
     target = Outlet(PtyLine() if kind == "pty" else TcpLine("127.0.0.1", 0, sole=True))
@@ -137,7 +137,7 @@ def test_a_stream_comes_out_as_it_went_in_at_every_speed(
 
 
 @pytest.mark.parametrize("speed", SPEEDS)
-def test_datagrams_come_out_as_they_went_in_at_every_speed(
+def test_replayed_datagrams_are_unchanged_at_every_speed(
     datagrams: Path, speed: float | None
 ) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
@@ -269,7 +269,7 @@ def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
     assert [type(error) for error in failed] == [Disconnected]
 
 
-def test_a_reader_that_floods_does_not_hold_up_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flooding_reader_does_not_delay_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outlets, "FETCH_TIMEOUT_S", 0.2)
     target = TcpLine("127.0.0.1", 0, sole=True)
     with socket.create_connection(("127.0.0.1", int(target.place.split(":")[2]))) as reader:

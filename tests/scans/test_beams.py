@@ -71,7 +71,7 @@ def test_each_beam_is_as_late_as_its_points(name: str) -> None:
         assert turned.sum() <= 0.04 * len(scan)
 
 
-def test_a_sensor_that_sees_less_than_a_turn_has_beams_where_it_sees() -> None:
+def test_beams_cover_the_field_of_view() -> None:
     scan, *_ = simulated("hokuyo-utm30lx")
     (one,) = planar(PlanarScans(), [scan])
     assert (math.degrees(one.angle_min), math.degrees(one.angle_max)) == pytest.approx((-135, 135))

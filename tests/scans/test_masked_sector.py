@@ -194,7 +194,7 @@ def test_a_rotor_that_stops_behind_a_masked_sector_ends_its_scans() -> None:
     assert scans
 
 
-def test_scans_are_cut_where_the_user_wants() -> None:
+def test_scans_are_cut_at_a_chosen_angle() -> None:
     packets = blocks_of(None, whole_packets=True)
     sensor = rotating(packets).configure(cut=90)
     frames = simulate(sensor, len(packets))

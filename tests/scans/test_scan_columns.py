@@ -229,7 +229,7 @@ def test_an_oscillating_sensor_is_cut_equally_for_all_batch_sizes() -> None:
 
 
 @pytest.mark.parametrize("name", SHAPED)
-def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str) -> None:
+def test_packets_in_shared_buffers_give_the_same_points(name: str) -> None:
     assert_place_of_packets_does_not_matter(SHAPES[name], "numpy")
 
 
@@ -237,7 +237,7 @@ def test_packets_that_stay_where_they_were_read_give_the_same_points(name: str) 
 @pytest.mark.parametrize(
     ("name", "backend"), [*((name, "numpy") for name in REPRESENTATIVES), *COMPILED_CASES]
 )
-def test_packets_of_a_sensor_that_stay_where_they_were_read_give_the_same_points(
+def test_packets_of_a_sensor_in_shared_buffers_give_the_same_points(
     name: str, backend: str
 ) -> None:
     assert_place_of_packets_does_not_matter(ls.sensor(name), backend)
@@ -274,7 +274,7 @@ def assert_place_of_packets_does_not_matter(sensor: Sensor, backend: str) -> Non
 
 
 @pytest.mark.parametrize("number", [0, -1, 2.5, "360", True])
-def test_a_number_of_sectors_that_is_none_is_refused_by_name(number: Any) -> None:
+def test_an_invalid_number_of_sectors_is_refused(number: Any) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     scan = next(sensor.scans(sensor.example("data")))
     for bins in (scan.to_bins, scan.to_laserscan):

@@ -166,7 +166,7 @@ def scans_without(name: str, lost: Collection[int], number: int = 4000) -> list[
 @pytest.mark.parametrize(
     "name", [*CUT_BY, *(pytest.param(name, marks=pytest.mark.slow) for name in RELATED)]
 )
-def test_a_scan_is_complete_where_nothing_is_missing_and_only_there(name: str) -> None:
+def test_a_scan_is_complete_exactly_if_nothing_is_missing(name: str) -> None:
     sound = scans_without(name, ())
     assert [scan.complete for scan in sound] == [False, *[True] * (len(sound) - 2), False]
     sizes, per_packet = np.cumsum([len(scan) for scan in sound]), sum(map(len, sound)) / 4000
@@ -204,9 +204,7 @@ def test_a_scan_is_complete_where_nothing_is_missing_and_only_there(name: str) -
     ],
 )
 @pytest.mark.parametrize("after", [0.0, 0.9, pytest.param(0.3, marks=pytest.mark.slow)])
-def test_no_two_turns_are_one_scan_whatever_is_missing(
-    name: str, turns: float, after: float
-) -> None:
+def test_two_turns_are_never_one_scan(name: str, turns: float, after: float) -> None:
     sound = scans_without(name, ())
     turn = round(len(sound[2]) * 4000 / sum(map(len, sound)))
     first = round((len(sound[0]) + len(sound[1])) * 4000 / sum(map(len, sound))) + round(
@@ -333,7 +331,7 @@ def test_false_and_missing_nodes_make_a_scan_incomplete(kind: str) -> None:
         assert len([scan for scan in scans[1:-1] if not scan.complete]) in (1, 2, 3)
 
 
-def test_a_datagram_of_others_takes_nothing_from_a_scan() -> None:
+def test_a_foreign_datagram_does_not_make_a_scan_incomplete() -> None:
     sensor = ls.sensor("velodyne-vlp16")
     frames = simulate(sensor, 400)
     assert [scan.complete for scan in sensor.scans([*frames[:150], b"noise", *frames[150:]])] == [
@@ -342,7 +340,7 @@ def test_a_datagram_of_others_takes_nothing_from_a_scan() -> None:
 
 
 @pytest.mark.parametrize("name", [*CUT_BY, "cspc-m1c1-mini"])
-def test_pieces_do_not_matter_where_packets_are_missing(name: str) -> None:
+def test_pieces_do_not_change_losses(name: str) -> None:
     sensor, draw = ls.sensor(name), random.Random(2)
     frames = simulate(sensor, 2500)
     for place in (300, 900, 1200):

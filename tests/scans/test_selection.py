@@ -154,7 +154,7 @@ def test_by_the_time_of_arrival(recordings: dict[str, Path]) -> None:
     assert all(scan.points.time[0] == 0 for scan in found)
 
 
-def test_returns_from_elsewhere_are_none(recordings: dict[str, Path]) -> None:
+def test_returns_outside_the_ranges_are_dropped(recordings: dict[str, Path]) -> None:
     every = list(scans(recordings["pcap"], Selection(scans=(3, 6))))
     for scan, near in zip(
         every, scans(recordings["pcap"], Selection(scans=(3, 6), ranges=(1.5, 3.0))), strict=True

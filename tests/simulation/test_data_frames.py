@@ -53,7 +53,7 @@ def test_a_count_further_out_is_filled_in() -> None:
     assert OUTER.parse(data).body.distances == [1, 2, 3]
 
 
-def test_a_count_further_out_that_is_wrong_is_the_callers_fault() -> None:
+def test_a_wrong_outer_count_is_a_usage_error() -> None:
     with pytest.raises(ls.UsageError, match="distances"):
         OUTER.build(
             "data", header={"version": 2, "size": 9}, body={"angle": 9, "distances": [1, 2, 3]}

@@ -74,7 +74,7 @@ def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
     assert device.commands_received == ["start", "stop"]
 
 
-def test_a_captured_start_of_a_coin_d4_comes_out_byte_for_byte_up_to_its_points() -> None:
+def test_a_simulated_coin_d4_starts_like_the_captured_one() -> None:
     device = on(ls.sensor("cspc-coin-d4"), seed=4)
     started = asked(device, "start", 0) + passing(device, 0, SECOND + 5 * MS)
     captured = (
@@ -153,7 +153,7 @@ def test_an_rplidar_reports_its_identity_and_scans_in_the_requested_mode() -> No
     assert passing(device, 5 * SECOND, 6 * SECOND) == b""
 
 
-def test_a_scan_mode_that_is_not_there_starts_nothing() -> None:
+def test_an_unsupported_scan_mode_starts_nothing() -> None:
     device = on(a1())
     assert asked(device, "express_scan", 0, mode=9) + passing(device, 0, SECOND) == b""
 

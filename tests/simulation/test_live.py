@@ -71,7 +71,7 @@ def test_a_simulated_sensor_is_a_source(name: str) -> None:
     assert all(scan.points.valid.mean() > 0.95 for scan in found)
 
 
-def test_a_sensor_that_is_not_started_keeps_silent() -> None:
+def test_an_unstarted_sensor_sends_nothing() -> None:
     with ls.open("sim:slamtec-rplidar-a1", start=False) as device:
         assert next(iter(device.packets(wait=0.3))).stats.bytes_in == 0
         assert device.send("get_info").values.hardware == 7
@@ -293,7 +293,7 @@ def test_a_start_command_that_no_program_sends_does_not_silence_a_sensor(tmp_pat
     assert device.sent["data"] == 41  # every 5 ms, both ends included
 
 
-def test_a_file_with_nothing_in_it_is_an_error_with_the_reason(tmp_path: Path) -> None:
+def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
     start = Command("order", {"code": 1}, starts=True)
     stop = Command("order", {"code": 2}, stops=True)
     slow = sound.sensor(

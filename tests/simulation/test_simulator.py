@@ -332,7 +332,7 @@ def turned_sensor(directions: Any) -> Sensor:
     return replace(sensor, points=turned, simulation=simulated)
 
 
-def test_coordinates_are_solved_for_whatever_points_makes_of_the_fields() -> None:
+def test_coordinates_are_solved_for_linear_points_functions() -> None:
     def directions(i: int) -> tuple[Any, Any]:
         return np.linspace(-1, 1, 2 + i % 5)[:, None] + i * 0.1, np.array([0.0, 0.3])
 
@@ -362,7 +362,7 @@ def test_directions_that_do_not_fit_and_fields_that_are_not_there_are_named() ->
         )
 
 
-def test_a_beam_that_meets_nothing_in_reach_has_no_coordinates() -> None:
+def test_a_beam_without_a_hit_has_no_coordinates() -> None:
     sensor = replace(coordinates.SENSORS[0], range_limits=(0.1, 3.0))
     cloud = sensor.decode(simulate(sensor, 40)).points()
     assert 0 < cloud.valid.sum() < len(cloud)

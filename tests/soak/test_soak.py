@@ -17,7 +17,7 @@ QUICK = ("P4", "P6", "P20", "P23")
 BY_NAME = {promise.name: promise for promise in EVERY}
 
 
-def test_each_promise_is_held_by_something_that_is_there() -> None:
+def test_each_promise_names_an_existing_test() -> None:
     assert [name for name in BY_NAME if name] == [f"P{number}" for number in range(1, 25)]
     for promise in EVERY:
         assert promise.tests or promise.measured
@@ -33,7 +33,7 @@ def test_every_promise_is_measured(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_promise_that_is_not_kept_says_so(tmp_path: Path) -> None:
+def test_a_broken_promise_is_reported(tmp_path: Path) -> None:
     (tmp_path / "test_promised.py").write_text(
         "def test_kept(): pass\ndef test_broken(): assert False\n"
     )

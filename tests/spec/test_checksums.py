@@ -510,7 +510,7 @@ class Attentive(Checksum):
         return "a sum that remembers"
 
 
-def test_a_checksum_that_may_be_not_filled_is_computed_only_where_it_is() -> None:
+def test_an_absent_checksum_is_not_computed() -> None:
     attentive = Attentive()
     sensor = against_construct.sensor(
         Checksummed(

@@ -20,11 +20,11 @@ def steps(azimuth: list[float], *, repeat: bool = True) -> Floats:
     return np.round(np.asarray(found, np.float64), 2)
 
 
-def test_a_gap_and_the_end_take_the_last_good_step() -> None:
+def test_gaps_and_the_end_use_the_last_valid_step() -> None:
     np.testing.assert_array_equal(steps([10.0, 10.2, 90.0, 90.3]), [0.2, 0.2, 0.3, 0.3])
 
 
-def test_a_lone_block_between_two_gaps_takes_the_last_good_step() -> None:
+def test_a_single_block_between_gaps_uses_the_last_valid_step() -> None:
     np.testing.assert_array_equal(steps([10.0, 10.2, 50.0, 90.0]), [0.2, 0.2, 0.2, 0.2])
 
 

@@ -526,7 +526,7 @@ def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> Non
     assert not any(text.startswith("LS212") for text in told(sound.sensor(sealed), vectors))
 
 
-def test_a_vector_that_cannot_be_read_hides_no_other() -> None:
+def test_an_invalid_vector_does_not_hide_others() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     wrong = {**known[0], "values": {"number": 19}}
     vectors = [
@@ -544,7 +544,7 @@ def test_a_vector_that_cannot_be_read_hides_no_other() -> None:
     ]
 
 
-def test_a_reply_that_nothing_makes_up_asks_for_answers() -> None:
+def test_a_reply_that_cannot_be_simulated_requires_answers() -> None:
     def configure(sensor: Sensor, *, serial: int) -> Sensor:
         return sensor
 

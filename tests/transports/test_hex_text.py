@@ -61,7 +61,7 @@ def test_a_line_without_end_is_read_in_pieces(
     assert max(map(len, found)) <= block
 
 
-def test_a_single_digit_is_a_byte_where_it_says_so_alone() -> None:
+def test_a_single_digit_is_a_byte_only_with_a_prefix() -> None:
     assert parse_hex("0xa, 0x5") == b"\x0a\x05"
     assert parse_hex("") == b""
     for text, reason in (

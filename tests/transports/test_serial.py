@@ -56,7 +56,7 @@ def test_the_sensor_says_the_baud_rate_and_the_source_overrides_it(tmp_path: Pat
             one.close()
 
 
-def test_control_lines_are_taken_where_the_port_has_none(tmp_path: Path) -> None:
+def test_control_lines_are_ignored_by_ports_without_them(tmp_path: Path) -> None:
     with port(tmp_path) as line:
         one = opened(f"serial://{line.name}?baud=9600")
         one.lines(dtr=False, rts=True)

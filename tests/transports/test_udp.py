@@ -69,7 +69,7 @@ def test_the_sensor_says_the_ports() -> None:
     one.close()
 
 
-def test_a_host_binds_that_interface_alone() -> None:
+def test_a_host_binds_only_that_interface() -> None:
     port = free_port()
     one = opened(f"udp://127.0.0.1:{port}")
     with udp("127.0.0.2") as sender:
@@ -130,7 +130,7 @@ def test_data_is_sent_to_the_requested_sender_only() -> None:
     one.close()
 
 
-def test_a_port_that_is_none_is_refused() -> None:
+def test_an_invalid_port_is_refused() -> None:
     with pytest.raises(UsageError, match="a sender is ADDRESS or ADDRESS:PORT"):
         opened("udp://:2368?src=10.0.0.1:0")
 

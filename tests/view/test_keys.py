@@ -65,7 +65,7 @@ def test_screens_of_the_docs_are_complete() -> None:
     assert [text.text for text in root.findall(".//{*}text")] == ["a", "<", "b"]
 
 
-def test_c_goes_through_all_that_colours_can_show() -> None:
+def test_the_key_c_cycles_through_all_columns() -> None:
     shown, choice = ["range", "velocity", "snr"], ViewSettings()
     seen = [(choice := choice.after_key("c", 6, shown)).ramp for _ in range(3)]
     assert seen == ["velocity", "snr", "range"]

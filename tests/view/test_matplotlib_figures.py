@@ -37,7 +37,7 @@ def offsets(axes: Any) -> np.ndarray:
     return np.asarray(axes.collections[0].get_offsets())
 
 
-def test_a_flat_scan_is_seen_from_above_forward_up_and_left_left() -> None:
+def test_a_planar_scan_is_drawn_from_above() -> None:
     one = simulated("ldrobot-stl27l", 600)
     axes, bar = figures.of_scan(one, choose_appearance(one.points), "title").axes
     cloud = one.points[one.points.valid]

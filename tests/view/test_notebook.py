@@ -33,7 +33,7 @@ def dots(svg: str, view: int = 0) -> list[tuple[float, float]]:
     return [(across, down) for across, down in found]
 
 
-def test_a_cloud_is_drawn_where_its_points_are() -> None:
+def test_a_cloud_is_drawn_at_its_coordinates() -> None:
     svg = cloud((4, 0, 0), (0, 2, 0))._repr_svg_()
     assert svg is not None
     middle = 260
@@ -57,7 +57,7 @@ def test_a_cloud_with_heights_is_drawn_from_the_side_as_well() -> None:
     assert low - high == pytest.approx(metres, abs=0.6)
 
 
-def test_a_point_shows_as_text_and_nothing_as_a_picture() -> None:
+def test_single_points_and_empty_clouds_are_displayed_as_text() -> None:
     assert cloud((1, 2, 0))[0]._repr_svg_() is None
     assert "0 returns" in str(cloud()._repr_svg_())
 

@@ -105,7 +105,7 @@ def test_a_circle_is_round() -> None:
     assert height == pytest.approx(2 * 4.5 / 5 * 59.5, abs=2)
 
 
-def test_points_beyond_the_picture_are_left_out_and_it_keeps_its_size() -> None:
+def test_points_beyond_the_picture_are_not_drawn() -> None:
     assert of_points(cloud((7, 0, 0))) == set()
     for points in (cloud((7, 0, 0)), cloud(), cloud((1, 1, 1))):
         for chosen in (FLAT, TALL):

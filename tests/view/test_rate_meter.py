@@ -109,7 +109,7 @@ def test_without_arrival_times_rates_are_by_the_sensors_clock() -> None:
     assert found.longest_gap_s is None
 
 
-def test_before_anything_has_come_nothing_is_known() -> None:
+def test_before_any_data_there_are_no_figures() -> None:
     bench = Bench()
     found = bench.meter.reading(bench.decoder.stats)
     assert (found.packets, found.scans, found.error_rate) == (0, 0, 0.0)

@@ -758,9 +758,7 @@ def test_an_at128_has_the_angles_of_its_file(tmp_path: Path) -> None:
     ],
     ids=["text", "short", "changed", "longer"],
 )
-def test_a_file_that_is_none_of_an_at128_is_refused(
-    content: bytes, message: str, tmp_path: Path
-) -> None:
+def test_an_invalid_at128_file_is_refused(content: bytes, message: str, tmp_path: Path) -> None:
     file = tmp_path / "unit.dat"
     file.write_bytes(content)
     with pytest.raises(ls.UsageError, match=message):

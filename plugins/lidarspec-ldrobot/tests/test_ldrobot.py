@@ -247,7 +247,7 @@ def test_six_real_frames() -> None:
     assert packets.raw["speed"].tolist() == [item["speed_dps"] for item in expected]
 
 
-def test_no_return_has_no_place_whatever_its_intensity() -> None:
+def test_points_without_a_return_have_no_coordinates() -> None:
     cloud = decoded(LD06, vector_bytes(FILE, "ld20_capture")).points()
     assert cloud.intensity is not None
     assert not cloud.valid.any()

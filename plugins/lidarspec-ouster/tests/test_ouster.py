@@ -176,7 +176,7 @@ def metadata_of(params: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def test_bits_of_every_profile_stand_where_the_table_has_them() -> None:
+def test_bits_of_every_profile_match_the_table() -> None:
     vectors(FILE)
     table = json.loads(
         (capture("ouster").parents[1] / "protocols" / "tables_udp3d.json").read_text(
@@ -234,7 +234,7 @@ def test_lost_and_invalid_columns_leave_gaps() -> None:
 
 
 @pytest.mark.slow
-def test_packets_alone_tell_their_layout() -> None:
+def test_packets_identify_their_layout() -> None:
     for name, (_, layout) in CAPTURES.items():
         found = identify_senders(capture(f"ouster/{name}.pcap"))[0]
         options = found.candidates[0].sensor.options

@@ -27,7 +27,7 @@ def test_the_packet_of_three_returns() -> None:
     assert cloud.return_index[:4].tolist() == [0, 1, 2, 0]
 
 
-def test_a_return_that_repeats_another_is_one_point() -> None:
+def test_a_repeated_return_is_one_point() -> None:
     parsed = M8.parse(vector_bytes(FILE, NAME))
     parsed.firings[0].first = list(parsed.firings[0].third)
     cloud = decoded(M8, M8.build("data", parsed)).points()

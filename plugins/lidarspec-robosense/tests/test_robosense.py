@@ -243,7 +243,7 @@ def test_device_information_layouts_are_distinguished() -> None:
 
 
 @pytest.mark.parametrize("size", [0, 1, 255, 257, 1209, 1211, 62152])
-def test_datagrams_of_another_size_are_none_of_ours(size: int) -> None:
+def test_datagrams_of_another_size_are_rejected(size: int) -> None:
     whole = vector_bytes(FILE, "rsm1_msop_full_dual_1") + bytes(62152)
     packets = decoded(SENSOR, [whole[:size], whole[:SIZE]])
     assert (len(packets), packets.stats.bad_length, packets.stats.bytes_skipped) == (1, 1, size)

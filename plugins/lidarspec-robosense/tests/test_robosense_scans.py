@@ -136,7 +136,7 @@ def test_late_and_doubled_packets_give_the_same_scans(
     assert (packets.stats.late > 0) == (disturbed is shuffled)
 
 
-def test_a_late_packet_over_the_border_of_frames_belongs_to_its_own() -> None:
+def test_a_late_packet_is_part_of_its_own_scan() -> None:
     data = frames(2)
     late = data[:627] + data[628:634] + [data[627]] + data[634:]
     same_scans(list(SENSOR.scans(late)), list(SENSOR.scans(data)))
@@ -160,7 +160,7 @@ def test_a_long_loss_is_counted_by_the_length_of_the_frame() -> None:
     assert SENSOR.decode(single[:100] + single[650:660]).stats.lost == 550
 
 
-def test_no_point_is_left_over_from_the_scan_before() -> None:
+def test_no_point_remains_from_the_previous_scan() -> None:
     for earlier, later in pairwise(SENSOR.scans(shuffled(frames(4), 9))):
         assert {number // 1000 for number in numbers(earlier)} == {numbers(earlier)[-1] // 1000}
         assert later.stamp_ns - earlier.stamp_ns == 100_000_000

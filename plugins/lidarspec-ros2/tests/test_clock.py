@@ -44,7 +44,7 @@ def test_stamps_are_within_a_millisecond_and_a_clock_that_is_set_is_reported(
 
 
 @pytest.mark.parametrize("jitter", LATE_ONLY)
-def test_packets_tell_more_than_scans_alone(jitter: str) -> None:
+def test_packets_improve_stamps_over_scans(jitter: str) -> None:
     alone, with_packets = (simulated(1, jitter, each=each) for each in (1, 40))
     errors = [np.abs(run.errors[run.is_settled]).mean() for run in (alone, with_packets)]
     assert errors[1] < errors[0] / 2
@@ -154,7 +154,7 @@ def test_stamps_continue_after_a_pause(pause: int) -> None:
     st.sampled_from([-1, 1]),
 )
 @settings(max_examples=10, deadline=None)
-def test_any_drift_and_any_step_come_out_right(
+def test_any_drift_and_step_is_followed(
     wraps: bool, jitter: str, seed: int, drift: float, step: float, sign: int
 ) -> None:
     run = simulated(seed, jitter, drift_ppm=drift, step=sign * step, wraps=wraps)

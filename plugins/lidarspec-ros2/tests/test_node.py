@@ -150,9 +150,7 @@ def test_invalid_arguments_give_the_errors_of_the_command_line(
         assert (process.returncode, reason in complaints) == (known.returncode, True)
 
 
-def test_parameters_are_described_and_changed_where_that_makes_sense(
-    run: Any, client: Client
-) -> None:
+def test_parameters_have_descriptions_and_some_can_be_changed(run: Any, client: Client) -> None:
     scans = client.listen("scan", LaserScan)
     run(*STL, ros=given(qos="reliable", frame_id="front"))
     client.until(lambda: scans)
@@ -391,9 +389,7 @@ def plugged(tmp_path: Path) -> Iterator[Callable[..., tuple[Path, int]]]:
         process.communicate()
 
 
-def test_a_port_that_goes_away_makes_the_node_inactive_until_it_is_back(
-    run: Any, client: Client, plugged: Any
-) -> None:
+def test_a_missing_port_makes_the_node_inactive(run: Any, client: Client, plugged: Any) -> None:
     port, _ = plugged("--unplug", "5s", "--absent", "3s")
     scans = client.listen("scan", LaserScan)
     run(str(port), "-s", "ldrobot-stl27l", ros=given(qos="reliable"))

@@ -119,7 +119,7 @@ def test_an_unknown_sensor_gets_room_for_usual_clouds_unless_its_line_is_slow() 
     assert choose(None, is_serial=True).notice == ""
 
 
-def test_a_sensor_that_is_not_installed_is_left_to_the_node() -> None:
+def test_an_uninstalled_sensor_is_reported_by_the_node() -> None:
     def find_sensor() -> Sensor:
         return ls.sensor("acme-x1")
 

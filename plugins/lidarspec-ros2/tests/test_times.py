@@ -105,7 +105,7 @@ def test_stamps_by_the_sensors_clock_are_closer_to_the_truth_than_arrivals(
     assert (np.diff(stamps) > 0).all()
 
 
-def test_a_clock_that_is_set_is_reported(
+def test_a_clock_change_is_reported(
     run: Callable[..., Any], client: Client, tmp_path: Path
 ) -> None:
     path, _ = recorded(

@@ -39,7 +39,7 @@ def test_packets_of_one_return_and_two_by_hand(
     assert cloud.ring[:4].tolist() == [0, 1, 2, 3]
 
 
-def test_a_frame_is_a_scan_and_a_packet_shorter_than_it_says_is_none() -> None:
+def test_a_frame_is_a_scan_and_a_short_packet_is_invalid() -> None:
     sent = simulate(FALCON, 200)
     scans = list(FALCON.scans(sent))
     assert [(len(scan), scan.complete) for scan in scans] == [

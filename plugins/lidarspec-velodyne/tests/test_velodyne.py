@@ -566,7 +566,7 @@ def test_an_hdl64e_has_the_corrections_of_its_file(tmp_path: Path) -> None:
     assert_points(cloud, [(33, (4.63188, 0.28318, -0.43726))], atol=5e-5)
 
 
-def test_a_file_that_is_none_of_an_hdl64e_is_refused(tmp_path: Path) -> None:
+def test_an_invalid_hdl64e_file_is_refused(tmp_path: Path) -> None:
     sensor, text = ls.sensor("velodyne-hdl64e-s3"), tmp_path / "text.xml"
     text.write_text("lasers: 64")
     with pytest.raises(

@@ -122,7 +122,7 @@ def test_lost_and_reordered_packets_do_not_mislead(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(
+def test_a_point_leads_to_its_frame_after_bytes_were_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lidarspec_web.recent_bytes.MAX_INPUT_BYTES", 1)
@@ -135,7 +135,7 @@ def test_a_point_leads_to_its_frame_where_the_newest_bytes_are_gone(
 
 
 @pytest.mark.slow
-def test_points_that_are_not_shown_are_gone(tmp_path: Path) -> None:
+def test_points_of_old_scans_are_discarded(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
         header, _ = page.scan()
         assert page.asked("frame", point={"scan": header["scan"] + 9, "index": 1})["is"] == "gone"

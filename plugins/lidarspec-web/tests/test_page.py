@@ -376,7 +376,7 @@ def test_the_file_that_a_browser_is_started_with_leads_to_the_page(
         page.close()
 
 
-def test_a_hidden_page_asks_for_nothing(tmp_path: Path) -> None:
+def test_a_hidden_page_requests_no_scans(tmp_path: Path) -> None:
     """Without playwright, which keeps every page visible.
 
     Tabs of one window are controlled by the browser's own

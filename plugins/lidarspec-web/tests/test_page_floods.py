@@ -121,7 +121,7 @@ def test_questions_of_a_page_are_answered_in_their_order(station: Station) -> No
     assert [answer["number"] for answer in answers] == list(range(count))
 
 
-def test_scans_that_are_written_keep_nothing_from_pages(
+def test_writing_scans_does_not_delay_pages(
     station: Station, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk hangs, and there are more requests than the limit of saved scans."""

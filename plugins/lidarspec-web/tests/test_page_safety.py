@@ -65,7 +65,7 @@ def test_a_foreign_host_is_refused(shared: Station, path: str, host: str) -> Non
     assert b"<title>" not in body
 
 
-def test_all_names_of_this_computer_are_its_own(shared: Station) -> None:
+def test_all_names_of_this_computer_are_accepted(shared: Station) -> None:
     for name in ("127.0.0.1", "localhost", "[::1]"):
         status, _, body = shared.answered("/", Host=f"{name}:{shared.port}")
         assert (status, b"<title>page</title>" in body) == (200, True), name

@@ -229,7 +229,7 @@ def test_a_file_ends_and_is_played_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_behind_the_end_of_a_file_is_its_end(tmp_path: Path) -> None:
+def test_seeking_past_the_end_shows_the_end(tmp_path: Path) -> None:
     with Station(recorded(tmp_path, seconds=1), tmp_path) as station, station.page() as page:
         page.say("seek", to=100)
         page.until("ended")
@@ -286,7 +286,7 @@ def test_invalid_requests_are_refused_and_end_nothing(tmp_path: Path) -> None:
         assert page.scan()[1]["x"].size
 
 
-def test_a_message_that_is_too_long_ends_its_page_alone(tmp_path: Path) -> None:
+def test_a_too_long_message_closes_its_own_page_only(tmp_path: Path) -> None:
     with (
         Station(f"sim:{FLAT}", tmp_path) as station,
         station.page() as page,
@@ -348,7 +348,7 @@ def test_a_file_is_not_recorded(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_page_that_takes_nothing_is_dropped_and_a_recording_loses_nothing(
+def test_a_page_that_does_not_read_is_disconnected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It requests scan after scan and reads none of them, until its window is full."""
