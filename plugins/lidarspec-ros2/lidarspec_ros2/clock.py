@@ -250,7 +250,7 @@ class DeviceClock:
         strays = list(self._strays)[-SURELY:]
         self.jumps += 1
         self.jump = (
-            "the sensor's clock was set by"
+            "the sensor's clock was changed by"
             f" {(self._line.delay - min(sample.delay for sample in strays)) / 1e9:+.3f} s"
         )
         self._begin()

@@ -56,11 +56,11 @@ def ros2(
     options: Sequence[str],
     calibration: str | None,
 ) -> None:
-    """A sensor as a ROS 2 node, which publishes its scans, until it is interrupted or a file ends.
+    """Publish the scans of a sensor as a ROS 2 node, until interrupted or at the end of a file.
 
-    What follows --ros-args is ROS's own: parameters (-p frame_id:=front), a file of them
+    Options after --ros-args are those of ROS: parameters (-p frame_id:=front), a parameter file
     (--params-file), names (-r __node:=front, -r scan:=front/scan). The node is configured and
-    activated at once; its parameters are on the page of the reference.
+    activated when it starts. The reference lists its parameters.
     """
     given = {
         "source": source,
@@ -89,10 +89,10 @@ def import_ros() -> None:
     try:
         importlib.import_module("rclpy")
     except ImportError as error:
-        text = f"ROS 2 is not found ({error})"
+        text = f"ROS 2 not found ({error})"
         raise UsageError(
-            f"{text}: source one, as with `. /opt/ros/jazzy/setup.bash`, or pip install"
-            " 'lidarspec-ros2[ros2]'"
+            f"{text}: source it, such as `. /opt/ros/jazzy/setup.bash`, or install"
+            " lidarspec-ros2[ros2]"
         ) from None
 
 

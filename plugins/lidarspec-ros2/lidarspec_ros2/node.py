@@ -292,8 +292,8 @@ class LidarNode(LifecycleNode):
                     and value != self._settings[name]
                 ):
                     raise UsageError(
-                        f"{name} is read on configuring: clean the node up, set it, and configure"
-                        " it again"
+                        f"{name} is read when the node is configured: clean the node up, set it,"
+                        " and configure it again"
                     )
             self._settings = Settings({**self._settings.values, **ours})
         except UsageError as error:
@@ -309,9 +309,7 @@ class LidarNode(LifecycleNode):
         for name in self._parameter_overrides:  # which rclpy tells in no other way
             if not self.has_parameter(name) and not name.startswith("qos_overrides."):
                 close = did_you_mean(name, [one.name for one in PARAMETERS])
-                self.get_logger().warning(
-                    f"parameter {name!r} is left out, as there is none of that name{close}"
-                )
+                self.get_logger().warning(f"unknown parameter {name!r} is ignored{close}")
 
     def _serve_commands(self, device: Device) -> None:
         """A service for each command of the sensor, beside the node's own, such as get_state, and a
@@ -321,8 +319,7 @@ class LidarNode(LifecycleNode):
             for argument in command.args:
                 if not self.has_parameter(f"{name}.{argument}"):
                     text = (
-                        f"An argument of the service {name}, in the unit of its field, or with a"
-                        " unit."
+                        f"Argument of the service {name}, in the unit of its field, or with a unit."
                     )
                     self.declare_parameter(
                         f"{name}.{argument}",

@@ -86,7 +86,7 @@ class PacketTransport(LiveTransport):
         """A topic does not go away."""
 
     def write(self, data: bytes) -> None:
-        raise SourceError(f"{self.label} is a topic of packets: nothing can be sent to it")
+        raise SourceError(f"cannot send to {self.label}: it is a topic of packets")
 
     def close(self) -> None:
         self.closed = True

@@ -221,12 +221,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self["qos"] not in QUALITIES:
-            raise UsageError(f"qos is {' or '.join(QUALITIES)}, not {self['qos']!r}")
+            raise UsageError(f"qos: expected {' or '.join(QUALITIES)}, got {self['qos']!r}")
         self.selection()
         if self["scan_z_min"] > self["scan_z_max"]:
             raise UsageError(
-                f"from scan_z_min {self['scan_z_min']} up to scan_z_max {self['scan_z_max']} there"
-                " is nothing"
+                f"scan_z_min {self['scan_z_min']} is above scan_z_max {self['scan_z_max']}"
             )
 
     def __getitem__(self, name: str) -> Any:

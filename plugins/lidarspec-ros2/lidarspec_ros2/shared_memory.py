@@ -113,16 +113,16 @@ def _fit(cloud_bytes: int | None, free: int) -> SharedMemory:
     for clouds in (CLOUDS, FEWER_CLOUDS):
         segment_bytes = _segment_for(clouds * assumed)
         if free >= FREE_SEGMENTS * segment_bytes:
-            reason = "" if cloud_bytes is not None else ", as the size of this sensor's is unknown"
+            reason = "" if cloud_bytes is not None else " (the size for this sensor is unknown)"
             notice = (
                 f"Fast DDS: shared memory of {format_megabytes(segment_bytes)} for clouds of up to "
                 f"{size}{reason}; set {profile_variable()} to use another profile"
             )
             return SharedMemory(segment_bytes, segment_bytes // MIN_CLOUDS, notice)
     warning = (
-        f"Fast DDS: default transports, which lose clouds of {size} with best effort, as"
-        f" {SHARED_MEMORY_DIR} has {format_megabytes(free)} free and"
-        f" {format_megabytes(FREE_SEGMENTS * segment_bytes)} are needed; give a container more with"
+        f"Fast DDS: default transports, which lose clouds of {size} with best effort:"
+        f" {SHARED_MEMORY_DIR} has {format_megabytes(free)} free,"
+        f" {format_megabytes(FREE_SEGMENTS * segment_bytes)} are required; in a container, use"
         " docker run --shm-size=512m or --ipc=host, or publish with qos:=reliable"
     )
     return SharedMemory(warning=warning)

@@ -208,8 +208,8 @@ class Topics:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
             raise UsageError(
-                f"publish_tf takes tf2_msgs, which this ROS has not ({error});"
-                " static_transform_publisher does it too"
+                f"publish_tf requires tf2_msgs, which is not installed ({error});"
+                " static_transform_publisher is an alternative"
             ) from None
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         stamp = self._node.get_clock().now().to_msg()
@@ -239,8 +239,8 @@ class Topics:
             return
         self._max_cloud_bytes = None
         self._node.get_logger().warning(
-            f"clouds of {format_megabytes(size)} may be lost, as shared memory was chosen for up to"
-            f" {format_megabytes(limit)}; name the sensor when the node starts, or set"
+            f"clouds of {format_megabytes(size)} may be lost: the size of the shared memory is for"
+            f" up to {format_megabytes(limit)}; name the sensor when the node starts, or set"
             " qos:=reliable"
         )
 

@@ -38,7 +38,7 @@ HEADERS = {
     "cache-control": "no-store",
 }
 OTHER_HOST = "this server has another host name: open the link that lidarspec printed"
-OTHER_PAGE = "another page asked for this"
+OTHER_PAGE = "request from another page refused"
 TOKEN_NEEDED = """<!doctype html>
 <html lang="en">
 <meta charset="utf-8">

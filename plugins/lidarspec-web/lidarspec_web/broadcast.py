@@ -192,7 +192,7 @@ class Broadcast:
         Raises:
             UsageError: if the source is live.
         """
-        self._refuse_live("pauses for its viewers, each by itself")
+        self._refuse_live("each page pauses by itself")
         self.paused = True
 
     def play(self) -> None:
@@ -201,7 +201,7 @@ class Broadcast:
         Raises:
             UsageError: if the source is live.
         """
-        self._refuse_live("plays by itself")
+        self._refuse_live("only a file can be played")
         if self._feed.ended:
             self.seek(0.0)
         self.paused = False
@@ -213,7 +213,7 @@ class Broadcast:
         Raises:
             UsageError: if the source is live.
         """
-        self._refuse_live("has no next scan before it comes")
+        self._refuse_live("its next scan has not arrived")
         self.paused = True
         self._steps += 1
         self._has_request.set()
@@ -225,7 +225,7 @@ class Broadcast:
             UsageError: if the source cannot be moved through.
         """
         if not self.can_seek:
-            raise UsageError(f"{self.source} cannot be moved through")
+            raise UsageError(f"cannot seek in {self.source}")
         self._seek_target = max(to, 0.0)
         self._has_request.set()
 
@@ -235,12 +235,9 @@ class Broadcast:
         Raises:
             UsageError: if the source is live, or the speed is out of range.
         """
-        self._refuse_live("comes as fast as it does")
+        self._refuse_live("its speed cannot be changed")
         if not MIN_SPEED <= times <= MAX_SPEED:
-            raise UsageError(
-                f"a file is played {MIN_SPEED:g} to {MAX_SPEED:g} times as fast, not"
-                f" {times:g} times"
-            )
+            raise UsageError(f"expected a speed from {MIN_SPEED:g} to {MAX_SPEED:g}, got {times:g}")
         self.speed = times
 
     def run(self, until: float) -> None:
@@ -406,4 +403,4 @@ class Broadcast:
 
     def _refuse_live(self, reason: str) -> None:
         if self.is_live:
-            raise UsageError(f"{self.source} is live, and {reason}")
+            raise UsageError(f"{self.source} is live: {reason}")

@@ -119,8 +119,7 @@ class Connections:
         if not self._has_reported:
             self._has_reported = True
             self._report(
-                f"more than {MAX_CONNECTIONS} connections at once: those without the token are"
-                " closed first"
+                f"more than {MAX_CONNECTIONS} connections: closing those without the token first"
             )
 
     def _close_waiting(self, client: Client) -> None:

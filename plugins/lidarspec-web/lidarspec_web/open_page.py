@@ -119,7 +119,7 @@ class OpenPage:
                 if message is None:
                     await self._wait_for_news()
                 elif not await self._send_in_time(message):
-                    return "dropped: it takes nothing any more"
+                    return "disconnected: it stopped reading"
         except WebSocketDisconnect:
             return "closed"
 
@@ -250,7 +250,7 @@ class OpenPage:
                 await asyncio.sleep(BUSY_CHECK_S)
         if message.get("code") in CLOSE_CODES:
             return "closed"
-        return "dropped: it does not answer any more"
+        return "disconnected: it stopped replying"
 
     @property
     def _is_busy(self) -> bool:
@@ -265,10 +265,12 @@ class OpenPage:
             if isinstance(request, dict):
                 word = str(request.get("do"))
             if word not in self._handlers:
-                raise UsageError(f"a message says what to do: {', '.join(self._handlers)}")
+                raise UsageError(
+                    f"invalid message: expected do to be one of {', '.join(self._handlers)}"
+                )
             self._handlers[word](self, request)
         except (ValueError, RecursionError):
-            self._refuse(word, UsageError("a message is an object in JSON"))
+            self._refuse(word, UsageError("invalid message: expected a JSON object"))
         except LidarSpecError as error:
             self._refuse(word, error)
 
@@ -308,7 +310,7 @@ class OpenPage:
         if not self._broadcast.is_live:
             self._broadcast.pause()
         elif not self._held:
-            raise UsageError("there is nothing to pause before the first scan")
+            raise UsageError("cannot pause before the first scan")
         elif self._frozen is not None:
             return
         else:
@@ -367,11 +369,11 @@ class OpenPage:
         switch = self._broadcast.switch
         if switch is None:
             raise UsageError(
-                f"{self._broadcast.source} is a file already: there is nothing to record"
+                f"{self._broadcast.source} is a file: only a live source can be recorded"
             )
         on = request.get("on")
         if not isinstance(on, bool | None):
-            raise UsageError("on is true or false")
+            raise UsageError("on: expected true or false")
 
         def change() -> None:
             if on is None:
@@ -410,7 +412,7 @@ def _number(request: Mapping[str, Any], name: str, low: float, high: float) -> f
     """
     value = request.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise UsageError(f"{name} is a number from {low:g} to {high:g}")
+        raise UsageError(f"{name}: expected a number from {low:g} to {high:g}")
     return value
 
 
@@ -427,5 +429,5 @@ def _command(request: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
         or not isinstance(arguments, dict)
         or not all(isinstance(text, str) for text in arguments.values())
     ):
-        raise UsageError("a command has a name, and arguments that are texts")
+        raise UsageError("invalid command: expected a name, and arguments as strings")
     return name, {argument: text for argument, text in arguments.items() if text}

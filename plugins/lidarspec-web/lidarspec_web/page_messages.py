@@ -264,9 +264,9 @@ def _why_no_control(broadcast: Broadcast, *, control: bool) -> str:
     """Return the reason why no commands are sent, "" if they are."""
     sensor = broadcast.device.sensor
     if not sensor.commands:
-        return f"{sensor.id} takes no commands"
+        return f"{sensor.id} has no commands"
     if not broadcast.is_live:
-        return f"{broadcast.source} is a file: nothing can be sent to it"
+        return f"cannot send to {broadcast.source}: it is a file"
     if not control and not broadcast.source.startswith("sim:"):
-        return "commands are sent to a sensor only where the page was opened with --control"
+        return "sending commands requires --control on the command line"
     return ""

@@ -199,12 +199,12 @@ class PageSite:
         """Send a scan as a file, by its number."""
         number, _, suffix = request.path_params["name"].partition(".")
         if suffix not in list_save_formats():
-            return PlainTextResponse(f"a scan is saved as {', '.join(list_save_formats())}", 404)
+            return PlainTextResponse(f"unknown format: expected {', '.join(list_save_formats())}", 404)
         shown = None
         if number.isdecimal() and len(number) < MAX_NUMBER_DIGITS:
             shown = self._broadcast.find_scan(int(number))
         if shown is None:
-            return PlainTextResponse("this scan is not kept any more: pause before saving", 404)
+            return PlainTextResponse("this scan is no longer available: pause before saving", 404)
         return self._saves.response(shown, suffix)
 
 
@@ -228,7 +228,7 @@ def _listen(host: str, port: int) -> socket.socket:
         listener = socket.create_server((host, port), family=family)
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else error
-        raise SourceError(f"no page can be served at {host}:{port}: {reason}") from error
+        raise SourceError(f"cannot serve the page at {host}:{port}: {reason}") from error
     if hasattr(socket, "TCP_USER_TIMEOUT"):
         # The system then drops data that a page never reads. Connections inherit the option.
         listener.setsockopt(

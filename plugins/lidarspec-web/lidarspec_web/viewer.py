@@ -174,7 +174,7 @@ def _make_widget(height: int) -> Any:
         import anywidget
         import traitlets  # a requirement of anywidget
     except ImportError as error:
-        text = f"the viewer in notebooks needs anywidget, which cannot be imported: {error}"
+        text = f"the viewer in notebooks requires anywidget, which cannot be imported: {error}"
         raise suggest(UsageError(text), "pip install 'anywidget>=0.9.13'") from error
     attributes = {"_esm": SCRIPT, "height": traitlets.Int(height).tag(sync=True)}
     return type("Viewer", (anywidget.AnyWidget,), attributes)()

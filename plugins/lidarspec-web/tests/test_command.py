@@ -110,7 +110,7 @@ def test_a_port_that_is_taken_is_one_clear_line(tmp_path: Path) -> None:
         with served(tmp_path, f"sim:{FLAT}", "--address", f"127.0.0.1:{port}") as (running, link):
             code, out, lines = ended(running)
     assert (code, link, out) == (3, "", "")
-    assert lines[0] == f"no page can be served at 127.0.0.1:{port}: Address already in use"
+    assert lines[0] == f"cannot serve the page at 127.0.0.1:{port}: Address already in use"
 
 
 @pytest.mark.slow

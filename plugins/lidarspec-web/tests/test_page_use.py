@@ -321,7 +321,7 @@ def test_a_question_to_a_running_sensor_stops_it_and_starts_it_again(browser: An
         visit = Visit(browser, link)
         visit.page.click("#tab-commands")
         assert visit.page.locator("#commands h2").all_inner_texts() == [
-            "Ask",
+            "Read",
             "Set",
             "Start and stop",
         ]
@@ -332,7 +332,7 @@ def test_a_question_to_a_running_sensor_stops_it_and_starts_it_again(browser: An
         visit.page.click(".list [data-value=get_info]")
         send = visit.page.locator("#commands .primary")
         visit.until(
-            lambda: send.inner_text() == "Stop, ask, start again" and send.is_enabled(),
+            lambda: send.inner_text() == "Stop, send, start again" and send.is_enabled(),
             "it does not offer to stop",
         )
         send.click()

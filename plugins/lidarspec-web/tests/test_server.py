@@ -366,7 +366,7 @@ def test_a_page_that_does_not_read_is_disconnected(
             with contextlib.suppress(OSError):
                 raw.sendall(masked({"do": "next", "most": 1 << 20}))
             assert healthy.scan(most=2000)[1]["x"].size
-        assert station.said[-1].startswith("page 2 dropped: it ")
+        assert station.said[-1].startswith("page 2 disconnected: it ")
         healthy.say("record")
         healthy.state(lambda state: state["recording"] is None)
     with ls.open(tmp_path / name) as again:

@@ -16,7 +16,7 @@ const KINDS = 8;
 const COUNTS = new Intl.NumberFormat("en-US");
 
 export class Bytes {
-  readonly #live = made("button", { className: "live", textContent: "Live", title: "Follow the newest frame, twice a second; or hold the one that is shown" });
+  readonly #live = made("button", { className: "live", textContent: "Live", title: "Follow the newest frame, or hold this one" });
   readonly #held = made("span", { className: "badge held", textContent: "held" });
   readonly #title = made("span", { className: "caption" });
   readonly #verdict = made("span", { className: "verdict" });
@@ -42,8 +42,8 @@ export class Bytes {
     const bar = made(
       "div",
       { className: "bar" },
-      made("button", { textContent: "‹", title: "The frame before", ariaLabel: "The frame before", onclick: step(-1) }),
-      made("button", { textContent: "›", title: "The frame after", ariaLabel: "The frame after", onclick: step(1) }),
+      made("button", { textContent: "‹", title: "Previous frame", ariaLabel: "Previous frame", onclick: step(-1) }),
+      made("button", { textContent: "›", title: "Next frame", ariaLabel: "Next frame", onclick: step(1) }),
       this.#live,
       this.#held,
       this.#title,
@@ -89,7 +89,7 @@ export class Bytes {
 
   #step(by: number): void {
     if (!this.#frame) return;
-    if (this.#frame.number === null) return this.gone("The frames beside this one are not kept any more.");
+    if (this.#frame.number === null) return this.gone("The neighbouring frames are no longer available.");
     const number = this.#frame.number + by;
     this.#hold(this.#frame.why === "damaged" ? { do: "frame", damaged: number } : { do: "frame", number });
   }
@@ -256,7 +256,7 @@ export class Bytes {
   #say(node: Part | null, shared: number | null): void {
     const anatomy = this.#anatomy;
     this.#said.replaceChildren();
-    if (!node || !anatomy) return this.#said.append("Point at a byte or at a field; a click keeps it marked.");
+    if (!node || !anatomy) return this.#said.append("Point at a byte or a field; click to keep it marked.");
     const nodes = shared === null ? [node] : anatomy.owners(shared).map((owner) => anatomy.nodes.get(anatomy.values[owner]!.path)!);
     for (const [number, part] of nodes.entries()) this.#said.append(...(number ? [made("br")] : []), ...this.#words(part, anatomy));
   }

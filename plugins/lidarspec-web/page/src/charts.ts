@@ -42,9 +42,9 @@ const FIGURES: [string, (figures: Figures) => string | null][] = [
   ["Packets", ({ packet_rate_hz: rate }) => (rate == null ? null : `${whole.format(rate)} /s`)],
   ["Input", ({ bytes_per_s: rate }) => (rate == null ? null : rate < 1e6 ? `${(rate / 1e3).toFixed(1)} kB/s` : `${(rate / 1e6).toFixed(2)} MB/s`)],
   ["Points per scan", ({ points }) => (points == null ? null : whole.format(points))],
-  ["With a return", ({ points, valid }) => (!points || valid == null ? null : `${((100 * valid) / points).toFixed(1)} %`)],
+  ["Valid points", ({ points, valid }) => (!points || valid == null ? null : `${((100 * valid) / points).toFixed(1)} %`)],
   ["Bytes skipped", ({ skipped_rate }) => (skipped_rate == null ? null : `${(100 * skipped_rate).toFixed(2)} %`)],
-  ["Packets missing so far", ({ lost }) => (lost == null ? null : whole.format(lost))],
+  ["Packets lost", ({ lost }) => (lost == null ? null : whole.format(lost))],
   ["Longest gap", ({ longest_gap_s: gap }) => (gap == null ? null : `${(1e3 * gap).toFixed(1)} ms`)],
   ["Disconnects", ({ disconnects }) => (disconnects ? whole.format(disconnects) : null)],
 ];

@@ -5,9 +5,9 @@ import type { Argument, Ask, Command, Composed, Hello, Refused, Replied } from "
 
 /** Milliseconds from the last key to when the bytes are asked for. */
 const SETTLED = 200;
-const GROUPS = { ask: "Ask", set: "Set", switch: "Start and stop" };
+const GROUPS = { ask: "Read", set: "Set", switch: "Start and stop" };
 const GROUP_NAMES = Object.keys(GROUPS) as Command["group"][];
-const UNCHOSEN = "Choose a command: its bytes are shown before it is sent.";
+const UNCHOSEN = "Choose a command. Its bytes are shown before you send it.";
 
 export class Commands {
   readonly #list = made("div", { className: "list scroll", tabIndex: 0, role: "group", ariaLabel: "Commands" });
@@ -69,7 +69,7 @@ export class Commands {
   /** How the source is doing: a sensor that sends data has to be stopped before some commands. */
   state(state: string): void {
     this.#streams = state === "streaming";
-    if (!this.#steps.length) this.#send.textContent = this.#interrupts ? "Stop, ask, start again" : "Send";
+    if (!this.#steps.length) this.#send.textContent = this.#interrupts ? "Stop, send, start again" : "Send";
   }
 
   /** Whether the sensor is stopped for the chosen command and started again after it. */
@@ -86,7 +86,7 @@ export class Commands {
     const { stop, start } = this.#restart!;
     this.#given = this.#arguments();
     this.#steps = [stop, this.#command!.name, start];
-    this.#say(`${stop} is sent first`);
+    this.#say(`sending ${stop} first`);
     this.#step();
   }
 
@@ -150,7 +150,7 @@ export class Commands {
     if (!this.#command) return;
     const given = this.#arguments();
     const missing = this.#command.arguments.find(({ name, default: fallback }) => fallback === null && !(name in given));
-    if (missing) this.#bytes.replaceChildren(made("p", { className: "faint", textContent: `The bytes show when ${missing.name} is given.` }));
+    if (missing) this.#bytes.replaceChildren(made("p", { className: "faint", textContent: `Enter ${missing.name} to see the bytes.` }));
     else this.ask({ do: word, command: this.#command.name, arguments: given });
   }
 

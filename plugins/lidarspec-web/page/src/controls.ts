@@ -16,15 +16,15 @@ const SOUGHT = 150;
 /** Milliseconds from one press of Record to the next that counts: the second click of a double click does not. */
 const RECORD_AGAIN = 500;
 const KEYS = [
-  ["space", "pause and go on"],
-  [".", "one scan on, while paused"],
-  ["c", "what colours show"],
+  ["space", "pause and continue"],
+  [".", "next scan, while paused"],
+  ["c", "value that sets the colour"],
   ["+ -", "zoom in and out"],
-  ["arrows", "move what is in the middle"],
-  ["enter", "with the picture in focus: the frame of the point in the middle"],
-  ["0", "all of it again"],
+  ["arrows", "move the view"],
+  ["enter", "frame of the point in the middle, if the picture has the focus"],
+  ["0", "show all points"],
   ["1 2 3 4", "polar, top, side, 3D"],
-  ["r", "record to a file, and stop"],
+  ["r", "start and stop recording to a file"],
   ["?", "this list"],
 ];
 

@@ -21,6 +21,6 @@ export function missing({ error_rate: damaged, loss_rate: lost }: Figures): Miss
 /** Return the split in words. */
 export function split({ damaged, absent }: Missing): string {
   const words = [`damaged ${damaged.toFixed(2)} %`];
-  if (absent !== null) words.push(`not arrived ${absent.toFixed(2)} %`);
+  if (absent !== null) words.push(`lost ${absent.toFixed(2)} %`);
   return words.join(" · ");
 }

@@ -156,7 +156,7 @@ class Page {
         drawn: (milliseconds, scan) => this.#drawn(milliseconds, scan),
       });
     } catch (error) {
-      element.replaceChildren(made("p", { className: "empty", textContent: `This browser cannot draw in three dimensions: ${String(error)}` }));
+      element.replaceChildren(made("p", { className: "empty", textContent: `This browser does not support WebGL: ${String(error)}` }));
       return;
     }
     this.#controls = new Controls(this.#picture, hello, (words) => this.#ask(words), (as) => void this.#save(as));
@@ -173,7 +173,7 @@ class Page {
     this.#latency = Date.now() - 1000 * scan.sent;
     this.#pictures.push(performance.now());
     while (this.#pictures[0]! < performance.now() - COUNTED) this.#pictures.shift();
-    named("amount").textContent = [thinned(scan.points, scan.of), scan.whole ? "" : "a part of a scan", scan.nominal ? "nominal calibration" : ""].filter(Boolean).join(" · ");
+    named("amount").textContent = [thinned(scan.points, scan.of), scan.whole ? "" : "incomplete scan", scan.nominal ? "nominal calibration" : ""].filter(Boolean).join(" · ");
     this.#controls?.scanned(scan.position);
     this.#connection.next(this.#pace.most);
   }
@@ -194,7 +194,7 @@ class Page {
     this.#age();
     const isLive = this.#hello?.live === true && !state.paused;
     if (state.figures) this.#charts.add(state.figures);
-    this.#charts.tell(state.figures, [["Pictures", `${this.#rate().toFixed(1)} /s`], ...(isLive && this.#latency ? [["To the screen", `${this.#latency.toFixed(0)} ms`] as [string, string]] : [])]);
+    this.#charts.tell(state.figures, [["Drawing rate", `${this.#rate().toFixed(1)} /s`], ...(isLive && this.#latency ? [["Latency", `${this.#latency.toFixed(0)} ms`] as [string, string]] : [])]);
     const { source } = this.#hello ?? { source: "" };
     named("warnings").replaceChildren(...state.warnings.map((text) => made("p", { textContent: text.replace(`${source}: `, "") })));
     named("info").replaceChildren(...Object.entries(state.info).flatMap(([name, text]) => [made("dt", { textContent: name }), made("dd", { textContent: text })]));
@@ -217,8 +217,8 @@ class Page {
 
   /** The one line that says what is wrong: the connection before the source, and that before what was refused. */
   #notice(): void {
-    let lost = this.#hello ? "The connection is lost; it is tried again." : "Connecting.";
-    if (this.#refusesLink) lost = "The server was started again, with another token: open the link that it printed.";
+    let lost = this.#hello ? "Connection lost. Reconnecting." : "Connecting.";
+    if (this.#refusesLink) lost = "The server was restarted with another token. Open the link that it printed.";
     const text = this.#open ? this.#ended || this.#refused || this.#reason : lost;
     if (text !== this.#shown) {
       this.#shown = text;

@@ -204,7 +204,7 @@ export function decoded(data: ArrayBuffer | ArrayBufferView): Scan {
   let offset = begin + 4 + length;
   for (const { name, type } of described) {
     const Kind = TYPES[type];
-    if (Kind === undefined) throw new TypeError(`column ${name} has the type ${type}, which this page does not know`);
+    if (Kind === undefined) throw new TypeError(`column ${name} has the type ${type}, which this page does not support`);
     const column = new Kind(buffer, offset, head.points);
     columns.set(name, column);
     offset += Math.ceil(column.byteLength / STEP) * STEP;

@@ -6,9 +6,9 @@ const STALE_SCANS = 10;
 
 /** The states in which nothing is seen of the sensor, in words. */
 const REASONS: Record<string, string> = {
-  disconnected: "The sensor is gone. It is read on when it is back.",
-  silent: "Nothing arrives from the sensor.",
-  "no frames": "Bytes arrive, but no frame of the sensor.",
+  disconnected: "The sensor is disconnected. Waiting for it.",
+  silent: "No data from the sensor.",
+  "no frames": "Bytes received, but no frame of the sensor.",
 };
 
 /** Whether a scan is too old to pass for the present, `age` seconds after it arrived; `rate`: scans a second. */

@@ -11,7 +11,7 @@ test("a scan is stale after three seconds or ten scan times, whichever is later"
 test("ages and reasons are short", () => {
   assert.deepEqual([describeAge(4.4), describeAge(119), describeAge(300)], ["4 s old", "119 s old", "5 min old"]);
   assert.equal(reason("streaming"), "");
-  assert.match(reason("disconnected"), /gone/);
+  assert.match(reason("disconnected"), /disconnected/);
 });
 
 test("the path of the source is not repeated", () => {
