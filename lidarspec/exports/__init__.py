@@ -124,7 +124,7 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
         ExportError: if there are no frames yet, or one contains Python code or has a wire form.
     """
     if not sensor.frames:
-        raise ExportError(f"{sensor.id}: has no frames yet: configure it first")
+        raise ExportError(f"{sensor.id} has no frames until it is configured")
     formed = [
         f"{name} in {frame.wire}"
         for name, frame in sensor.frames.items()
@@ -132,7 +132,7 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
     ]
     if formed:
         raise ExportError(
-            f"{sensor.id}: no other language recodes what stands on the wire: {', '.join(formed)}"
+            f"{sensor.id}: exports do not support frames with a wire form: {', '.join(formed)}"
         )
     return tuple(_message(sensor, name, frame) for name, frame in sensor.frames.items())
 
@@ -169,7 +169,7 @@ def _message(sensor: Sensor, name: str, frame: Frame) -> ExportedFrame:
     except (ExportError, SpecError) as refused:
         raise ExportError(f"{sensor.id} {name}: {refused}") from None
     if not isinstance(root, tree.Struct | tree.Sealed):
-        raise ExportError(f"{sensor.id} {name}: the frame is no struct")
+        raise ExportError(f"{sensor.id} {name}: the frame is not a struct")
     return ExportedFrame(name, frame, root)
 
 
@@ -183,13 +183,13 @@ def _check(node: tree.Node) -> None:
             raise ExportError(formula.reason)
         if element := next((ref.path for ref in tree.refs(formula) if "[" in ref.path), None):
             raise ExportError(
-                f"{element}: an element of an array decides on what follows, and this language"
-                " keeps none"
+                f"{element}: the layout depends on an array element, which this language does not"
+                " store"
             )
     if isinstance(node, tree.Opaque):
         reason = node.reason
         if not node.inside:
-            reason = f"{node.kind} is Python code, which no other language runs"
+            reason = f"{node.kind} is Python code and cannot be exported"
         raise ExportError(f"{node.info.path}: {reason}")
     if isinstance(node, tree.Sealed):
         _ = node.algorithm

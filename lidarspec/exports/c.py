@@ -97,10 +97,7 @@ def checksum(algorithm: Checksum, name: str) -> str:
     is_counting = isinstance(algorithm, ZeroPadded) or isinstance(inner, WordXor | Fold15)
     if isinstance(algorithm, ZeroPadded):
         if isinstance(inner, Fold15):
-            raise ExportError(
-                "a folded sum that is padded with zeros:"
-                " which bytes count depends on how many there are in all"
-            )
+            raise ExportError("a folded sum padded with zeros is not supported")
         pad = (
             f"    for (; i % {algorithm.to}; ++i) {{\n"
             f"        const uint8_t byte = 0;\n{indent(body.step, 8 * ' ')}\n    }}\n"
@@ -143,7 +140,7 @@ def _make_body(algorithm: Checksum) -> _ChecksumBody:
             )
             return _ChecksumBody(begin, step, "((total & 0x7fff) + (total >> 15)) & 0x7fff")
     raise ExportError(
-        f"the checksum {type(algorithm).__name__} is Python code, which C does not run"
+        f"the checksum {type(algorithm).__name__} is Python code and cannot be exported to C"
     )
 
 
@@ -309,7 +306,7 @@ def _format_checksum(
     held = [access for path in seal.fields for access in accesses(layout, path)]
     for path in seal.fields:
         if [access.depth for access in held if access.info.path == path] != [entry.depth]:
-            raise ExportError(f"{path}: a checksum that stands in several places")
+            raise ExportError(f"{path}: a checksum in several places is not supported")
     return _CHECKSUM.format(
         name=name.removesuffix("_ok"),
         parameters=parameters(entry.depth),

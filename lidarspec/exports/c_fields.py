@@ -228,7 +228,7 @@ class CLayout:
             ExportError: if its value may exceed 64-bit integers.
         """
         if tree.width(value) > tree.MOST_BITS:
-            raise ExportError("a formula that may pass what a 64-bit integer holds")
+            raise ExportError("a formula may exceed a 64-bit integer")
         return tree.write(
             value,
             lambda ref: f"(int64_t){self.name(ref.path, '')}({arguments(len(ref.info.axes))})",
@@ -274,8 +274,9 @@ class CLayout:
                 return SizeFormula(0, (f"(int64_t){self.extent_name(entry)}({arguments})",))
             case tree.PartSequence():
                 raise ExportError(
-                    f"{entry.path}: parts of sizes of their own, of which none has a place without"
-                    " reading those before it"
+                    f"{entry.path}: the offset of a part depends on the sizes of the parts before"
+                    " it,"
+                    " which is not supported"
                 )
             case tree.Empty():
                 return SizeFormula()
@@ -343,8 +344,8 @@ class CLayout:
         size = self.extent(replace(entry, node=node.element, depth=entry.depth + 1))
         if size.terms and any(node.axis in ref.info.axes for ref in find_references(node.element)):
             raise ExportError(
-                f"{node.axis}: its elements differ in size, so that none has a place of its own"
-                " without reading those before it"
+                f"{node.axis}: the offset of an element depends on the sizes of the elements before"
+                " it, which is not supported"
             )
         return size
 

@@ -101,7 +101,7 @@ def format_reference(scope: Scope, ref: tree.Ref) -> str:
             return (
                 "_parent." * up + ".".join(map(identifier, names)) + ".to_i" * (ref.info.bits == 1)
             )
-    raise ExportError(f"{ref.path} cannot be reached in Kaitai")
+    raise ExportError(f"{ref.path} cannot be referred to in Kaitai")
 
 
 _OPERATIONS = {
@@ -148,7 +148,9 @@ def block_type(
         ExportError: for an integer that is too wide for Kaitai.
     """
     if any(part.bits.width > WIDEST for part in block.parts):
-        raise ExportError(f"{block.info.path}: an integer of more than {WIDEST} bits")
+        raise ExportError(
+            f"{block.info.path}: an integer of more than {WIDEST} bits is not supported"
+        )
     ordered = _in_order(block)
     if ordered is None:
         calculated = {
@@ -294,7 +296,7 @@ def ksy(sensor: Sensor) -> str:
     types = {identifier(message.name): _frame(sensor, message) for message in frames}
     if len(types) < len(frames):
         raise ExportError(
-            f"{sensor.id}: two frame types have one name in Kaitai, where names are in lower case"
+            f"{sensor.id}: two frame types have the same name in lower case, as Kaitai requires it"
         )
     name = identifier(make_prefix(sensor))
     document = {
@@ -333,7 +335,7 @@ class _KaitaiType:
         twice = next((name for name in ids if ids.count(name) > 1), None)
         if twice:
             raise ExportError(
-                f"{path or 'the frame'} has two members that are called {twice!r} in Kaitai"
+                f"{path or 'the frame'} has two members with the Kaitai name {twice!r}"
             )
         return {name: part for name, part in vars(self).items() if part or name == "seq"}
 
@@ -410,9 +412,7 @@ class _KaitaiWriter:
     ) -> None:
         """Add parts of one kind; Kaitai has to know a type before it reads it."""
         if len(node.kinds) > 1:
-            raise ExportError(
-                f"{node.axis}: parts that are told apart by their constants, which Kaitai cannot do"
-            )
+            raise ExportError(f"{node.axis}: Kaitai cannot distinguish parts by their constants")
         (kind,), name = node.kinds, identifier(node.name)
         if node.within is not None:
             inner = _KaitaiType(
@@ -503,7 +503,7 @@ class _KaitaiWriter:
         letter = {"uint": "u", "int": "s", "float": "f"}[node.kind]
         if node.kind == "float" and node.size not in FLOATS:
             raise ExportError(
-                f"{node.info.path}: a float of {node.size} bytes, and Kaitai knows those of 4 and 8"
+                f"{node.info.path}: a float of {node.size} bytes; Kaitai supports 4 and 8 bytes"
             )
         if node.size > 1:
             order = {"little": "le", "big": "be"}[node.order]

@@ -29,7 +29,7 @@ STATUSES = {
     "manual": "written from the manual",
     "vectors": "agrees with published example frames",
     "capture": "agrees with captures of the device",
-    "hardware": "tried on the device",
+    "hardware": "tested with the device",
 }
 #: Rule of a scan -> a description of its end.
 RULES = {
@@ -37,7 +37,7 @@ RULES = {
     "OnFlag": "before every packet in which `{name}` is set",
     "OnChange": "before every packet in which `{name}` changes",
     "OnJump": "before every packet in which `{name}` jumps by more than {by:g}",
-    "OnRewind": "before every packet in which `{name}` falls back",
+    "OnRewind": "before every packet in which `{name}` decreases",
 }
 #: Maximum number of channels to list.
 RINGS = 128
@@ -72,7 +72,7 @@ def _facts(sensor: Sensor) -> Iterator[str]:
     rows += [("losses", describe_losses(sensor))]
     rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []
     rows += [
-        ("proven", f"{sensor.status}: {STATUSES[sensor.status]}"),
+        ("verified", f"{sensor.status}: {STATUSES[sensor.status]}"),
         ("source", escape(sensor.source)),
     ]
     return _table(["", ""], rows)
@@ -120,7 +120,7 @@ def _clock(clock: Clock) -> str:
     else:
         fields = " + ".join(f"`{name}`" for name in names)
     if clock.wraps_at:
-        again = f", starts again at {clock.wraps_at:g} s"
+        again = f", wraps at {clock.wraps_at:g} s"
     else:
         again = ""
     return (
@@ -162,7 +162,7 @@ def effect(sensor: Sensor, name: str) -> str:
     effects = {
         "starts the data": command.starts,
         "stops the data": command.stops,
-        "answered only while no data are sent": command.only_stopped,
+        "accepted only while the sensor sends no data": command.only_stopped,
         f"{command.settle:g} s before the next command": command.settle > 0,
         f"again every {command.every:g} s": command.every > 0,
         "sent on opening": name in sensor.on_open,
@@ -190,11 +190,9 @@ def _frame(name: str, frame: Frame) -> Iterator[str]:
     yield f"## `{name}`: {kind}"
     size = frame_size(frame)
     remarks = [f"{size} bytes" if size.isdigit() else f"`{size}` bytes, at most {frame.max_length}"]
-    remarks += [f"looked for after a `{frame.after}`"] * (frame.after is not None)
-    remarks += [f"believed in runs of {frame.confirm} or more"] * (frame.confirm > 1)
-    remarks += ["a plausibility test turns down what no sensor would send"] * (
-        frame.plausible is not None
-    )
+    remarks += [f"expected after a `{frame.after}` frame"] * (frame.after is not None)
+    remarks += [f"accepted in runs of {frame.confirm} or more"] * (frame.confirm > 1)
+    remarks += ["checked for plausible values"] * (frame.plausible is not None)
     yield "; ".join(remarks) + "."
     rows = [
         (row.offset, row.size, row.type, f"`{row.field}`", row.unit, row.meaning)
@@ -214,7 +212,7 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
     )
     if sensor.vendor_axes:
         x, y, z = sensor.vendor_axes
-        yield f"With `configure(frame='vendor')` they are in the vendor's own: x {x}, y {y}, z {z}."
+        yield f"`configure(frame='vendor')` selects the vendor's axes: x {x}, y {y}, z {z}."
     for name, frame in sensor.frames.items():
         cloud = _cloud(sensor, name) if frame.data else None
         if cloud is None:
@@ -229,11 +227,11 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
             for column, values in cloud.extra.items()
         ]
         if len(cloud) == 1:
-            many = "a point"
+            many = "one point"
         elif frame_size(frame).isdigit():
             many = f"{len(cloud)} points"
         else:
-            many = "points by its header"
+            many = "a number of points given by its header"
         yield ""
         yield f"A `{name}` frame has {many}" + (
             f", with {', '.join(more[:-1])}{' and ' * (len(more) > 1)}{more[-1]}." if more else "."
@@ -244,8 +242,8 @@ def _geometry(sensor: Sensor) -> Iterator[str]:
                 ""
                 if not cloud.nominal
                 else (
-                    "\nThe directions below are the default ones; a calibration file gives the"
-                    " device's own."
+                    "\nThe directions below are nominal; a calibration file gives those of the"
+                    " device."
                 )
             )
             yield from _table(["channel", "elevation"], rows)

@@ -55,11 +55,11 @@ def pyi(sensor: Sensor) -> str:
     frames = messages(sensor, on_wire=False)
     names = {message.name: to_class_name(message.name) for message in frames}
     if len(set(names.values())) < len(names):
-        raise ExportError(f"{sensor.id}: two frame types have one class name")
+        raise ExportError(f"{sensor.id}: two frame types have the same class name")
     classes = _StubClasses({to_class_name(sensor.id)})
     for message in frames:
         names[message.name] = classes.add(
-            message.root, names[message.name], f"A frame of the type {message.name}."
+            message.root, names[message.name], f"Frame of type {message.name}."
         )
     parts = [
         _HEAD.format(id=sensor.id, title=_quote(f"{sensor.vendor} {sensor.model}")),
@@ -77,7 +77,7 @@ def to_class_name(name: str) -> str:
     return f"_{words}"
 
 
-_HEAD = '''"""{title}: the types of what `parse` returns and `build` and `command` take. Made by lidarspec export pyi {id}."""
+_HEAD = '''"""{title}: types of the results of `parse` and of the arguments of `build` and `command`. Made by lidarspec export pyi {id}."""
 
 from typing import Any, Literal, overload
 

@@ -468,10 +468,11 @@ def _algorithm(algorithm: Checksum) -> Table:
             return {"algorithm": "fold15"}
         case ZeroPadded():
             if isinstance(algorithm.algorithm, ZeroPadded):
-                raise ExportError("a checksum padded twice")
+                raise ExportError("a checksum padded twice is not supported")
             return {**_algorithm(algorithm.algorithm), "pad": algorithm.to}
     raise ExportError(
-        f"the checksum {type(algorithm).__name__} is Python code, which Wireshark does not run"
+        f"the checksum {type(algorithm).__name__} is Python code and cannot be exported to"
+        " Wireshark"
     )
 
 
@@ -587,7 +588,7 @@ def dissector(sensor: Sensor) -> str:
     link = sensor.links.get("data")
     if isinstance(link, Udp) and link.assembled is not None:
         raise ExportError(
-            f"{sensor.id}: messages in several datagrams, which the dissector does not join"
+            f"{sensor.id}: the dissector does not support messages in several datagrams"
         )
     # The dissector shows the first type that matches. Incoming types come first, so bytes that
     # match both directions are shown as incoming. Types with more constants come before others,

@@ -179,7 +179,7 @@ def write(
         check_holds(path, "packets")
         if PLACE.search(str(path)):
             raise UsageError(
-                f"{path}: packets stand beside the points in one file, and not in several"
+                f"{path}: packets can be written beside the points to a single file only"
             )
     if organized:
         check_holds(path, "organized")
@@ -202,8 +202,7 @@ def check_holds(path: str | Path, what: str) -> None:
     if what not in format_of(path).holds:
         having = ", ".join(suffix for suffix, known in formats().items() if what in known.holds)
         raise UsageError(
-            f"{path}: {format_of(path).suffix} has no place for --{what}; those that have are"
-            f" {having}"
+            f"{path}: {format_of(path).suffix} does not support --{what}; formats that do: {having}"
         )
 
 
@@ -216,15 +215,15 @@ def _iter_organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterat
     for number, scan in enumerate(scans):
         if scan.points.shape is None:
             raise UsageError(
-                f"{scan.sensor.id}: its points have no rows and columns: leave out --organized"
+                f"points of {scan.sensor.id} have no rows and columns: omit --organized"
             )
         if number and alone:
             error = UsageError(
-                f"{path} holds the rows and columns of one scan, and there are several"
+                f"with --organized, {path} can hold one scan only, but several are selected"
             )
             raise suggest(
                 error,
-                "the same with --scans 1:2, or with a file for each scan:"
+                "repeat with --scans 1:2, or with a file for each scan:"
                 f" {path.with_suffix('')}-%05d{path.suffix}",
             )
         yield scan
@@ -238,8 +237,8 @@ def _iter_files(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Itera
     ):
         if name in begun:
             raise UsageError(
-                f"{name}: its time comes again after that of other files; %F, %H, %M and %S in the"
-                " name together tell them apart"
+                f"{name} would be written twice, as its time repeats; use %F, %H, %M and %S in the"
+                " name"
             )
         begun.add(name)
         with system_errors(path):

@@ -203,6 +203,6 @@ def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
         column.finish()
 
 
-NPZ = Format(".npz", "NumPy arrays, one a column", write, ("organized",))
+NPZ = Format(".npz", "NumPy arrays, one per column", write, ("organized",))
 NPY = Format(".npy", "a structured NumPy array with PCL's layout", write_npy, ("organized",))
-ZARR = Format(".zarr", "Zarr, a folder with an array a column (zarr)", write_zarr)
+ZARR = Format(".zarr", "Zarr, a folder with one array per column (zarr)", write_zarr)

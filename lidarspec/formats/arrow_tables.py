@@ -154,11 +154,11 @@ def _batches(path: Path, schema: Any, compression: str | None) -> Any:
 
 
 PARQUET = Format(
-    ".parquet", "Parquet, one row a point (pyarrow)", partial(_write, open_writer=_parquet)
+    ".parquet", "Parquet, one row per point (pyarrow)", partial(_write, open_writer=_parquet)
 )
 ARROW = Format(
     ".arrow",
-    "Arrow, one row a point, to be mapped (pyarrow)",
+    "Arrow, one row per point, for memory mapping (pyarrow)",
     partial(_write, open_writer=partial(_batches, compression=None)),
 )
 FEATHER = Format(

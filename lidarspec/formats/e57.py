@@ -176,4 +176,4 @@ def _kind(libe57: Any, image: Any, column: NDArray[Any]) -> Any:
     )
 
 
-E57 = Format(".e57", "ASTM E57, a header a scan (pye57)", _write)
+E57 = Format(".e57", "ASTM E57, one header per scan (pye57)", _write)

@@ -39,7 +39,9 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
         log = support.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
         for scan in scans:
             if scan.stamp_ns < 0:
-                raise UsageError(f"a scan at {scan.stamp_ns} ns: logs begin in 1970")
+                raise UsageError(
+                    f"stamp of a scan is {scan.stamp_ns} ns: MCAP files support no time before 1970"
+                )
             units |= {name: unit for name, unit in scan.points.units.items() if unit}
             messages = {TOPICS[CLOUD]: _cloud(scan.points, every_point=every_point)}
             if (planar := planes.project(scan)) is not None:

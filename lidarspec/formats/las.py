@@ -152,8 +152,8 @@ def _fill(
         steps = steps if valid.all() else np.where(valid, steps, 0)
         if np.abs(steps).max() > FARTHEST:
             far = (
-                f"{axis} is {np.abs(steps).max() * STEP / 1000:.0f} km from {offset:.0f} m, more"
-                " than LAS holds in steps of 0.1 mm"
+                f"{axis} is {np.abs(steps).max() * STEP / 1000:.0f} km from {offset:.0f} m, which"
+                " exceeds LAS with steps of 0.1 mm"
             )
             raise suggest(UsageError(far), "lidarspec convert IN OUT.parquet")
         rows[axis.upper()] = steps

@@ -151,7 +151,7 @@ class RosMessages:
     def _time(self, at: int) -> Any:
         if not 0 <= at < _SECOND << 31:
             raise UsageError(
-                f"a scan or packet at {at} ns: stamps of ROS hold the years 1970 to 2038"
+                f"stamp of a scan or packet is {at} ns: ROS supports the years 1970 to 2038"
             )
         return self.types.types["builtin_interfaces/msg/Time"](*divmod(at, _SECOND))
 

@@ -88,9 +88,9 @@ def _compress(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
 
 def _refuse_size(size: int) -> None:
     if size > _MOST_COMPRESSED:
-        reason = "a compressed PCD file holds 4 GiB of points at the most"
+        reason = "a compressed PCD file can hold at most 4 GiB of points"
         raise suggest(
-            UsageError(reason), "the same to a .pcd file, or to one for each scan: %05d.lzf.pcd"
+            UsageError(reason), "repeat with a .pcd file, or with one for each scan: %05d.lzf.pcd"
         )
 
 
@@ -174,4 +174,4 @@ def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None
 PCD = Format(".pcd", "a point cloud of PCL, binary", write_pcd, ("organized",))
 LZF_PCD = Format(".lzf.pcd", "a point cloud of PCL, compressed", write_lzf_pcd, ("organized",))
 PLY = Format(".ply", "a point cloud, binary", write_ply)
-KITTI = Format(".bin", "x y z intensity as KITTI has them, float32", write_kitti)
+KITTI = Format(".bin", "x y z intensity as in KITTI, float32", write_kitti)

@@ -182,7 +182,7 @@ class RerunRecording:
         facts = {
             "model": f"{scan.sensor.vendor} {scan.sensor.model}",
             **scan.facts,
-            "mount": str(mount or "as the sensor stands"),
+            "mount": str(mount or "none"),
         }
         units = {f"unit of {name}": unit for name, unit in scan.points.units.items() if unit}
         text = "\n".join(f"{name}: {value}" for name, value in {**facts, **units}.items())

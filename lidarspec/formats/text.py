@@ -103,8 +103,8 @@ def _column(values: NDArray[Any] | None, length: int) -> NDArray[Any]:
     return values
 
 
-CSV = Format(".csv", "comma-separated values, one row a point", write)
+CSV = Format(".csv", "comma-separated values, one row per point", write)
 CSV_GZ = Format(
     ".csv.gz", "comma-separated values, compressed", functools.partial(write, is_zipped=True)
 )
-XYZ = Format(".xyz", "x y z as text, one row a point", write_xyz)
+XYZ = Format(".xyz", "x y z as text, one row per point", write_xyz)

@@ -136,7 +136,7 @@ def _folder(folder: Path) -> CheckTarget:
     else:
         name = None
     if not isinstance(name, str):
-        raise SourceError(f"{file} names no project")
+        raise SourceError(f"{file} does not name a project")
     entries = _entries(name)
     if not entries:
         raise SourceError(f"{name} is not installed, or has no sensors: pip install -e {folder}")
@@ -218,7 +218,7 @@ def _holders(sensors: list[Sensor], file: Path) -> list[Finding]:
     return [
         Finding(
             "LS005",
-            f"{plugin.distribution} is installed, and has it ({plugin.entry_point})",
+            f"the installed {plugin.distribution} has the same id ({plugin.entry_point})",
             "",
             sensor.id,
         )
@@ -491,10 +491,10 @@ def _mistakes(
             ):
                 yield "LS805", ast.unparse(node), node
             case ast.Expr(value=ast.Call() as call) if _short_write(call, sockets=sockets):
-                yield "LS803", f"what {ast.unparse(call.func)} returns is dropped", node
+                yield "LS803", f"the result of {ast.unparse(call.func)} is not used", node
         for test in _tests(node):
             if _is_expression(test, expressions):
-                yield "LS804", f"Python asks whether `{ast.unparse(test)}` is true", test
+                yield "LS804", f"Python tests whether `{ast.unparse(test)}` is true", test
 
 
 def _names_of_this(tree: ast.Module) -> set[str]:
@@ -647,7 +647,7 @@ def _beside(subject: SensorUnderTest) -> Iterator[tuple[str, str]]:
     sensor = subject.sensor
     missing = lacking(subject)
     if missing:
-        yield "vectors", f"{missing}; x and y of points in two quadrants would prove the picture"
+        yield "vectors", f"{missing}; x and y of points in two quadrants would verify these values"
     yield (
         "vendor_axes",
         f"x, y, z are {', '.join(sensor.vendor_axes)}" if sensor.vendor_axes else "not declared",
@@ -669,7 +669,9 @@ def _report(
     sensor: Sensor = subject.sensor
     report = Report(sensor.id, list(mistakes))
     if not sensor.frames:
-        report.skipped["all properties"] = "it has no frames before it is configured with its file"
+        report.skipped["all properties"] = (
+            "the sensor has no frames until it is configured with its file"
+        )
         return report
     watch(f"{sensor.id}: declaration", 0)
     report.findings += check_declaration(subject)
@@ -678,7 +680,7 @@ def _report(
             {finding.code for finding in unacknowledged(report.findings, sensor, whole=False)}
             & set(one.unless)
         )
-        reason = one.lacks(subject) or (f"{', '.join(known)} is found already" if known else "")
+        reason = one.lacks(subject) or (f"{', '.join(known)} was found" if known else "")
         if reason:
             report.skipped[one.name] = reason
             continue
@@ -686,7 +688,7 @@ def _report(
         report.held += not findings
         report.findings += findings
         if any(finding.code in FATAL for finding in report.findings):
-            report.skipped[ELSE] = "nothing can be tried before what is found is mended"
+            report.skipped[ELSE] = "cannot be tested until the findings are fixed"
             break
     distinct = list(
         {(finding.code, finding.path): finding for finding in reversed(report.findings)}.values()

@@ -68,10 +68,10 @@ def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -
         assert data == b"", "a command without a frame has bytes"
         return
     parsed = sensor.parse(data, frame=command.frame)
-    assert sensor.build(command.frame, parsed) == data, "it builds as other bytes"
+    assert sensor.build(command.frame, parsed) == data, "building it gives other bytes"
     for path, value in command.fixed.items():
         assert get_nested(parsed, path) == value, (
-            f"{path} is {get_nested(parsed, path)}, and {value} is meant"
+            f"{path} is {get_nested(parsed, path)}, expected {value}"
         )
     for argument, value in arguments_given.items():
         slot = argument_slot(sensor, name, argument)
@@ -81,10 +81,10 @@ def _parses_back(sensor: Sensor, name: str, arguments_given: dict[str, float]) -
         if isinstance(declared.kind, Range):
             read = slot.info.physical(read)
             assert abs(read - value) <= abs(slot.info.scale) * 0.5001, (
-                f"{argument} is {read:g}, and {value:g} is given"
+                f"{argument} is {read:g}, expected {value:g}"
             )
         else:
-            assert read == raw, f"{argument} is {read!r}, and {value!r} is given"
+            assert read == raw, f"{argument} is {read!r}, expected {value!r}"
 
 
 def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> None:
@@ -105,7 +105,7 @@ def arguments_are_held_to_their_ranges(subject: SensorUnderTest, name: str) -> N
                 continue
             raise ViolationError(
                 "LS602",
-                f"{key} = {outside} is sent, and {format_argument_type(kind)} is declared",
+                f"{key} = {outside} is accepted, but {format_argument_type(kind)} is declared",
                 f"commands.{name}.args.{key}",
             )
 
@@ -124,12 +124,14 @@ def an_exchange_holds(
         require(
             built == data,
             "LS605",
-            f"{built.hex(' ')} is sent, and {data.hex(' ')} is printed",
+            f"sends {built.hex(' ')}, expected {data.hex(' ')}",
             place,
         )
         if answer is None:
             return
-        require(command.replies, "LS605", "it has a reply here, and none is declared", place)
+        require(
+            command.replies, "LS605", "it has a reply, but the command declares no reply", place
+        )
         session = Session(sensor)
         pending = session.request(name, 0, **given)
         kind = identify(sensor, answer)
@@ -172,7 +174,7 @@ def the_simulated_sensor_answers(subject: SensorUnderTest, name: str) -> None:
         except SpecError as error:
             if name in subject.sensor.simulation.answers:
                 raise
-            what = f"its reply cannot be made up without answers= of the Simulation: {error.reason}"
+            what = f"cannot simulate its reply without answers= of the Simulation: {error.reason}"
             raise ViolationError("LS604", what, f"commands.{name}") from error
         require(reply.confirmed, "LS604", "the reply is not confirmed", f"commands.{name}")
         _learn(subject, name, reply)
@@ -190,10 +192,13 @@ def _learn(subject: SensorUnderTest, name: str, reply: Reply) -> None:
             sensor.configure(**values)
     except Exception as error:  # any error of `learns` and `configure` of the plugin
         if name in sensor.simulation.answers:
-            which = "its reply, as given by"
+            which = "with"
         else:
-            which = "its reply, which is made up without"
-        what = f"{which} answers= of the Simulation, cannot be learned from: {error}"
+            which = "without"
+        what = (
+            f"cannot read options from its reply, simulated {which} answers= of the"
+            f" Simulation: {error}"
+        )
         raise ViolationError("LS604", what, f"commands.{name}") from error
 
 

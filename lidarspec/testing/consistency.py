@@ -49,7 +49,7 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
         return
     most = int(readings.max(initial=0))
     message = (
-        f"along the sweep it reads {most / 1e9:g} s, and wraps_at is {float(clock.wraps_at):g} s"
+        f"it reaches {most / 1e9:g} s in the sweep, but wraps_at is {float(clock.wraps_at):g} s"
     )
     require(most <= exact(clock.wraps_at) * 10**9, "LS512", message, "clock")
 
@@ -66,8 +66,8 @@ def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
     times = packets.points().time
     spread = float(np.ptp(times)) if len(times) else 0.0
     message = (
-        f"the points of {len(packets)} packets are spread over {spread:.3g} s, and the clock runs"
-        f" on by {step:.3g} s a packet"
+        f"the points of {len(packets)} packets cover {spread:.3g} s, but the clock advances by"
+        f" {step:.3g} s per packet"
     )
     require(
         step <= 0 or spread <= (len(packets) + MOST_STEPS) * step,
@@ -121,7 +121,7 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
         require(
             worst <= BACK,
             "LS504",
-            f"{turn} leave a point {np.rad2deg(worst):.1f} degrees from where it belongs",
+            f"{turn} leave a point {np.rad2deg(worst):.1f} degrees from its expected direction",
             f"{name}.points",
         )
 

@@ -106,9 +106,9 @@ def _sensor(sensor: Sensor) -> Findings:
         if not getattr(sensor, name).strip():
             yield "LS211", f"{name} is empty", ""
     if "data" not in sensor.links:
-        yield "LS211", "there is no link 'data'", "links"
+        yield "LS211", "link 'data' is missing", "links"
     if sensor.frames and not any(frame.data for frame in sensor.frames.values()):
-        yield "LS211", "no frame is the data", "frames"
+        yield "LS211", "no frame is declared with data=True", "frames"
     low, high = sensor.range_limits
     if not 0 <= low < high:
         yield "LS210", f"range_limits are {low:g} .. {high:g}", "range_limits"
@@ -141,7 +141,7 @@ def _check_required_fields(sensor: Sensor) -> Findings:
     for place, path in given:
         there = cut_by if place == "scan" else known
         if path and without_indices(path)[0] not in there:
-            yield "LS216", f"there is no field {path!r}{did_you_mean(path, there)}", place
+            yield "LS216", f"no field {path!r}{did_you_mean(path, there)}", place
 
 
 def _clock(sensor: Sensor) -> Findings:
@@ -166,7 +166,7 @@ def _clock(sensor: Sensor) -> Findings:
         for info in infos
     ]
     if 0 < sum(spans) < LONG:
-        what = f"it can count {sum(spans):g} s, then it starts again, and wraps_at is not given"
+        what = f"it wraps after {sum(spans):g} s, but wraps_at is not declared"
         yield "LS509", what, f"{sensor.data_frame}.{paths[0]}"
 
 
@@ -193,7 +193,7 @@ def _options(sensor: Sensor) -> Findings:
         elif _changes_nothing(sensor, name, option.choices):
             yield (
                 "LS217",
-                f"configure returns the same sensor whatever {name!r} is",
+                f"configure returns the same sensor for every value of {name!r}",
                 f"configure.{name}",
             )
 
@@ -227,7 +227,7 @@ def _frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     elif engine.size is not None and engine.size != frame.max_length:
         yield (
             "LS203",
-            f"every frame has {engine.size} bytes, and max_length is {frame.max_length}",
+            f"every frame has {engine.size} bytes, but max_length is {frame.max_length}",
             name,
         )
     else:
@@ -268,7 +268,7 @@ def _longest(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     yield (
         "LS203",
         (
-            f"the longest of {len(sizes)} random frames has {max(sizes)} bytes, and max_length is"
+            f"the longest of {len(sizes)} random frames has {max(sizes)} bytes, but max_length is"
             f" {frame.max_length}"
         ),
         name,
@@ -329,7 +329,7 @@ def _names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
         ):
             yield (
                 "LS201",
-                f"{info.name!r} is a measure, and no Scaled says its unit",
+                f"{info.name!r} is a measured value without a unit (Scaled)",
                 f"{name}.{path}",
             )
 
@@ -383,7 +383,7 @@ def _plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     if is_expression(answer):
         yield "LS207", f"it returns {answer!r}, an expression of construct", f"{name}.plausible"
     elif isinstance(answer, bool | np.bool_ | str | type(None)):
-        yield "LS207", f"it returns {answer!r} whatever the frame is", f"{name}.plausible"
+        yield "LS207", f"it returns {answer!r} for every frame", f"{name}.plausible"
 
 
 def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
@@ -416,7 +416,7 @@ def _find_uncovered(name: str, layouts: list[Layout]) -> Findings:
                 reported.add(path)
                 yield (
                     "LS205",
-                    f"byte {min(own - under)} is under no checksum of the frame",
+                    f"no checksum of the frame covers byte {min(own - under)}",
                     f"{name}.{path}",
                 )
 
@@ -426,7 +426,7 @@ def _sync(subject: SensorUnderTest, name: str, frame: Frame, engine: CompiledCod
     if subject.sensor.datagrams or frame.confirm > 1:
         return
     if not engine.prefix:
-        yield "LS204", "it has no constant bytes, and every byte is a candidate", name
+        yield "LS204", "it has no constant bytes, so that every offset is a candidate", name
         return
     seeds = range(subject.scale_rounds(SYNC_EXAMPLES, least=4))
     data = np.frombuffer(
@@ -445,7 +445,7 @@ def _sync(subject: SensorUnderTest, name: str, frame: Frame, engine: CompiledCod
     chance = COMMON + 4 * (COMMON / len(matching)) ** 0.5
     share = expected if expected > COMMON else share
     if expected > COMMON or share > chance:
-        yield "LS204", f"its constants stand at {share:.1%} of the places in payloads", name
+        yield "LS204", f"its constants occur at {share:.1%} of the offsets in payloads", name
 
 
 def _strength(subject: SensorUnderTest, name: str, frame: Frame, layouts: list[Layout]) -> Findings:
@@ -461,7 +461,7 @@ def _strength(subject: SensorUnderTest, name: str, frame: Frame, layouts: list[L
         yield (
             "LS206",
             (
-                f"its constants and checksums have {weakest} bits, and it declares neither"
+                f"its constants and checksums have only {weakest} bits, and it declares neither"
                 " plausible nor confirm"
             ),
             name,
@@ -520,7 +520,7 @@ def _intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
             others = ", ".join(info.path for info in own if info is not None)
             yield (
                 "LS218",
-                f"it comes from {others}, and no column from this field",
+                f"it comes from {others}; no column uses this field",
                 f"{name}.{path}",
             )
             return
@@ -548,14 +548,14 @@ def _reach(subject: SensorUnderTest) -> Findings:
         declared = "{:g} .. {:g}".format(*subject.sensor.range_limits)
         held = [info.physical(raw) * float(metres) for raw in (1, info.limits[1])]
         subject.picture[f"{name}: range"] = (
-            f"{held[0]:.4g} .. {held[1]:.6g} m can be said, {declared} m is declared"
+            f"{held[0]:.4g} .. {held[1]:.6g} m can be represented, {declared} m is declared"
         )
         reach.append((held[1], f"{name}.{info.path}"))
     furthest, path = max(reach, default=(np.inf, ""))
     if subject.sensor.range_limits[1] > furthest * 1.001:
         yield (
             "LS210",
-            f"it ends at {furthest:g} m, and range_limits at {subject.sensor.range_limits[1]:g} m",
+            f"it ends at {furthest:g} m, but range_limits at {subject.sensor.range_limits[1]:g} m",
             path,
         )
 
@@ -569,7 +569,7 @@ def _column(
     if column == "range" and measured and all(CODE.fullmatch(info.name) for info in measured):
         yield (
             "LS219",
-            "the range of points comes from it, and it is a code by its name",
+            "the range of points comes from it, but by its name it is a code",
             f"{name}.{measured[0].path}",
         )
     free = [info for info in infos if info is not None and info.const is None and not info.labels]
@@ -588,11 +588,11 @@ def _column(
                 ),
             )
             if first.unit:
-                problem = f"{first.unit!r} is no unit of it: {' or '.join(units)}"
+                problem = f"its unit is {first.unit!r}, expected {' or '.join(units)}"
             else:
-                problem = f"it has no unit: {' or '.join(units)}"
+                problem = f"it has no unit, expected {' or '.join(units)}"
             yield (
                 "LS201",
-                f"the {column} of points comes from it, and {problem}",
+                f"the {column} of points comes from it, but {problem}",
                 f"{name}.{first.path}",
             )

@@ -257,7 +257,7 @@ def unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool) -> l
                 if not reason.strip():
                     problem = "has no reason"
                 else:
-                    problem = "is not found"
+                    problem = "does not occur"
                 left.append(
                     Finding("LS209", f"{key!r} is acknowledged, and {problem}", place, sensor.id)
                 )

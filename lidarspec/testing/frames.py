@@ -75,7 +75,7 @@ def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
     require(
         longest <= frame.max_length,
         "LS203",
-        f"an example has {longest} bytes, and max_length is {frame.max_length}",
+        f"an example has {longest} bytes, but max_length is {frame.max_length}",
         name,
     )
     fixed = material.seals(subject.sensor, name, examples[0])
@@ -103,7 +103,7 @@ def bytes_survive_parsing_and_building(subject: SensorUnderTest, name: str) -> N
                 _lost(subject, name, data, built, "LS302")
             again = sensor.parse(built, frame=name)
             require(
-                same(parsed, again), "LS302", "what is parsed a second time is something else", name
+                same(parsed, again), "LS302", "parsing the built frame gives another value", name
             )
 
 
@@ -151,7 +151,7 @@ def _require_same_values(parsed: Any, again: Any, sealed: set[str], name: str) -
         if path == other and is_number and not same(before, after):
             raise ViolationError(
                 "LS303" if is_cut(before, after) else "LS302",
-                f"{before!r} comes back as {after!r}",
+                f"{before!r} becomes {after!r}",
                 f"{name}.{path}",
             )
 
@@ -185,7 +185,7 @@ def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
                 require(
                     built == other,
                     "LS312",
-                    f"{leaf.scalar(other)} passes, and {leaf.scalar(built)} is built",
+                    f"{leaf.scalar(other)} is accepted, but {leaf.scalar(built)} is built",
                     path,
                 )
 
@@ -222,12 +222,12 @@ def parse_finds_out_the_type(subject: SensorUnderTest, name: str) -> None:
     fitting = [
         other for other in subject.sensor.frames if is_valid_frame(subject.sensor, data, other)
     ]
-    require(name in fitting, "LS306", "its own example is not parsed as such a frame", name)
+    require(name in fitting, "LS306", "its own example is not parsed as a frame of this type", name)
     read = [subject.sensor.parse(data, frame=other) for other in fitting]
     require(
         any(same(subject.sensor.parse(data), one) for one in read),
         "LS306",
-        "the type is found out wrongly",
+        "parsing without a type gives the wrong type",
         name,
     )
 
@@ -261,12 +261,12 @@ def _lost(subject: SensorUnderTest, name: str, data: bytes, built: bytes, code: 
     if difference is None:
         was, became = (part[offset : offset + 1].hex() for part in (data, built))
         raise ViolationError(
-            code, f"byte {offset} of {len(data)} is {was} and comes back as {became}", name
+            code, f"byte {offset} of {len(data)} is {was} and becomes {became}", name
         )
     path, before, after = difference
     raise ViolationError(
         "LS303" if is_cut(before, after) else code,
-        f"{before!r} comes back as {after!r}",
+        f"{before!r} becomes {after!r}",
         f"{name}.{path}",
     )
 
@@ -359,14 +359,14 @@ def _check(
         require(
             got == wanted or path in sealed,
             "LS305",
-            f"{wanted} is written, and {got} is read",
+            f"{wanted} is written, but {got} is read",
             f"{name}.{path}",
         )
     path = spots[edits[0]][2]
     require(
         subject.sensor.build(name, again) == built,
         "LS302",
-        f"an edit of {path} builds other bytes again",
+        f"after an edit of {path}, building it again gives other bytes",
         f"{name}.{path}",
     )
 
@@ -407,13 +407,15 @@ def a_truncated_frame_is_a_wire_error(subject: SensorUnderTest, name: str) -> No
             require(
                 0 <= error.offset <= end,
                 "LS307",
-                f"cut at byte {end}, and the fault is told at byte {error.offset}",
+                f"cut at byte {end}, but the error names byte {error.offset}",
                 name,
             )
         except Exception as error:
             raise _undocumented_error(error, f"cut at byte {end} of {len(data)}", name) from error
         else:
-            raise ViolationError("LS307", f"cut at byte {end} of {len(data)}, and it passes", name)
+            raise ViolationError(
+                "LS307", f"accepted although it is cut at byte {end} of {len(data)}", name
+            )
 
 
 def a_damaged_frame_is_at_worst_a_wire_error(subject: SensorUnderTest, name: str) -> None:
@@ -473,12 +475,12 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
             require(
                 byte not in covered,
                 "LS310",
-                f"bit {bit} of byte {byte} is flipped, and the frame passes",
+                f"accepted although bit {bit} of byte {byte} is flipped",
                 place,
             )
     if tried:
-        kind = "under a checksum" if sealed else "without a checksum"
-        subject.measured[f"{name}, {kind}: single-bit errors that pass"] = (
+        kind = "with a checksum" if sealed else "without a checksum"
+        subject.measured[f"{name}, {kind}: undetected single-bit errors"] = (
             f"{100 * passed / tried:.3g} %"
         )
 

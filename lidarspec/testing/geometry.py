@@ -236,7 +236,7 @@ def clouds_keep_the_conventions(subject: SensorUnderTest, name: str) -> None:
         assert_well_formed(cloud)
     except AssertionError as error:
         raise ViolationError(
-            "LS501", str(error).splitlines()[0] or "the cloud is not well formed", f"{name}.points"
+            "LS501", str(error).splitlines()[0] or "the cloud is malformed", f"{name}.points"
         ) from error
 
 
@@ -319,7 +319,7 @@ def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> 
         except SpecError as error:
             raise ViolationError(
                 "LS505",
-                f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit}: {error.reason}",
+                f"{path} of {FULL_TURNS[info.unit]:g} {info.unit}: {error.reason}",
                 f"{name}.{path}",
             ) from error
         if not clouds or not _turn(info, clouds[1], clouds[2]):
@@ -332,7 +332,7 @@ def the_full_circle_is_the_same_as_none(subject: SensorUnderTest, name: str) -> 
         require(
             same,
             "LS505",
-            f"{path} of exactly {FULL_TURNS[info.unit]:g} {info.unit} gives other points than 0",
+            f"{path} of {FULL_TURNS[info.unit]:g} {info.unit} and of 0 give different points",
             f"{name}.{path}",
         )
 
@@ -360,8 +360,8 @@ def the_points_turn_as_the_axes_do(subject: SensorUnderTest, name: str) -> None:
         axes = subject.sensor.vendor_axes
         expected = _sense_of(axes, first) if axes else 0
         message = (
-            f"points turn {words[sense]} as {path} grows, and with vendor_axes of"
-            f" {', '.join(axes or ())} angles run {words.get(expected)}"
+            f"points turn {words[sense]} as {path} grows, but angles in vendor_axes"
+            f" {', '.join(axes or ())} turn {words.get(expected)}"
         )
         is_proven = name in subject.placed
         require(is_proven or expected in (0, sense), "LS511", message, f"{name}.points")
@@ -422,7 +422,8 @@ def angles_are_in_order(subject: SensorUnderTest, name: str) -> None:
         back = steps * np.sign(median) < -max(BACK, MEDIANS * abs(median))
         if one_way < ONE_WAY:
             message = (
-                f"only {one_way:.0%} of the steps go the same way, and scans are cut where it wraps"
+                f"only {one_way:.0%} of the steps have the same direction, but scans end at its"
+                " wrap"
             )
             require(not isinstance(subject.sensor.scan, OnWrap), "LS506", message, f"{name}.points")
         elif back.any():
@@ -457,8 +458,8 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
             subject, name, frames, by_clock=False
         ).stats  # the clock would compensate for the counter
         message = (
-            f"along the sweep {stats.lost} packets are lost, {stats.late} late, {stats.duplicates}"
-            " doubled"
+            f"in the sweep {stats.lost} packets count as lost, {stats.late} as late,"
+            f" {stats.duplicates} as duplicates"
         )
         require(
             (stats.lost, stats.late, stats.duplicates) == (0, 0, 0),
@@ -472,8 +473,7 @@ def counters_run_on(subject: SensorUnderTest, name: str) -> None:
         require(
             back.min() >= 0,
             "LS509",
-            f"packet {index + 1} of the sweep is {-back.min() / 1e9:g} s before the one in front"
-            " of it",
+            f"packet {index + 1} of the sweep is {-back.min() / 1e9:g} s before the one before it",
             name,
         )
 
@@ -642,16 +642,20 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
     cloud = read(subject, name, block.frames).points()
     seconds = float(block.times[-1]) / 1e9
     if seconds:
-        subject.picture[f"{name}: rate"] = f"{len(cloud) / seconds:.0f} points a second, simulated"
+        rate = len(cloud) / seconds
+        subject.picture[f"{name}: rate"] = f"{rate:.0f} points per second, simulated"
     else:
-        subject.picture[f"{name}: rate"] = "nothing tells it"
+        subject.picture[f"{name}: rate"] = "unknown"
     count = len(cloud) - 2 * len(cloud) // len(
         block.frames
     )  # directions of the last packet may depend on the next one
     valid = cloud.valid[:count]
     share = float(valid.mean()) if count else 0.0
     require(
-        share > 0.5, "LS507", f"{share:.0%} of the beams in a closed room return", f"{name}.points"
+        share > 0.5,
+        "LS507",
+        f"only {share:.0%} of the beams in a closed room return",
+        f"{name}.points",
     )
     apart = distance_outside(room, cloud.xyz[:count][valid].astype(np.float64))
     worst = float(apart.max(initial=0))
@@ -663,7 +667,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
     require(
         near_enough,
         "LS507",
-        f"a point lies {worst:.4f} m from every surface of the scene",
+        f"a point is {worst:.4f} m from the nearest surface of the scene",
         f"{name}.points",
     )
     near, far = subject.sensor.range_limits

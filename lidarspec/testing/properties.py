@@ -24,10 +24,10 @@ from lidarspec.testing.sensor_under_test import SensorUnderTest
 def _no_sweep(subject: SensorUnderTest) -> str:
     names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
-        return "it declares no `sweep`, and cannot be simulated"
+        return "it declares no `sweep`, so that it cannot be simulated"
     alone = [name for name in names if not codec(subject.sensor.frames[name]).is_compiled]
     if alone:
-        return f"{', '.join(alone)} is not compiled, and cannot be simulated"
+        return f"{', '.join(alone)} is not compiled, so that it cannot be simulated"
     return ""
 
 

@@ -21,7 +21,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Register the marker `lidarspec`."""
     config.addinivalue_line(
         "markers",
-        "lidarspec(sensor): the sensor that the `sensor` fixture gives: an id, a Sensor or a file",
+        "lidarspec(sensor): the sensor of the `sensor` fixture: an id, a Sensor or a file",
     )
 
 
@@ -41,8 +41,8 @@ def sensor(request: pytest.FixtureRequest) -> Sensor:
         wanted = getattr(request.cls, "sensor", None)
     if not wanted:
         raise pytest.UsageError(
-            'which sensor? mark the test with @pytest.mark.lidarspec("acme-x1"), or give its class'
-            " a `sensor`"
+            'sensor missing: mark the test with @pytest.mark.lidarspec("acme-x1"), or set'
+            " `sensor` in its class"
         )
     if isinstance(wanted, Sensor):
         return wanted

@@ -50,10 +50,10 @@ def _loss(sent: list[tuple[str, bytes]], received: list[tuple[str, bytes]]) -> V
             break
         equal += 1
     name = sent[min(equal, len(sent) - 1)][0]
-    text = f"of {len(sent)} frames, number {equal} is not found"
+    text = f"frame {equal} of {len(sent)} is not found"
     if equal < len(received) and received[equal][0] != name:
         return ViolationError(
-            "LS306", f"{text}; a {received[equal][0]!r} frame is found there", name
+            "LS306", f"{text}; a {received[equal][0]!r} frame is found instead", name
         )
     return ViolationError("LS401", text, name)
 
@@ -71,7 +71,7 @@ def the_same_bytes_give_the_same_points(subject: SensorUnderTest) -> None:
         require(
             column.tobytes() == other.columns[name].tobytes(),
             "LS415",
-            f"two runs give another {name}",
+            f"two runs give different values of {name}",
             f"{subject.sensor.data_frame}.points",
         )
 
@@ -84,13 +84,13 @@ def scans_do_not_depend_on_batches(subject: SensorUnderTest) -> None:
         whole = _scans_in_batches(subject.sensor, frames, len(frames))
         if whole:
             break
-    require(whole, "LS404", "there is no scan")
+    require(whole, "LS404", "no scan found")
     for size in BATCH_SIZES:
         parts = _scans_in_batches(subject.sensor, frames, size)
         require(
             [_cut(scan) for scan in parts] == [_cut(scan) for scan in whole],
             "LS404",
-            f"{size} packets at a time give other scans than all at once",
+            f"batches of {size} packets give other scans than a single batch",
         )
         for part, other in zip(parts, whole, strict=True):
             assert_well_formed(part.points)

@@ -84,17 +84,17 @@ def _is_text(value: object) -> bool:
 #: Key of an entry -> description and test of its value.
 KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
     "sensor": (
-        "an id, or a list of ids",
+        "an id or a list of ids",
         lambda one: _is_text(one) or (isinstance(one, list) and all(map(_is_text, one))),
     ),
-    **dict.fromkeys(("command", "reply", "source", "frame", "hex"), ("a text", _is_text)),
+    **dict.fromkeys(("command", "reply", "source", "frame", "hex"), ("a string", _is_text)),
     "note": ("anything", lambda one: True),
     **dict.fromkeys(
         ("args", "values"),
-        ("an object of numbers and texts", lambda one: _is_table(one, _is_value)),
+        ("an object of numbers and strings", lambda one: _is_table(one, _is_value)),
     ),
     "units": ("an object of numbers", lambda one: _is_table(one, _is_number)),
-    "points": ("an object of points, by their numbers, with numbers", _are_points),
+    "points": ("an object of points by number, each an object of numbers", _are_points),
 }
 
 
@@ -109,7 +109,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
     for place, vector in chosen.items():
         if isinstance(vector, ViolationError):
             raise vector
-        require(str(vector.get("source", "")).strip(), "LS701", "it names no source", place)
+        require(str(vector.get("source", "")).strip(), "LS701", "source missing", place)
         data = parse_hex(vector["hex"])
         name = vector["frame"]
         parsed = _parse_vector(subject, name, data, place)
@@ -117,7 +117,7 @@ def vectors_hold(subject: SensorUnderTest, only: str = "") -> None:
         require(
             subject.sensor.build(name, parsed) == data,
             "LS302",
-            "its bytes do not survive parsing and building",
+            "parsing and building gives other bytes",
             f"{place} {name}",
         )
         if "command" in vector:
@@ -143,11 +143,11 @@ def lacking(subject: SensorUnderTest) -> str:
     Returns "" if there are any, or if `vectors_hold` reports their faults.
     """
     if subject.vectors is None:
-        return "there is no file of golden vectors"
+        return "no file of golden vectors"
     try:
         if _read_entries(subject):
             return ""
-        return f"{Path(subject.vectors).name} has none of {subject.sensor.id}"
+        return f"{Path(subject.vectors).name} has no vectors of {subject.sensor.id}"
     except ViolationError:
         return ""
 
@@ -193,8 +193,8 @@ def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None
     required = [
         path for path in free if path not in sealing and not IDLE.search(path.rpartition(".")[2])
     ]
-    problems = {"no vector gives a value of": [path for path in required if path not in pinned]}
-    problems["0 alone is given of"] = [path for path in required if pinned.get(path) is False]
+    problems = {"no vector has a value of": [path for path in required if path not in pinned]}
+    problems["all vectors have 0 for"] = [path for path in required if pinned.get(path) is False]
     message = "; ".join(f"{words} {', '.join(paths)}" for words, paths in problems.items() if paths)
     require(not message, "LS711", message, name)
 
@@ -222,18 +222,18 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
         seen = "no returns"
     number = f"{len(quadrants)} quadrant{'s' * (len(quadrants) != 1)}"
     subject.picture[f"{name}: vectors"] = (
-        f"{seen} in {len(vectors)} of them, which say x and y in {number}"
+        f"{seen} in {len(vectors)} vectors, with x and y in {number}"
     )
     far = subject.sensor.range_limits[1]
     require(
         not len(ranges) or ranges.max() <= far * (1 + NEAR),
         "LS713",
-        f"{ranges.max(initial=0):.4g} m, and range_limits end at {far:g} m",
+        f"{ranges.max(initial=0):.4g} m, but range_limits end at {far:g} m",
         name,
     )
     if vectors:
         require(
-            len(quadrants) > 1, "LS712", f"they say x and y of points in {number}", f"{name}.points"
+            len(quadrants) > 1, "LS712", f"x and y of points are in {number} only", f"{name}.points"
         )
         subject.placed.add(name)
 
@@ -268,13 +268,13 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
         if path in (named or free) and (named or match.doubt >= PROVEN):
             fits = f"{_in_words(match, len(frames[0]))} fits every vector"
             raise ViolationError(
-                "LS212", f"{fits}, and no Checksummed holds a frame to it", f"{name}.{path}"
+                "LS212", f"{fits}, but no Checksummed verifies it", f"{name}.{path}"
             )
     unsaid = [path for path in named if not fields[path].docs.startswith(NOT_CHECKED)]
     require(
         not unsaid,
         "LS212",
-        "it is a checksum by its name, and no Checksummed holds a frame to it",
+        "by its name it is a checksum, but no Checksummed verifies it",
         f"{name}.{''.join(unsaid[:1])}",
     )
 
@@ -401,7 +401,7 @@ def _read_entries(subject: SensorUnderTest) -> dict[str, Any]:
     except LidarSpecError as error:
         raise ViolationError("LS702", str(error), str(subject.vectors)) from None
     if not isinstance(content, list):
-        raise ViolationError("LS702", "the file is no list of vectors", str(subject.vectors))
+        raise ViolationError("LS702", "the file is not a list of vectors", str(subject.vectors))
     own_entries: dict[str, Any] = {}
     for index, vector in enumerate(content):
         place = f"vectors[{index}]"
@@ -419,30 +419,30 @@ def _check_entry(subject: SensorUnderTest, vector: Any, place: str) -> bool:
     Raises:
         Violation: for an invalid entry.
     """
-    require(isinstance(vector, dict), "LS702", "it is no object", place)
+    require(isinstance(vector, dict), "LS702", "not an object", place)
     unknown = sorted(vector.keys() - KEYS.keys())
-    require(not unknown, "LS702", f"unknown keys {unknown}; known are {sorted(KEYS)}", place)
+    require(not unknown, "LS702", f"unknown keys {unknown}; expected {sorted(KEYS)}", place)
     for key, value in vector.items():
         expected, fits = KEYS[key]
-        require(fits(value), "LS702", f"{key} is {expected}, not {shown(value)}", place)
+        require(fits(value), "LS702", f"{key}: expected {expected}, got {shown(value)}", place)
     if not _is_of(subject, vector, place):
         return False
     if "command" in vector:
         command = subject.sensor.commands.get(vector["command"])
         vector.setdefault("frame", command.frame if command is not None else None)
         sends = command is not None and command.frame == vector["frame"]
-        require(sends, "LS702", f"no command {vector['command']!r} sends such a frame", place)
+        require(sends, "LS702", f"no command {vector['command']!r} sends this frame", place)
     require(
         vector.get("frame") in subject.sensor.frames,
         "LS702",
-        f"there is no frame {vector.get('frame')!r}",
+        f"no frame {vector.get('frame')!r}",
         place,
     )
     try:
         parse_hex(vector.get("hex", "-"))
         parse_hex(vector.get("reply", ""))
     except ValueError:
-        raise ViolationError("LS702", "its `hex`, or its `reply`, is no hex text", place) from None
+        raise ViolationError("LS702", "`hex` or `reply` is not hexadecimal text", place) from None
     return True
 
 
@@ -456,15 +456,15 @@ def _is_of(subject: SensorUnderTest, vector: Mapping[str, Any], place: str) -> b
     family = subject.family
     ids = [named] if isinstance(named, str) else named
     message = (
-        f'it names no sensor, and the file is shared by {", ".join(family)}: "sensor":'
-        f' "{subject.sensor.id}"'
+        f'sensor missing, such as "sensor": "{subject.sensor.id}"; the file is shared by'
+        f" {', '.join(family)}"
     )
     require(ids or len(family) < 2, "LS702", message, place)
     nobody = [one for one in ids if family and one not in family]
     require(
         not nobody,
         "LS702",
-        f"there is no sensor {', '.join(map(repr, nobody))} here, but {', '.join(family)}",
+        f"no sensor {', '.join(map(repr, nobody))}; the file is shared by {', '.join(family)}",
         place,
     )
     return not ids or subject.sensor.id in ids
@@ -505,7 +505,7 @@ def _values(
     wanted += [(path, value, True) for path, value in vector.get("units", {}).items()]
     for path, value, in_units in wanted:
         require(
-            path in parsed_values, "LS702", f"the frame has no field {path!r}", f"{place} {name}"
+            path in parsed_values, "LS702", f"no field {path!r} in the frame", f"{place} {name}"
         )
         info = fields.get(re.sub(r"\[\d+\]", "", path))
         raw = parsed_values[path]
@@ -532,7 +532,7 @@ def _values(
             expected = value
         raise ViolationError(
             _reading(info, raw, expected),
-            f"{plain} is read, and {value} is printed",
+            f"parsed {plain}, expected {value}",
             f"{place} {name}.{path}",
         )
 
@@ -566,7 +566,7 @@ def _points(
         require(
             -len(cloud) <= number < len(cloud),
             "LS708",
-            f"there is no point {number} among {len(cloud)}",
+            f"no point {number}: the frame has {len(cloud)} points",
             f"{place} {name}",
         )
         got = {}
@@ -574,7 +574,7 @@ def _points(
             require(
                 column in columns_of_points,
                 "LS702",
-                f"points have no {column!r}",
+                f"points have no column {column!r}",
                 f"{place} {name}",
             )
             got[column] = float(cloud.columns[column][number])
@@ -588,7 +588,7 @@ def _points(
             for column in wrong
         )
         message = ", ".join(
-            f"{column} is {got[column]:.5g}, and {columns[column]:g} is printed" for column in wrong
+            f"{column} is {got[column]:.5g}, expected {columns[column]:g}" for column in wrong
         )
         require(
             not wrong,

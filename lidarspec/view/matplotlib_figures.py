@@ -148,7 +148,7 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
             )
             counted.update(dict(zip(values.tolist(), numbers.tolist(), strict=True)))
     if not counted:
-        raise UsageError("there are no intensities to count")
+        raise UsageError("the points have no intensity")
     strengths, counts = np.array(sorted(counted.items())).T
     middle = strengths[np.searchsorted(np.cumsum(counts), counts.sum() / 2)]
     figure = _figure(f"{title}: {int(counts.sum()):,} returns")
@@ -159,7 +159,7 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
     axes.hist(strengths, bins=np.arange(low, high + width, width), weights=counts, color="C0")
     axes.axvline(float(middle) + 0.5, color="C1", label=f"median {middle:g}")
     axes.set(
-        xlabel="intensity, as the sensor gives it",
+        xlabel="intensity, raw value",
         ylabel="returns",
         yscale="log",
         xlim=(low, high + width),
@@ -220,7 +220,7 @@ def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
     axes.plot(times[order] + last / 2, medians, color="C3", linewidth=1, label="median")
     axes.set(xlabel="time from the first scan [s]", ylabel="range [m]", ylim=(0, edges[-1]))
     _legend(axes)
-    figure.colorbar(shown, label=f"returns in {edges[1]:.2g} m of a scan", pad=0.02)
+    figure.colorbar(shown, label=f"returns per scan, in bins of {edges[1]:.2g} m", pad=0.02)
     return figure
 
 
@@ -237,7 +237,7 @@ def draw_rates(rates: RateSeries, title: str) -> Any:
     for axes, values, label in (
         (panels[0], packets / rates.width, "packets [1/s]"),
         (panels[2], _share(lost, packets), "lost [%]"),
-        (panels[3], _share(wrong, packets), "wrong [%]"),
+        (panels[3], _share(wrong, packets), "invalid [%]"),
     ):
         axes.stairs(values, seconds, baseline=None, color="C0", linewidth=1.2, clip_on=False)
         axes.set(ylabel=label, ylim=(0, max(float(np.nanmax(values, initial=0)) * 1.15, 1.0)))
@@ -319,9 +319,7 @@ class RateSeries:
         The last step is left out, because it is incomplete.
         """
         if self._last < self.width:
-            raise UsageError(
-                f"{self._feed.device.source}: its packets bear no times, or all the same"
-            )
+            raise UsageError(f"{self._feed.device.source}: packets have no times, or all the same")
         full = max(int(self._last / self.width), 1)
         joined = -(-full // MOMENTS)
         counts = self.totals[:, : max(full // joined, 1) * joined]

@@ -74,10 +74,7 @@ def open_page_server(
     """
     entries = entry_points(PAGE)
     if not entries:
-        error = UsageError(
-            f"the page of view --web needs {DISTRIBUTION}, which is not installed: pip install"
-            f" {DISTRIBUTION}, or in a checkout pip install ./plugins/{DISTRIBUTION}"
-        )
+        error = UsageError(f"view --web requires {DISTRIBUTION}, which is not installed")
         raise suggest(error, install_command(DISTRIBUTION))
     entry = entries[0]
     server: PageServer | None = load_hooks(entry).call(

@@ -10,14 +10,14 @@ from lidarspec.points.appearance import STEPS, CloudAppearance
 from lidarspec.view.canvas import ALARM, FAINT, FIRST_STEP, LABEL, PLAIN, STRONG, CellGrid
 
 KEYS = (
-    ("space", "pause and go on"),
-    ("c", "what colours show"),
+    ("space", "pause and continue"),
+    ("c", "value that sets the colour"),
     ("+ -", "zoom in and out"),
-    ("arrows", "move what is in the middle"),
-    ("0", "all of it again"),
-    ("r", "record to a file, and stop; not of files"),
+    ("arrows", "move the view"),
+    ("0", "show all points"),
+    ("r", "start and stop recording to a file; live sources only"),
     ("q", "quit"),
-    ("?", "this page"),
+    ("?", "this list"),
 )
 HINTS = (("space pause", "c colour"), ("+ - zoom", "0 all"), ("? help", "q quit"))
 HINT_COLUMNS = 13

@@ -27,9 +27,9 @@ def test_a_clean_file_says_so() -> None:
     done = ran("check", STRANGER, "--max-examples", "8", "-v")
     assert "acme-x1: clean" in done.output
     assert re.search(
-        r"measured  data, under a checksum: single-bit errors that pass: 0 %", done.output
+        r"measured  data, with a checksum: undetected single-bit errors: 0 %", done.output
     )
-    assert "skipped   vectors_hold: there is no file of golden vectors" in done.output
+    assert "skipped   vectors_hold: no file of golden vectors" in done.output
 
 
 @pytest.mark.slow
@@ -68,19 +68,19 @@ def test_measured_values_are_listed_beside_references() -> None:
     assert lines == [
         lines[0],
         "  data: first beam: at azimuth 0.0 deg where start_angle is 0 (0 is ahead, 90 is left)",
-        "  data: range: 0.001 .. 65.535 m can be said, 0.03 .. 25 m is declared",
+        "  data: range: 0.001 .. 65.535 m can be represented, 0.03 .. 25 m is declared",
         lines[3],
         "  data: sense: clockwise as start_angle grows, seen from above",
         "  data: step: 0.166 deg clockwise from point to point along the sweep",
-        "  data: vectors: 0.192 .. 2 m in 2 of them, which say x and y in 3 quadrants",
+        "  data: vectors: 0.192 .. 2 m in 2 vectors, with x and y in 3 quadrants",
         "  vendor_axes: x, y, z are forward, right, up",
         "  source: STL-27L development manual, sections 1 to 4",
     ]
-    assert re.fullmatch(r"  data: rate: 21[56]\d\d points a second, simulated", lines[3])
+    assert re.fullmatch(r"  data: rate: 21[56]\d\d points per second, simulated", lines[3])
     unproven = ran("check", STRANGER, "--max-examples", "3").output
     assert (
-        "  vectors: there is no file of golden vectors;"
-        " x and y of points in two quadrants would prove the picture"
+        "  vectors: no file of golden vectors;"
+        " x and y of points in two quadrants would verify these values"
     ) in unproven
 
 
@@ -97,7 +97,7 @@ def test_a_file_with_the_id_of_an_installed_sensor_names_its_plugin(tmp_path: Pa
         "camsense-x1",
     ]
     assert {finding["code"] for finding in loading["findings"]} == {"LS005"}
-    said = "lidarspec-camsense is installed, and has it (lidarspec.sensors = lidarspec_camsense)"
+    said = "lidarspec-camsense has the same id (lidarspec.sensors = lidarspec_camsense)"
     assert loading["findings"][0]["what"] == said
     assert all(finding["line"] for finding in loading["findings"])
     assert not any(report["findings"] for report in others)

@@ -127,13 +127,13 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
 
 def test_organised_points_of_several_scans_and_of_none(drive: Path, tmp_path: Path) -> None:
     failed = ran("convert", drive, tmp_path / "out.npy", "--organized", code=2)
-    assert "holds the rows and columns of one scan, and there are several" in failed.stderr
+    assert "can hold one scan only, but several are selected" in failed.stderr
     source = tmp_path / "in.bin"
     source.write_bytes(EXAMPLE * 3)
     failed = ran(
         "convert", source, tmp_path / "out.npy", "--organized", "-s", "ldrobot-stl27l", code=2
     )
-    assert "its points have no rows and columns" in failed.stderr
+    assert "points of ldrobot-stl27l have no rows and columns" in failed.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["in.bin"]
 
 

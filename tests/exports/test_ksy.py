@@ -36,7 +36,7 @@ from tests.exports.trees import distinct_sensors, installed_sensors, recoded
 
 #: the shapes that are exported; of oddities there are own ones below.
 SHAPED = {name: sensor for name, sensor in trees.SHAPED.items() if name != "shape-oddities"}
-_CONSTANTS = "told apart by their constants"
+_CONSTANTS = "Kaitai cannot distinguish parts by their constants"
 #: the shapes that Kaitai cannot say, and why.
 REFUSED = {
     "shape-text": "Decimal is Python code",
@@ -177,7 +177,7 @@ def test_sensors_that_kaitai_cannot_express_are_refused() -> None:
 def test_other_refusals_have_reasons_too() -> None:
     with pytest.raises(ExportError, match="a float of 2 bytes"):
         export(made("half" / Float16b), "ksy")
-    with pytest.raises(ExportError, match="two members that are called 'speed'"):
+    with pytest.raises(ExportError, match="two members with the Kaitai name 'speed'"):
         export(made("speed" / Int8ul, "Speed" / Int8ul), "ksy")
     with pytest.raises(ExportError, match="Python function decides"):
         export(

@@ -48,12 +48,12 @@ def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
         (with_frame("x" / Bytes(this.a / 2)), "x: an expression with '/'"),
         (
             with_frame("l" / Array(2, Int8ub), "x" / Bytes(this.l[1])),
-            "l[1]: an element of an array",
+            "l[1]: the layout depends on an array element",
         ),
         (with_frame("x" / Bytes(this.later)), "x: an expression asks for 'later'"),
         (with_frame("x" / Switch(this.a, {"word": Int8ub})), "a has no value named 'word'"),
         (with_frame(algorithm=Own()), "the checksum Own is Python code"),
-        (BARE, "has no frames yet"),
+        (BARE, "has no frames until it is configured"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -66,7 +66,7 @@ def test_refused_with_the_reason(kind: str, sensor: Sensor, reason: str) -> None
 
 def test_c_has_no_place_for_elements_that_differ_in_size_and_no_number_for_all_products() -> None:
     chain = with_frame("parts" / Array(3, Struct("n" / Int8ub, "data" / Bytes(this.n))))
-    with pytest.raises(ExportError, match="parts: its elements differ in size"):
+    with pytest.raises(ExportError, match="parts: the offset of an element depends on the sizes"):
         export(chain, "c")
     assert "parts" in export(chain, "wireshark")
     wide = with_frame(

@@ -16,7 +16,7 @@ from tests.shapes import SHAPES
 #: the invented sensors that have frames, by id.
 SHAPED = {sensor.id: sensor for sensor in (*SHAPES.values(), oddities.SENSOR) if sensor.frames}
 #: the reason of every refusal of a frame that stands on the wire in a form of its own.
-RECODED = "no other language recodes"
+RECODED = "exports do not support frames with a wire form"
 
 
 @functools.cache

@@ -144,7 +144,7 @@ def test_where_no_viewer_can_be_shown_one_line_says_so(tmp_path: Path) -> None:
     done = subprocess.run(words, env=hidden, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.splitlines() == [
-        "there is no display for Rerun's viewer",
+        "Rerun's viewer requires a display",
         "  next: lidarspec view SOURCE --rerun -o scans.rrd",
     ]
     assert (

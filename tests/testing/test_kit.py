@@ -311,13 +311,13 @@ def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
     with pytest.raises(ViolationError) as found:
         values_survive_building_and_parsing(SensorUnderTest(sound.sensor(kind=Lossy), 80), "data")
     assert (found.value.code, found.value.path) == ("LS305", "data.tilt")
-    assert found.value.what == "-101 is written, and 101 is read"
+    assert found.value.what == "-101 is written, but 101 is read"
 
 
 @pytest.mark.slow
 def test_an_edit_is_read_back_beside_integers_that_cannot_be_edited() -> None:
     frame = sound.frame(sound.sealed(revision=Const(3, Int8ul)), max_length=sound.SIZE + 1)
-    with pytest.raises(ViolationError, match="-101 is written, and 101 is read"):
+    with pytest.raises(ViolationError, match="-101 is written, but 101 is read"):
         values_survive_building_and_parsing(
             SensorUnderTest(sound.sensor(frame, Lossy), 200), "data"
         )
@@ -396,11 +396,9 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
         sound.sensor(status="vectors"),
         json.loads(BY_VECTORS.read_text(encoding="utf-8")),
     )
-    assert told(proven, None) == [
-        "LS710 : status is 'vectors', and there is no file of golden vectors"
-    ]
+    assert told(proven, None) == ["LS710 : status is 'vectors', and no file of golden vectors"]
     assert told(proven, [{**entry, "sensor": "broken-two"} for entry in known]) == [
-        "LS710 : status is 'vectors', and vectors.json has none of broken-one"
+        "LS710 : status is 'vectors', and vectors.json has no vectors of broken-one"
     ]
     assert (
         told(
@@ -418,14 +416,11 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
 def test_vectors_of_several_sensors_name_their_sensor() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     asked = told(sound.sensor(), known, "broken-one", "broken-two")
-    assert (
-        "it names no sensor, and the file is shared by broken-one, broken-two:"
-        ' "sensor": "broken-one"'
-    ) in asked[0]
+    assert 'sensor missing, such as "sensor": "broken-one"' in asked[0]
     asked = told(
         sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one"
     )
-    assert "there is no sensor 'borken-one' here, but broken-one" in asked[0]
+    assert "no sensor 'borken-one'; the file is shared by broken-one" in asked[0]
 
 
 def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
@@ -437,7 +432,7 @@ def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
     )
     first["values"]["samples[2].distance"] = 0
     assert told(sound.sensor(), [first, second]) == [
-        "LS711 data: no vector gives a value of last; 0 alone is given of samples.distance"
+        "LS711 data: no vector has a value of last; all vectors have 0 for samples.distance"
     ]
     ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
     assert told(sound.sensor(), [ack]) == []
@@ -446,11 +441,11 @@ def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
 def test_vectors_place_points_in_two_quadrants_within_reach() -> None:
     first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     assert told(sound.sensor(range_limits=(0.05, 4.0)), [first, second]) == [
-        "LS713 data: 4.66 m, and range_limits end at 4 m"
+        "LS713 data: 4.66 m, but range_limits end at 4 m"
     ]
     del second["points"]
     assert told(sound.sensor(), [first, second]) == [
-        "LS712 data.points: they say x and y of points in 1 quadrant"
+        "LS712 data.points: x and y of points are in 1 quadrant only"
     ]
 
 
@@ -472,7 +467,7 @@ def test_the_sense_of_the_points_is_measured_and_held_against_the_axes(
     )
     the_points_turn_as_the_axes_do(right, "data")
     assert right.picture["data: sense"] == f"{sense} as first grows, seen from above"
-    with pytest.raises(ViolationError, match=f"angles run {sense}") as found:
+    with pytest.raises(ViolationError, match=f"turn {sense}") as found:
         the_points_turn_as_the_axes_do(wrong, "data")
     assert found.value.code == "LS511"
 
@@ -569,12 +564,11 @@ def test_a_reply_that_cannot_be_simulated_requires_answers() -> None:
     )
     (empty,) = finding(learning, page)
     assert empty.startswith(
-        "LS604 commands.ask: its reply, which is made up without answers= of the Simulation,"
-        " cannot be learned from"
+        "LS604 commands.ask: cannot read options from its reply, simulated without answers="
     )
     (unmade,) = finding(Command("order", {"code": 9}, reply="page"), ended)
     assert unmade.startswith(
-        "LS604 commands.ask: its reply cannot be made up without answers= of the Simulation:"
+        "LS604 commands.ask: cannot simulate its reply without answers= of the Simulation:"
         " cannot be simulated"
     )
 
@@ -604,9 +598,9 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
     ("changes", "said"),
     [
         ({}, ""),
-        ({"hex": "16 61 02 75"}, "16 61 01 76 is sent, and 16 61 02 75 is printed"),
+        ({"hex": "16 61 02 75"}, "sends 16 61 01 76, expected 16 61 02 75"),
         ({"reply": "17 71 44 02 20"}, "the device answered with ack with code 2 instead of 1"),
-        ({"command": "stop"}, "no command 'stop' sends such a frame"),
+        ({"command": "stop"}, "no command 'stop' sends this frame"),
         ({"args": {"speed": 3}}, "unknown"),
     ],
 )
@@ -643,20 +637,23 @@ def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
         ("[" + "9" * 5000 + "]", "not JSON: "),
         (b"\xff", "not JSON: "),
         (" " * (1 << 22) + "[]", "not JSON: it is longer than 4096 kB"),
-        ('[{"hex": 1}]', "hex is a text, not 1"),
-        ('[{"frame": ["data"]}]', r"frame is a text, not \['data'\]"),
-        ('[{"command": {}}]', "command is a text, not {}"),
-        ('[{"sensor": 3}]', "sensor is an id, or a list of ids, not 3"),
-        ('[{"sensor": [[]]}]', "sensor is an id, or a list of ids"),
-        ('[{"values": [1]}]', "values is an object of numbers and texts"),
-        ('[{"values": {"a": {}}}]', "values is an object of numbers and texts"),
-        ('[{"values": {"a": 1e400}}]', "values is an object of numbers and texts"),
-        ('[{"values": {"a": ' + "9" * 400 + "}}]", "values is an object of numbers and texts"),
-        ('[{"units": {"a": "1"}}]', "units is an object of numbers"),
-        ('[{"units": {"a": NaN}}]', "units is an object of numbers"),
-        ('[{"points": {"a": {}}}]', "points is an object of points, by their numbers"),
-        ('[{"points": {"0": [1]}}]', "points is an object of points, by their numbers"),
-        ('[{"args": 1}]', "args is an object of numbers and texts"),
+        ('[{"hex": 1}]', "hex: expected a string, got 1"),
+        ('[{"frame": ["data"]}]', r"frame: expected a string, got \['data'\]"),
+        ('[{"command": {}}]', "command: expected a string, got {}"),
+        ('[{"sensor": 3}]', "sensor: expected an id or a list of ids, got 3"),
+        ('[{"sensor": [[]]}]', "sensor: expected an id or a list of ids"),
+        ('[{"values": [1]}]', "values: expected an object of numbers and strings"),
+        ('[{"values": {"a": {}}}]', "values: expected an object of numbers and strings"),
+        ('[{"values": {"a": 1e400}}]', "values: expected an object of numbers and strings"),
+        (
+            '[{"values": {"a": ' + "9" * 400 + "}}]",
+            "values: expected an object of numbers and strings",
+        ),
+        ('[{"units": {"a": "1"}}]', "units: expected an object of numbers"),
+        ('[{"units": {"a": NaN}}]', "units: expected an object of numbers"),
+        ('[{"points": {"a": {}}}]', "points: expected an object of points by number"),
+        ('[{"points": {"0": [1]}}]', "points: expected an object of points by number"),
+        ('[{"args": 1}]', "args: expected an object of numbers and strings"),
     ],
 )
 def test_vectors_of_any_shape_are_a_fault_of_their_file(

@@ -179,9 +179,7 @@ def test_parameters_have_descriptions_and_some_can_be_changed(run: Any, client: 
     assert (len(newest().ranges), newest().range_max, newest().angle_min) == (450, 3.0, -1.0)
     assert all(one <= 3.0 or one == float("inf") for one in newest().ranges)
     assert "source is read when" in client.set("source", "udp://")
-    assert (
-        client.set("scan_z_min", 2.0) == "scan_z_min 2.0 is above scan_z_max 0.0"
-    )
+    assert client.set("scan_z_min", 2.0) == "scan_z_min 2.0 is above scan_z_max 0.0"
     assert "5.0 to 3.0" in client.set("range_min", 5.0)
     assert client.set("beams", -1)
     assert (client.value("scan_z_min"), client.value("range_min")) == (0.0, 0.0)
@@ -202,9 +200,7 @@ def test_an_unknown_parameter_is_reported(run: Any, client: Client) -> None:
     (said,) = complaints.splitlines()
     assert (
         code,
-        said.endswith(
-            "unknown parameter 'beam' is ignored; did you mean 'beams'?"
-        ),
+        said.endswith("unknown parameter 'beam' is ignored; did you mean 'beams'?"),
     ) == (0, True)
 
 

@@ -199,7 +199,9 @@ class PageSite:
         """Send a scan as a file, by its number."""
         number, _, suffix = request.path_params["name"].partition(".")
         if suffix not in list_save_formats():
-            return PlainTextResponse(f"unknown format: expected {', '.join(list_save_formats())}", 404)
+            return PlainTextResponse(
+                f"unknown format: expected {', '.join(list_save_formats())}", 404
+            )
         shown = None
         if number.isdecimal() and len(number) < MAX_NUMBER_DIGITS:
             shown = self._broadcast.find_scan(int(number))
