@@ -1,31 +1,31 @@
-"""lidarspec: every lidar's wire protocol written down once, and everything else a function of that.
+"""Read, simulate and convert lidar data, from descriptions of wire protocols.
 
     import lidarspec as ls
 
     s = ls.sensor("vendor-model")
     s.parse(frame), s.build("data", ...), s.decode(data).points(), s.scans(data), ls.open(source, s)
 
-Here are the names of those who read a lidar; those who write a sensor find theirs in
-`lidarspec.spec`, and every error is in `lidarspec.errors`. They are imported when they are first
-used, so that ``lidarspec --help`` is quick.
+This module has the names for reading a lidar. Names for describing a sensor are in
+`lidarspec.spec`, errors in `lidarspec.errors`. All are imported on first use, so that
+``lidarspec --help`` starts quickly.
 
-The packages are stations on the way of a byte, and import each other in one direction; each says
-what comes in and what goes out:
+The packages follow the path of the data, and import each other in one direction. Each `__init__`
+lists its input and its output:
 
-    spec        what a sensor is               packets     frames of one type, in order, in time
-    frames      a frame and its bytes          points      packets as point clouds
-    expressions columns given to plugins       scans       the end of a revolution
-    framing     where frames are in bytes      device      a sensor on a source
+    spec        description of a sensor        packets     frames of one type as columns
+    frames      parsing and building a frame   points      packets as point clouds
+    expressions columns for plugin functions   scans       revolutions of points
+    framing     finding frames in bytes        device      a sensor on a source
 
-    transports  where bytes come from, go to   simulation  a sensor that is not there, from its spec
-    captures    pcap files of other tools      recording   all that came over a link, with its time
-    explaining  a frame, byte by byte          detect      which sensor, what is wrong
-    exports     a spec for other tools         drafting    the spec of an unknown format
-    view        scans drawn                    formats     scans as files
-    plugins     what is installed, its hooks   testing     the test kit for authors
-    cli         the command line, on top
+    transports  serial ports, sockets, files   simulation  simulated sensors
+    captures    pcap files of other tools      recording   received bytes with arrival times
+    explaining  a frame, byte by byte          detect      identification, diagnosis
+    exports     a spec for other tools         drafting    draft of an unknown format
+    view        pictures of scans              formats     scans as files
+    plugins     installed sensors and hooks    testing     test kit for sensors
+    cli         command line
 
-`Sensor` is in `sensor_operations`: a description from `spec` whose methods call these engines.
+`Sensor` is in `sensor_operations`: a description from `spec` with methods that call these engines.
 """
 
 from __future__ import annotations

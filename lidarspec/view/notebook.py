@@ -131,7 +131,7 @@ def sensor(value: Sensor) -> str:
     """Return the packet diagrams of a sensor as HTML; only those of data are open."""
     head = (
         f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b>"
-        f" <code>{escape(value.id)}</code>, proven by {escape(value.status)}"
+        f" <code>{escape(value.id)}</code>, verified by {escape(value.status)}"
     )
     source = f'<div style="opacity:.75">{escape(printable(value.source))}</div>'
     return "\n".join(

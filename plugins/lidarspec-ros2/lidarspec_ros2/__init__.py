@@ -1,4 +1,4 @@
-"""A ROS 2 driver for every lidar that lidarspec knows: the verb `lidarspec ros2`, and the
+"""ROS 2 driver for all lidars of lidarspec: the verb `lidarspec ros2`, and the
 executable `lidarspec_node`.
 
 A lifecycle node over a `Device`, as every verb has one. ROS is imported when the node starts, and
