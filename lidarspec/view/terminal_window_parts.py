@@ -11,7 +11,7 @@ from lidarspec.view.canvas import ALARM, FAINT, FIRST_STEP, LABEL, PLAIN, STRONG
 
 KEYS = (
     ("space", "pause and continue"),
-    ("c", "value that sets the colour"),
+    ("c", "switch colours"),
     ("+ -", "zoom in and out"),
     ("arrows", "move the view"),
     ("0", "show all points"),

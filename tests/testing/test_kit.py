@@ -132,7 +132,7 @@ def test_an_authors_tests_run_with_the_kits_fixtures(tmp_path: Path) -> None:
     done = run(
         tmp_path, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "--strict-markers", "."
     )
-    assert "which sensor? mark the test with" in done.stdout
+    assert "sensor missing: mark the test with" in done.stdout
     assert "5 passed, 1 error" in done.stdout, done.stdout
     assert "failed" not in done.stdout, done.stdout
 

@@ -53,7 +53,7 @@ def test_keys_match_the_help(tmp_path: Path) -> None:
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         terminal.wait_for("6 m")
         terminal.type("?")
-        assert "value that sets the colour" in terminal.wait_for(" keys ")
+        assert "switch colours" in terminal.wait_for(" keys ")
         terminal.type("?c")
         terminal.wait_for("intensity")
         terminal.type("c+++++")

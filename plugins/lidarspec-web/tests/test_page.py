@@ -334,7 +334,7 @@ def test_a_page_reports_a_restarted_server(browser: Any) -> None:
     source = "sim:ldrobot-stl27l?rate=0.5"
     with served(source, address=f"127.0.0.1:{port}") as link:
         visit = Visit(browser, link)
-    visit.until(lambda: "connection is lost" in visit.text("#notice"), "nothing is said of it")
+    visit.until(lambda: "Connection lost" in visit.text("#notice"), "nothing is said of it")
     assert visit.text("#status") == "no server"
     with served(source, address=f"127.0.0.1:{port}") as link:
         visit.until(
@@ -355,7 +355,7 @@ def test_a_page_reconnects(browser: Any, tmp_path: Path, monkeypatch: pytest.Mon
     source = "sim:ldrobot-stl27l?rate=0.5"
     with Station(source, tmp_path, page=PAGE) as station:
         visit = Visit(browser, station.link)
-    visit.until(lambda: "connection is lost" in visit.text("#notice"), "nothing is said of it")
+    visit.until(lambda: "Connection lost" in visit.text("#notice"), "nothing is said of it")
     with Station(source, tmp_path, page=PAGE, port=station.port):
         visit.until(lambda: visit.text("#status") == "streaming", "it does not connect again")
         assert not visit.page.locator("#notice").is_visible()

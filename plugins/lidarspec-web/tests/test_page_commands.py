@@ -91,7 +91,7 @@ def test_a_command_without_an_answer_is_sent(tmp_path: Path) -> None:
     """The rotor stops, and the data with it."""
     with Station(f"sim:{STREAM}", tmp_path) as station, station.page() as page:
         page.scan()
-        assert "not known" in page.asked("send", command="stop", arguments={})["text"]
+        assert "unknown" in page.asked("send", command="stop", arguments={})["text"]
         page.state(lambda state: state["state"] == "silent")
         page.asked("send", command="scan", arguments={})
         page.scan()

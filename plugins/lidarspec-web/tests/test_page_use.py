@@ -336,7 +336,7 @@ def test_a_question_to_a_running_sensor_stops_it_and_starts_it_again(browser: An
             "it does not offer to stop",
         )
         send.click()
-        visit.until(lambda: "answered" in visit.text("#commands .reply"), "there is no reply")
+        visit.until(lambda: "replied" in visit.text("#commands .reply"), "there is no reply")
         visit.until(lambda: len(visit.asked_for("send")) == 3, "it is not started again")
         assert visit.asked_for("send")[1]["command"] == "get_info"
         before = visit.value("lidarspec.picture.scan.scan")

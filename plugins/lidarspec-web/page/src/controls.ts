@@ -18,7 +18,7 @@ const RECORD_AGAIN = 500;
 const KEYS = [
   ["space", "pause and continue"],
   [".", "next scan, while paused"],
-  ["c", "value that sets the colour"],
+  ["c", "switch colours"],
   ["+ -", "zoom in and out"],
   ["arrows", "move the view"],
   ["enter", "frame of the point in the middle, if the picture has the focus"],
