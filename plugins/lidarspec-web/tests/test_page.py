@@ -338,7 +338,7 @@ def test_a_page_reports_a_restarted_server(browser: Any) -> None:
     assert visit.text("#status") == "no server"
     with served(source, address=f"127.0.0.1:{port}") as link:
         visit.until(
-            lambda: "open the link that it printed" in visit.text("#notice"),
+            lambda: "Open the link that it printed" in visit.text("#notice"),
             "it does not say what to do",
         )
         visit.page.reload()
