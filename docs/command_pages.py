@@ -154,13 +154,14 @@ def node(text: str) -> str:
     sys.path.insert(0, str(DOCS.parent / "plugins" / "lidarspec-ros2"))
     from lidarspec_ros2.parameters import PARAMETERS
 
-    table = ["| parameter | default | |", "|---|---|---|"]
+    rows = []
     for parameter in PARAMETERS:
-        name = f"`{parameter.name}`*" if parameter.live else f"`{parameter.name}`"
-        default = json.dumps(parameter.default)
-        table.append(f"| {name} | `{default}` | {parameter.text} |")
+        name = f"`{parameter.name}`" + ("\\*" if parameter.live else "")
+        is_empty = parameter.default in ("", [""], 0.0) and parameter.default is not False
+        default = "" if is_empty else f" [default: {json.dumps(parameter.default)}]"
+        rows.append(f"* {name}: {parameter.text}{default}")
     before, after = text.partition(BEGIN)[0], text.partition(END)[2]
-    return "\n".join([f"{before}{BEGIN}", "", *table, "", f"{END}{after}"])
+    return "\n".join([f"{before}{BEGIN}", "", *rows, "", f"{END}{after}"])
 
 
 def manual(verb: str) -> str:
