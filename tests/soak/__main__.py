@@ -113,9 +113,10 @@ def ran(promise: Promise, *, long: bool) -> Figure:
     passed = len(cases) - len(failed) - sum(case.find("skipped") is not None for case in cases)
     if failed or not passed:
         return Figure(f"{len(failed)} of {len(cases)} tests fail: {', '.join(failed[:3])}", False)
-    return Figure(
-        "; ".join(part for part in (promise.told if long else "", f"{passed} tests") if part), True
-    )
+    text = promise.told if long else ""
+    if not text and promise.measured is None:
+        text = f"{passed} tests"
+    return Figure(text, True)
 
 
 def table(figures: dict[Promise, Figure], seconds: float, effort: str = "") -> str:

@@ -78,8 +78,7 @@ def splits(share: float) -> Figure:
             tried += 1
             differing += books.finish() != whole or books.decoder.stats != stats
     return Figure(
-        f"{tried:,} splits of the streams of {len(streams())} sensors and shapes: {differing}"
-        " differ",
+        f"{tried:,} splits of streams of {len(streams())} sensors and shapes: {differing} differ",
         not differing,
     )
 
@@ -98,8 +97,7 @@ def recovered(share: float) -> Figure:
                 extra + len(found - wanted),
             )
     return Figure(
-        f"{frames:,} frames in damaged streams, by brute force: {missed} missed, {extra} found"
-        " besides",
+        f"{frames:,} frames found by brute force: {missed} missed, {extra} extra",
         not missed + extra,
     )
 
@@ -226,8 +224,8 @@ def in_any_order(share: float) -> Figure:
         if not is_same:
             differing.append(name)
     words = (
-        f"{len(few(sensors, share))} sensors, 1,000 packets each, 10 % of them duplicated,"
-        " every one displaced by up to 3 places: "
+        f"{len(few(sensors, share))} sensors, 1,000 packets each, 10 % duplicated,"
+        " displaced by up to 3 places: "
     )
     return Figure(
         words
@@ -369,8 +367,7 @@ def strangers(share: float) -> Figure:
             return Figure(f"the session ended: {error}"[:160], False)
         foreign = device.stats.foreign
     return Figure(
-        f"{number - 1} frames of another sender among {number}: {points} read, {foreign} counted as"
-        " foreign",
+        f"{number} frames and {number - 1} of another sender: {points} read, {foreign} foreign",
         (points, foreign) == (number, number - 1),
     )
 
@@ -447,7 +444,7 @@ def complete(share: float) -> Figure:
             len(whole(sensor, left)),
         )
         told.append(
-            f"{name} without {number} packets: lost {lost}, {before - after} fewer scans complete"
+            f"{name} without {number} packets: {lost} lost, {before - after} fewer scans complete"
         )
         kept &= abs(lost - number) <= 1 and after < before
     return Figure("; ".join(told), kept)
