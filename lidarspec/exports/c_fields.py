@@ -278,7 +278,7 @@ class CLayout:
                     " it,"
                     " which is not supported"
                 )
-            case tree.Empty():
+            case tree.Empty() | tree.Derived():
                 return SizeFormula()
         return sum((self.extent(below) for below in self._below(entry)), SizeFormula())
 
@@ -302,7 +302,7 @@ class CLayout:
     def _visit(self, entry: CEntry) -> None:
         """Store an entry and all entries in it."""
         node = entry.node
-        if not isinstance(node, tree.Empty):
+        if not isinstance(node, tree.Empty | tree.Derived):
             if isinstance(node, tree.Repeat):
                 path = node.axis
             else:

@@ -204,7 +204,7 @@ def node_data(node: tree.Node) -> dict[str, Any]:
             return {"kind": "check", "name": node.name, "condition": formula_data(node.condition)}
         case tree.Never():
             return {"kind": "never", "name": node.name}
-        case tree.Empty() | tree.Opaque():
+        case tree.Empty() | tree.Derived() | tree.Opaque():
             return {"kind": "nothing", "name": node.name}
 
 

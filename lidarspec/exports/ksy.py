@@ -361,7 +361,7 @@ class _KaitaiWriter:
         """Add a part to a type, with further keys of its attribute."""
         node = as_block(node)
         match node:
-            case tree.Empty():
+            case tree.Empty() | tree.Derived():
                 return
             case tree.Check():
                 kaitai.seq.append(
@@ -554,7 +554,7 @@ def _value(node: tree.Node) -> tree.Node:
     if isinstance(node, tree.Number):
         parent = node.info.path.rpartition(".")[0]
         return replace(node, info=replace(node.info, path=f"{parent}.value" if parent else "value"))
-    if isinstance(node, tree.Sealed):
+    if isinstance(node, tree.Sealed | tree.Derived):
         return node
     return replace(node, name="value")
 

@@ -25,6 +25,7 @@ from lidarspec.spec.tree import (
     Blob,
     Block,
     Check,
+    Derived,
     Empty,
     FieldInfo,
     Never,
@@ -163,6 +164,10 @@ class _StubClasses:
                 return " | ".join(
                     dict.fromkeys(self._type(owner, name, branch) for branch in children(node))
                 )
+            case Derived() if node.node is not None:
+                return self._type(owner, name, node.node)
+            case Derived():
+                return node.info.kind if node.info.kind != "other" else "Any"
             case Empty() | Check() | Never() | Opaque():
                 return "None"
 

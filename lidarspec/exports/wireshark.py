@@ -200,7 +200,7 @@ class _TableWriter:
                 return {"kind": "check", "name": node.name, "condition": _function(node.condition)}
             case tree.Never():
                 return {"kind": "never"}
-            case tree.Empty() | tree.Opaque():
+            case tree.Empty() | tree.Derived() | tree.Opaque():
                 return {"kind": "empty", "skip": 0}
 
     def _number(self, node: tree.Number) -> Table:

@@ -783,8 +783,14 @@ def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
 
 def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
     """A field in its unit: float64, shape (n, *lengths); nan where a frame lacks the field."""
+    array = table.raw(info.path)
+    if array.dtype == object:
+        raise SpecError(
+            "its values are no numbers, and a column holds numbers: declare a text as bytes",
+            path=info.path,
+        )
     with np.errstate(invalid="ignore"):  # a signalling nan is a nan
-        array = table.raw(info.path).astype(np.float64)
+        array = array.astype(np.float64)
     if info.scaled:
         array *= info.scale
         array += info.offset
@@ -856,9 +862,9 @@ def _paths(batch: Batch, frame: str) -> Iterable[str]:
     packets.
     """
     if not frame:
-        return batch.table.schema.fields
+        return batch.table.schema.columns
     table, _ = batch.state[frame]
-    return {*batch.defaults.get(frame, {}), *(table.schema.fields if table is not None else ())}
+    return {*batch.defaults.get(frame, {}), *(table.schema.columns if table is not None else ())}
 
 
 class _States:
@@ -883,18 +889,18 @@ def _column(batch: Batch, frame: str, path: str) -> Column:
     table, which = batch.state[frame] if frame else (batch.table, np.zeros(0, np.intp))
     if (
         table is not None
-        and path not in table.schema.fields
-        and without_indices(path)[0] in table.schema.fields
+        and path not in table.schema.columns
+        and without_indices(path)[0] in table.schema.columns
     ):
         raise SpecError("there is no such element", path=path)
     if not frame:
-        return field_column(batch.table.schema.fields[path], batch.table, depth, batch)
+        return field_column(batch.table.schema.columns[path], batch.table, depth, batch)
     defaults = batch.defaults.get(frame, {})
     missing = which < 0
     if not missing.any() and table is not None:
         same = len(which) == 0 or int(which.min()) == int(which.max())
         return field_column(
-            table.schema.fields[path], table, depth, batch, which[:1] if same else which, frame
+            table.schema.columns[path], table, depth, batch, which[:1] if same else which, frame
         )
     base, indices = without_indices(path)
     if base not in defaults:
@@ -909,7 +915,7 @@ def _column(batch: Batch, frame: str, path: str) -> Column:
     array = default.reshape(1, *default.shape, *spare)
     if table is not None and not missing.all():
         known = field_column(
-            table.schema.fields[path], table, depth, batch, np.maximum(which, 0)
+            table.schema.columns[path], table, depth, batch, np.maximum(which, 0)
         ).array
         array = np.where(missing.reshape(-1, *(1,) * (known.ndim - 1)), array, known)
     return Column(array, (*names, *(None,) * len(spare)), batch, source=path, frame=frame)

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.expressions.columns import NO_TRUTH, Batch, Column, Fields, align, call_aligned
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
-from lidarspec.frames.schema import Schema
+from lidarspec.frames.schema import Schema, without_indices
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis
 
@@ -335,6 +335,8 @@ class TracedFields:
             return value
         if not isinstance(value, Column):
             return TracedFields(value, self._tape, path, read)
+        if without_indices(path)[0] in value.batch.table.schema.derived and not value.frame:
+            raise UntraceableError(f"{path} is computed, and has no bytes of its own")
         return self._tape.add("state" if self._real._is_around else "field", read, (), value, path)
 
     def __getitem__(self, index: Any) -> TracedFields:

@@ -156,7 +156,7 @@ class _Encoder:
                     value = None
         if isinstance(value, list) and names in self._indices:
             value = value[self._indices[names]]
-        info = self._schema.fields[path]
+        info = self._schema.columns[path]
         if value is None or (info.rebuilt is not None and not info.held):
             value = self._find_implied(info)
         if value is None:
@@ -200,7 +200,7 @@ class _Encoder:
             encoded.insert(0, encoder.encode())
             following = len(encoded[0])
         total = sum(map(len, encoded))
-        fields = self._schema.fields
+        fields = self._schema.columns
         fill_in(node.count, self._given, len(encoded), fields, node.axis)
         fill_in(node.size, self._given, following, fields, node.axis)
         fill_in(node.within, self._given, total, fields, node.axis)
@@ -533,7 +533,7 @@ def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
 def list_paths(root: Node) -> frozenset[str]:
     """Return the paths of all fields of a frame type, and of the structs and arrays around them."""
     table = schema(root)
-    paths = {*table.all_fields, *table.arrays}
+    paths = {*table.all_fields, *table.arrays, *table.derived}
     for node in nodes(root):
         if isinstance(node, Struct):
             paths |= {f"{node.path}.{child.name}".strip(".") for child in node.members}

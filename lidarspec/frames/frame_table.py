@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.frames.arrays import add_axes, count_up, is_counted, repeat
-from lidarspec.frames.layout import Bytes2D, Layout, Leaf, rows_at
+from lidarspec.frames.layout import Bytes2D, Derivation, Layout, Leaf, rows_at
 from lidarspec.frames.schema import Schema, schema, without_indices
 from lidarspec.spec.syntax import get_member, leaves
 
@@ -106,48 +106,48 @@ class CompiledTable:
         return self._length
 
     def raw(self, path: str) -> NDArray[Any]:
-        info = self.schema.fields[path]
-        assert info.dtype is not None
+        info = self.schema.columns[path]
+        dtype = info.dtype or np.dtype(object)  # of a computed constant that is no number
         if len(self.groups) == 1:
             group = self.groups[0]
-            leaf = group.layout.leaves.get(path)
+            leaf = group.layout.column(path)
             # The general path handles empty arrays: an array in an empty one has length 0,
             # whatever its declared length.
             if leaf is not None and 0 not in leaf.shape:
                 values = self._load(leaf, path, group)[group.stream_order]
-                return values.astype(info.dtype, copy=False)
+                return values.astype(dtype, copy=False)
         lengths = [self.length(axis) for axis in info.axes]
-        column = np.zeros((len(self), *lengths), info.dtype)
+        column = np.zeros((len(self), *lengths), dtype)
         for group in self.groups:
-            leaf = group.layout.leaves.get(path)
+            leaf = group.layout.column(path)
             if leaf is not None and 0 not in leaf.shape:
                 values = self._load(leaf, path, group)
                 corner: Any = (group.where, *(slice(0, length) for length in values.shape[1:]))
                 column[corner] = values
         return column
 
-    def _load(self, leaf: Leaf, path: str, group: LayoutRows) -> NDArray[Any]:
+    def _load(self, leaf: Leaf | Derivation, path: str, group: LayoutRows) -> NDArray[Any]:
         """Return the raw values of a field in the frames of a group.
 
         An index in the path removes the axis of which it selects one element.
         """
-        values = leaf.load(group.rows)
+        values = group.layout.load(path, group.rows)
         if "[" not in path:
             return values
-        axes = self.schema.fields[without_indices(path)[0]].axes
+        axes = self.schema.columns[without_indices(path)[0]].axes
         lengths = zip(axes, leaf.shape, strict=False)
         kept = [length for axis, length in lengths if axis in leaf.info.axes]
         return values.reshape(len(values), *kept)
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
-        if not self.schema.fields[path].optional:
+        if not self.schema.columns[path].optional:
             return None
         there = np.zeros(len(self), np.bool_)
         for group in self.groups:
             is_empty = any(
-                group.layout.lengths.get(axis) == 0 for axis in self.schema.fields[path].axes
+                group.layout.lengths.get(axis) == 0 for axis in self.schema.columns[path].axes
             )
-            there[group.where] = is_empty or path in group.layout.leaves
+            there[group.where] = is_empty or group.layout.column(path) is not None
         return there
 
     def counts(self, axis: str) -> NDArray[np.intp]:
@@ -381,31 +381,35 @@ class ParsedTable:
         return len(self._parsed)
 
     def raw(self, path: str) -> NDArray[Any]:
-        info, (base, indices) = self.schema.fields[path], without_indices(path)
+        info, (base, indices) = self.schema.columns[path], without_indices(path)
         if indices:
             return self._take_element(self.raw(base), base, indices)[0]
         values = [
             _collect_values(parsed, path.split("."), len(info.axes)) for parsed in self._parsed
         ]
+        if info.dtype is None and not _are_numbers(values):
+            return _make_object_column(values)
         lengths = [self.length(axis) for axis in info.axes]
         if info.dtype is not None:
             dtype = info.dtype
         else:
-            dtype = _find_common_dtype(values, path)
+            dtype = _find_common_dtype(values)
         column = np.zeros((len(self), *lengths), dtype)
         try:
             for index, value in enumerate(values):
                 _copy_value(column, index, value)
         except (IndexError, TypeError, ValueError):
+            if info.dtype is None:
+                return _make_object_column(values)
             raise SpecError(
                 "its branches give values of different shapes, and a column has one", path=path
             ) from None
         return column
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
-        if not self.schema.fields[path].optional:
+        if not self.schema.columns[path].optional:
             return None
-        axes, (base, indices) = self.schema.fields[path].axes, without_indices(path)
+        axes, (base, indices) = self.schema.columns[path].axes, without_indices(path)
         if indices:
             base_present = self.present(base)
             elements, inside = self._take_element(
@@ -442,7 +446,7 @@ class ParsedTable:
             indices: the index in each axis to remove. A negative index counts from the end.
         """
         inside = np.ones(len(self), np.bool_)
-        axes = self.schema.fields[path].axes
+        axes = self.schema.columns[path].axes
         for axis in sorted(indices, key=axes.index, reverse=True):
             place = 1 + axes.index(axis)
             counts = self.counts(axis)
@@ -615,24 +619,30 @@ def _iter_numbers(value: Any) -> Iterator[Any]:
         yield value
 
 
-def _find_common_dtype(raw_values: list[Any], path: str) -> np.dtype[Any]:
-    """Return the dtype for the values of a field without a declared dtype.
-
-    Raises:
-        SpecError: if the values are not numbers, or do not fit into 64 bits.
-    """
-    values = list(_iter_numbers(raw_values))
+def _are_numbers(found: list[Any]) -> bool:
+    """Return whether values are numbers that fit into 64 bits, or equally nested lists of them."""
+    values = list(_iter_numbers(found))
     if not all(isinstance(value, int | float) for value in values):
-        raise SpecError(
-            "its values are no numbers, and a column holds numbers: declare a text as bytes",
-            path=path,
-        )
+        return False
+    whole = [value for value in values if isinstance(value, int)]
+    least = min(whole, default=0)
+    most = max(whole, default=0)
+    return any(
+        np.iinfo(kind).min <= least and most <= np.iinfo(kind).max for kind in (np.int64, np.uint64)
+    )
+
+
+def _make_object_column(values: list[Any]) -> NDArray[Any]:
+    """Return a column of any values, (n,)."""
+    column = np.empty(len(values), object)
+    column[:] = values
+    return column
+
+
+def _find_common_dtype(found: list[Any]) -> np.dtype[Any]:
+    """Return the dtype for numbers of a field without a declared dtype."""
+    values = list(_iter_numbers(found))
     if any(isinstance(value, float) for value in values):
         return np.dtype(np.float64)
-    for kind in (np.int64, np.uint64):
-        if (
-            np.iinfo(kind).min <= min(values, default=0)
-            and max(values, default=0) <= np.iinfo(kind).max
-        ):
-            return np.dtype(kind)
-    raise SpecError("its numbers are wider than the 64 bits that a column holds", path=path)
+    is_small = max(values, default=0) <= np.iinfo(np.int64).max
+    return np.dtype(np.int64 if is_small else np.uint64)

@@ -345,6 +345,65 @@ class Leaf:
         return replace(self, offset=self.offset - offset)
 
 
+@dataclass(frozen=True, eq=False)
+class Derivation:
+    """A value that frames of one layout have without bytes of its own.
+
+    Attributes:
+        info: the value as a field.
+        shape: the number of elements along each of its arrays.
+        strides: what is added to `start` from one element to the next along each array.
+        formula: of fields of the frame; None if the value is `start`.
+        start: the value of the first element.
+        picked: the index in each array that is taken; None for all elements.
+    """
+
+    info: FieldInfo
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    formula: Formula | None = None
+    start: Any = 0
+    picked: tuple[int | None, ...] = ()
+
+    def load(self, rows: Bytes2D, leaves: Mapping[str, Leaf]) -> NDArray[Any]:
+        """Return the values of frames given as rows of bytes, (n, *shape)."""
+        whole = self._compute(rows, leaves)
+        full = np.broadcast_to(whole, (len(rows), *self.shape))
+        if not self.picked:
+            return full
+        chosen = (slice(None) if index is None else index for index in self.picked)
+        return full[(slice(None), *chosen)]
+
+    def _compute(self, rows: Bytes2D, leaves: Mapping[str, Leaf]) -> NDArray[Any]:
+        depth = len(self.shape)
+        if self.formula is not None:
+            columns = {}
+            for ref in refs(self.formula):
+                values = leaves[ref.path].load(rows)
+                dtype = np.int64 if values.dtype.kind in "iu" else np.float64
+                spare = (1,) * (1 + depth - values.ndim)
+                columns[ref.path] = values.astype(dtype).reshape(*values.shape, *spare)
+            return np.asarray(arrays(self.formula, columns, None))
+        values = np.array(self.start).reshape((1,) * (1 + depth))
+        if any(self.strides):
+            for axis, (length, stride) in enumerate(zip(self.shape, self.strides, strict=True)):
+                steps = np.arange(length) * stride
+                values = values + steps.reshape(*(1,) * (1 + axis), -1, *(1,) * (depth - axis - 1))
+        return values
+
+    def element(self, path: str, indices: Mapping[str, int]) -> Derivation | None:
+        """Return one element of its arrays, None if it does not exist."""
+        info = element_of(self.info, path, indices)
+        picked = tuple(indices.get(axis) for axis in self.info.axes)
+        exists = all(
+            index is None or -length <= index < length
+            for index, length in zip(picked, self.shape, strict=True)
+        )
+        if info is None or not exists:
+            return None
+        return replace(self, info=info, picked=picked)
+
+
 #: Computes the checksums of one seal for many frames, (n,). Returns None if the algorithm of the
 #: seal has to compute them.
 Sums = Callable[["Seal", Bytes2D], "NDArray[np.uint64] | None"]
@@ -576,6 +635,8 @@ class Layout:
         regions: the `Region` of each sequence of parts (frames within the frame), by its axis.
         held: the values of the fields that declare the sizes of parts, in the form of `constants`.
         conditions: conditions that the values of its fields have to meet.
+        derived: by path, the values that have no bytes of their own, and the places of those that
+            repeat bytes of other fields.
         notes: cache for results derived from the layout.
     """
 
@@ -590,6 +651,7 @@ class Layout:
     regions: Mapping[str, Any] = field(default_factory=dict)
     held: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     conditions: tuple[Condition, ...] = ()
+    derived: Mapping[str, Leaf | Derivation] = field(default_factory=dict)
     notes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -613,6 +675,18 @@ class Layout:
     def _value(self) -> int:
         """The values of `bits_by_offset` as one little-endian number."""
         return sum(value << 8 * offset for offset, (_, value) in self.known.items())
+
+    def column(self, path: str) -> Leaf | Derivation | None:
+        """Return the position of a field, or how a derived value is computed; None without it."""
+        return self.leaves.get(path) or self.derived.get(path)
+
+    def load(self, path: str, rows: Bytes2D) -> NDArray[Any]:
+        """Return the raw values of a field, or of a derived value, (n, *shape)."""
+        found = self.column(path)
+        if isinstance(found, Derivation):
+            return found.load(rows, self.leaves)
+        assert found is not None
+        return found.load(rows)
 
     def sound(self, frame: bytes) -> bool:
         """Return whether one frame is valid.

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import group_by_value
 from lidarspec.frames.compilability import NotCompilableError, check_compilable
-from lidarspec.frames.layout import Condition, Layout, LayoutRefusal, Leaf, Seal
+from lidarspec.frames.layout import Condition, Derivation, Layout, LayoutRefusal, Leaf, Seal
 from lidarspec.frames.parts import CONSTANT, FAILED, PartKind, PartRule, PartsSize, Region
 from lidarspec.frames.schema import PathMapping, without_indices
 from lidarspec.spec import tree
@@ -141,6 +141,10 @@ class HeaderWalk:
     open_regions: dict[str, Region] = field(default_factory=dict)
     #: what values have to meet; each once, as a key.
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
+    #: values without bytes of their own, by path.
+    derived: dict[str, Leaf | Derivation] = field(default_factory=dict)
+    #: the offset of each part; in arrays, that of the first element.
+    starts: dict[str, int] = field(default_factory=dict)
     #: elements without a byte, of all arrays.
     empty: int = 0
     #: fields that formulas can ask for by now; None for a field that the header leaves out.
@@ -164,7 +168,8 @@ class HeaderWalk:
             self.lengths,
             self.regions,
         )
-        return Layout(*found, held, tuple(self.conditions.values()))
+        derived = PathMapping(self.derived, lambda each, path, indices: each.element(path, indices))
+        return Layout(*found, held, tuple(self.conditions.values()), derived)
 
     def read(self, path: str) -> int | None:
         """Return the raw value of a field that a formula asks for.
@@ -204,7 +209,7 @@ class HeaderWalk:
         self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()
     ) -> None:
         """Go through a part; `shape` and `strides` of the arrays that it is in."""
-        start = self.cursor
+        start = self.starts[path] = self.cursor
         match node:
             case tree.Struct():
                 self._struct(node, path, shape, strides)
@@ -227,6 +232,8 @@ class HeaderWalk:
                 self.conditions[node] = Condition.of(node)
             case tree.Never():
                 raise TooLongError(path)
+            case tree.Derived():
+                self._derived(node, path, shape, strides)
             case tree.Opaque():
                 raise NotCompilableError(node.info.path, node.reason)
         if self.cursor > self.limit:
@@ -262,15 +269,47 @@ class HeaderWalk:
         self.empty += 0 if size else math.prod(shape) * count
         if start + size * count > self.limit or self.empty > self.limit:
             raise TooLongError(path)
-        for name, leaf in self.leaves.items():
-            if node.axis in leaf.info.axes:
-                self.leaves[name] = replace(
-                    leaf, strides=(*leaf.strides[:depth], size, *leaf.strides[depth + 1 :])
-                )
+        for leaves in (self.leaves, self.derived):
+            _set_stride(leaves, node.axis, depth, size)
         for offset in [offset for offset in self.constants if offset >= start]:
             byte = self.constants.pop(offset)
             self.constants.update({offset + size * index: byte for index in range(count)})
         self.cursor = start + size * count
+
+    def _derived(
+        self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
+    ) -> None:
+        """Add a value without bytes of its own."""
+        info = node.info
+        match node.kind:
+            case "computed":
+                self.derived[path] = Derivation(info, shape, (), node.formula, node.constant)
+            case "offset":
+                self.derived[path] = Derivation(info, shape, strides, start=self.cursor)
+            case "size":
+                size = self.cursor - self.starts[node.part]
+                self.derived[path] = Derivation(info, shape, (), start=size)
+            case "bytes":
+                start = self.starts[node.part]
+                size = self.cursor - start
+                place = (*shape, size), (*strides, 1)
+                self.derived[path] = Leaf(info, start, *place, size, np.dtype("u1"))
+                self.lengths[info.axes[-1]] = 0 if 0 in shape else size
+            case "peeked":
+                self._peek(node, path, shape, strides)
+
+    def _peek(
+        self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
+    ) -> None:
+        """Add the fields of a node at this place, whose bytes belong to the nodes behind it."""
+        start = self.cursor
+        leaves = self.leaves
+        self.leaves = {}
+        assert node.node is not None
+        self.visit(node.node, path, shape, strides)
+        self.derived |= self.leaves
+        self.leaves = leaves
+        self.cursor = start
 
     def _parts(self, node: tree.PartSequence, path: str) -> None:
         """Visit parts; their size follows from the header or is requested like a field."""
@@ -459,6 +498,15 @@ class HeaderWalk:
         if not 0 <= count <= self.limit:
             raise TooLongError(path, count)
         return count
+
+
+def _set_stride(leaves: dict[str, Any], axis: str, depth: int, size: int) -> None:
+    """Set the distance of the elements of an array in all leaves that are in it."""
+    for path, leaf in leaves.items():
+        is_constant = isinstance(leaf, Derivation) and not leaf.strides[depth:]
+        if axis in leaf.info.axes and not is_constant:
+            strides = (*leaf.strides[:depth], size, *leaf.strides[depth + 1 :])
+            leaves[path] = replace(leaf, strides=strides)
 
 
 def _in_order(seals: list[Seal]) -> Iterator[Seal]:

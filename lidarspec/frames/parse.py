@@ -14,12 +14,13 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
 from construct import Container, ListContainer
 
 from lidarspec.errors import SpecError, UnknownFrame, WireError, refuse_text, struct_error
 from lidarspec.frames import diagnose
 from lidarspec.frames.compilability import NotCompilableError
-from lidarspec.frames.layout import Layout, LayoutRefusal, Leaf
+from lidarspec.frames.layout import Derivation, Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.parts import Region
 from lidarspec.frames.plain import parse_plain, plain_fault
@@ -33,6 +34,7 @@ from lidarspec.spec.syntax import WireNaN, to_seen, to_unnamed
 from lidarspec.spec.tree import (
     Blob,
     Block,
+    Derived,
     FieldInfo,
     Node,
     Number,
@@ -326,10 +328,42 @@ def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
         case When() | Select():
             return _make_reader(layout.branches[node], path, layout, count)
         case Number() | Blob():
-            return _make_field_reader(node, layout.leaves[path])
+            return _make_field_reader(node, _leaf(layout, path))
+        case Derived():
+            return _make_derived_reader(node, path, layout, count)
         case Block():
             return _make_block_reader(node, path, layout, count)
     return functools.partial(_read_nothing, count)
+
+
+def _leaf(layout: Layout, path: str) -> Leaf:
+    """Return the position of a field, which may be one that is read twice."""
+    leaf = layout.column(path)
+    assert isinstance(leaf, Leaf)
+    return leaf
+
+
+def _make_derived_reader(node: Derived, path: str, layout: Layout, count: int) -> Reader:
+    """Return a reader of values without bytes of their own."""
+    if node.node is not None:
+        return _make_reader(node.node, path, layout, count)
+    found = layout.derived[path]
+    if isinstance(found, Leaf):
+        return _make_unpacker(found.offsets(len(found.shape) - 1), "<", f"{found.size}s")
+    if found.formula is None:
+        values = found.load(np.zeros((1, layout.size), np.uint8), layout.leaves)
+        return functools.partial(_read_constants, tuple(values.reshape(-1).tolist()))
+    return functools.partial(_read_computed, found, layout)
+
+
+def _read_constants(values: Sequence[Any], frame: bytes) -> Sequence[Any]:
+    return values
+
+
+def _read_computed(derivation: Derivation, layout: Layout, frame: bytes) -> Sequence[Any]:
+    row = np.frombuffer(frame, np.uint8).reshape(1, -1)
+    values: list[Any] = derivation.load(row, layout.leaves).reshape(-1).tolist()
+    return values
 
 
 def _read_no_values(frame: bytes) -> Sequence[Any]:
@@ -454,7 +488,7 @@ def _make_block_reader(node: Block, path: str, layout: Layout, count: int) -> Re
     Each block is read as one number. The byte order is the one that splits its parts into fewer
     runs of bits.
     """
-    leaf = layout.leaves[".".join(name for name in (path, *node.parts[0].names) if name)]
+    leaf = _leaf(layout, ".".join(name for name in (path, *node.parts[0].names) if name))
     offsets = leaf.offsets()
     orders = [
         (order, [_runs(part.bits, node.size, order) for part in node.parts])

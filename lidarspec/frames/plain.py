@@ -89,7 +89,7 @@ def _fields_of(
         path = f"{prefix}.{name}".strip(".")
         value = struct[name]
         elements = value if isinstance(value, list) else [value]
-        if elements and all(_is_placed(element, end) for element in elements):
+        if elements and all(_is_placed(element, start, end) for element in elements):
             for index, element in enumerate(elements):
                 if isinstance(value, list):
                     below = f"{path}[{index}]"
@@ -110,11 +110,15 @@ def _fields_of(
             yield WireField(path, path, info, start, end, None, raw)
 
 
-def _is_placed(value: Any, end: int) -> bool:
-    """Return whether a value is a struct whose members say where they stand in the frame."""
+def _is_placed(value: Any, start: int, end: int) -> bool:
+    """Return whether a value is a struct whose members say where they stand in the frame.
+
+    Members of a struct in bytes that were recoded are placed in those.
+    """
     if not isinstance(value, dict) or not value.get("_marks"):
         return False
-    return bool(max(stop for _, stop in value["_marks"].values()) <= end)
+    spans = value["_marks"].values()
+    return bool(min(spans)[0] >= start and max(stop for _, stop in spans) <= end)
 
 
 def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:

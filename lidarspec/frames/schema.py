@@ -20,6 +20,7 @@ from lidarspec.errors import SpecError, UnknownField
 from lidarspec.spec.tree import (
     Blob,
     Block,
+    Derived,
     FieldInfo,
     Formula,
     Node,
@@ -107,13 +108,23 @@ class Schema:
 
     `arrays`: path -> declared count; a number where every frame has so many elements, else a
     formula of header fields, or None. `parts`: frames within the frame, by path, which are tables
-    of their own; `inside`: their fields, by path from the top.
+    of their own; `inside`: their fields, by path from the top. `derived`: values without bytes of
+    their own.
     """
 
     fields: Mapping[str, FieldInfo]
     arrays: Mapping[str, Formula | None]
     parts: Mapping[str, PartSequence] = field(default_factory=dict)
     inside: Mapping[str, FieldInfo] = field(default_factory=dict)
+    derived: Mapping[str, FieldInfo] = field(default_factory=dict)
+
+    @cached_property
+    def columns(self) -> Mapping[str, FieldInfo]:
+        """The fields of the frame and the values derived from them."""
+        if not self.derived:
+            return self.fields
+        element = functools.partial(_element, self.arrays)
+        return PathMapping({**self.fields, **self.derived}, element)
 
     @cached_property
     def all_fields(self) -> Mapping[str, FieldInfo]:
@@ -220,7 +231,8 @@ def schema(root: Node) -> Schema:
     """The table of fields of a frame's tree."""
     fields: dict[str, FieldInfo] = {}
     arrays: dict[str, Formula | None] = {}
-    _walk(root, fields, arrays, optional=False)
+    derived: dict[str, FieldInfo] = {}
+    _walk(root, fields, arrays, derived, optional=False)
     structs = {
         node.path: node.docs for node in nodes(root) if isinstance(node, Struct) and node.docs
     }
@@ -228,12 +240,13 @@ def schema(root: Node) -> Schema:
     inside: dict[str, FieldInfo] = {}
     for node in parts.values():
         for kind in node.kinds:
-            _walk(kind.element, inside, {}, optional=False)
+            _walk(kind.element, inside, {}, {}, optional=False)
     return Schema(
         PathMapping(_with_docs(fields, structs), functools.partial(_element, arrays)),
         arrays,
         {axis: node for axis, node in parts.items() if not node.total.axes},
         _with_docs(inside, structs),
+        derived,
     )
 
 
@@ -274,9 +287,20 @@ def _docs_around(path: str, structs: Mapping[str, str]) -> str:
 
 
 def _walk(
-    node: Node, fields: dict[str, FieldInfo], arrays: dict[str, Formula | None], *, optional: bool
+    node: Node,
+    fields: dict[str, FieldInfo],
+    arrays: dict[str, Formula | None],
+    derived: dict[str, FieldInfo],
+    *,
+    optional: bool,
 ) -> None:
     match node:
+        case Derived(node=below) if below is not None:
+            _walk(below, derived, arrays, derived, optional=optional)
+        case Derived():
+            if node.info.kind == "bytes":
+                arrays.setdefault(node.info.axes[-1], None)
+            _add(derived, node.info)
         case Repeat():
             _count(arrays, node.axis, node.count, optional=optional)
         case Blob() if node.name:
@@ -293,7 +317,8 @@ def _walk(
         case PartSequence():
             return
     for child in children(node):
-        _walk(child, fields, arrays, optional=optional or isinstance(node, When | Select))
+        is_optional = optional or isinstance(node, When | Select)
+        _walk(child, fields, arrays, derived, optional=is_optional)
 
 
 def _block(

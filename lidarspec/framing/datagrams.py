@@ -221,7 +221,9 @@ class _DatagramBatch:
         for kind in self._framing.active_types(mode) if len(data) else ():
             if not self._has_constants(kind, start, size).all():
                 continue
-            frame = self._framing.survey(kind, data, np.zeros(1, np.intp))
+            is_rest = self._framing.codecs[kind].frame.endless is not None
+            stops = np.array([len(data)]) if is_rest else None
+            frame = self._framing.survey(kind, data, np.zeros(1, np.intp), stops)
             if frame.status[0] == VALID and frame.sizes[0] == len(data):
                 return Frames(
                     self._buffer, frame.kinds, start, size, layouts=frame.layouts, forms=frame.forms

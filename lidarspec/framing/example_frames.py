@@ -197,7 +197,9 @@ def _make_of_values(
             raise
         except Exception as error:
             raise struct_error(error, path=frame, sensor=sensor.id) from error
-        if engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status[0] == VALID:
+        rows = np.frombuffer(data, np.uint8)
+        stops = np.array([len(data)])
+        if engine.survey(rows, np.zeros(1, np.intp), stops).status[0] == VALID:
             return data
     raise SpecError("no random frame is valid", path=frame, sensor=sensor.id)
 
@@ -233,7 +235,9 @@ def _set_headers(
 ) -> NDArray[np.uint8]:
     """Random frames with the header values of their layout, constants and checksums set."""
     for path, value in chosen.items():
-        layout.leaves[path].store(rows, value)
+        leaf = layout.column(path)
+        assert isinstance(leaf, Leaf)
+        leaf.store(rows, value)
     layout.seal(rows)
     return rows
 

@@ -147,6 +147,9 @@ class PlainCodec(Codec):
             status = self._text.judge(buffer, offsets, ends)
             is_whole = ends - offsets >= self.frame.room
             status[is_whole & (status == SHORT)] = LENGTH
+        if self.frame.endless is not None:
+            # The frame is the rest of a datagram: a stream or a longer datagram has no such frame.
+            status[np.full(len(ends), True) if stops is None else ends < stops] = LENGTH
         sizes = np.zeros(len(offsets), np.intp)
         errors: list[PluginError] = []
         for index in np.flatnonzero(status == VALID).tolist():

@@ -123,15 +123,15 @@ class Packets:
         Raises:
             UnknownField: with the closest known path.
         """
-        info = self.table.schema.fields.get(path)
+        info = self.table.schema.columns.get(path)
         if info is None:
             raise UnknownField(
-                path, self.table.schema.fields, place=f"{self.sensor.id} {self.frame}"
+                path, self.table.schema.columns, place=f"{self.sensor.id} {self.frame}"
             )
         return physical(info, self.table)
 
     def _ipython_key_completions_(self) -> list[str]:
-        return list(self.table.schema.fields)
+        return list(self.table.schema.columns)
 
     @property
     def raw(self) -> NDArray[Any]:
@@ -139,7 +139,7 @@ class Packets:
 
         Variable arrays are padded with 0.
         """
-        columns = {path: self.table.raw(path) for path in self.table.schema.fields}
+        columns = {path: self.table.raw(path) for path in self.table.schema.columns}
         array = np.zeros(len(self), _nested_dtype(self.table.schema, columns, ""))
         for path, column in columns.items():
             target = array
@@ -341,7 +341,7 @@ def _nested_dtype(
     """
     members: list[Any] = []
     seen: set[str] = set()
-    for path, info in schema.fields.items():
+    for path, info in schema.columns.items():
         if not path.startswith(prefix):
             continue
         name, _, below = path[len(prefix) :].partition(".")
@@ -356,7 +356,8 @@ def _nested_dtype(
                 path=here,
             )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
-        shape = tuple(columns[path].shape[1 + index] for index in own)
+        is_array = columns[path].ndim > 1  # values that are no numbers stand in lists
+        shape = tuple(columns[path].shape[1 + index] for index in own if is_array)
         if below:
             kind = _nested_dtype(schema, columns, f"{here}.")
         else:
@@ -372,7 +373,7 @@ def _forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
     """
     parts = [
         (path, info)
-        for path, info in schema.fields.items()
+        for path, info in schema.columns.items()
         if path == here or path.startswith(f"{here}.")
     ]
     return {

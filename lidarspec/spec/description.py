@@ -148,6 +148,7 @@ class Frame:
     acknowledged: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     wire: WireForm | None = field(default=None, kw_only=True)
     prepared: Construct = field(init=False, repr=False)
+    endless: SpecError | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.direction not in ("in", "out"):
@@ -167,7 +168,7 @@ class Frame:
         longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
         object.__setattr__(self, "max_length", longest)
         object.__setattr__(self, "prepared", prepare(self.struct, self.room or sys.maxsize))
-        check_struct(self.prepared)
+        object.__setattr__(self, "endless", check_struct(self.prepared))
         if not longest:
             raise SpecError(
                 "max_length may be left out only where the struct has a fixed size, and no wire"

@@ -376,6 +376,9 @@ class Checksummed(layer.SealedStruct):
         return start, end
 
 
+layer.SealedStruct.author_class = Checksummed
+
+
 class Parts(layer.Partition):
     """Consecutive structs, each with its own size.
 

@@ -299,6 +299,14 @@ def _check_facts(sensor: SensorDescription) -> None:
             path="api",
             sensor=sensor.id,
         )
+    for name, frame in sensor.frames.items():
+        if frame.endless is not None and not _comes_in_datagrams(sensor, frame):
+            raise SpecError(
+                f"{frame.endless.reason}; only a datagram ends it",
+                path=f"{name}.{frame.endless.path}".strip("."),
+                sensor=sensor.id,
+                rule=frame.endless.rule,
+            )
     unknown_roles = sorted(set(sensor.info) - set(ROLES))
     if unknown_roles:
         raise SpecError(
@@ -319,6 +327,15 @@ def _check_facts(sensor: SensorDescription) -> None:
             path="turn",
             sensor=sensor.id,
         )
+
+
+def _comes_in_datagrams(sensor: SensorDescription, frame: Frame) -> bool:
+    """Return whether a frame is never part of a byte stream that the sensor sends."""
+    if frame.direction == "out":
+        return True
+    if frame.data and "data" in sensor.links:
+        return is_datagram(sensor.links["data"])
+    return all(map(is_datagram, sensor.links.values()))
 
 
 def _check_command(sensor: SensorDescription, name: str, command: Command) -> None:

@@ -17,6 +17,7 @@ storage. Its offset is the sum of the sizes of the nodes before it.
     Empty           no bytes
     Check           no bytes; a condition that the frame must meet
     Never           an alternative that is always an error
+    Derived         no bytes; a value made from other bytes of the frame
     Opaque          a part that only construct can read
 
 Counts, lengths, conditions and keys are formulas: numbers, references to fields (`Ref`) and
@@ -229,7 +230,8 @@ class Op:
     ``//`` and ``%`` round down. Comparisons return 1 or 0.
 
     Attributes:
-        symbol: + - * // % & | ^ << >> == != < <= > >= with two arguments; - and not with one.
+        symbol: + - * // % & | ^ << >> == != < <= > >= with two arguments; - and not with one. A
+            computed value can also have / and floats.
     """
 
     symbol: str
@@ -264,6 +266,7 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
         "%": operator.mod,
         "&": operator.and_,
         "|": operator.or_,
+        "/": operator.truediv,
     },
     **{"^": operator.xor, "<<": operator.lshift, ">>": operator.rshift, "not": operator.not_},
     **{
@@ -394,6 +397,16 @@ def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldI
         kind=kind,
         bits=bits,
     )
+
+
+def fraction_in(formula: Formula) -> str | float | None:
+    """Return the operator or constant with which a formula may give a fraction; None without."""
+    for part in parts(formula):
+        if isinstance(part, float):
+            return part
+        if isinstance(part, Op) and part.symbol == "/":
+            return part.symbol
+    return None
 
 
 def parts(formula: Formula) -> Iterator[Formula]:
@@ -712,6 +725,34 @@ class Check:
 
 
 @dataclass(frozen=True, eq=False)
+class Derived:
+    """A value of a parsed frame that has no bytes of its own, and that is ignored when it is built.
+
+    Attributes:
+        info: the value as a field.
+        kind: "computed" from other fields (construct's Computed), the "offset" of its place in the
+            frame (Tell), the "size" or the "bytes" of a part before it (RawCopy), or the node
+            whose bytes follow, "peeked" (Peek).
+        formula: of a computed value; None if it is `constant`.
+        constant: the value of a computed one without fields.
+        part: the path of the part that is measured or copied.
+        node: the node that is peeked.
+    """
+
+    info: FieldInfo
+    kind: Literal["computed", "offset", "size", "bytes", "peeked"]
+    formula: Formula | None = None
+    constant: Any = None
+    part: str = ""
+    node: Node | None = None
+
+    @functools.cached_property
+    def name(self) -> str:
+        """The name of the field."""
+        return self.info.name
+
+
+@dataclass(frozen=True, eq=False)
 class Never:
     """An alternative that is an error, so that no valid frame has it."""
 
@@ -757,6 +798,7 @@ Node = (
     | Empty
     | Check
     | Never
+    | Derived
     | Opaque
 )
 
@@ -915,12 +957,12 @@ class Scope:
         self.parent = parent
         self.path = path
         self.asked = asked
-        self.names: dict[str, Ref | Scope] = {}
+        self.names: dict[str, Ref | Scope | Value] = {}
         #: names that different branches define differently.
         self.ambiguous: set[str] = set()
 
-    def add(self, name: str, part: Ref | Scope) -> None:
-        """Add a field or struct that later expressions may read."""
+    def add(self, name: str, part: Ref | Scope | Value) -> None:
+        """Add a field, a computed value or a struct that later expressions may read."""
         known = self.names.get(name)
         if known is not None and not (
             isinstance(known, Ref)
@@ -944,11 +986,13 @@ class Scope:
         part = self.names[name]
         if isinstance(part, Scope):
             return part
-        self.asked.append(part)
+        self.asked += [part] if isinstance(part, Ref) else part.refs
         if name in self.ambiguous:
             raise UntraceableExpressionError(
                 f"an expression asks for {name!r}, which has several forms"
             )
+        if isinstance(part, Value):
+            return part.read()
         return Symbol(part)
 
     def __getattr__(self, name: str) -> Any:
@@ -956,6 +1000,50 @@ class Scope:
 
     def __len__(self) -> int:
         raise UntraceableExpressionError("an expression asks for the length of an array")
+
+
+class Beside(Scope):
+    """The context of a value that stands in no struct of its own (construct's RawCopy).
+
+    Its own names are those of its bytes and place. Expressions of the value see the outer context.
+    """
+
+    def __init__(self, scope: Scope | None, path: str, asked: list[Ref]) -> None:
+        super().__init__(scope, path, asked)
+        self._outer = scope
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self.names or self._outer is None:
+            return super().__getitem__(name)
+        return self._outer[name]
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """A computed value, as later expressions read it.
+
+    Attributes:
+        content: a formula or a constant; `Untraced` if no formula gives it.
+    """
+
+    content: Any
+
+    @property
+    def refs(self) -> tuple[Ref, ...]:
+        """The fields that it depends on."""
+        return refs(self.content)
+
+    def read(self) -> Any:
+        """Return a symbol, or the constant.
+
+        Raises:
+            UntraceableExpressionError: if no formula gives the value.
+        """
+        if isinstance(self.content, Untraced):
+            raise UntraceableExpressionError(self.content.reason.partition(": ")[2])
+        if isinstance(self.content, Ref | Op):
+            return Symbol(self.content)
+        return self.content
 
 
 class OuterScope(Scope):
@@ -1028,7 +1116,7 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
         if pair[one] in known.info.labels:  # construct replaces this number by its name
             return Symbol(int(symbol == "!="))
         pair[one] = _find_label_value(known, pair[one]) if isinstance(pair[one], str) else pair[one]
-    wrong = next((part for part in pair if not isinstance(part, int | Ref | Op)), None)
+    wrong = next((part for part in pair if not isinstance(part, int | float | Ref | Op)), None)
     if wrong is not None:
         raise UntraceableExpressionError(f"an expression with {wrong!r}")
     return Symbol(
@@ -1042,6 +1130,7 @@ def _raise_no_integer(sign: str) -> Any:
 
 _SYMBOLS = {
     **{
+        "truediv": "/",
         "add": "+",
         "sub": "-",
         "mul": "*",
@@ -1067,7 +1156,7 @@ for _name, _symbol in _SYMBOLS.items():
             f"__r{_name}__",
             lambda self, other, symbol=_symbol: _trace_operation(symbol, other, self),
         )
-for _name, _symbol in {"truediv": "/", "pow": "**", "divmod": "divmod", "matmul": "@"}.items():
+for _name, _symbol in {"pow": "**", "divmod": "divmod", "matmul": "@"}.items():
     for _full in (f"__{_name}__", f"__r{_name}__"):
         setattr(Symbol, _full, lambda self, other, sign=_symbol: _raise_no_integer(sign))
 

@@ -43,12 +43,12 @@ LS102 the field name is reserved | `f.state` and `column.on` have another meanin
 LS103 the field name is not a public identifier | == ignores names that begin with _ | choose an identifier without a leading _
 LS104 two fields have the same name | the last one replaces the others | number the names: reserved_1, reserved_2
 LS105 the field has no name | its bytes are lost on a round trip | declare "reserved" / Bytes(n)
-LS106 the struct contains Padding | its bits come back as zeros
-      | declare "reserved" / Bytes(n); among bits, BitsInteger(n)
+LS106 a part loses bytes | they are not built as they were read
+      | end the part with "rest" / GreedyBytes, or make it a named member of a Struct
 LS107 Flag is used for a whole byte | seven of its bits are lost on a round trip | declare all eight bits in a BitStruct
 LS108 the struct contains FlagsEnum | bits without a name are lost on a round trip | use a BitStruct
-LS109 the struct contains RawCopy, Union or construct's Checksum | they ignore edits when the frame is built
-      | use Checksummed(Struct(...), field=...), and declare the bytes once
+LS109 the struct contains Union | edits of all but one reading are ignored when the frame is built
+      | declare one reading of the bytes
 LS110 the struct contains Pickled | it runs code from the wire | declare the fields
 LS111 a field is greedy | it has no end on a stream, or if its elements are empty | declare a count, a length or a terminator
 LS112 the struct contains Pointer or Seek | they read bytes outside the frame | declare fields in the order of the wire

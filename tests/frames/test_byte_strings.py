@@ -29,7 +29,6 @@ from construct import (
     Int8ub,
     Int16ub,
     Int32ub,
-    LazyStruct,
     Mapping,
     NullStripped,
     NullTerminated,
@@ -44,7 +43,6 @@ from construct import (
     StopIf,
     Struct,
     Switch,
-    Terminated,
     Transformed,
     Union,
     len_,
@@ -274,7 +272,7 @@ def test_invalid_lengths_are_plugin_errors_or_wire_errors(
 @pytest.mark.parametrize(
     ("part", "reason"),
     [
-        (Computed(this.a + 1), "Computed is no field of the wire"),
+        (Computed(lambda found: int(found.a) + 1), "a Python function of other fields"),
         (
             BitStruct(
                 "n" / BitsInteger(8),
@@ -342,9 +340,14 @@ def test_elements_within_a_bit_block_are_no_elements_without_a_byte(backend: str
     )
 
 
+def twice(found: Any) -> int:
+    """A function that branches, so that construct alone computes it."""
+    return found.n * 2 if found.n else 0
+
+
 @pytest.mark.parametrize("part", [Array(this.n, Struct()), Array(this.n, Int8ub), Bytes(this.n)])
 def test_plain_examples_have_consistent_counts(part: Any) -> None:
-    ours = sensor(Struct("n" / Int32ub, "v" / part, "twice" / Computed(this.n * 2)), max_length=300)
+    ours = sensor(Struct("n" / Int32ub, "v" / part, "twice" / Computed(twice)), max_length=300)
     assert not is_compiled(ours.frames["data"])
     assert len({len(ours.parse(ours.example("data", seed=seed)).v) for seed in range(8)}) > 3
 
@@ -401,7 +404,6 @@ def test_of_a_greedy_array_no_byte_is_dropped() -> None:
 @pytest.mark.parametrize(
     ("part", "reason"),
     [
-        (GreedyRange(Int8ub), "GreedyRange has no end of its own"),
         (
             Prefixed(Int8ub, Struct("r" / GreedyBytes, "a" / Int8ub)),
             "r: GreedyBytes has no end of its own",
@@ -436,9 +438,8 @@ def test_structs_without_an_end_or_that_drop_bytes_are_refused(part: Any, reason
 
 def test_examples_pass_checks_of_the_whole_frame() -> None:
     checked = Struct("ok" / Check(this._.a < 200), "x" / Array(this._root.a % 3, Int8ub))
-    ours = sensor(
-        Struct("a" / Int8ub, "v" / Array(2, checked), "twice" / Computed(this._root.a * 2))
-    )
+    double = Computed(lambda found: int(found.a) * 2)
+    ours = sensor(Struct("a" / Int8ub, "v" / Array(2, checked), "twice" / double))
     examples = [ours.parse(ours.example("data", seed=seed)) for seed in range(9)]
     assert all(
         found.a < 200 and found.twice == 2 * found.a and len(found.v[1].x) == found.a % 3
@@ -452,7 +453,6 @@ def test_examples_pass_checks_of_the_whole_frame() -> None:
     ("part", "instead"),
     [
         (Check(this.k < 3), "plausible=lambda f"),
-        (Terminated, "the last field ends it"),
         (Probe(), "lidarspec explain shows"),
         (StopIf(this.k == 0), "If(this.more, Struct"),
         (Seek(4), "name the bytes between"),
@@ -468,7 +468,6 @@ def test_nameless_checks_are_refused_with_a_suggestion(part: Any, instead: str) 
     ("part", "instead"),
     [
         (Sequence(Int8ub, Int16ub), "say Struct('a'"),
-        (LazyStruct("a" / Int8ub), "say Struct, which is read in bulk"),
         (RepeatUntil(obj_ == 0, Int8ub), "Array with a count"),
         (ProcessXor(0x55, Int16ub), "undo it in `points`"),
         (Transformed(Int16ub, inverted, 2, inverted, 2), "undo it in `points`"),
@@ -476,7 +475,7 @@ def test_nameless_checks_are_refused_with_a_suggestion(part: Any, instead: str) 
         (Mapping(Int8ub, {100: 1, 200: 2}), "say Enum"),
         (PaddedString(8, "ascii"), "say Bytes(n)"),
         (FixedSized(8, CString("ascii")), "say Bytes(n)"),
-        (Computed(this.k * 2), "calculate it in `points`"),
+        (Computed(lambda found: int(found.k) * 2), "computed in bulk"),
         (Array(2, Struct("n" / Int8ub, "x" / Array(this.n, Int8ub))), "Parts(struct, count)"),
         (Array(2, PrefixedArray(Int8ub, Int8ub)), "a named member of a Struct alone"),
     ],

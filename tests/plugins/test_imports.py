@@ -30,7 +30,13 @@ ALLOWED = {
         "spec.bits",
         "spec.checksums",
     ),
-    *("spec.syntax", "spec.syntax.meaning", "spec.syntax.refusals", "spec.syntax.replacements"),
+    *(
+        "spec.syntax",
+        "spec.syntax.meaning",
+        "spec.syntax.raw_checksums",
+        "spec.syntax.refusals",
+        "spec.syntax.replacements",
+    ),
     "spec.syntax.structs",
     *(
         "spec.description",

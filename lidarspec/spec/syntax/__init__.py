@@ -5,6 +5,7 @@ In: an author's struct. Out: `prepare`, a copy of it for the engine; `check_stru
 against it; `frame_tree`, the nodes that it means. Modules in reading order:
 
 * `replacements`: the classes that replace construct's, each with its reason, and parts of our own.
+* `raw_checksums`: construct's Checksum of a RawCopy as a seal.
 * `structs`: a struct prepared, the properties of a construct, random values for it.
 * `refusals`: what no frame can be described by, with the reason.
 * `meaning`: a struct read off as nodes.

@@ -43,10 +43,13 @@ from lidarspec.spec.syntax.replacements import (
     LimitedNumber,
     PaddingField,
     Partition,
+    RawPart,
+    Reserved,
     SealedStruct,
     SizeField,
 )
 from lidarspec.spec.syntax.structs import (
+    author_class,
     is_greedy,
     leaves,
     unwrap,
@@ -154,11 +157,13 @@ class _Context:
     in_bits: bool = False
     #: number of bytes up to the end of the enclosing part, if its length is declared elsewhere.
     room: tree.Formula | None = None
+    #: returns the offset in the frame, None if no formula gives it; None in parts, whose offset in
+    #: the frame is not known.
+    offset: Callable[[], tree.Formula | None] | None = lambda: 0
 
     def inside(self, **changes: Any) -> _Context:
         """The place with some facts of the field changed."""
-        info = replace(self.info, **changes)
-        return _Context(info, self.scope, self.name, self.in_bits, self.room)
+        return replace(self, info=replace(self.info, **changes))
 
 
 class _Builder:
@@ -202,6 +207,8 @@ class _Builder:
             axis = axis_path(info)
             count = self._formula(inner.count, place)
             inside = place.inside(axes=(*info.axes, axis), default=None)
+            if inside.offset is not None:
+                inside = replace(inside, offset=_no_offset)
             return tree.Repeat(name, axis, count, self.node(inner.subcon, inside), info.default)
         if isinstance(inner, Partition):
             return self._parts(inner, place)
@@ -220,15 +227,99 @@ class _Builder:
         ):
             room = self._formula(inner.length, place)
             return self.node(inner.subcon, replace(place, room=room))
-        if isinstance(inner, construct.GreedyRange) and place.room is not None:
+        if isinstance(inner, construct.GreedyRange | construct.RepeatUntil) and not place.in_bits:
             return self._filling(inner, place)
+        if isinstance(inner, RawPart):
+            return self._raw(inner, place)
         if isinstance(inner, construct.Check):
             return self._check(inner, place)
         if inner is construct.Error:
             return tree.Never(name)
         if inner is construct.Pass:
             return tree.Empty(name)
+        if name and not place.in_bits:
+            derived = self._derived(inner, place)
+            if derived is not None:
+                return derived
         return self._leaf(inner, place)
+
+    def _derived(self, con: Construct, place: _Context) -> tree.Node | None:
+        """Return the node of a value that is not on the wire; None for another construct, or if
+        only construct can compute it.
+        """
+        if isinstance(con, construct.Computed):
+            return self._computed(con, place)
+        if con is construct.Tell and place.offset is not None:
+            info = _integer(place.info)
+            offset = place.offset()
+            if offset is None:
+                reason = f"{info.path}: Tell in an array, or behind a part without a known size"
+                offset = tree.Untraced(reason, "?")
+            self._add_value(place, offset)
+            return tree.Derived(info, "offset")
+        if isinstance(con, construct.Peek):
+            node = self.node(con.subcon, place)
+            if isinstance(tree.size(node), int) and all(map(_is_free, tree.nodes(node))):
+                return tree.Derived(place.info, "peeked", node=node)
+        return None
+
+    def _computed(self, con: construct.Computed, place: _Context) -> tree.Node | None:
+        if not callable(con.func):
+            self._add_value(place, con.func)
+            return tree.Derived(place.info, "computed", constant=con.func)
+        formula = self._formula(con.func, place, may_be_fraction=True)
+        asked = [] if isinstance(formula, tree.Untraced) else tree.refs(formula)
+        is_fractional = tree.fraction_in(formula) is not None
+        is_computable = (
+            not isinstance(formula, tree.Untraced)
+            and all(_is_near(ref, place.info) for ref in asked)
+            and all(map(_is_whole, tree.parts(formula)))
+            and (is_fractional or tree.width(formula) <= tree.MOST_BITS)
+        )
+        if not is_computable:
+            return None
+        self._add_value(place, formula)
+        is_float = is_fractional or any(ref.info.kind == "float" for ref in asked)
+        info = replace(place.info, dtype=np.dtype(float), kind="float", bits=64)
+        return tree.Derived(info if is_float else _integer(place.info), "computed", formula)
+
+    def _raw(self, con: RawPart, place: _Context) -> tree.Struct:
+        """Return a part as the value of a struct that also has its bytes and their place."""
+        info = place.info
+        scope = tree.Beside(place.scope, info.path, self._asked)
+        if place.name and place.scope is not None:
+            place.scope.add(place.name, scope)
+
+        def field(name: str, **facts: Any) -> tree.FieldInfo:
+            path = f"{info.path}.{name}".strip(".")
+            return tree.FieldInfo(path, info.axes, optional=info.optional, **facts)
+
+        default = info.default.get("value") if isinstance(info.default, dict) else None
+        inside = _Context(
+            field("value", default=default), scope, "value", room=place.room, offset=place.offset
+        )
+        value = self.node(con.subcon, inside)
+        size = tree.size(value)
+        unknown = tree.Untraced(f"{info.path}: the place of a part without a known size", "?")
+        start = None if place.offset is None else place.offset()
+        end = tree.combine("+", start, size)
+        for name, content in {"offset1": start, "offset2": end, "length": size}.items():
+            scope.add(name, tree.Value(unknown if content is None else content))
+        data = field("data", dtype=np.dtype("u1"), kind="bytes")
+        data = replace(data, axes=(*data.axes, data.path))
+        part = inside.info.path
+        behind = (
+            tree.Derived(data, "bytes", part=part),
+            tree.Derived(_integer(field("length")), "size", part=part),
+            tree.Derived(_integer(field("offset2")), "offset"),
+        )
+        before = tree.Derived(_integer(field("offset1")), "offset")
+        return tree.Struct(place.name, info.path, (before, value, *behind), info.docs)
+
+    def _add_value(self, place: _Context, content: Any) -> None:
+        """Let later expressions read a computed value."""
+        if place.scope is not None:
+            place.scope.add(place.name, tree.Value(content))
 
     def _unwrap_describing(self, con: Construct, place: _Context) -> tuple[Construct, _Context]:
         """Remove the wrappers that only describe a field, such as its name, unit and labels.
@@ -280,8 +371,11 @@ class _Builder:
         known: tree.Scope | None = None,
         *,
         is_key: bool = False,
+        may_be_fraction: bool = False,
     ) -> tree.Formula:
-        """A count, length, condition or key as data, as far as it can be written down."""
+        """A count, length, condition, key or computed value as data, as far as it can be written
+        down.
+        """
         if isinstance(expression, int):
             return int(expression)
         scope = next(
@@ -291,6 +385,7 @@ class _Builder:
         scope.asked.clear()
         try:
             value = _trace(expression, scope)
+            fraction = tree.fraction_in(value.formula) if isinstance(value, tree.Symbol) else None
             if not isinstance(expression, ExprMixin) and any(
                 ref.info.optional for ref in scope.asked
             ):
@@ -301,6 +396,8 @@ class _Builder:
                 reason = f"an expression that gives {value!r}"
             elif not is_key and isinstance(value.formula, tree.Ref) and value.formula.info.labels:
                 reason = "an expression takes the name of a value for a number"
+            elif fraction is not None and not may_be_fraction:
+                reason = f"an expression with {fraction!r}, which need not give an integer"
             else:
                 return value.formula
         except tree.UntraceableExpressionError as untraceable:
@@ -358,7 +455,12 @@ class _Builder:
                 optional=info.optional,
                 default=default,
             )
-            inside = _Context(described, scope, child.name or "", place.in_bits)
+            offset = (
+                None
+                if place.offset is None
+                else functools.partial(_offset_behind, place.offset, members, len(members))
+            )
+            inside = _Context(described, scope, child.name or "", place.in_bits, offset=offset)
             part = unwrap(child)
             if isinstance(
                 filler := (
@@ -374,6 +476,9 @@ class _Builder:
                     inside, room=tree.combine("-", place.room, tree.total(map(tree.size, members)))
                 )
             members.append(self.node(child, inside))
+        for index, member in enumerate(members):
+            if isinstance(member, tree.Derived) and member.kind == "peeked":
+                members[index] = _check_peeked(member, members[index + 1 :])
         self.scopes[info.path] = scope
         made = tree.Struct(place.name, info.path, tuple(members), info.docs)
         for index, sizing in self._measured.pop(scope):
@@ -421,20 +526,32 @@ class _Builder:
             return None
         return size
 
-    def _filling(self, con: construct.GreedyRange, place: _Context) -> tree.Node:
-        """Return the number of elements of one size that fill a part."""
+    def _filling(
+        self, con: construct.GreedyRange | construct.RepeatUntil, place: _Context
+    ) -> tree.Node:
+        """Return the number of elements of one size that fill a part; what only construct can read
+        if the number depends on the elements.
+        """
         axis = axis_path(place.info)
         element = self.node(
-            con.subcon, replace(place.inside(axes=(*place.info.axes, axis)), room=None)
+            con.subcon,
+            replace(
+                place.inside(axes=(*place.info.axes, axis)),
+                room=None,
+                offset=None if place.offset is None else _no_offset,
+            ),
         )
         size = tree.size(element)
+        kind = author_class(con)
+        if isinstance(con, construct.RepeatUntil) or place.room is None:
+            return tree.Opaque(place.name, place.info, kind, _INSTEAD[kind], (element,))
         if not isinstance(size, int) or not size:
             reason = (
                 "elements of sizes of their own, which fill a length: say Parts(element,"
                 " within=...) for them"
             )
-            return tree.Opaque(place.name, place.info, "GreedyRange", reason, (element,))
-        return tree.Repeat(place.name, axis, tree.calculate("//", place.room, size), element)  # type: ignore[arg-type]
+            return tree.Opaque(place.name, place.info, kind, reason, (element,))
+        return tree.Repeat(place.name, axis, tree.calculate("//", place.room, size), element)
 
     def _parts(self, con: Partition, place: _Context) -> tree.PartSequence:
         info = place.info
@@ -442,7 +559,8 @@ class _Builder:
         axis = axis_path(place.info)
         assert scope is not None  # since parts are a member of a struct
         elements = [
-            self.node(case, place.inside(axes=(*info.axes, axis))) for case in con.cases.values()
+            self.node(case, replace(place.inside(axes=(*info.axes, axis)), offset=None))
+            for case in con.cases.values()
         ]
         kinds = list[tree.Kind]()
         outer = dict[tree.Ref, None]()
@@ -483,7 +601,9 @@ class _Builder:
         """A part as a frame in itself, and the size of the one behind it."""
 
         def around(builder: _Builder) -> _Context:
-            return _Context(tree.FieldInfo(""), tree.OuterScope(place.scope, builder._asked))  # type: ignore[arg-type]
+            assert place.scope is not None
+            outside = tree.OuterScope(place.scope, builder._asked)
+            return _Context(tree.FieldInfo(""), outside, offset=None)
 
         root, builder = _build_twice(lambda builder: builder.node(case, around(builder)))
         if following is None:
@@ -567,9 +687,11 @@ class _Builder:
                 info = replace(info, default=con.pattern)
             node = tree.Blob(name, info, place.room, info.const)
         elif isinstance(con, Bytes) and not isinstance(con, PaddingField):
+            if isinstance(con, Reserved):
+                info = replace(info, default=con.pattern)
             node = tree.Blob(name, info, self._formula(con.length, place), info.const)
         else:
-            kind = type(con).__name__
+            kind = author_class(con)
             if isinstance(con, construct.FixedSized):
                 size = self._formula(con.length, place)
             else:
@@ -625,9 +747,73 @@ def _is_whole(formula: tree.Formula) -> bool:
 
     Division, modulo and shifts are only if the right operand is a positive constant.
     """
-    return not (isinstance(formula, tree.Op) and formula.symbol in ("//", "%", "<<", ">>")) or (
-        isinstance(formula.args[1], int) and formula.args[1] > 0
+    if not isinstance(formula, tree.Op) or formula.symbol not in ("/", "//", "%", "<<", ">>"):
+        return True
+    divisor = formula.args[1]
+    return isinstance(divisor, int | float) and divisor > 0
+
+
+def _no_offset() -> None:
+    """The offset of a place in an array, which differs from element to element."""
+    return
+
+
+def _offset_behind(
+    start: Callable[[], tree.Formula | None], members: Sequence[tree.Node], count: int
+) -> tree.Formula | None:
+    """Return the offset behind the first members of a struct that begins at `start`."""
+    return tree.combine("+", start(), tree.total(map(tree.size, members[:count])))
+
+
+def _is_near(ref: tree.Ref, info: tree.FieldInfo) -> bool:
+    """Return whether a computed value has one number of a field that is always there."""
+    return (
+        not ref.path.startswith("_.")
+        and ref.info.kind in ("int", "float")
+        and ref.info.axes == info.axes[: len(ref.info.axes)]
+        and (info.optional or not ref.info.optional)
     )
+
+
+def _integer(info: tree.FieldInfo) -> tree.FieldInfo:
+    """Return the description of a computed integer."""
+    return replace(info, dtype=np.dtype(np.int64), kind="int", bits=64)
+
+
+def _check_peeked(derived: tree.Derived, behind: Sequence[tree.Node]) -> tree.Node:
+    """Return a peeked value, or what only construct can read, if it may be cut off by the end of
+    the frame.
+    """
+    assert derived.node is not None
+    needed = tree.size(derived.node)
+    if isinstance(needed, int) and sum(map(_least_size, behind)) >= needed:
+        return derived
+    reason = "Peek may read beyond the frame: name the bytes behind it in the same Struct"
+    return tree.Opaque(derived.name, derived.info, "Peek", reason)
+
+
+def _is_free(node: tree.Node) -> bool:
+    """Return whether a node reads any bytes without an error."""
+    is_plain = isinstance(node, tree.Number | tree.Blob | tree.Block | tree.Struct | tree.Repeat)
+    infos = tree.infos(node)
+    return is_plain and all(info.const is None and info.allowed is None for info in infos)
+
+
+def _least_size(node: tree.Node) -> int:
+    """Return the least number of bytes that a node has, as far as it is known."""
+    match node:
+        case tree.When():
+            return min(_least_size(node.then), _least_size(node.otherwise))
+        case tree.Select():
+            options = [*(case for _, case in node.cases), node.default]
+            sizes = [_least_size(case) for case in options if not isinstance(case, tree.Never)]
+            return min(sizes, default=0)
+        case tree.Struct() | tree.Sealed():
+            return sum(map(_least_size, tree.children(node)))
+        case tree.Repeat():
+            return node.count * _least_size(node.element) if isinstance(node.count, int) else 0
+    size = tree.size(node)
+    return size if isinstance(size, int) else 0
 
 
 def _from(members: Sequence[tree.Node], first: str, last: str = "") -> tree.Formula | None:
@@ -669,7 +855,7 @@ _INSTEAD = {
     **{name: _TURNED.format(name) for name in ("ProcessXor", "ProcessRotateLeft", "Compressed")},
     **{
         name: f"{name} has no numbers of its own: say the Array or Struct below it"
-        for name in ("Slicing", "Indexing", "NamedTuple", "LazyArray")
+        for name in ("NamedTuple",)
     },
     "StringEncoded": (
         "a text has no numbers and no fixed place: say Bytes(n), and decode it where it is shown"
@@ -684,17 +870,13 @@ _INSTEAD = {
         " plausible=lambda f: ..."
     ),
     "Computed": (
-        "Computed is no field of the wire: calculate it in `points`, and repeat it where a count"
-        " needs it"
+        "a Python function of other fields: an expression of numbers such as this.a * 2 + 1 is"
+        " computed in bulk"
     ),
-    "Peek": (
-        "Peek reads bytes twice: declare them as a field, and let If or Switch behind it choose"
-    ),
-    "Tell": "Tell is no field of the wire: SizeOf says and holds the length of a part",
+    "Peek": "Peek of a part without a fixed size: declare its bytes as a field",
+    "Tell": "Tell within Parts: SizeOf says and holds the length of a part",
     "Index": "Index is no field of the wire: in `points` the index of an element is f.x.index",
-    "LazyBound": (
-        "LazyBound has no fixed place: say the part itself, or Parts for one after another"
-    ),
+    "LazyBound": "a part that contains itself has no fixed place: Parts for one after another",
     "VarInt": "VarInt has no fixed place: a WireForm makes numbers of as many bytes as they need",
     "ZigZag": "ZigZag has no fixed place: a WireForm makes numbers of as many bytes as they need",
     "FocusedSeq": (
@@ -705,7 +887,12 @@ _INSTEAD = {
         "Prefixed is compiled as a named member of a Struct alone: Struct('part' / Prefixed(...))"
     ),
     "Sequence": "the parts of a Sequence have no names: say Struct('a' / ..., 'b' / ...)",
-    "LazyStruct": "LazyStruct has no fixed place: say Struct, which is read in bulk",
+    "GreedyBytes": "it takes the rest of a datagram: Bytes(n) behind its length is read in bulk",
+    "GreedyRange": (
+        "it takes the rest of a datagram: PrefixedArray, or Prefixed(GreedyRange), is read in bulk"
+    ),
+    "NullTerminated": "a text up to a terminator has no fixed place: Bytes(n) is read in bulk",
+    "Terminated": "Terminated asks for the end of the datagram: leave it out",
     "RepeatUntil": (
         "RepeatUntil has no fixed place: say Array with a count, or Parts with one of its rules"
     ),

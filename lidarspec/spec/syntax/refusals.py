@@ -19,8 +19,11 @@ from lidarspec.spec.syntax.replacements import (
 )
 from lidarspec.spec.syntax.structs import (
     GREEDY,
+    RECODING,
+    author_class,
     children,
     fixed_size,
+    is_greedy,
     unwrap,
 )
 
@@ -34,11 +37,6 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.FlagsEnum: (
         "LS108",
         "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct",
-    ),
-    construct.RawCopy: ("LS109", "RawCopy ignores edits on rebuild: use Checksummed"),
-    construct.Checksum: (
-        "LS109",
-        "construct's Checksum needs RawCopy, which ignores edits on rebuild: use Checksummed",
     ),
     construct.Union: (
         "LS109",
@@ -61,6 +59,8 @@ _REFUSED: dict[type, tuple[str, str]] = {
             " Struct('part' / Aligned(4, ...))"
         ),
     ),
+    construct.Slicing: ("LS106", "Slicing loses the other elements: use the Array below it"),
+    construct.Indexing: ("LS106", "Indexing loses the other elements: use the Array below it"),
     construct.Pointer: ("LS112", "Pointer reads outside the frame"),
     construct.Seek: ("LS112", "Seek reads outside the frame"),
     construct.Select: (
@@ -79,10 +79,6 @@ _INSTEAD: dict[type, str] = {
         "a Check has no name to be told by: 'valid' / Check(...), or plausible=lambda f: ..., which"
         " is judged in bulk"
     ),
-    type(construct.Terminated): (
-        "Terminated asks for the end of a stream, which a frame does not have: the last field"
-        " ends it"
-    ),
     construct.Probe: "Probe prints while it parses: lidarspec explain shows every byte of a frame",
     construct.StopIf: (
         "StopIf leaves out what follows in a struct: 'rest' / If(this.more, Struct(...))"
@@ -91,14 +87,17 @@ _INSTEAD: dict[type, str] = {
 }
 
 
-def check_struct(con: Construct) -> None:
+def check_struct(con: Construct) -> SpecError | None:
     """Raise `SpecError` with path and reason if a frame cannot be described by this construct.
+
+    Returns:
+        Why its frames have no end on a byte stream; None if they have one.
 
     Raises:
         SpecError: for a shadowed, reserved, duplicate or missing name, or a construct that loses
             bits or never ends.
     """
-    _check_ends(con, "", bounded=False)
+    endless = _check_ends(con, "", bounded=False)
     for path, part, in_bits in _walk(con, "", in_bits=False):
         for kind, (rule, reason) in _REFUSED.items():
             if isinstance(part, kind):
@@ -111,6 +110,8 @@ def check_struct(con: Construct) -> None:
             )
         if isinstance(part, Struct):
             _check_names(part, path, in_bits=in_bits)
+        if isinstance(part, construct.FocusedSeq):
+            _check_focus(part, path)
         if isinstance(part, Partition) and any(
             child.name == "frame" for case in part.cases.values() for child in unwrap(case).subcons
         ):
@@ -120,45 +121,58 @@ def check_struct(con: Construct) -> None:
                 rule="LS102",
             )
     _check_measures(con, "", (1, 0, ""), {})
+    return endless
 
 
-def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
-    """Refuse what has no end on a stream: greedy parts, unless they are the last in one that has an
-    end; and what such a one would drop.
+def _check_ends(
+    con: Construct, path: str, *, bounded: bool, is_last: bool = True
+) -> SpecError | None:
+    """Refuse greedy parts, unless they are the last in one that has an end or in the frame; and
+    what such a one would drop.
+
+    Returns:
+        Why a frame has no end on a stream, if its last part is greedy.
+
+    Raises:
+        SpecError: for another greedy part without an end.
     """
     if isinstance(con, construct.Renamed):
         path = f"{path}.{con.name}".strip(".")
-    if isinstance(con, GREEDY) and not bounded:
-        if con is construct.GreedyBytes:
-            kind = type(con)
-            what = "length"
-        else:
-            kind = construct.GreedyRange
-            what = "count"
-        reason = (
-            f"{kind.__name__} has no end of its own on a stream: give a {what}, or a terminator, or"
-            " bound it by Prefixed or FixedSized"
-        )
-        raise SpecError(reason, path=path, rule="LS111")
     below = children(con)
-    for child in below:
-        if isinstance(con, Struct):
-            passes = bounded and child is below[-1]
-        else:
-            passes = bounded
-        _check_ends(
-            child,
-            path,
-            bounded=isinstance(con, _BOUNDED)
-            or (passes and not isinstance(con, Array | construct.GreedyRange)),
+    endless: SpecError | None = None
+    if con is construct.Terminated:
+        reason = (
+            "Terminated asks for the end of a stream: leave it out, the last field ends a frame"
         )
+        endless = SpecError(reason, path=path, rule="LS111")
+        if not is_last:
+            raise endless
+    if isinstance(con, (*GREEDY, *RECODING)) and not bounded:
+        what = "count" if isinstance(con, construct.GreedyRange) else "length"
+        reason = (
+            f"{author_class(con)} has no end of its own on a stream: give a {what}, or a"
+            " terminator, or bound it by Prefixed or FixedSized"
+        )
+        endless = SpecError(reason, path=path, rule="LS111")
+        if not is_last:
+            raise endless
+    for child in below:
+        passes = not hasattr(con, "subcons") or child is below[-1]
+        passes = passes and not isinstance(con, Array | construct.GreedyRange)
+        is_bounded = isinstance(con, (*_BOUNDED, *RECODING)) or (passes and bounded)
+        error = _check_ends(child, path, bounded=is_bounded, is_last=passes and is_last)
+        endless = endless or error
     is_sized = isinstance(con, construct.FixedSized)
     fits = is_sized and isinstance(con.length, int) and fixed_size(con.subcon) == con.length
-    if isinstance(con, _BOUNDED) and not fits and not _fills(con.subcon, padded=is_sized):
-        if isinstance(con, BoundedPart):
-            name = "Prefixed"
-        else:
-            name = type(con).__name__
+    # A named part behind its length has a field for it, which is held to the size of the part.
+    is_held = isinstance(con, BoundedPart) and not is_greedy(con.subcon, (construct.NullStripped,))
+    if (
+        isinstance(con, _BOUNDED)
+        and not is_held
+        and not fits
+        and not _fills(con.subcon, padded=is_sized)
+    ):
+        name = "Prefixed" if isinstance(con, BoundedPart) else type(con).__name__
         if isinstance(con, BoundedPart | construct.NullTerminated):
             named = ""
         else:
@@ -168,6 +182,7 @@ def _check_ends(con: Construct, path: str, *, bounded: bool) -> None:
             " for it, 'rest' / GreedyBytes"
         )
         raise SpecError(reason, path=path, rule="LS106")
+    return endless
 
 
 def _fills(con: Construct, *, padded: bool) -> bool:
@@ -181,6 +196,17 @@ def _fills(con: Construct, *, padded: bool) -> bool:
     return isinstance(con, construct.GreedyRange) or _fills(children(con)[-1], padded=padded)
 
 
+def _check_focus(con: construct.FocusedSeq, path: str) -> None:
+    """Refuse a FocusedSeq that drops the value of a field."""
+    for member in con.subcons:
+        if member.name != con.parsebuildfrom and not member.flagbuildnone:
+            reason = (
+                f"FocusedSeq keeps {con.parsebuildfrom!r} alone, and loses"
+                f" {member.name or type(member).__name__!r}: use a Struct"
+            )
+            raise SpecError(reason, path=path, rule="LS105")
+
+
 def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
     seen: set[str] = set()
     for child in struct.subcons:
@@ -189,8 +215,8 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
             place = f"{path}.{name}"
         else:
             place = str(name)
-        if isinstance(child, construct.Padded):
-            continue  # refused on its own, and with a better reason
+        if unwrap(child) is construct.Terminated:
+            continue
         if name is None:
             if in_bits or not isinstance(unwrap(child), Const):
                 kind = type(unwrap(child))

@@ -16,7 +16,7 @@ import math
 import operator
 import struct
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import construct
@@ -346,6 +346,101 @@ class NamedEnum(construct.Enum):  # type: ignore[misc]
         return self._decode(raw, context, path)
 
 
+class RawPart(Construct):  # type: ignore[misc]
+    """A part with its bytes and their place, as construct's RawCopy gives them.
+
+    It is built from its `value`. construct's own is built from `data`, so that edits of the value
+    of a parsed frame are lost.
+    """
+
+    def __init__(self, subcon: Construct) -> None:
+        super().__init__()
+        self.subcon = subcon
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        value = self.subcon._parsereport(stream, context, f"{path} -> value")
+        return self._describe(value, stream, start)
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        if not isinstance(obj, dict) or not {"value", "data"} & obj.keys():
+            raise MismatchError(path, 0, "a mapping with its value", repr(obj), "value")
+        start = stream.tell()
+        value = obj.get("value")
+        if "value" in obj:
+            value = self.subcon._build(value, stream, context, f"{path} -> value")
+        else:
+            construct.stream_write(stream, obj["data"], len(obj["data"]), path)
+        return self._describe(value, stream, start)
+
+    def _describe(self, value: Any, stream: Any, start: int) -> Container:
+        end = stream.tell()
+        stream.seek(start)
+        data = stream.read(end - start)
+        return Container(
+            data=data,
+            value=value,
+            offset1=start,
+            offset2=end,
+            length=end - start,
+            _marks={"value": (start, end)},
+        )
+
+    def _sizeof(self, context: Any, path: str) -> int:
+        return int(self.subcon._sizeof(context, path))
+
+
+class CheckedChecksum(construct.Checksum):  # type: ignore[misc]
+    """A Checksum that can be read unchecked, and reports its offset and both values."""
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        stored = self.checksumfield._parsereport(stream, context, path)
+        if is_verifying(context):
+            computed = self.hashfunc(self.bytesfunc(context))
+            if stored != computed:
+                expected = tree.format_hex(computed)
+                raise MismatchError(path, start, expected, tree.format_hex(stored), "checksum")
+        return stored
+
+
+class BareNamedTuple(construct.NamedTuple):  # type: ignore[misc]
+    """A NamedTuple of the fields of a struct alone; construct's own expects no private entries."""
+
+    def _decode(self, obj: Any, context: Any, path: str) -> Any:
+        if not isinstance(obj, dict):
+            return super()._decode(obj, context, path)
+        return self.factory(**{name: obj[name] for name in self.factory._fields})
+
+
+class CheckedCompressed(construct.Compressed):  # type: ignore[misc]
+    """A Compressed for which bytes that cannot be decompressed are an invalid value."""
+
+    def _parse(self, stream: Any, context: Any, path: str) -> Any:
+        start = stream.tell()
+        try:
+            return super()._parse(stream, context, path)
+        except construct.ConstructError:
+            raise
+        except Exception as error:  # each library raises errors of its own
+            expected = f"bytes compressed by {self.encoding}"
+            raise MismatchError(path, start, expected, "other bytes", "value") from error
+
+
+class Reserved(CountedBytes):
+    """Bytes without a meaning, which construct's Padding drops: those of a pattern unless given."""
+
+    def __init__(self, length: Any, pattern: bytes = b"\0") -> None:
+        super().__init__(length)
+        self.pattern = pattern
+        self.flagbuildnone = True
+
+    def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
+        if obj is None:
+            obj = self.pattern * int(construct.evaluate(self.length, context))
+        return super()._build(obj, stream, context, path)
+
+
 class DescribedField(Subconstruct):  # type: ignore[misc]
     """A part that only says something of the field below it: parses and builds what that does."""
 
@@ -369,6 +464,9 @@ class SealedStruct(Subconstruct):  # type: ignore[misc]
     algorithm: Checksum | None
     over: tuple[str, ...] | None
     absent: frozenset[int]
+
+    #: the class that authors write; makes the seals that construct's Checksum stands for.
+    author_class: Callable[..., SealedStruct]
 
 
 class SizeField(Subconstruct):  # type: ignore[misc]

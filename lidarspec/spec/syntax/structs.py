@@ -29,8 +29,12 @@ from construct import (
 )
 from construct.expr import ExprMixin
 
+from lidarspec.spec.syntax.raw_checksums import extract_seals, seal
 from lidarspec.spec.syntax.replacements import (
+    BareNamedTuple,
     BoundedPart,
+    CheckedChecksum,
+    CheckedCompressed,
     CheckedConst,
     CountedBytes,
     CountField,
@@ -45,6 +49,8 @@ from lidarspec.spec.syntax.replacements import (
     PaddingField,
     ParsedParts,
     Partition,
+    RawPart,
+    Reserved,
     SealedStruct,
     SizeField,
     SoughtTerminator,
@@ -65,10 +71,24 @@ _REPLACEMENTS: dict[type, type] = {
     construct.Enum: NamedEnum,
     construct.GreedyRange: FullRange,
     construct.NullTerminated: SoughtTerminator,
+    construct.NamedTuple: BareNamedTuple,
+    construct.Compressed: CheckedCompressed,
 }
 
+#: how a value is printed or when it is read; it is the value below.
+_TRANSPARENT = (
+    construct.Hex,
+    construct.HexDump,
+    construct.Lazy,
+    construct.Debugger,
+    construct.Rebuffered,
+)
+
+#: the LazyBound constructs that are being prepared.
+_BINDING: list[Construct] = []
+
 #: attributes of constructs that hold others; "cases" does by key.
-_INNER = ("subcon", "thensubcon", "elsesubcon", "default")
+_INNER = ("subcon", "thensubcon", "elsesubcon", "default", "checksumfield")
 
 
 def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) -> Construct:
@@ -82,10 +102,20 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         if con.fmtstr[-1] in "efd":
             return ExactFloat(con.fmtstr[0], con.fmtstr[-1])
         return con
-    if isinstance(
-        con, construct.Hex | construct.HexDump
-    ):  # how a value is printed; it is the value below it
+    if isinstance(con, _TRANSPARENT):
         return prepare(con.subcon, limit, in_bits=in_bits)
+    if isinstance(con, construct.LazyStruct):
+        return prepare(Struct(*con.subcons), limit, in_bits=in_bits)
+    if isinstance(con, construct.LazyArray):
+        return prepare(Array(con.count, con.subcon), limit, in_bits=in_bits)
+    if isinstance(con, construct.LazyBound):
+        return _bind(con, limit, in_bits=in_bits)
+    if isinstance(con, construct.Compiled):
+        return prepare(con.defersubcon, limit, in_bits=in_bits)
+    if isinstance(con, construct.Sequence | construct.FocusedSeq):
+        same = copy.copy(con)
+        same.subcons = [prepare(child, limit, in_bits=in_bits) for child in con.subcons]
+        return same
     if isinstance(con, construct.Check):
         return HeldCheck(con.func)
     if isinstance(con, construct.Mapping) and {
@@ -98,19 +128,29 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
         )
     if isinstance(con, construct.ExprValidator) and (allowed := _find_allowed(con)) is not None:
         return LimitedNumber(prepare(con.subcon, limit, in_bits=in_bits), allowed)
-    if isinstance(con, PaddingField):
+    if isinstance(con, PaddingField | Reserved):
         con.limit = limit
         return con
+    if isinstance(con, construct.RawCopy):
+        return RawPart(prepare(con.subcon, limit, in_bits=in_bits))
+    if isinstance(con, construct.Checksum):
+        field = prepare(con.checksumfield, limit, in_bits=in_bits)
+        return CheckedChecksum(field, con.hashfunc, con.bytesfunc)
+    if isinstance(con, construct.Padded):
+        padded = _with_padding(con, in_bits=in_bits)
+        if padded is not None:
+            return prepare(padded, limit, in_bits=in_bits)
     if isinstance(con, Bytes):
         counted = CountedBytes(con.length)
         counted.limit = limit
         return counted
     if isinstance(con, Struct):
-        if in_bits:
-            members = con.subcons
-        else:
-            members = [member for child in con.subcons for member in _expand_macro(child)]
-        return MarkedStruct(*(prepare(child, limit, in_bits=in_bits) for child in members))
+        members = _name_padding(con.subcons)
+        if not in_bits:
+            members = [member for child in members for member in _expand_macro(child)]
+        members, checksums = extract_seals(members)
+        prepared = (prepare(child, limit, in_bits=in_bits) for child in members)
+        return seal(MarkedStruct(*prepared), checksums)
     if isinstance(con, construct.Renamed):
         inner = con.subcon
         while isinstance(
@@ -143,6 +183,51 @@ def prepare(con: Construct, limit: int = sys.maxsize, *, in_bits: bool = False) 
     if isinstance(same, Partition):
         same.limit = limit
     return same
+
+
+def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
+    """Return the construct that a LazyBound stands for; itself where it contains itself."""
+    if con in _BINDING:
+        return con
+    _BINDING.append(con)
+    try:
+        return prepare(con.subconfunc(), limit, in_bits=in_bits)
+    finally:
+        _BINDING.remove(con)
+
+
+def _name_padding(members: list[Construct]) -> list[Construct]:
+    """Return the members of a struct, with a name for each padding that has none."""
+    taken = {member.name for member in members}
+    named = list[Construct]()
+    for member in members:
+        if isinstance(member, construct.Padded) and member.subcon is construct.Pass:
+            number = 1
+            name = "padding"
+            while name in taken:
+                number += 1
+                name = f"padding_{number}"
+            taken.add(name)
+            named.append(construct.Renamed(member, newname=name))
+        else:
+            named.append(member)
+    return named
+
+
+def _with_padding(con: construct.Padded, *, in_bits: bool) -> Construct | None:
+    """Return the bytes or bits of a padding, or a struct with its padding as the last member; None
+    for another padded part.
+    """
+    if con.subcon is construct.Pass and in_bits:
+        return construct.Default(BitsInteger(con.length), 0)
+    if con.subcon is construct.Pass:
+        return Reserved(con.length, con.pattern)
+    inner = con.subcon
+    if not in_bits and isinstance(inner, Struct) and isinstance(con.length, int):
+        left = con.length - fixed_size(inner)
+        if fixed_size(inner) and left >= 0:
+            return Struct(*inner.subcons, construct.Padded(left, construct.Pass, con.pattern))
+    return None
 
 
 def _expand_macro(con: Construct) -> list[Construct]:
@@ -199,8 +284,10 @@ def _expand_macro(con: Construct) -> list[Construct]:
             rename_ending("_count", CountField(count.subcon, name), "number of"),
             construct.Renamed(array, newname=name, newdocs=docs),
         ]
+    is_padded = isinstance(inner, construct.Padded) and inner.subcon is not construct.Pass
     if name and (
         isinstance(inner, construct.Aligned)
+        or is_padded
         or (isinstance(inner, construct.FixedSized) and not is_greedy(inner.subcon))
     ):
         members = _expand_macro(construct.Renamed(inner.subcon, newname=name, newdocs=docs))
@@ -217,10 +304,9 @@ def _expand_macro(con: Construct) -> list[Construct]:
         is_full = isinstance(inner.length, int) and inner.length == fixed_size(inner.subcon)
         if is_full:
             return members
-        return [
-            *members,
-            rename_ending("_padding", PaddingField(span, to=inner.length), "padding of"),
-        ]
+        pattern = inner.pattern if is_padded else b"\0"
+        filler = PaddingField(span, to=inner.length, pattern=pattern)
+        return [*members, rename_ending("_padding", filler, "padding of")]
     return [con]
 
 
@@ -280,8 +366,13 @@ def _find_allowed(con: construct.Validator) -> tuple[int, ...] | None:
 #: what takes all bytes that there are.
 GREEDY = (construct.GreedyRange, type(construct.GreedyBytes))
 
+#: what takes all bytes that there are, and makes others of them.
+RECODING = (construct.Tunnel, construct.ProcessXor, construct.ProcessRotateLeft)
 
-def is_greedy(con: Construct, kinds: tuple[type, ...] = (*GREEDY, construct.NullStripped)) -> bool:
+
+def is_greedy(
+    con: Construct, kinds: tuple[type, ...] = (*GREEDY, *RECODING, construct.NullStripped)
+) -> bool:
     """Whether a part takes all bytes that it is given, by ending in one of some kinds that do."""
     if isinstance(con, kinds):
         return True
@@ -368,9 +459,16 @@ def field_path(path: str | None) -> str:
     return ".".join(names)
 
 
+def author_class(con: Construct) -> str:
+    """Return the name of the class that the author wrote, which `prepare` may have replaced."""
+    classes = type(con).__mro__
+    own = [kind for kind in classes if not kind.__module__.startswith("lidarspec.spec.syntax")]
+    return own[0].__name__
+
+
 def children(con: Construct) -> list[Construct]:
     """The constructs directly below one, branches included."""
-    if isinstance(con, Struct):
+    if isinstance(con, Struct | construct.Sequence | construct.FocusedSeq):
         return list(con.subcons)
     below = [getattr(con, name) for name in _INNER if name in vars(con)]
     return below + (list(con.cases.values()) if "cases" in vars(con) else [])
@@ -445,11 +543,15 @@ def random_value(
                     child, source, drawn, values, f"{path}.{child.name}" if path else child.name
                 )
         return values
+    if isinstance(con, RawPart):
+        return Container(value=random_value(con.subcon, source, drawn, scope, f"{path}.value"))
     if isinstance(con, construct.GreedyRange):
         return [
             random_value(con.subcon, source, drawn, scope, path)
             for _ in range(source.randint(0, 4))
         ]
+    if isinstance(con, construct.RepeatUntil):
+        return _random_until(con, source, drawn, scope, path)
     if isinstance(con, Partition):
         return _random_parts(con, source, drawn, scope, path)
     if isinstance(con, Array):
@@ -496,6 +598,19 @@ def random_value(
     return random_value(con.subcon, source, drawn, scope, path)
 
 
+def _random_until(
+    con: construct.RepeatUntil, source: random.Random, drawn: Drawn, scope: Any, path: str
+) -> list[Any]:
+    """Some elements up to the first that ends them."""
+    found: list[Any] = construct.ListContainer()
+    for _ in range(DRAWS):
+        element = random_value(con.subcon, source, drawn, scope, path)
+        found.append(element)
+        if con.predicate is True or con.predicate(element, found, scope):
+            break
+    return found
+
+
 def _elements(con: Construct, scope: Any) -> int:
     """How many an element of an array has itself, where it is an array too; as far as that is known
     before there is one.
@@ -537,13 +652,15 @@ def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any
 
 
 def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
-    if con is construct.Pass or isinstance(con, construct.Check | PaddingField):
+    if con is construct.Pass or isinstance(con, construct.Check | PaddingField | Reserved):
         # whether a Check holds, and how much there is to fill, is seen when the frame is built
         return None
     if isinstance(con, construct.NullTerminated):
         return str(source.randrange(10 ** source.randint(1, 4))).encode()
     if isinstance(con, construct.Computed):
         return construct.evaluate(con.func, scope)
+    if isinstance(con, CheckedChecksum):
+        return None  # computed when the frame is built
     if con is construct.GreedyBytes:
         return source.randbytes(source.randint(0, 4))
     if isinstance(con, Bytes):

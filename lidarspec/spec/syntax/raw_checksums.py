@@ -1,0 +1,134 @@
+"""Recognise construct's Checksum of a RawCopy as a seal of the struct that has both.
+
+``"body" / RawCopy(...), "crc" / Checksum(Int8ub, function, this.body.data)`` is the same as
+`Checksummed` with a function for its algorithm. The argument of the function is found by calling
+its expression with an object that records the names that it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import construct
+from construct import Construct, Struct
+
+from lidarspec.spec.checksums import Checksum
+from lidarspec.spec.syntax.replacements import BoundedPart, SealedStruct
+
+#: maximum width of a checksum that is judged in bulk.
+MAX_BITS = 64
+
+
+@dataclass(frozen=True)
+class FunctionChecksum(Checksum):
+    """The function of construct's Checksum, called for each frame.
+
+    Attributes:
+        function: returns the checksum, a number or bytes.
+        takes_part: whether it takes the whole part of construct's RawCopy, in place of its bytes.
+    """
+
+    function: Callable[[Any], int | bytes]
+    width: int
+    takes_part: bool = False
+
+    def __call__(self, data: bytes | bytearray | memoryview) -> int:
+        content: Any = bytes(data)
+        if self.takes_part:
+            content = construct.Container(data=content, length=len(content))
+        value = self.function(content)
+        if isinstance(value, bytes):
+            value = int.from_bytes(value, self.order)
+        return value & ((1 << self.width) - 1)
+
+    def describe(self) -> str:
+        return getattr(self.function, "__name__", "a function")
+
+
+@dataclass(frozen=True)
+class _Names:
+    """The names that an expression asks for, from the struct that it is in."""
+
+    names: tuple[str, ...] = ()
+
+    def __getitem__(self, name: str) -> _Names:
+        return _Names((*self.names, name))
+
+    def __getattr__(self, name: str) -> _Names:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self[name]
+
+
+def extract_seals(members: Sequence[Construct]) -> tuple[list[Construct], list[dict[str, Any]]]:
+    """Return the members of a struct with plain fields in place of checksums of a RawCopy.
+
+    Returns:
+        The members, and for each of these checksums the arguments of a `Sealing`.
+    """
+    found = list[Construct]()
+    seals = list[dict[str, Any]]()
+    for member in members:
+        checksum = _strip(member)
+        over = _covered_part(checksum, members) if member.name else None
+        if over is None or not isinstance(checksum, construct.Checksum):
+            found.append(member)
+            continue
+        names, takes_part = over
+        width = 8 * int(checksum.checksumfield.sizeof())
+        algorithm = FunctionChecksum(checksum.hashfunc, width, takes_part)
+        seals.append({"field": member.name, "algorithm": algorithm, "over": ".".join(names)})
+        found.append(
+            construct.Renamed(checksum.checksumfield, newname=member.name, newdocs=member.docs)
+        )
+    return found, seals
+
+
+def seal(struct: Construct, seals: Sequence[dict[str, Any]]) -> Construct:
+    """Return a struct with seals around it."""
+    for arguments in seals:
+        struct = SealedStruct.author_class(struct, **arguments)
+    return struct
+
+
+def _covered_part(
+    checksum: Construct, members: Sequence[Construct]
+) -> tuple[tuple[str, ...], bool] | None:
+    """Return the names of the RawCopy that a checksum is made of, and whether its function takes
+    the whole part; None for another checksum.
+    """
+    if not isinstance(checksum, construct.Checksum):
+        return None
+    try:
+        asked = checksum.bytesfunc(_Names())
+        bits = 8 * int(checksum.checksumfield.sizeof())
+    except Exception:  # the author's function may do anything with what it is given
+        return None
+    if not isinstance(asked, _Names) or bits > MAX_BITS:
+        return None
+    if asked.names[-1:] == ("data",) and _is_raw_copy(members, asked.names[:-1]):
+        return asked.names[:-1], False
+    if _is_raw_copy(members, asked.names):
+        return asked.names, True
+    return None
+
+
+def _is_raw_copy(members: Sequence[Construct], names: Sequence[str]) -> bool:
+    """Return whether names lead to a RawCopy, through structs only."""
+    part: Construct | None = None
+    for index, name in enumerate(names):
+        if index:
+            if not isinstance(part, Struct):
+                return False
+            members = part.subcons
+        part = next((_strip(member) for member in members if member.name == name), None)
+    return isinstance(part, construct.RawCopy)
+
+
+def _strip(con: Construct) -> Construct:
+    """Return a construct without its name, and without a length in front of it."""
+    while isinstance(con, construct.Renamed | construct.Prefixed | BoundedPart):
+        con = con.subcon
+    return con

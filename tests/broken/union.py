@@ -1,0 +1,14 @@
+"""Union, which ignores edits of all but one of its readings."""
+
+from __future__ import annotations
+
+from construct import Bytes, Int16ul, Union
+
+from lidarspec.spec import hookimpl
+from tests.broken.sound import SIZE, frame, sealed, sensor
+
+
+@hookimpl
+def lidarspec_sensors():
+    spare = Union(0, "number" / Int16ul, "data" / Bytes(2))
+    return [sensor(frame(sealed(spare=spare), max_length=SIZE + 8))]

@@ -1,0 +1,470 @@
+"""Each class of construct in a small struct, as people write it: values, bytes and columns are
+those of construct, and it is known by name which structs are compiled.
+
+construct itself, with the struct as it is written here, is the judge.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import construct
+import numpy as np
+import pytest
+from construct import (
+    Array,
+    BitsInteger,
+    BitStruct,
+    Byte,
+    Bytes,
+    Checksum,
+    Compressed,
+    Computed,
+    Const,
+    Construct,
+    CString,
+    Debugger,
+    FixedSized,
+    FocusedSeq,
+    GreedyBytes,
+    GreedyRange,
+    GreedyString,
+    If,
+    Index,
+    Int8ub,
+    Int16sb,
+    Int16ub,
+    Lazy,
+    LazyArray,
+    LazyBound,
+    LazyStruct,
+    NamedTuple,
+    NullTerminated,
+    Padded,
+    Padding,
+    PascalString,
+    Peek,
+    Prefixed,
+    ProcessXor,
+    RawCopy,
+    Rebuffered,
+    RepeatUntil,
+    Sequence,
+    Struct,
+    Switch,
+    Tell,
+    Terminated,
+    Transformed,
+    VarInt,
+    ZigZag,
+    len_,
+    obj_,
+    this,
+)
+
+from lidarspec import Sensor, SpecError, WireError
+from lidarspec.spec import Fields, Polar, Serial
+from tests.engine.against_construct import at, sensor
+from tests.engine.engines import interpreted_reason, is_compiled
+
+MARK = b"\x5a\xa5"
+
+
+def add(data: bytes) -> int:
+    return sum(data) & 0xFF
+
+
+def add_part(part: Any) -> int:
+    return add(part.data)
+
+
+def add_as_bytes(data: bytes) -> bytes:
+    return bytes([add(data), 0])
+
+
+def flip(data: bytes) -> bytes:
+    return bytes(byte ^ 0x55 for byte in data)
+
+
+def odd_or_even(found: Any) -> str:
+    return "odd" if found.n % 2 else "even"
+
+
+class Celsius(construct.Adapter):  # type: ignore[misc]
+    """An adapter of an author's own."""
+
+    def _decode(self, obj: Any, context: Any, path: str) -> Any:
+        return obj - 40
+
+    def _encode(self, obj: Any, context: Any, path: str) -> Any:
+        return obj + 40
+
+
+NODE = Struct("v" / Int8ub, "after" / If(this.v, LazyBound(lambda: NODE)))
+BODY = Struct("a" / Int8ub, "b" / Int16ub)
+TWO = Struct("x" / Int8ub, "y" / Int8ub)
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A struct behind a constant of two bytes, and what stands behind it in some frames.
+
+    `reason` is part of why construct reads the frames; "" if they are compiled.
+    """
+
+    members: tuple[Construct, ...]
+    frames: tuple[bytes, ...]
+    reason: str = ""
+    #: whether only datagrams can have such frames.
+    is_rest: bool = False
+
+    @property
+    def struct(self) -> Construct:
+        return Struct("mark" / Const(MARK), *self.members)
+
+
+def case(*members: Construct, frames: str, reason: str = "", is_rest: bool = False) -> Case:
+    """A case whose frames are given in hexadecimal, with spaces between them."""
+    return Case(members, tuple(map(bytes.fromhex, frames.split())), reason, is_rest)
+
+
+COMPILED: dict[str, Case] = {
+    "Tell that nobody uses": case("t" / Tell, "a" / Int8ub, frames="01 02"),
+    "Tell behind a count": case("n" / Int8ub, "d" / Bytes(this.n), "t" / Tell, frames="026162 00"),
+    "Tell in elements": case("r" / Array(3, Struct("t" / Tell, "a" / Int16ub)), frames="00" * 6),
+    "Tell that Computed uses": case(
+        "n" / Int8ub,
+        "s" / Tell,
+        "d" / Bytes(this.n),
+        "e" / Tell,
+        "size" / Computed(this.e - this.s),
+        "rest" / Bytes(3 - this.size),
+        frames="0261624a 0000000a",
+    ),
+    "Computed of a field": case(
+        "n" / Int8ub, "c" / Computed(this.n * 2 + 1), "d" / Bytes(this.c), frames="01616263 0061"
+    ),
+    "Computed number": case("n" / Int8ub, "c" / Computed(7), "d" / Bytes(this.c), frames="00" * 8),
+    "Computed text": case("n" / Int8ub, "c" / Computed("v1"), frames="01"),
+    "Computed fraction": case("n" / Int16sb, "c" / Computed(this.n / 10), frames="0101 ffff"),
+    "Computed condition": case("n" / Int8ub, "c" / Computed(this.n > 3), frames="01 04"),
+    "Computed in elements": case(
+        "k" / Int8ub,
+        "r" / Array(2, Struct("a" / Int8ub, "c" / Computed(this.a * this._.k))),
+        frames="030102 000405",
+    ),
+    "Computed in a branch": case(
+        "k" / Int8ub, "v" / If(this.k, Struct("c" / Computed(this._.k + 1))), frames="00 02"
+    ),
+    "Peek of a number": case("p" / Peek(Int8ub), "a" / Int16ub, frames="0102"),
+    "Peek of a struct": case("p" / Peek(BODY), "a" / Array(3, Int8ub), frames="010203"),
+    "Peek that chooses": case(
+        "p" / Peek(Int8ub),
+        "v" / Switch(this.p, {1: Struct("k" / Int8ub, "x" / Int16ub)}, Struct("k" / Int8ub)),
+        frames="010203 04",
+    ),
+    "Peek in elements": case(
+        "r" / Array(2, Struct("p" / Peek(Int8ub), "a" / Int16ub)), frames="01020304"
+    ),
+    "RawCopy": case("r" / RawCopy(BODY), "z" / Int8ub, frames="01020304"),
+    "RawCopy of another size": case(
+        "n" / Int8ub, "r" / RawCopy(Bytes(this.n)), "d" / Bytes(this.r.length), frames="0261620102"
+    ),
+    "RawCopy of fields around": case(
+        "n" / Int8ub, "r" / RawCopy(Struct("d" / Bytes(this._.n))), frames="026162 00"
+    ),
+    "RawCopy in elements": case("a" / Array(2, Struct("r" / RawCopy(Int16ub))), frames="01020304"),
+    "Checksum of RawCopy": case(
+        "r" / RawCopy(BODY), "c" / Checksum(Int8ub, add, this.r.data), frames="01020306"
+    ),
+    "Checksum of the part": case(
+        "r" / RawCopy(BODY), "c" / Checksum(Int8ub, add_part, this.r), frames="01020306"
+    ),
+    "Checksum by a lambda": case(
+        "r" / RawCopy(BODY),
+        "c" / Checksum(Int8ub, add, lambda found: found.r.data),
+        frames="01020306",
+    ),
+    "Checksum of bytes": case(
+        "r" / RawCopy(BODY),
+        "c" / Checksum(Bytes(2), add_as_bytes, this.r.data),
+        frames="0102030600",
+    ),
+    "Checksum behind a length": case(
+        "r" / Prefixed(Int8ub, RawCopy(Struct("k" / Int8ub, "d" / GreedyBytes))),
+        "c" / Checksum(Int8ub, add, this.r.data),
+        frames="0301020306 010101",
+    ),
+    "Padding": case("a" / Int8ub, Padding(2), "b" / Int8ub, frames="01000002 01020304"),
+    "named Padding": case("a" / Int8ub, "spare" / Padding(2), frames="010000 010203"),
+    "two Paddings": case(Padding(1), "a" / Int8ub, Padding(1), frames="000100 010203"),
+    "Padding of bits": case("a" / BitStruct("x" / BitsInteger(3), Padding(5)), frames="e0 ff"),
+    "Padded": case("a" / Padded(4, Int16ub), "b" / Int8ub, frames="0102000003 0102030405"),
+    "Padded struct": case("a" / Array(2, Padded(3, TWO)), frames="010200030400 010203040506"),
+    "Lazy": case("a" / Lazy(Int16ub), frames="0102"),
+    "LazyStruct": case("a" / LazyStruct("x" / Int16ub, "y" / Int8ub), frames="010203"),
+    "LazyArray": case("a" / LazyArray(2, Int16ub), frames="01020304"),
+    "LazyBound": case("a" / LazyBound(lambda: BODY), frames="010203"),
+    "Debugger": case("a" / Debugger(Int16ub), frames="0102"),
+    "Rebuffered": case("a" / Rebuffered(Int16ub), frames="0102"),
+    "compiled by construct": case("a" / BODY.compile(), frames="010203"),
+}
+
+PLAIN: dict[str, Case] = {
+    "Computed by Python": case(
+        "n" / Int8ub, "c" / Computed(odd_or_even), frames="01 02", reason="a Python function"
+    ),
+    "Computed of an array": case(
+        "n" / Int8ub,
+        "a" / Array(this.n, Int8ub),
+        "c" / Computed(len_(this.a)),
+        frames="020102",
+        reason="a Python function",
+    ),
+    "Peek beyond the frame": case(
+        "a" / Int8ub, "p" / Peek(Int8ub), frames="01", reason="may read beyond the frame"
+    ),
+    "Checksum of something else": case(
+        "a" / Int8ub,
+        "c" / Checksum(Int8ub, lambda number: number + 1, this.a),
+        frames="0102",
+        reason="Checksum",
+    ),
+    "FocusedSeq": case(
+        "a" / FocusedSeq("v", "k" / Const(b"K"), "v" / Int8ub),
+        frames="4b01",
+        reason="PrefixedArray",
+    ),
+    "Sequence": case("a" / Sequence(Int8ub, Int16ub), frames="010203", reason="have no names"),
+    "VarInt": case("a" / VarInt, "b" / Int8ub, frames="810102 0102", reason="no fixed place"),
+    "ZigZag": case("a" / ZigZag, "b" / Int8ub, frames="810102 0102", reason="no fixed place"),
+    "CString": case(
+        "a" / CString("utf8"), frames="616200 00 c3a900", reason="a text has no numbers"
+    ),
+    "NullTerminated": case(
+        "a" / NullTerminated(GreedyBytes), "b" / Int8ub, frames="61620001", reason="terminator"
+    ),
+    "ProcessXor": case(
+        "a" / FixedSized(2, ProcessXor(0x55, GreedyBytes)),
+        frames="0102",
+        reason="makes other bytes",
+    ),
+    "ProcessXor of a struct": case(
+        "a" / Prefixed(Int8ub, ProcessXor(0x55, TWO)), frames="020102", reason="makes other bytes"
+    ),
+    "Transformed by a function": case(
+        "a" / Transformed(TWO, flip, 2, flip, 2), frames="0102", reason="not plain bits"
+    ),
+    "LazyBound of itself": case("a" / NODE, frames="00 020100", reason="contains itself"),
+    "NamedTuple of a struct": case(
+        "a" / NamedTuple("P", "x y", TWO), frames="0102", reason="the Array or Struct below it"
+    ),
+    "NamedTuple of an array": case(
+        "a" / NamedTuple("P", "x y", Int8ub[2]),
+        frames="0102",
+        reason="the Array or Struct below it",
+    ),
+    "If in elements": case(
+        "r" / Array(2, Struct("k" / Int8ub, "v" / If(this.k, Int8ub))),
+        frames="000102 0000",
+        reason="Parts(struct, count) reads such in bulk",
+    ),
+    "counts in elements": case(
+        "r" / Array(2, Struct("n" / Int8ub, "v" / Array(this.n, Int8ub))),
+        frames="000102 0000",
+        reason="Parts(struct, count) reads such in bulk",
+    ),
+    "RepeatUntil": case(
+        "a" / RepeatUntil(obj_ == 0, Int8ub), "b" / Int8ub, frames="01020003 0003", reason="Parts"
+    ),
+    "RepeatUntil of structs": case(
+        "a" / RepeatUntil(lambda one, found, context: one.x == 0, TWO),
+        frames="01020003 0004",
+        reason="Parts",
+    ),
+    "Index": case("r" / Array(2, Struct("i" / Index, "a" / Int8ub)), frames="0102", reason="Index"),
+    "an adapter of bits": case(
+        "a" / BitStruct("x" / Celsius(BitsInteger(8))), frames="01", reason="not plain bits"
+    ),
+    "GreedyBytes": case("a" / GreedyBytes, frames="616263 61", reason="rest", is_rest=True),
+    "GreedyString": case(
+        "a" / GreedyString("utf8"), frames="6162 c3a9", reason="text", is_rest=True
+    ),
+    "GreedyRange": case(
+        "a" / GreedyRange(Int16ub), frames="01020304 0102", reason="rest", is_rest=True
+    ),
+    "GreedyRange of texts": case(
+        "a" / GreedyRange(PascalString(Int8ub, "ascii")),
+        frames="0161026263",
+        reason="rest",
+        is_rest=True,
+    ),
+    "Terminated": case("a" / Int8ub, Terminated, frames="01", reason="Terminated", is_rest=True),
+    "ProcessXor of the rest": case(
+        "a" / ProcessXor(0x55, GreedyBytes), frames="0102", reason="makes other", is_rest=True
+    ),
+}
+
+CASES = COMPILED | PLAIN
+
+
+def of_links(made: Sensor, *links: Any) -> Sensor:
+    """A sensor with another data link."""
+    return dataclasses.replace(made, links={"data": links[0]})
+
+
+def bare(value: Any) -> Any:
+    """A parsed value of construct as dicts, lists and values, with lazy ones read."""
+    if isinstance(value, construct.lib.containers.Container | construct.core.LazyContainer):
+        return {name: bare(value[name]) for name in value if not name.startswith("_")}
+    if callable(value):
+        return bare(value())
+    if isinstance(value, list):
+        return [bare(part) for part in value]
+    return value
+
+
+def has_all(found: Any, wanted: Any) -> bool:
+    """Whether a value has everything that construct reads; it may have more fields."""
+    if isinstance(wanted, dict):
+        return all(name in found and has_all(found[name], wanted[name]) for name in wanted)
+    if isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(has_all, found, wanted))
+    return bool(found == wanted) and type(found) is type(wanted)
+
+
+def drop_unread(value: Any) -> Any:
+    """A parsed value without None, which construct gives where there is nothing to read."""
+    if isinstance(value, dict):
+        return {name: drop_unread(part) for name, part in value.items() if part is not None}
+    return value
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_values_and_bytes_are_those_of_construct(name: str) -> None:
+    one = CASES[name]
+    ours = sensor(one.struct)
+    for content in one.frames:
+        data = MARK + content
+        wanted = drop_unread(bare(one.struct.parse(data)))
+        found = ours.parse(data)
+        assert has_all(found, wanted), f"{found} {wanted}"
+        assert ours.build("data", found) == data
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_frames_are_found_in_datagrams_and_streams(name: str) -> None:
+    one = CASES[name]
+    frames = [MARK + content for content in one.frames]
+    ours = sensor(one.struct)
+    packets = ours.decode(frames)
+    assert len(packets) == len(frames)
+    if one.is_rest:
+        with pytest.raises(SpecError, match="only a datagram ends it"):
+            of_links(ours, Serial(9600))
+        assert len(ours.decode(b"".join(frames))) == 0
+        return
+    stream = of_links(ours, Serial(9600)).decode(b"\0" + b"\0\0".join(frames))
+    assert len(stream) == len(frames)
+    assert stream.stats.plugin_errors == 0
+
+
+def assert_padded(found: Any, wanted: Any, path: str) -> None:
+    """Fail unless a value of a column is that of construct, padded with zeros where it has none."""
+    if isinstance(wanted, list) and isinstance(found, np.ndarray):
+        for index, part in enumerate(wanted):
+            assert_padded(found[index], part, path)
+        assert not np.any(found[len(wanted) :]), path
+    elif wanted is not None:
+        assert found == wanted, path
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_columns_are_those_of_construct(name: str) -> None:
+    one = CASES[name]
+    frames = [MARK + content for content in one.frames]
+    packets = sensor(one.struct).decode(frames)
+    parsed = [bare(one.struct.parse(data)) for data in frames]
+    assert packets.table.schema.columns.keys() >= {"mark"}
+    for path in packets.table.schema.columns:
+        column = packets.table.raw(path)
+        for row, wanted in zip(column, parsed, strict=True):
+            assert_padded(row, at(wanted, path.split(".")), path)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_is_known_which_frames_are_compiled(name: str) -> None:
+    frame = sensor(CASES[name].struct).frames["data"]
+    assert is_compiled(frame) == (name in COMPILED)
+    if name in PLAIN:
+        assert CASES[name].reason in interpreted_reason(frame)
+
+
+def test_derived_values_are_columns_in_points() -> None:
+    def points(f: Fields) -> Polar:
+        return Polar(range=f.r.c + f.r.t, azimuth=0)
+
+    element = Struct("a" / Int8ub, "c" / Computed(this.a * 2 + this._.k), "t" / Tell)
+    made = sensor(Struct("k" / Int8ub, "r" / Array(2, element)))
+    ours = dataclasses.replace(made, points=points, range_limits=(0.1, 1000.0))
+    cloud = ours.decode([bytes([10, 1, 2]), bytes([20, 3, 4])]).points()
+    assert cloud.range.tolist() == [12 + 2, 14 + 3, 26 + 2, 28 + 3]
+
+
+def test_build_ignores_derived_values_and_takes_edits() -> None:
+    struct = Struct("r" / RawCopy(BODY), "c" / Checksum(Int8ub, add, this.r.data), "t" / Tell)
+    ours = sensor(struct)
+    found = ours.parse(b"\1\2\3\6")
+    found.r.value.a = 2
+    found.r.offset1 = found.t = 99
+    assert ours.build("data", found) == b"\2\2\3\7"
+    assert ours.build("data", r=dict(value=dict(a=1, b=2))) == b"\1\0\2\3"
+
+
+def test_a_wrong_checksum_of_construct_is_counted_as_one() -> None:
+    for function, reads in (
+        (add, this.r.data),
+        (add, lambda found: found.r.data[:]),
+    ):
+        struct = Struct("r" / RawCopy(BODY), "c" / Checksum(Int8ub, function, reads))
+        ours = sensor(struct)
+        assert ours.build("data", r=dict(value=dict(a=1, b=2))) == b"\1\0\2\3"
+        assert ours.decode([b"\1\0\2\4"]).stats.bad_checksum == 1
+        with pytest.raises(WireError, match=r"c.* checksum 0x4, expected 0x3|c.* checksum 0x04"):
+            ours.parse(b"\1\0\2\4")
+        assert ours.parse(b"\1\0\2\4", verify=False).c == 4
+
+
+def test_bytes_that_cannot_be_decompressed_are_no_frame() -> None:
+    ours = sensor(Struct("k" / Int8ub, "a" / Prefixed(Int8ub, Compressed(GreedyBytes, "zlib"))))
+    data = ours.build("data", k=1, a=b"abc")
+    assert ours.build("data", ours.parse(data)) == data
+    with pytest.raises(
+        WireError, match="a at byte 2: value other bytes, expected bytes compressed"
+    ):
+        ours.parse(b"\1\2ab")
+    assert ours.decode([b"\1\2ab", data]).stats.implausible == 1
+
+
+REFUSED: dict[str, tuple[Callable[[], Construct], str]] = {
+    "Union": (lambda: construct.Union(0, "x" / Int16ub, "y" / Bytes(2)), "declare one of them"),
+    "Seek": (lambda: construct.Seek(4), "outside the frame"),
+    "Pointer": (lambda: construct.Pointer(1, Byte), "outside the frame"),
+    "Flag": (lambda: construct.Flag, "use a BitStruct"),
+    "Optional": (lambda: construct.Optional(Byte), "use If or Switch"),
+    "Slicing": (lambda: construct.Slicing(Byte[3], 3, 0, 1), "use the Array below it"),
+    "FocusedSeq of two": (lambda: FocusedSeq("v", "k" / Byte, "v" / Byte), "loses 'k'"),
+    "ProcessXor before others": (
+        lambda: Struct("x" / ProcessXor(1, GreedyBytes), "y" / Byte),
+        "ProcessXor has no end of its own",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused_says_what_to_write(name: str) -> None:
+    make, reason = REFUSED[name]
+    with pytest.raises(SpecError, match=reason):
+        sensor(Struct("a" / make()))
