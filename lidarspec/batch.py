@@ -57,7 +57,7 @@ from lidarspec.remote_files import (
     digest,
     files_in,
     find_files,
-    is_stored,
+    is_remote,
     normalise_path,
     open_stored,
     read_stamp,
@@ -228,7 +228,7 @@ def _count_scans(piece: FilePiece, scans: Iterator[Scan], counts: Record) -> Ite
 
 def _write(piece: FilePiece, scans: Iterable[Scan]) -> None:
     """Write scans to the output of the piece, which appears only when complete."""
-    if not is_stored(piece.output):
+    if not is_remote(piece.output):
         with system_errors(piece.output):
             Path(piece.output).parent.mkdir(parents=True, exist_ok=True)
         write(piece.output, scans, every_point=piece.every_point)
@@ -317,7 +317,7 @@ class Manifest:
         self.path = f"{folder.rstrip('/')}/{MANIFEST}"
         self._records: dict[tuple[str, str], dict[int, Record]] = {}
         self._due = 0.0
-        self._is_stored = is_stored(folder)
+        self._is_stored = is_remote(folder)
         self._lines = [
             line for number, line in enumerate(self._read_lines(), 1) if self._known(line, number)
         ]
@@ -620,7 +620,7 @@ def _without_partial_files(folder: str, to: str) -> Iterator[None]:
     """Remove partial files of killed processes from a folder, before and after."""
 
     def sweep() -> None:
-        for path in () if is_stored(folder) else Path(folder).rglob(f".*.{to}"):
+        for path in () if is_remote(folder) else Path(folder).rglob(f".*.{to}"):
             if re.match(r"\.\d+\.", path.name):
                 remove(path)
 

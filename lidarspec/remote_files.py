@@ -31,12 +31,12 @@ DRIVERS = {
     "smb": "smbprotocol",
     "hdfs": "pyarrow",
 }
-#: bytes at the beginning and at the end that tell a file from others of its size.
-ENDS = 1 << 16
+#: number of bytes at the beginning and at the end that distinguish files of the same size.
+DIGESTED_END_BYTES = 1 << 16
 
 
-def is_stored(path: object) -> bool:
-    """bytes at the beginning and at the end that distinguish files of the same size."""
+def is_remote(path: object) -> bool:
+    """Return whether a path is a URL with a supported scheme."""
     scheme, mark, _ = str(path).partition("://")
     return bool(mark) and scheme in DRIVERS
 
@@ -65,7 +65,7 @@ def open_stored(path: str) -> BinaryIO:
         UsageError: if the library of a store is not installed.
         SourceError: if it cannot be opened.
     """
-    if not is_stored(path):
+    if not is_remote(path):
         with system_errors(path):
             return open(path, "rb")
     system = find_file_system(path)
@@ -88,7 +88,7 @@ def find_files(pattern: str) -> list[tuple[str, str]]:
     fixed = pattern
     while glob.has_magic(fixed):
         fixed = fixed.rpartition("/")[0]
-    if is_stored(pattern):
+    if is_remote(pattern):
         system = find_file_system(pattern)
         with _failures(pattern):
             paths = [system.unstrip_protocol(path) for path in system.glob(pattern)]
@@ -113,7 +113,7 @@ def files_in(folder: str) -> set[str]:
     Raises:
         SourceError: if the store cannot be reached.
     """
-    if not is_stored(folder):
+    if not is_remote(folder):
         return {
             normalise_path(Path(at, name))
             for at, folders, files in os.walk(folder)
@@ -131,7 +131,7 @@ def normalise_path(path: object) -> str:
 
     memory:///a and memory://a are equal, as are ./a and a.
     """
-    if is_stored(path):
+    if is_remote(path):
         return str(path).partition("://")[2].lstrip("/")
     return Path(str(path)).as_posix().removeprefix("./")
 
@@ -144,7 +144,7 @@ def read_stamp(path: str) -> dict[str, Any]:
     Raises:
         SourceError: if there is no such file.
     """
-    if not is_stored(path):
+    if not is_remote(path):
         with system_errors(path):
             status = os.stat(path)
         return {"size": status.st_size, "modified": str(status.st_mtime_ns)}
@@ -165,9 +165,9 @@ def read_stamp(path: str) -> dict[str, Any]:
 def digest(path: str) -> str:
     """Return a hash of the beginning and the end of a file."""
     with contextlib.closing(open_stored(path)) as file:
-        head = file.read(ENDS)
-        file.seek(max(file.seek(0, os.SEEK_END) - ENDS, 0))
-        return hashlib.blake2b(head + file.read(ENDS), digest_size=16).hexdigest()
+        head = file.read(DIGESTED_END_BYTES)
+        file.seek(max(file.seek(0, os.SEEK_END) - DIGESTED_END_BYTES, 0))
+        return hashlib.blake2b(head + file.read(DIGESTED_END_BYTES), digest_size=16).hexdigest()
 
 
 def upload(local: Path, url: str) -> None:
@@ -192,7 +192,7 @@ def remove(path: str | Path) -> None:
     Raises:
         SourceError: if that fails.
     """
-    if is_stored(path):
+    if is_remote(path):
         system = find_file_system(str(path))
         with _failures(str(path)):
             system.rm(str(path), recursive=True)

@@ -33,7 +33,7 @@ FLOORS = (
     "simulation",
     "plugins unfinished_files",
     "spec.__init__ captures recording",  # the names of authors
-    "device.settings device.session",
+    "device.named_devices device.session",
     "transports",
     "drafting",
     "detect",

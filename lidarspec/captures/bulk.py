@@ -326,7 +326,7 @@ class CaptureBatches(CaptureReader):
                     self.stats.datagrams += len(batch)
                     yield batch
                 if self._source.offset != place:
-                    continue  # the consumer of the batch called `skip`
+                    continue  # the consumer of the batch called `skip_until`
                 if isinstance(ended, DamagedRecordError):
                     self._skip_damage(form)
                 elif ended is not None:

@@ -184,18 +184,18 @@ class CaptureReader(ClosingContext):
             self._datagrams = self._iter_datagrams()
         return self._datagrams
 
-    def skip(self, at: int) -> bool:
+    def skip_until(self, time_ns: int) -> bool:
         """Seek shortly before the first datagram at or after a time.
 
         Skipped datagrams are not counted. Datagrams with fragments on both sides are lost.
 
         Args:
-            at: ns since 1970.
+            time_ns: ns since 1970.
 
         Returns:
             Whether seeking was possible.
         """
-        return self._form is not None and seek_time(self._source, self._form, at)
+        return self._form is not None and seek_time(self._source, self._form, time_ns)
 
     def close(self) -> None:
         """Close the file if it was given as a path."""

@@ -1,9 +1,8 @@
 """Completion of the command line in bash, zsh and fish.
 
-Extends click's own completion with the names that lidarspec knows.
-`_LIDARSPEC_COMPLETE=bash_source lidarspec` prints the code for the shell. The name of a parameter
-decides how it is completed, in every verb alike (`BY_NAME`): ids of sensors, frames, fields,
-commands, ports, devices of `lidarspec.toml`, files.
+Extends the completion of click. `_LIDARSPEC_COMPLETE=bash_source lidarspec` prints the code for the
+shell. The name of a parameter decides how it is completed, for all verbs (`BY_NAME`): as the id of
+a sensor, a frame, a field, a command, a port, a device of `lidarspec.toml`, or a file.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from click.shell_completion import (
 )
 
 from lidarspec.detect.identification import find_declared_sensor
-from lidarspec.device.settings import devices, find_device
+from lidarspec.device.named_devices import find_device, read_devices
 from lidarspec.errors import LidarSpecError
 from lidarspec.frames.schema import schema
 from lidarspec.plugins import registry, sensor as named_sensor
@@ -41,17 +40,17 @@ BREAKS = ":="
 class BashCompletion(BashComplete):
     """click's completion for bash, with support for words that contain ``:`` or ``=``.
 
-    No blank is added after ``field=`` and ``sim:``.
+    No blank is added after a completion that ends in ``=``, ``:`` or ``/``.
     """
 
     source_template = BashComplete.source_template.replace(
         "COMPREPLY+=($value)",
         "COMPREPLY+=($value)\n            [[ $value == *[=:/] ]] && compopt -o nospace",
     )
-    _broken = ""
+    _bash_prefix = ""  # the part of the word at the cursor that bash regards as earlier words
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Return the words before the cursor, and the word at it, joined again."""
+        """Return the words before the cursor and the word at it, which bash has split."""
         args, incomplete = super().get_completion_args()
         words: list[str] = []
         for word in (*args, incomplete):
@@ -60,12 +59,12 @@ class BashCompletion(BashComplete):
             elif word or not words or words[-1][-1:] not in BREAKS:
                 words.append(word)
         *args, incomplete = words
-        self._broken = incomplete[: max(incomplete.rfind(mark) for mark in BREAKS) + 1]
+        self._bash_prefix = incomplete[: max(incomplete.rfind(mark) for mark in BREAKS) + 1]
         return args, incomplete
 
     def format_completion(self, item: CompletionItem) -> str:
         """Return the completion of the part of the word that bash replaces."""
-        return f"{item.type},{item.value.removeprefix(self._broken)}"
+        return f"{item.type},{item.value.removeprefix(self._bash_prefix)}"
 
 
 def complete(group: click.Command, instruction: str) -> int:
@@ -80,20 +79,23 @@ def complete(group: click.Command, instruction: str) -> int:
 def attach(command: click.Command) -> None:
     """Complete the parameters of a verb by their names."""
     for param in command.params:
-        names = BY_NAME.get(param.name or "")
-        if names is not None and isinstance(param.type, click.types.StringParamType):
-            param.shell_complete = functools.partial(_items, names)  # type: ignore[method-assign]
+        list_names = BY_NAME.get(param.name or "")
+        if list_names is not None and isinstance(param.type, click.types.StringParamType):
+            param.shell_complete = functools.partial(  # type: ignore[method-assign]
+                _complete_word, list_names
+            )
 
 
-def _items(
-    names: Callable[[click.Context, str], Iterable[str]], ctx: click.Context, incomplete: str
+def _complete_word(
+    list_names: Callable[[click.Context, str], Iterable[str]], ctx: click.Context, incomplete: str
 ) -> list[CompletionItem]:
+    """Return the possible values that begin with a word, or let the shell complete files."""
     items = [
         CompletionItem(name)
-        for name in names(ctx, incomplete)
+        for name in list_names(ctx, incomplete)
         if name.startswith(incomplete) and name != incomplete
     ]
-    if items or names in LISTED:
+    if items or list_names in WITHOUT_FILES:
         return items
     return [CompletionItem(incomplete, type="file")]
 
@@ -103,16 +105,16 @@ def _sensors(ctx: click.Context, incomplete: str) -> Iterable[str]:
 
 
 def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return devices, ports and simulated sensors, with the files that match.
+    """Return devices, ports, simulated sensors, and the files that match.
 
-    If only files match, nothing is returned: the shell completes files better.
+    If only files match, the result is empty, so that the shell completes files.
     """
     if incomplete.startswith("sim:"):
         simulated = [f"sim:{name}" for name in registry().names()]
     else:
         simulated = ["sim:"]
     sources = [
-        *devices(),
+        *read_devices(),
         *(port.path for port in list_serial_ports()),
         "udp://",
         "tcp://",
@@ -120,19 +122,14 @@ def _sources(ctx: click.Context, incomplete: str) -> Iterable[str]:
     ]
     if not any(source.startswith(incomplete) for source in sources):
         return []
-    return [
-        *sources,
-        *(
-            name + "/" * os.path.isdir(name)
-            for name in sorted(glob.glob(glob.escape(incomplete) + "*"))
-        ),
-    ]
+    paths = sorted(glob.glob(glob.escape(incomplete) + "*"))
+    return [*sources, *(f"{path}/" if os.path.isdir(path) else path for path in paths)]
 
 
-def _sensor(ctx: click.Context) -> Sensor | None:
-    """Return the sensor that the words before the cursor name.
+def _find_sensor(ctx: click.Context) -> Sensor | None:
+    """Return the sensor that the words before the cursor name; None if they name none.
 
-    It is given by -s, by a device of lidarspec.toml, or simulated.
+    They name it with -s, with a device of lidarspec.toml, or with a simulated source.
     """
     if ctx.params.get("sensor_id"):
         return named_sensor(ctx.params["sensor_id"])
@@ -144,22 +141,22 @@ def _sensor(ctx: click.Context) -> Sensor | None:
 
 
 def _frames(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    sensor = _sensor(ctx)
+    sensor = _find_sensor(ctx)
     if sensor:
         return sensor.frames
     return ()
 
 
 def _commands(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    sensor = _sensor(ctx)
+    sensor = _find_sensor(ctx)
     if sensor:
         return sensor.commands
     return ()
 
 
 def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return the fields of a frame, or the arguments of a command."""
-    sensor = _sensor(ctx)
+    """Return the fields of a frame, or the arguments of a command, each with "="."""
+    sensor = _find_sensor(ctx)
     frame = ctx.params.get("frame") or ""
     command = ctx.params.get("command") or ""
     if sensor and frame in sensor.frames:
@@ -180,7 +177,7 @@ def _format_path(path: str, info: FieldInfo) -> str:
 
 
 def _columns(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return the columns of every sensor; others are unknown before there are points."""
+    """Return the columns that every sensor has; only data shows the others."""
     return ("range", "intensity")
 
 
@@ -201,14 +198,13 @@ def _verbs(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return ()
 
 
-def _either(ctx: click.Context, incomplete: str) -> Iterable[str]:
-    """Return sensors and distributions."""
+def _sensors_and_distributions(ctx: click.Context, incomplete: str) -> Iterable[str]:
     return [*registry().names(), *sorted({plugin.distribution for plugin in registry().plugins})]
 
 
-#: Functions that return all possible values; for others, files are possible as well.
-LISTED = (_frames, _commands, _assignments, _verbs, _columns, _formats)
-#: Name of a parameter -> function that returns its possible values.
+#: Functions that return all possible values. For the other functions, files are possible as well.
+WITHOUT_FILES = (_frames, _commands, _assignments, _verbs, _columns, _formats)
+#: name of a parameter -> function that returns its possible values.
 BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "sensor_id": _sensors,
     "source": _sources,
@@ -216,7 +212,7 @@ BY_NAME: dict[str, Callable[[click.Context, str], Iterable[str]]] = {
     "frame": _frames,
     "command": _commands,
     "assignments": _assignments,
-    "name": _either,
+    "name": _sensors_and_distributions,
     "verb": _verbs,
     "ramp": _columns,
     "suffix": _formats,

@@ -29,7 +29,7 @@ from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note
 from lidarspec.detect.identification import detect
 from lidarspec.device.device import Device, open as open_device
-from lidarspec.device.source_recording import recorder_like
+from lidarspec.device.source_recording import make_recorder
 from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
 from lidarspec.formats import check_holds, find_existing, format_of, write, write_imu
 from lidarspec.formats.common import replace_file
@@ -69,7 +69,7 @@ class _Counts:
             self.scans += 1
             self.units = self.units or scan.points.units
             self.points += len(scan) if every_point else int(scan.points.valid.sum())
-            progress(lambda: str(self), self.device.place)
+            progress(lambda: str(self), self.device.progress)
             yield scan
 
 
@@ -253,11 +253,11 @@ def _write_packets(
             # The packets of the new file are the frames of the sensor.
             sensor = _detect_sensor(source, target)
         try:
-            with recorder_like(opened, source, str(part), sensor, overwrite=True) as file:
+            with make_recorder(opened, source, str(part), sensor, overwrite=True) as file:
                 for chunk in iter_received(opened, times, source):
                     file.wait_for_room()
                     file.write(chunk)
-                    progress(lambda: f"{target}: {file.records} packets", opened.place)
+                    progress(lambda: f"{target}: {file.records} packets", opened.progress)
         except WriteError as error:  # its text names the temporary file
             raise WriteError(target, error.reason, "nothing was written") from None
         if not file.records:

@@ -20,24 +20,26 @@ def info(files: Sequence[str], as_json: bool, output: str | None) -> None:
     """Describe the contents of files: kind, times, senders, sensor, rates, loss.
 
     FILE is any readable file: a recording, a capture, a robotics log, raw bytes. If a file is long,
-    only its beginning and the time of its end are read. Several files are printed one after
-    another.
+    only its beginning and its last timestamp are read. Several files are printed one after another.
+    If no sensor is identified in a file, the exit code is 4.
     """
-    unknown_files = []
+    has_unknown_file = False
 
     def iter_texts() -> Iterator[str]:
+        """Yield the texts about the files, and note whether a sensor is unknown."""
+        nonlocal has_unknown_file
         for file in files:
-            held = read_contents(file)
+            contents = read_contents(file)
             if as_json:
-                yield json.dumps(held.to_dict(), indent=2, allow_nan=False)
+                yield json.dumps(contents.to_dict(), indent=2, allow_nan=False)
             else:
-                yield f"{held.path}: {held.kind}, {size(held.size)}"
-                yield from (f"  {word:<8}  {text}" for word, text in format_contents(held))
-            for warning in held.warnings:
+                yield f"{contents.path}: {contents.kind}, {size(contents.size)}"
+                yield from (f"  {word:<8}  {text}" for word, text in format_contents(contents))
+            for warning in contents.warnings:
                 note(warning)
-            if not any(content.sensors for content in held.contents):
-                unknown_files.append(file)
+            if not any(content.sensors for content in contents.contents):
+                has_unknown_file = True
 
     emit_parts(iter_texts(), output)
-    if unknown_files:
+    if has_unknown_file:
         raise click.exceptions.Exit(NO_DATA)

@@ -26,7 +26,12 @@ import click
 
 from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.terminal import note
-from lidarspec.detect.sample_bytes import LOOKED_AT, SampleBytes, read_beginning, take_leading
+from lidarspec.detect.sample_bytes import (
+    MAX_SAMPLE_BYTES,
+    SampleBytes,
+    read_beginning,
+    take_leading,
+)
 from lidarspec.errors import (
     CommandError,
     LidarSpecError,
@@ -88,7 +93,7 @@ def open_input(
                 text if len(text) <= REPEATED else "-", iter([Chunk(data)]), datagrams=False
             )
         except ValueError as error:
-            from lidarspec.device.settings import find_device
+            from lidarspec.device.named_devices import find_device
 
             if (device := find_device(text)) is None:
                 raise _no_bytes_error(words, error) from None
@@ -128,7 +133,7 @@ def _read_beginning(
     source: str, chunks: Iterator[Chunk], *, datagrams: bool, warnings: Sequence[str] = ()
 ) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
     with system_errors(source):
-        head = take_leading(chunks, LOOKED_AT)
+        head = take_leading(chunks, MAX_SAMPLE_BYTES)
     data = tuple(chunk.data for chunk in head)
     yield (
         SampleBytes(source, data, datagrams, warnings=tuple(warnings)),
@@ -143,9 +148,9 @@ def _read_rest(source: str, chunks: Iterator[Chunk]) -> Iterator[Chunk]:
 
 def _standard_input(file: FileTransport) -> Iterator[Chunk]:
     """Yield the bytes of standard input as they arrive; hexadecimal text is converted."""
-    head = sys.stdin.buffer.read(LOOKED_AT)
+    head = sys.stdin.buffer.read(MAX_SAMPLE_BYTES)
     stdin = sys.stdin.buffer
-    if not is_hexadecimal(head, whole=len(head) < LOOKED_AT):
+    if not is_hexadecimal(head, whole=len(head) < MAX_SAMPLE_BYTES):
         yield Chunk(head)
         yield from file.chunks()
         return
@@ -238,7 +243,7 @@ def _read_for(argument: str | Path | Sensor | None) -> Iterator[str | int]:
         if word == "-"
         else [word, word.partition("?")[0], word.rpartition(":")[0], word.partition("=")[2]]
     )
-    from lidarspec.device.settings import find_device
+    from lidarspec.device.named_devices import find_device
 
     with contextlib.suppress(
         LidarSpecError
@@ -394,7 +399,7 @@ def reread(source: str) -> SampleBytes | None:
         return None
     with contextlib.closing(transport(source)) as file:
         try:
-            chunks = tuple(chunk.data for chunk in read_beginning(file, LOOKED_AT))
+            chunks = tuple(chunk.data for chunk in read_beginning(file, MAX_SAMPLE_BYTES))
             return SampleBytes(source, chunks, file.datagrams, warnings=tuple(file.warnings))
         except LidarSpecError:
             return None

@@ -154,7 +154,7 @@ def _draw_over_time(
     device: Device, source: str, selection: Selection, kind: str, end_s: float
 ) -> Any:
     """Return a figure of the data until a time of `time.monotonic`."""
-    title = f"{device.sensor.id}, {Path(source).name if device.place else source}"
+    title = f"{device.sensor.id}, {Path(source).name if device.progress else source}"
     if kind == "rates":
         rates = matplotlib_figures.RateSeries(LiveScans(device, select=selection), end_s)
         conclude(device)

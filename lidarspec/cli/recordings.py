@@ -14,8 +14,8 @@ from lidarspec.cli.options import DURATION, SPEED, count_option, selecting, sens
 from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note, say
 from lidarspec.detect.identification import find_declared_sensor
-from lidarspec.device.settings import find_device
-from lidarspec.device.source_recording import SourceRecording, recorder_like
+from lidarspec.device.named_devices import find_device
+from lidarspec.device.source_recording import SourceRecording, make_recorder
 from lidarspec.errors import (
     CommandError,
     LidarSpecError,
@@ -330,7 +330,7 @@ def _make_file(
 ) -> BackgroundWriter:
     """Return a new file for the bytes of another one."""
     try:
-        return recorder_like(source, file, place, sensor, overwrite=force)
+        return make_recorder(source, file, place, sensor, overwrite=force)
     except UsageError as error:
         if os.path.exists(place) and not force:
             raise suggest(error, "repeat with --force, or with another file") from None

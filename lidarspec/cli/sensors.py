@@ -47,12 +47,12 @@ def list_sensors() -> tuple[list[KnownSensor], list[Plugin]]:
 
 def guide() -> str:
     """Return what is installed and connected, and the first commands to type."""
-    from lidarspec.device.settings import devices
+    from lidarspec.device.named_devices import read_devices
     from lidarspec.transports.ports import list_serial_ports
 
     installed, _ = list_sensors()
     ports = [port.path for port in list_serial_ports()]
-    named = list(devices())
+    named = list(read_devices())
     example = installed[0].id if installed else "ID"
     source = (named or ports or [f"sim:{example}"])[0]
     vendors = {sensor.vendor for sensor in installed}

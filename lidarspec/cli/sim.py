@@ -264,7 +264,7 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
         emit_json(_facts(result, whole), None)
     else:
         say("\n".join([render(_picture(whole[-1])), *_summary(result, whole, errors)]), colour=True)
-    if result.digest != result.again:
+    if result.digest != result.recorded_digest:
         click.get_current_context().exit(FINDINGS)
 
 
@@ -287,9 +287,9 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
         harm = "of the bytes damaged"
     lacks_pty = data_link(result.sensor, Serial) and not has_terminals()
     if lacks_pty:
-        where = f"{result.place} (no pseudo-terminals on this system)"
+        where = f"{result.address} (no pseudo-terminals on this system)"
     else:
-        where = result.place
+        where = result.address
     passed = f"{errors:.1%} {harm}, {result.intact} arrived undamaged"
     lines = [
         f"{name}, simulated on {where}: {result.sent} frames sent, {passed}",
@@ -309,12 +309,13 @@ def _summary(result: Demonstration, whole: list[Scan], errors: float) -> list[st
         " last scan:"
         f" {whole[-1]}"
     )
-    if result.digest == result.again:
+    if result.digest == result.recorded_digest:
         same = "the same points"
     else:
         same = "DIFFERENT points"
     lines.append(
-        f"recorded ({size(result.recorded)}) and read again: {same}, SHA-256 {result.again[:16]}..."
+        f"recorded ({size(result.recorded_bytes)}) and read again: {same},"
+        f" SHA-256 {result.recorded_digest[:16]}..."
     )
     return [*lines, f"next: lidarspec view sim:{name}"]
 
@@ -327,11 +328,11 @@ def _facts(result: Demonstration, whole: list[Scan]) -> dict[str, object]:
         "intact": result.intact,
         "scans": len(whole),
         "rate_hz": float(np.mean(rates)) if rates else None,
-        "place": result.place,
+        "place": result.address,
         "replies": [reply.command for reply in result.replies if reply.confirmed],
-        "recorded": result.recorded,
+        "recorded": result.recorded_bytes,
         "sha256": result.digest,
-        "same_when_replayed": result.digest == result.again,
+        "same_when_replayed": result.digest == result.recorded_digest,
         "points": sum(int(scan.points.valid.sum()) for scan in whole),
         "stats": result.stats.to_dict(),
     }

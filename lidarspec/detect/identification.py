@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from lidarspec.detect.listen import LISTEN, ignore_progress, read_samples
 from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.detect.uninstalled_sensors import suggest_installation
-from lidarspec.device.settings import find_device
+from lidarspec.device.named_devices import find_device
 from lidarspec.drafting.checksum_search import search
 from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError, suggest
 from lidarspec.expressions.columns import Fields

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lidarspec.detect.sample_bytes import LOOKED_AT, SampleBytes, read_beginning
+from lidarspec.detect.sample_bytes import MAX_SAMPLE_BYTES, SampleBytes, read_beginning
 from lidarspec.device.session import PendingReply, Session
 from lidarspec.errors import LidarSpecError, SourceError
 from lidarspec.framing.decoder import Decoder
@@ -142,7 +142,7 @@ def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> It
             if not chunks:
                 warnings = _other_senders_warning(opened)
         else:
-            chunks = read_beginning(opened, LOOKED_AT, number=number)
+            chunks = read_beginning(opened, MAX_SAMPLE_BYTES, max_chunks=number)
             warnings = tuple(opened.warnings)
     yield from _split_by_sender(
         SampleBytes(name, (), opened.datagrams, baud, warnings=warnings), chunks

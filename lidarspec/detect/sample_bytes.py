@@ -1,4 +1,4 @@
-"""The bytes that were read from one source to identify the sensor.
+"""The bytes of one sender that are examined to identify the sensor.
 
 Also reads the beginning of a file.
 """
@@ -13,27 +13,28 @@ from dataclasses import dataclass, field, replace
 from lidarspec.errors import SourceError
 from lidarspec.transports.protocol import Chunk, Transport
 
-#: bytes of a file that are examined.
-LOOKED_AT = 1 << 17
-#: bytes that are examined to recognise text, and the minimum for that.
-TEXT_BYTES = 1 << 12
+#: number of bytes of a file that are examined; the last chunk may exceed it.
+MAX_SAMPLE_BYTES = 1 << 17
+#: number of bytes that are examined to recognise text.
+MAX_TEXT_BYTES = 1 << 12
+#: minimum number of bytes to recognise text.
 MIN_TEXT_BYTES = 16
 
 
 @dataclass(frozen=True)
 class SampleBytes:
-    """Bytes that one sender of a source sent.
+    """The examined bytes of one sender.
 
     Attributes:
         source: the SOURCE, to open it again.
         chunks: datagrams, or pieces of a stream.
-        datagrams: whether they are datagrams.
+        datagrams: whether `chunks` are datagrams.
         baud: the baud rate at which a serial port was read; None for other sources, and for a port
             without a baud rate.
-        sender: address of the sender, if there are several.
-        failure: the reason why it could not be opened.
-        warnings: warnings about the source at its end.
-        ports: the UDP ports that datagrams of a capture were sent to.
+        sender: address of the sender, if the source has several senders; else "".
+        failure: the error if the source could not be opened; else None.
+        warnings: warnings of the transport after reading.
+        ports: the UDP ports to which datagrams of a capture were sent.
     """
 
     source: str
@@ -57,8 +58,8 @@ class SampleBytes:
 
     @property
     def is_text(self) -> bool:
-        """Whether the bytes begin as lines of printable text, as some sensors send."""
-        head = self.data[:TEXT_BYTES].removesuffix(b"\r")
+        """Whether the first bytes are printable text; some sensors send text."""
+        head = self.data[:MAX_TEXT_BYTES]
         return (
             len(head) >= MIN_TEXT_BYTES
             and head.isascii()
@@ -66,21 +67,28 @@ class SampleBytes:
         )
 
 
-def read_beginning(opened: Transport, most: int, *, number: int | None = None) -> list[Chunk]:
-    """Return the start of a file: `most` bytes, or `number` chunks if that is less."""
+def read_beginning(opened: Transport, enough: int, *, max_chunks: int | None = None) -> list[Chunk]:
+    """Return the first chunks of a file.
+
+    Args:
+        opened: the file.
+        enough: reading ends when the chunks have this number of bytes. It is also the maximum
+            length of each chunk.
+        max_chunks: maximum number of chunks; None for no limit.
+    """
     return [
-        replace(chunk, data=chunk.data[:most])
-        for chunk in take_leading(itertools.islice(opened.chunks(), number), most)
+        replace(chunk, data=chunk.data[:enough])
+        for chunk in take_leading(itertools.islice(opened.chunks(), max_chunks), enough)
     ]
 
 
-def take_leading(chunks: Iterable[Chunk], most: int) -> list[Chunk]:
-    """Return the first chunks, until they have `most` bytes."""
+def take_leading(chunks: Iterable[Chunk], enough: int) -> list[Chunk]:
+    """Return the first chunks, until they have at least `enough` bytes."""
     taken = list[Chunk]()
     size = 0
     for chunk in chunks:
         taken.append(chunk)
         size += len(chunk.data)
-        if size >= most:
+        if size >= enough:
             break
     return taken

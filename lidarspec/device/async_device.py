@@ -1,8 +1,8 @@
 """A `Device` for asyncio.
 
-`AsyncDevice` calls the methods of a `Device` in threads of its own, so that the event loop is never
-blocked. An item that a thread has found stays in a `_ThreadedIterator` until a call fetches it: a
-cancelled call loses nothing.
+`AsyncDevice` calls the methods of a `Device` in its own threads, so that the event loop is never
+blocked. An item that a thread has found stays in a `_ThreadedIterator` until a call fetches it, so
+that a cancelled call loses nothing.
 """
 
 from __future__ import annotations
@@ -28,15 +28,14 @@ from lidarspec.scans.selection import EVERYTHING, ScanSelector, Selection
 from lidarspec.sensor_operations import Sensor
 
 T = TypeVar("T")
-#: A thread waits for so long before it returns to the event loop,
-#: which may have cancelled the call.
-_WAIT_S = 0.2
+#: Longest wait of a thread before it returns to the event loop, which may have cancelled the call.
+_MAX_WAIT_S = 0.2
 
 
 class AsyncDevice:
-    """A `Device` whose waits are awaited; an asynchronous context manager.
+    """A `Device` with awaitable methods; an asynchronous context manager.
 
-    Its methods and properties are those of `Device`, with the same arguments, results and errors.
+    Its methods and properties have the arguments, results and errors of `Device`.
 
     Args:
         opening: opens the device.
@@ -52,7 +51,7 @@ class AsyncDevice:
 
     @property
     def device(self) -> Device:
-        """The device that is used.
+        """The device.
 
         Raises:
             UsageError: before it is opened.
@@ -85,12 +84,12 @@ class AsyncDevice:
 
     async def packets(self, frame: str | None = None) -> AsyncIterator[Packets]:
         """Yield packets in batches; see `Device.packets`."""
-        feed = self._get_iterator("packets", *filter(None, [frame]))
-        async for packets in self._fetch(feed):
+        iterator = self._get_iterator("packets", *filter(None, [frame]))
+        async for packets in self._fetch(iterator):
             yield packets
 
     async def scans(self, *, select: Selection = EVERYTHING) -> AsyncIterator[Scan]:
-        """Yield scans; see `Device.scans`. Scans before the first selected one are read."""
+        """Yield scans; see `Device.scans`. The source is read from its start."""
         sieve = ScanSelector(select, self.device.source)
         async for scan in self._fetch(self._get_iterator("scans")):
             wanted = sieve.select(scan)
@@ -107,7 +106,7 @@ class AsyncDevice:
             yield samples
 
     async def latest(self, timeout: float | None = None) -> Scan:
-        """Wait for the newest whole scan; see `Device.latest`."""
+        """Wait for the newest whole scan and return it; see `Device.latest`."""
         if timeout is None:
             deadline = None
         else:
@@ -155,28 +154,28 @@ class AsyncDevice:
         await self.close()
 
     def _get_iterator(self, method: str, *arguments: str) -> _ThreadedIterator[Any]:
-        """Return the feed of an iterator of the device; later calls continue with the same one."""
+        """Return the running iterator of a method of the device; start it on first use."""
         key = (method, *arguments)
         if key not in self._iterators:
             self._iterators[key] = _ThreadedIterator(
-                getattr(self.device, method)(*arguments, wait=_WAIT_S)
+                getattr(self.device, method)(*arguments, wait=_MAX_WAIT_S)
             )
         return self._iterators[key]
 
-    async def _fetch(self, feed: _ThreadedIterator[T]) -> AsyncIterator[T]:
-        """Yield the items of a feed until it ends."""
+    async def _fetch(self, iterator: _ThreadedIterator[T]) -> AsyncIterator[T]:
+        """Yield the items of an iterator until it ends."""
         while True:
-            while feed.items:
-                yield feed.items.popleft()
-            if feed.ended:
+            while iterator.items:
+                yield iterator.items.popleft()
+            if iterator.ended:
                 return
-            await _run(self._reading, feed.find_next)
+            await _run(self._reading, iterator.find_next)
 
     def _find_newest(self, deadline: float | None) -> None:
-        """Wait a short time for the newest scan; called in the thread."""
+        """Wait up to `_MAX_WAIT_S` for the newest scan; called in the thread."""
         if self._newest is not None:
             return  # found by the thread of a call that was cancelled
-        wait = _WAIT_S
+        wait = _MAX_WAIT_S
         if deadline is not None:
             wait = min(wait, max(deadline - time.monotonic(), 0.0))
         self._newest = self.device.newest(wait)
@@ -189,10 +188,10 @@ class _ThreadedIterator(Generic[T]):
     """The items of an iterator, found in a thread and fetched in the event loop.
 
     Args:
-        source: the iterator. If nothing has come it yields None, or a batch without rows.
+        source: the iterator. If nothing has arrived, it yields None or an empty batch.
 
     Attributes:
-        items: the items that were found and not fetched.
+        items: the items that were found and not fetched yet.
         ended: whether the iterator has ended.
     """
 
@@ -202,7 +201,7 @@ class _ThreadedIterator(Generic[T]):
         self.ended = False
 
     def find_next(self) -> None:
-        """Wait a short time for the next item; called in the thread."""
+        """Wait up to `_MAX_WAIT_S` for the next item; called in the thread."""
         if self.items or self.ended:
             return  # found by the thread of a call that was cancelled
         try:
@@ -220,7 +219,7 @@ async def _run(executor: ThreadPoolExecutor, function: Callable[[], T]) -> T:
 
 
 async def _finish(future: asyncio.Future[T]) -> T:
-    """Return the result of a future; a cancellation waits for its end.
+    """Return the result of a future; if cancelled, wait for its end first.
 
     A device that is half open or half closed would keep its port.
     """
@@ -236,6 +235,6 @@ def open_async(
 ) -> AsyncDevice:
     """Open a sensor on any SOURCE, for ``async with``.
 
-    The arguments and errors are those of `open`.
+    The arguments and errors are the same as for `open`.
     """
     return AsyncDevice(partial(open_device, source, sensor, **options))

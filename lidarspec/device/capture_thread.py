@@ -1,13 +1,13 @@
-"""Capture in a thread, which queues incoming data for decoding.
+"""Read a live source in a thread, and queue the data for decoding.
 
-The thread only reads, keeps the time, records and queues, so that a consumer which is slow, or busy
-in Python, loses no byte. A recording gets everything. The queue is bounded, with a policy:
-"drop_oldest" drops the oldest chunks, "block" makes the thread wait. Every produced chunk is
+The thread only reads, records and queues, so that no byte is lost if the consumer is slow. The
+recording contains everything that arrives. The queue is bounded. If it is full, the policy
+"drop_oldest" drops the oldest chunks, and "block" makes the thread wait. Every produced chunk is
 consumed, dropped or still in the queue.
 
-If the device disappears, the thread reports it, tries to open it again with growing pauses, and
-marks the first chunk after the gap. Silence is measured by reads that returned nothing: time in
-which the thread did not run does not count.
+If the device disappears, the thread reports this, tries to open the device again with growing
+pauses, and marks the first chunk after the gap. Silence is the sum of the durations of reads that
+returned nothing, so that time in which the thread did not run does not count.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
 
-#: limits of a queue, chunks and bytes; several seconds of the fastest sensors.
-CHUNKS = 1 << 16
-BYTES = 1 << 25
-#: first and longest pause between attempts to open a device again, in seconds.
-SOON = 0.02
-LATER = 0.25
+#: limits of a queue: several seconds of data of the fastest sensors.
+MAX_QUEUED_CHUNKS = 1 << 16
+MAX_QUEUED_BYTES = 1 << 25
+#: first and longest pause between attempts to open a device again.
+MIN_RETRY_PAUSE_S = 0.02
+MAX_RETRY_PAUSE_S = 0.25
 POLICIES = ("drop_oldest", "block")
 
 
 class LinkEvent(Enum):
-    """An event on a link besides data."""
+    """An event on a link that is not data."""
 
     SILENT = "silent"
     LOST = "lost"
@@ -48,9 +48,12 @@ Event = tuple[str, Item]
 class BoundedQueue:
     """The events on the links of a device that have not been taken yet.
 
+    Its length is the number of chunks.
+
     Args:
-        policy: of a full queue: "drop_oldest" or "block".
-        chunks, size: the maximum number of chunks, and of bytes in them.
+        policy: the policy of a full queue, "drop_oldest" or "block".
+        chunks: maximum number of chunks.
+        size: maximum number of bytes in all chunks.
 
     Attributes:
         produced, consumed, dropped: numbers of chunks; ``produced == consumed + dropped +
@@ -58,16 +61,20 @@ class BoundedQueue:
     """
 
     def __init__(
-        self, policy: str = "drop_oldest", *, chunks: int = CHUNKS, size: int = BYTES
+        self,
+        policy: str = "drop_oldest",
+        *,
+        chunks: int = MAX_QUEUED_CHUNKS,
+        size: int = MAX_QUEUED_BYTES,
     ) -> None:
         if policy not in POLICIES:
             raise UsageError(f"a full queue can {' or '.join(POLICIES)}, not {policy!r}")
         self._blocks = policy == "block"
-        self._most = chunks
-        self._largest = size
+        self._max_chunks = chunks
+        self._max_bytes = size
         self._events: deque[Event] = deque()
-        self._kept: dict[Event, None] = {}
-        self._cut: set[str] = set()
+        self._kept: dict[Event, None] = {}  # events other than data that left the full queue
+        self._cut: set[str] = set()  # links with dropped chunks; their next chunk has a gap
         self._waiting = self._size = 0
         self._changed = threading.Condition()
         self.produced = self.consumed = self.dropped = 0
@@ -77,12 +84,12 @@ class BoundedQueue:
         return self._waiting
 
     def put(self, link: str, items: Iterable[Item]) -> None:
-        """Add events of a link, in order."""
+        """Add events of a link, in order; drop or wait if the queue is full."""
         with self._changed:
             for item in items:
                 if isinstance(item, Chunk):
                     size = len(item.data)
-                    if self._waiting >= self._most or self._size + size > self._largest:
+                    if self._waiting >= self._max_chunks or self._size + size > self._max_bytes:
                         self._make_room(size)
                     if self.closed:
                         return
@@ -92,15 +99,18 @@ class BoundedQueue:
                 self._events.append((link, item))
             self._changed.notify_all()
 
-    def take(self, timeout: float, *, until: float = 0.0, chunks: int = CHUNKS) -> list[Event]:
-        """Return the events that have arrived, in order.
+    def take(
+        self, timeout: float, *, until: float = 0.0, chunks: int = MAX_QUEUED_CHUNKS
+    ) -> list[Event]:
+        """Remove the events that have arrived, and return them in order.
 
-        The list is empty if nothing arrives within `timeout` seconds, or if the queue is closed and
-        empty.
+        The list is empty if nothing arrives in time, or if the queue is closed and empty.
 
         Args:
-            until: a time of the monotonic clock; events are gathered until then.
-            chunks: how many events at most.
+            timeout: seconds to wait.
+            until: a time of `time.monotonic`; events are collected until this time, but not longer
+                than `timeout`.
+            chunks: maximum number of events.
         """
         pause = min(until - time.monotonic(), timeout)
         if pause > 0 and not self.closed:
@@ -117,7 +127,7 @@ class BoundedQueue:
                 self.consumed += self._waiting
                 self._waiting = self._size = 0
             while self._events and len(events) < chunks:
-                events.append(self._left())
+                events.append(self._take_oldest())
             self._changed.notify_all()
             return events
 
@@ -127,8 +137,7 @@ class BoundedQueue:
             self.closed = True
             self._changed.notify_all()
 
-    def _left(self) -> Event:
-        """Remove the oldest event of the queue and return it."""
+    def _take_oldest(self) -> Event:
         link, item = self._events.popleft()
         if isinstance(item, Chunk):
             self.consumed += 1
@@ -143,7 +152,7 @@ class BoundedQueue:
         while (
             self._waiting
             and not self.closed
-            and (self._waiting >= self._most or self._size + size > self._largest)
+            and (self._waiting >= self._max_chunks or self._size + size > self._max_bytes)
         ):
             if self._blocks:
                 self._changed.notify_all()
@@ -164,17 +173,18 @@ class CaptureThread:
     """The thread that reads a live transport.
 
     Args:
-        transport: the open transport; closed with the capture.
+        transport: the open transport; closed with the thread.
         queue: receives the events.
         link: the name of the link.
-        log: the recording, if there is one.
+        log: the recording; None to record nothing.
         clock: the host's clock, for recorded events.
 
     Attributes:
         transport: the transport.
         connected: whether the device is connected.
-        disconnects: how often it disappeared.
-        last: the time of the last arrival by `time.monotonic`; at first the time of opening.
+        disconnects: how often the device has disappeared.
+        last_arrival: the time of the last arrival by `time.monotonic`; before it, the time of
+            opening.
         warnings: warnings about the host's clock.
     """
 
@@ -190,7 +200,7 @@ class CaptureThread:
         self.transport = transport
         self.connected = True
         self.disconnects = 0
-        self.last = time.monotonic()
+        self.last_arrival = time.monotonic()
         self._queue = queue
         self._link = link
         self._log = log
@@ -209,9 +219,9 @@ class CaptureThread:
         self.transport.close()
 
     def record(self, log: TrafficLog | None) -> None:
-        """Record from now on, and discard the events in the queue.
+        """Start or replace the recording, and discard the events in the queue.
 
-        All events that come out of the queue afterwards are recorded.
+        All events that are taken from the queue afterwards are in the recording.
         """
         while not self._handing.acquire(timeout=POLL):
             self._queue.take(0.0)  # the thread may wait for room in the queue
@@ -237,7 +247,7 @@ class CaptureThread:
                     quiet = False
                     continue
                 if chunks:
-                    self.last = time.monotonic()
+                    self.last_arrival = time.monotonic()
                     self._hand_on(chunks, gap=gap, quiet=quiet)
                     silence = 0.0
                     gap = False
@@ -251,7 +261,7 @@ class CaptureThread:
             self._queue.put(self._link, [error])
 
     def _hand_on(self, chunks: list[Chunk], *, gap: bool, quiet: bool) -> None:
-        """Record and queue chunks, and mark the first one after a gap or silence."""
+        """Record and queue chunks, and mark the first chunk after a gap or silence."""
         if gap or quiet:
             chunks[0] = replace(chunks[0], gap=gap, quiet=quiet)
         self._follow_wall_clock(chunks[0])
@@ -262,9 +272,9 @@ class CaptureThread:
             self._queue.put(self._link, chunks)
 
     def _follow_wall_clock(self, chunk: Chunk) -> None:
-        """Keep arrival times steady if the wall clock was set before a chunk arrived.
+        """Warn of a step if the wall clock was set, and record the step.
 
-        The step is reported in `warnings` and recorded each time.
+        Arrival times do not follow the step.
         """
         ahead = self._clock.find_step()
         if ahead is None:
@@ -277,22 +287,23 @@ class CaptureThread:
             self._log.event("clock", chunk.at, ahead_ns=ahead)
 
     def _reconnect(self) -> bool:
-        """Report that the device is gone, and wait until it is back.
+        """Report that the device has disappeared, and wait until it is back.
 
-        Returns False if the capture is stopped meanwhile.
+        Returns:
+            False if the capture was stopped before.
         """
         self.connected = False
         self.disconnects += 1
         self._queue_event(LinkEvent.LOST, "disconnect")
-        pause = SOON
+        pause = MIN_RETRY_PAUSE_S
         while not self._stop.wait(pause):
-            pause = min(pause * 2, LATER)
+            pause = min(pause * 2, MAX_RETRY_PAUSE_S)
             try:
                 self.transport.reopen()
             except SourceError:
                 continue
             self.connected = True
-            self.last = time.monotonic()
+            self.last_arrival = time.monotonic()
             self._queue_event(LinkEvent.BACK, "reconnect")
             return True
         return False

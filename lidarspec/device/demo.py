@@ -1,9 +1,8 @@
 """Demonstrate a session with a simulated sensor, end to end.
 
-The sensor is connected to a real line. It is started, read, recorded and read again.
-
-A serial sensor uses a pseudo-terminal, or a TCP port if the system has none; others send UDP
-datagrams on loopback. The line adds errors. The recording is decoded again, and has to give the
+The simulated sensor sends over an operating system interface: a pseudo-terminal for a serial sensor
+(a TCP port if the system has no pseudo-terminals), UDP on loopback for others. The line adds
+errors. The sensor is started, read and recorded. The recording is then decoded and has to give the
 same points.
 """
 
@@ -32,10 +31,10 @@ from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals
 from lidarspec.transports.serving import Served
 
-#: additional seconds that the scans may take.
-PATIENCE = 15.0
-#: seconds without a scan after which all sent data has arrived.
-QUIET = 0.2
+#: time limit for the scans, in addition to one second for each scan.
+EXTRA_TIMEOUT_S = 15.0
+#: time without a scan after which all sent data has arrived.
+DRAINED_AFTER_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,26 +42,28 @@ class Demonstration:
     """The results of the demonstration.
 
     Attributes:
-        sensor, place: the sensor, and its address.
-        replies: of the commands that opened it.
-        scans: the received scans; the last one is complete.
+        sensor: the sensor.
+        address: its SOURCE.
+        replies: the replies to the commands that started the sensor.
+        scans: the received scans; the last scan is complete.
         stats: the decoder's counters.
-        sent, intact: numbers of packets sent, and of those without errors after the line.
+        sent: number of packets that were sent.
+        intact: number of packets that the line did not damage.
         digest: SHA-256 of the points of the complete scans.
-        again: SHA-256 of the points of the recording.
-        recorded: bytes in the recording.
+        recorded_digest: SHA-256 of the points of the complete scans in the recording.
+        recorded_bytes: size of the recording.
     """
 
     sensor: Sensor
-    place: str
+    address: str
     replies: tuple[Reply, ...]
     scans: tuple[Scan, ...]
     stats: Counters
     sent: int
     intact: int
     digest: str
-    again: str
-    recorded: int
+    recorded_digest: str
+    recorded_bytes: int
 
 
 def demonstrate(
@@ -72,8 +73,9 @@ def demonstrate(
 
     Args:
         turns: the number of complete scans.
-        errors: share of the bytes of a stream that are damaged, at most one in each of the longest
-            frames; for datagrams, the share of lost ones.
+        errors: for a stream, the share of damaged bytes, limited to one byte in the length of the
+            longest data frame; for datagrams, the share of lost datagrams.
+        seed: the seed of the errors and the scene.
 
     Raises:
         SourceError: if no line is available, or the scans do not arrive.
@@ -87,16 +89,23 @@ def demonstrate(
     simulated = SimulatedDevice(sensor, seed=seed, faults=faults)
     with tempfile.TemporaryDirectory(prefix="lidarspec-demo-") as folder:
         path = Path(folder) / "demo.lsr"
-        place, replies, scans, stats = _run_live(sensor, simulated, path, turns)
+        address, replies, scans, stats = _run_live(sensor, simulated, path, turns)
         line = simulated.lines["data"]
-        recorded = path.stat().st_size
+        recorded_bytes = path.stat().st_size
         with open_device(path, sensor) as recording:
-            again = digest(
-                list(itertools.islice((scan for scan in recording.scans() if scan.whole), turns))
-            )
-    digested = digest([scan for scan in scans if scan.whole])
+            whole_scans = (scan for scan in recording.scans() if scan.whole)
+            recorded_digest = digest(list(itertools.islice(whole_scans, turns)))
     return Demonstration(
-        sensor, place, replies, scans, stats, line.sent, line.intact, digested, again, recorded
+        sensor,
+        address,
+        replies,
+        scans,
+        stats,
+        sent=line.sent,
+        intact=line.intact,
+        digest=digest([scan for scan in scans if scan.whole]),
+        recorded_digest=recorded_digest,
+        recorded_bytes=recorded_bytes,
     )
 
 
@@ -113,24 +122,21 @@ def digest(scans: Sequence[Scan]) -> str:
 def _run_live(
     sensor: Sensor, simulated: SimulatedDevice, path: Path, turns: int
 ) -> tuple[str, tuple[Reply, ...], tuple[Scan, ...], Counters]:
-    """Return the address, replies, scans and counters of a live session.
-
-    Everything that arrives is recorded.
-    """
+    """Run a live session and record it; return address, replies, scans and counters."""
     if sensor.datagrams:
         port = _free_port()
-        at = f"udp://{LOCALHOST}:{port}"
+        address = f"udp://{LOCALHOST}:{port}"
         with (
-            open_device(at, sensor, start=False, record=path) as device,
-            Served(simulated, simulated_outlet(sensor, at)) as served,
+            open_device(address, sensor, start=False, record=path) as device,
+            Served(simulated, simulated_outlet(sensor, address)) as served,
         ):
-            return at, *_read(device, served, turns)
+            return address, *_read(device, served, turns)
     if has_terminals() and data_link(sensor, Serial):
-        to = "pty"
+        destination = "pty"
     else:
-        to = f"tcp://{LOCALHOST}:0"
+        destination = f"tcp://{LOCALHOST}:0"
     with (
-        Served(simulated, simulated_outlet(sensor, to), patient=True) as served,
+        Served(simulated, simulated_outlet(sensor, destination), patient=True) as served,
         open_device(served.path, sensor, start=False, record=path) as device,
     ):
         return served.path, *_read(device, served, turns)
@@ -140,14 +146,14 @@ def _read(
     device: Device, served: Served, turns: int
 ) -> tuple[tuple[Reply, ...], tuple[Scan, ...], Counters]:
     replies = tuple(device.send(name) for name in device.sensor.on_open)
-    limit = time.monotonic() + PATIENCE + turns
+    limit = time.monotonic() + EXTRA_TIMEOUT_S + turns
     scans: list[Scan] = []
     for scan in device.scans(wait=0.1):
         scans += [scan] if scan is not None else []
         if sum(one.whole for one in scans) >= turns:
             served.stop_sending()
-            while device.newest(QUIET) is not None:
-                pass  # data that is still on the way counts as sent, so it is read too
+            while device.newest(DRAINED_AFTER_S) is not None:
+                pass  # `sent` counts the data that is still on the way, so that it has to be read
             break
         if time.monotonic() > limit:
             break
@@ -155,7 +161,7 @@ def _read(
         raise failure
     if sum(one.whole for one in scans) >= turns:
         return replies, tuple(scans), device.stats
-    number = f"{len(scans)} scans in {PATIENCE + turns:g} s, and not {turns}"
+    number = f"{len(scans)} scans in {EXTRA_TIMEOUT_S + turns:g} s, and not {turns}"
     raise SourceError(f"the simulated {device.sensor.id} gave {number}: {device.stats}")
 
 

@@ -1,7 +1,7 @@
 """A sensor on a source: packets and scans as they arrive, commands, counters.
 
-A `Device` takes the frames that have arrived from its input, which is a `FileInput` or a
-`LiveInput` with the same interface. `PacketReader` makes packets and scans out of them.
+A `Device` gets frames from its input, which is a `FileInput` or a `LiveInput` with the same
+interface. A `PacketReader` makes packets and scans from the frames.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from lidarspec.detect.identification import (
     find_simulated_sensor,
     read_info,
 )
-from lidarspec.device.device_input import Arrival, DeviceInput, FileInput
-from lidarspec.device.live_input import PERIOD, LiveInput
+from lidarspec.device.device_input import DeviceInput, FileInput, FrameBatch
+from lidarspec.device.live_input import PERIOD_S, LiveInput
+from lidarspec.device.named_devices import find_device
 from lidarspec.device.packet_reader import PacketReader
 from lidarspec.device.session import Reply
-from lidarspec.device.settings import find_device
 from lidarspec.errors import SourceError, SourceTimeout, UsageError, suggest
 from lidarspec.framing.decoder import DecoderObserver
 from lidarspec.framing.results import Counters, Found
@@ -42,9 +42,9 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import ClosingContext, LiveTransport, Transport
 
-#: number of first frames that are compared with related models.
+#: number of frames at the start that are compared with related models.
 _MAX_CHECKED_FRAMES = 64
-#: the maximum length of one wait for data.
+#: wait for data if the caller sets no limit.
 _LONG_WAIT_S = 3600.0
 
 
@@ -54,8 +54,8 @@ class Device(ClosingContext):
     Attributes:
         source: the source that is read.
         sensor: the sensor, given or detected.
-        mount: the pose of the sensor, if `lidarspec.toml` has one. Scans are then in the axes of
-            the carrier, and packets in those of the sensor.
+        mount: the pose of the sensor from `lidarspec.toml`; None if the file has none. With a
+            mount, scans are in the axes of the carrier, and packets in the axes of the sensor.
         imu_samples: the IMU samples that arrived with the last batch of `packets`, in the axes of
             the carrier if the sensor has a mount.
     """
@@ -69,7 +69,7 @@ class Device(ClosingContext):
         start: bool = True,
         record: RecordTo | None = None,
         overflow: str | None = None,
-        period: float = PERIOD,
+        period: float = PERIOD_S,
         mount: Mount | None = None,
     ) -> None:
         self.sensor = sensor
@@ -79,13 +79,13 @@ class Device(ClosingContext):
         self._readers: dict[str | None, PacketReader] = {}
         self._latest_stream: ScanStream | None = None
         self._unseen_scans: deque[Scan] = deque()
-        # The arrival in which `latest` found its last scan of a file.
-        self._ahead: Arrival | None = None
+        # The batch in which `latest` found its last scan of a file.
+        self._ahead: FrameBatch | None = None
         self._first_frames: list[Found] = []
         self._is_checked = not sensor.relatives and "model" not in sensor.info
         self._contradiction = ""
         self._own_recorders: list[TrafficLog] = []
-        self._input = self._open_input(backend, record, overflow, period, learns=start)
+        self._input = self._open_input(backend, record, overflow, period, will_begin=start)
         self._finalizer = weakref.finalize(self, _close, self._input, self._own_recorders)
         if start:
             try:
@@ -110,7 +110,7 @@ class Device(ClosingContext):
         )
 
     async def __aexit__(self, *_: object) -> None:
-        """Do nothing; without this method Python raises a TypeError before `__aenter__`."""
+        """Do nothing; without this method Python would not call `__aenter__`."""
 
     @property
     def stats(self) -> Counters:
@@ -119,9 +119,9 @@ class Device(ClosingContext):
 
     @property
     def warnings(self) -> list[str]:
-        """The present warnings about the source and the sensor.
+        """The current warnings about the source and the sensor.
 
-        Among them: a truncated file, silence, a baud rate that is probably wrong, a small receive
+        Examples are a truncated file, silence, a baud rate that is probably wrong, a small receive
         buffer, frames of another sensor, scans without an end, times without a date, a nominal
         calibration, and errors of the plugin.
         """
@@ -149,7 +149,8 @@ class Device(ClosingContext):
     def info(self) -> dict[str, str]:
         """The identity that the sensor has reported so far.
 
-        Keys are those of "serial", "firmware", "model" and "temperature" that its frames contain.
+        Possible keys are "serial", "firmware", "model" and "temperature". Values that no frame has
+        reported are missing.
         """
         return read_info(self.sensor, self._input.info_frames.values())
 
@@ -157,8 +158,8 @@ class Device(ClosingContext):
     def state(self) -> str:
         """The state of the source.
 
-        "streaming", "waiting" (for a first frame), "silent" (for three seconds), "no frames" (bytes
-        only), "disconnected", "ended" (a file) or "closed".
+        One of "streaming", "waiting" (for a first frame), "silent" (no data for three seconds), "no
+        frames" (bytes, but no valid frame), "disconnected", "ended" (a file) and "closed".
         """
         return self._input.state
 
@@ -168,48 +169,47 @@ class Device(ClosingContext):
         return self._input.queued
 
     @property
-    def place(self) -> tuple[int, int] | None:
-        """The number of bytes read of the stored file, and its size; None if unknown.
+    def progress(self) -> tuple[int, int] | None:
+        """The number of bytes read from a file, and its size; None if unknown.
 
-        Both are those of the compressed file, if it is one.
+        For a compressed file, both count compressed bytes.
         """
-        return self._input.place
+        return self._input.progress
 
     @property
     def is_live(self) -> bool:
-        """Whether data arrive at their own pace, and not from a file."""
+        """Whether data arrives from a live source, not from a file."""
         return self._input.is_live
 
     def packets(self, frame: str | None = None, *, wait: float | None = None) -> Iterator[Packets]:
         """Yield packets in batches, until the input ends or the device is closed.
 
-        A file is read once, by all iterators together. After `latest` they begin with the batch in
-        which its scan was found.
+        A file is read only once: all iterators share one position in it. After `latest`, a new
+        iterator begins with the batch that contains the end of the returned scan.
 
         Args:
             frame: the name of a frame type; by default the data frame.
-            wait: yield an empty batch if none arrives for this number of seconds, so that the
-                caller can do something else.
+            wait: if no packet arrives for this number of seconds, yield an empty batch.
 
         Raises:
-            SourceError: if a file has been read to its end before.
+            SourceError: if a file has already been read to its end.
         """
         reader = self._get_reader(frame)
         ahead = self._take_ahead()
-        pace = _TurnTimer(wait)
-        for arrival in self._iter_arrivals(wait, ahead):
+        yield_timer = _YieldTimer(wait)
+        for batch in self._iter_batches(wait, ahead):
             packets = None
-            if arrival is not None and arrival is ahead and frame is None:
+            if batch is not None and batch is ahead and frame is None:
                 packets = reader.last
-            elif arrival is not None:
-                packets = reader.add(arrival)
+            elif batch is not None:
+                packets = reader.add(batch)
                 if frame is None:
-                    reader.add_imu(arrival, packets)
-            self.imu_samples = self._get_imu_samples(reader, arrival)
+                    reader.add_imu(batch, packets)
+            self.imu_samples = self._get_imu_samples(reader, batch)
             has_data = (packets is not None and len(packets)) or len(self.imu_samples)
-            if has_data or arrival is None or pace.is_due():
+            if has_data or batch is None or yield_timer.is_due():
                 yield reader.make_empty_batch() if packets is None else packets
-                pace.restart()
+                yield_timer.restart()
 
     @overload
     def scans(self, *, select: Selection | None = None) -> Iterator[Scan]: ...
@@ -220,67 +220,65 @@ class Device(ClosingContext):
     def scans(self, *, wait: float | None = None, select: Selection | None = None) -> Iterator[Any]:
         """Yield scans, until the input ends or the device is closed.
 
-        The first and the last one, and those before and after an interruption, have
-        ``complete=False``. A scan that does not end within twice the slowest turn is yielded as it
-        is, and `warnings` names it.
+        The first and the last scan, and the scans before and after an interruption, have
+        ``complete=False``. A scan without an end is yielded after twice the longest revolution of
+        the sensor, and `warnings` reports it.
 
-        A file is read once, by all iterators together. After `latest` they begin with the batch in
-        which its scan was found.
+        A file is read only once: all iterators share one position in it. After `latest`, a new
+        iterator begins with the batch that contains the end of the returned scan.
 
         Args:
-            wait: yield None if no scan arrives for this number of seconds, so that the caller can
-                do something else.
-            select: the scans and the parts of them to yield. Nothing is read after the last one,
-                and long stretches of a recording before the first one are skipped.
+            wait: if no scan arrives for this number of seconds, yield None.
+            select: the scans, and the parts of them, to yield. Reading stops after the last
+                selected scan. Long parts of a recording before the first selected scan are skipped.
 
         Raises:
-            SourceError: if a file has been read to its end before.
-            UsageError: if no scan is selected.
+            SourceError: if a file has already been read to its end.
+            UsageError: if the selection contains no scan.
         """
         scans = self._iter_scans(wait)
         if select is None:
             return scans
-        return ScanSelector(select, self.source, self.skip).iter_selected(scans)
+        return ScanSelector(select, self.source, self.skip_until).iter_selected(scans)
 
     def imu(self, *, wait: float | None = None) -> Iterator[ImuSamples]:
         """Yield the samples of the sensor's IMU in batches, until the input ends.
 
         They are in the axes of the carrier if the sensor has a mount. `Scan.imu` has the samples
-        that belong to a scan. A file is read once, by all iterators together.
+        that belong to a scan. A file is read only once: all iterators share one position in it.
 
         Args:
-            wait: yield no samples if none arrive for this number of seconds, so that the caller can
-                do something else.
+            wait: if no sample arrives for this number of seconds, yield an empty batch.
 
         Raises:
             UsageError: if no frame of the sensor has IMU samples.
-            SourceError: if a file has been read to its end before.
+            SourceError: if a file has already been read to its end.
         """
         if not self.sensor.imu_frames:
             raise UsageError(f"{self.sensor.id}: no frame says what an IMU felt")
         reader = self._get_reader(None)
         ahead = self._take_ahead()
-        pace = _TurnTimer(wait)
-        for arrival in self._iter_arrivals(wait, ahead):
-            if arrival is not None and arrival is not ahead:
-                reader.add_imu(arrival, reader.add(arrival))
+        yield_timer = _YieldTimer(wait)
+        for batch in self._iter_batches(wait, ahead):
+            if batch is not None and batch is not ahead:
+                reader.add_imu(batch, reader.add(batch))
             if reader.waiting_imu is not None:
-                reader.waiting_imu.take_until(None)  # no scan will take them
-            samples = self._get_imu_samples(reader, arrival)
-            if len(samples) or arrival is None or pace.is_due():
+                reader.waiting_imu.take_until(None)  # free memory: no scan uses them
+            samples = self._get_imu_samples(reader, batch)
+            if len(samples) or batch is None or yield_timer.is_due():
                 yield samples
-                pace.restart()
+                yield_timer.restart()
 
     def latest(self, timeout: float | None = None) -> Scan:
-        """Wait for the newest whole scan, newer than that of the last call; skip older ones.
+        """Wait for a whole scan that the last call did not return; return the newest.
 
-        A file has no newest scan: each call returns the next one.
+        Older scans are dropped. For a file, each call returns the next whole scan.
 
         Args:
-            timeout: seconds to wait.
+            timeout: seconds to wait; None for no limit.
 
         Raises:
-            SourceTimeout: if none arrives in time.
+            SourceTimeout: if no whole scan arrives in time.
             SourceError: if the input has ended or the device was closed.
         """
         if timeout is None:
@@ -299,7 +297,7 @@ class Device(ClosingContext):
                 raise self.make_timeout_error()
 
     def newest(self, wait: float) -> Scan | None:
-        """Return the newest whole scan, as `latest`, or None after `wait` seconds.
+        """Return the newest whole scan like `latest`, or None after `wait` seconds.
 
         Raises:
             SourceError: if the input has ended or the device was closed.
@@ -311,10 +309,10 @@ class Device(ClosingContext):
                 raise SourceError(
                     f"{self.source}: no further scan, since the input is {self._input.state}"
                 )
-            arrival = self._next_arrival(max(deadline - time.monotonic(), 0.0))
-            if arrival is not None:
-                self._find_whole_scans(arrival)
-            has_no_more = arrival is None or self._input.caught_up(mark)
+            batch = self._next_batch(max(deadline - time.monotonic(), 0.0))
+            if batch is not None:
+                self._find_whole_scans(batch)
+            has_no_more = batch is None or self._input.caught_up(mark)
             if not self._unseen_scans and has_no_more and time.monotonic() >= deadline:
                 return None
         if not self.is_live:
@@ -324,45 +322,50 @@ class Device(ClosingContext):
         return scan
 
     def make_timeout_error(self) -> SourceTimeout:
-        """Return the error for a scan that did not come in time."""
+        """Return the error for a scan that did not arrive in time."""
         error = SourceTimeout(f"{self.source}: no scan in time; the source is {self.state}")
         return suggest(error, f"lidarspec doctor {quote(str(self.source))} -s {self.sensor.id}")
 
-    def skip(self, at: int) -> bool:
-        """Skip input that arrived before a time; return whether that is possible.
+    def skip_until(self, time_ns: int) -> bool:
+        """Skip input that arrived before a time, if the source can seek.
 
-        Nothing is read for it. Frames that were read already are still returned. After them the
-        stream continues as after an interruption.
+        Frames that were already read are still returned. The stream then continues as after an
+        interruption.
 
         Args:
-            at: ns since 1970.
+            time_ns: ns since 1970.
+
+        Returns:
+            Whether input was skipped.
         """
-        return self._input.skip(at)
+        return self._input.skip_until(time_ns)
 
-    def gather(self, until: float) -> None:
-        """Let arriving data wait, to decode it together with less processor time.
+    def delay_decoding(self, until: float) -> None:
+        """Collect arriving data until a time, and decode it together.
 
-        It does not wait longer than the `wait` of an iterator. A file ignores this.
+        This needs less processor time. An iterator with `wait` does not delay longer. Files ignore
+        this.
 
         Args:
             until: a time of `time.monotonic`.
         """
-        self._input.gather(until)
+        self._input.delay_decoding(until)
 
     def read_ahead(self, size: int) -> None:
         """Read a file in portions of about `size` bytes from now on.
 
-        A program that shows a file at its recorded pace uses this: counters, and the input of a
-        `DecoderObserver`, are then not far ahead of the picture. 0 is the fastest size.
+        A program that shows a file at its recorded pace needs this: otherwise the counters and the
+        input of a `DecoderObserver` are far ahead of the picture. The default 0 is the fastest
+        size. Live sources ignore this.
         """
         self._input.read_ahead(size)
 
-    def observe(self, witness: DecoderObserver) -> None:
-        """Show all input that is decoded from now on, and its frames, to a witness.
+    def observe(self, observer: DecoderObserver) -> None:
+        """Pass all input that is decoded from now on, and its frames, to an observer.
 
-        It is called in the thread that reads.
+        The observer is called in the thread that reads.
         """
-        self._input.decoder.observer = witness
+        self._input.decoder.observer = observer
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         """Send a command and return the reply.
@@ -371,35 +374,35 @@ class Device(ClosingContext):
 
         Args:
             name: the name of the command.
-            timeout: seconds to wait for the reply; by default as the sensor declares.
-            arguments: by name, in units.
+            timeout: seconds to wait for the reply; by default the timeout that the sensor declares.
+            arguments: the arguments of the command by name, in their units.
 
         Raises:
             UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
                 is sent.
             CommandError: if the device refuses, or the connection is lost.
-            ReplyTimeout: if no reply comes in time.
+            ReplyTimeout: if no reply arrives in time.
         """
         return self._input.send(name, timeout=timeout, **arguments)
 
     def write(self, data: bytes, link: str = "data") -> None:
         """Send bytes as they are, without waiting for a reply.
 
-        A reply arrives among the other frames. The bytes are not interpreted, so that a sensor that
-        they start is not stopped on closing.
+        A reply arrives among the other frames. The bytes are not interpreted: if they start the
+        sensor, `close` does not stop it.
 
         Args:
             data: the bytes.
             link: the name of one of the sensor's links.
 
         Raises:
-            UsageError: for a text, or an unknown link.
+            UsageError: if `data` is a str, or for an unknown link.
             SourceError: if the connection is lost, or there is no device.
         """
         self._input.write(data, link)
 
     def leave_on(self) -> None:
-        """Leave the sensor as it is when the device is closed."""
+        """Do not stop the sensor when the device is closed."""
         self._input.stays_on = True
 
     def close(self) -> None:
@@ -419,7 +422,7 @@ class Device(ClosingContext):
         overflow: str | None,
         period: float,
         *,
-        learns: bool,
+        will_begin: bool,
     ) -> DeviceInput:
         opened = transport(self.source, self.sensor)
         try:
@@ -427,7 +430,7 @@ class Device(ClosingContext):
                 if record is not None:
                     raise UsageError(f"{self.source} is a file already: there is nothing to record")
                 return FileInput(self.source, self.sensor, opened, backend=backend)
-            # This must not refer to the device, which otherwise is never garbage.
+            # This must not refer to the device: the cycle would keep it alive.
             make_recorder = partial(
                 _make_recorder, record, self.source, opened, self._own_recorders
             )
@@ -438,7 +441,7 @@ class Device(ClosingContext):
                 backend=backend,
                 policy=opened.overflow if overflow is None else overflow,
                 record=make_recorder,
-                learns=learns,
+                will_begin=will_begin,
                 period=period,
             )
         except BaseException:
@@ -452,8 +455,8 @@ class Device(ClosingContext):
             )
         return self._readers[frame]
 
-    def _get_imu_samples(self, reader: PacketReader, arrival: Arrival | None) -> ImuSamples:
-        if arrival is None:
+    def _get_imu_samples(self, reader: PacketReader, batch: FrameBatch | None) -> ImuSamples:
+        if batch is None:
             return join_samples([])
         if self.mount is None:
             return reader.imu_samples
@@ -465,36 +468,39 @@ class Device(ClosingContext):
     def _iter_scans(self, wait: float | None) -> Iterator[Scan | None]:
         reader = self._get_reader(None)
         ahead = self._take_ahead()
-        pace = _TurnTimer(wait)
+        yield_timer = _YieldTimer(wait)
         stream = self._make_scan_stream()
-        for arrival in self._iter_arrivals(wait, ahead):
-            if arrival is not None:
-                for scan in reader.find_scans(stream, arrival, is_added=arrival is ahead):
+        for batch in self._iter_batches(wait, ahead):
+            if batch is not None:
+                for scan in reader.find_scans(stream, batch, is_added=batch is ahead):
                     yield scan
                     del scan  # only the caller may keep it alive
-                    pace.restart()
-                if arrival.interrupted:
+                    yield_timer.restart()
+                if batch.interrupted:
                     stream = self._make_scan_stream()
-            if pace.is_due() or (arrival is None and wait is not None):
+            if yield_timer.is_due() or (batch is None and wait is not None):
                 yield None
-                pace.restart()
+                yield_timer.restart()
         yield from stream.finish()
 
-    def _find_whole_scans(self, arrival: Arrival) -> None:
-        """Add the whole scans that an arrival completes to the unseen ones."""
+    def _find_whole_scans(self, batch: FrameBatch) -> None:
+        """Add the whole scans that a batch completes to `_unseen_scans`."""
         if self._latest_stream is None:
             self._latest_stream = self._make_scan_stream()
         reader = self._get_reader(None)
-        scans = [scan for scan in reader.find_scans(self._latest_stream, arrival) if scan.whole]
+        scans = [scan for scan in reader.find_scans(self._latest_stream, batch) if scan.whole]
         self._unseen_scans += scans
-        self._ahead = arrival if scans and not self.is_live else None
-        if arrival.interrupted:
+        self._ahead = batch if scans and not self.is_live else None
+        if batch.interrupted:
             self._latest_stream = None
 
-    def _take_ahead(self) -> Arrival | None:
-        """Return the arrival in which `latest` found its last scan of a file.
+    def _take_ahead(self) -> FrameBatch | None:
+        """Take the batch in which `latest` found its last scan of a file.
 
-        A new iterator begins with it, and `latest` forgets its further scans.
+        A new iterator begins with this batch, so `latest` must not return its other scans as well.
+
+        Raises:
+            SourceError: if the file has been read to its end.
         """
         ahead = self._ahead
         self._ahead = None
@@ -507,30 +513,30 @@ class Device(ClosingContext):
             )
         return ahead
 
-    def _iter_arrivals(
-        self, wait: float | None, ahead: Arrival | None = None
-    ) -> Iterator[Arrival | None]:
-        """Yield arrivals until the end; None if there is none for `wait` seconds."""
+    def _iter_batches(
+        self, wait: float | None, ahead: FrameBatch | None = None
+    ) -> Iterator[FrameBatch | None]:
+        """Yield batches until the end, and None after each `wait` seconds without one."""
         if ahead is not None:
             yield ahead
         while not self._input.ended:
-            arrival = self._next_arrival(_LONG_WAIT_S if wait is None else wait)
-            if arrival is not None or not self._input.ended:
-                yield arrival
+            batch = self._next_batch(_LONG_WAIT_S if wait is None else wait)
+            if batch is not None or not self._input.ended:
+                yield batch
 
-    def _next_arrival(self, wait: float) -> Arrival | None:
-        """Return the next arrival, and keep the first frames for `warnings`."""
-        arrival = self._input.next(wait)
-        if self._is_checked or arrival is None or len(self._first_frames) >= _MAX_CHECKED_FRAMES:
-            return arrival
-        for frames in arrival.found:
+    def _next_batch(self, wait: float) -> FrameBatch | None:
+        """Return the next batch, and keep the first frames for `warnings`."""
+        batch = self._input.next(wait)
+        if self._is_checked or batch is None or len(self._first_frames) >= _MAX_CHECKED_FRAMES:
+            return batch
+        for frames in batch.frames:
             self._first_frames += frames.select(slice(0, _MAX_CHECKED_FRAMES)).found()
-        return arrival
+        return batch
 
     def _check_first_frames(self) -> list[str]:
         """Return a warning if the first frames belong to another sensor or model.
 
-        They are checked once, when there are enough of them.
+        They are checked once: when enough of them have arrived, or at the end of the input.
         """
         has_enough = len(self._first_frames) >= _MAX_CHECKED_FRAMES or self._input.ended
         if not self._is_checked and has_enough:
@@ -546,22 +552,22 @@ class Device(ClosingContext):
         ]
 
 
-class _TurnTimer:
-    """Tells an iterator when its caller is due for a turn.
+class _YieldTimer:
+    """Decides when an iterator has to yield although it has no data.
 
     Args:
-        wait: seconds between two turns; None if the caller needs none.
+        wait: longest time between two yields, in seconds; None for no limit.
     """
 
     def __init__(self, wait: float | None) -> None:
         self._wait = wait
-        self._last_turn = time.monotonic()
+        self._last_yield = time.monotonic()
 
     def is_due(self) -> bool:
-        return self._wait is not None and time.monotonic() - self._last_turn >= self._wait
+        return self._wait is not None and time.monotonic() - self._last_yield >= self._wait
 
     def restart(self) -> None:
-        self._last_turn = time.monotonic()
+        self._last_yield = time.monotonic()
 
 
 def open(
@@ -572,26 +578,26 @@ def open(
     start: bool = True,
     record: RecordTo | None = None,
     overflow: str | None = None,
-    period: float = PERIOD,
+    period: float = PERIOD_S,
 ) -> Device:
     """Open a sensor on any SOURCE.
 
     Args:
-        source: a port, a socket, a simulated device, a file, or "-" for standard input:
+        source: a port, a socket, a simulated device, a file, or "-" for standard input. Examples:
             "/dev/ttyUSB0", "serial:///dev/ttyUSB0?baud=230400", "udp://", "tcp://host:port",
-            "capture.pcap", or a name of `lidarspec.toml`.
+            "capture.pcap", or a device name from `lidarspec.toml`.
         sensor: an id, a path to a sensor's module, or a Sensor; by default it is detected.
         backend: evaluates `points`: "auto", "numpy" or "jit".
         start: False omits the commands that the sensor declares for opening and closing.
         record: a new file, or a `Recorder`, for everything that arrives and is sent; or a function
-            that makes one for the open transport.
-        overflow: the policy of a live source with a slow consumer: "drop_oldest" or "block". By
-            default only a simulated sensor without a pace of its own blocks.
-        period: seconds between two decodings of the data that have arrived.
+            that makes a recorder for the open transport.
+        overflow: the policy if the consumer of a live source is too slow: "drop_oldest" or "block".
+            The default is "block" for a simulated sensor without a rate, else "drop_oldest".
+        period: seconds between two decodings of the data that has arrived.
 
     Raises:
         SourceError: if the source cannot be opened.
-        UsageError, WireError: if the sensor was omitted and several fit, or none.
+        UsageError, WireError: if no sensor is given and detection finds none, or several.
         CommandError: if the device does not start.
     """
     settings = find_device(source)
@@ -610,7 +616,7 @@ def open(
 
 
 def _describe_nominal(sensor: Sensor) -> str:
-    """Return a warning about a nominal calibration, and how to give the unit's own."""
+    """Return a warning about a nominal calibration, with the option that replaces it."""
     text = f"{sensor.id}: points by the nominal calibration of the model, not of this unit"
     files = [name for name in sensor.configure.files if name not in sensor.options]
     if files:
@@ -627,9 +633,9 @@ def _make_recorder(
     own_recorders: list[TrafficLog],
     sensor: Sensor,
 ) -> TrafficLog | None:
-    """Return the recorder that was asked for.
+    """Return the requested recorder, None if nothing is recorded.
 
-    It is added to `own_recorders` if the device has to close it.
+    If the device has to close the recorder, it is added to `own_recorders`.
     """
     if record is None:
         return None
@@ -640,7 +646,7 @@ def _make_recorder(
 
 
 def _close(source: DeviceInput | Transport, recorders: list[TrafficLog]) -> None:
-    """Close everything; recordings are closed even if the source fails."""
+    """Close source and recorders, the recorders even if the source raises."""
     try:
         source.close()
     finally:

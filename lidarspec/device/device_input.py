@@ -1,7 +1,7 @@
-"""The interface of a device's input, live or not, and the input of a file.
+"""The interface of a device's input (`DeviceInput`), and the input of a file (`FileInput`).
 
 An input returns frames in batches. `FileInput` reads a file or standard input as fast as the caller
-requests frames. `live_input` has the input of a live source.
+requests batches. `live_input.LiveInput` reads a live source.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from lidarspec.captures.bulk import CapturedDatagrams
 from lidarspec.detect.identification import read_info
-from lidarspec.device.first_frames import FirstFrames, find_first_frames, is_searched
+from lidarspec.device.first_frames import FirstFrames, find_first_frames, needs_first_frames
 from lidarspec.device.sender_filter import SenderCheck, frame_senders
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, SourceError
 from lidarspec.frames.schema import schema
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
-from lidarspec.remote_files import is_stored
+from lidarspec.remote_files import is_remote
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.files import CaptureTransport
 from lidarspec.transports.open_url import transport
@@ -34,28 +34,30 @@ from lidarspec.transports.protocol import Chunk, Transport
 
 
 @dataclass(frozen=True, eq=False)
-class Arrival:
+class FrameBatch:
     """Frames of a piece of input, in stream order.
 
     Attributes:
-        found: the frames of every incoming type.
-        interrupted: whether input is missing after them: no frame, packet or scan continues there.
-        replaced: whether these frames come from another sensor than the previous ones, which have
-            to be discarded.
+        frames: the frames of all incoming types.
+        interrupted: whether input is missing after these frames, so that no frame, packet or scan
+            continues in the next batch.
+        replaced: whether the sensor has changed: all earlier frames have to be discarded.
     """
 
-    found: list[Frames] = field(default_factory=list)
+    frames: list[Frames] = field(default_factory=list)
     interrupted: bool = False
     replaced: bool = False
 
 
 class DeviceInput(Protocol):
-    """The source of a device's frames; the defaults here are those of a file.
+    """The source of a device's frames.
+
+    Methods with a body have the behaviour of a source that is not live.
 
     Attributes:
-        is_live: whether data arrives at its own pace, and not from a file.
+        is_live: whether data arrives from a live source, not from a file.
         decoder: finds the frames of the data link.
-        stays_on: whether the sensor is left running at the end.
+        stays_on: whether `close` leaves the sensor running.
         sensor: the sensor, configured with the `learned` options.
         learned: the options that the sensor reported.
         info_frames: the last frame of each type with a field of `Sensor.info`, from any link.
@@ -71,7 +73,7 @@ class DeviceInput(Protocol):
     def store_info_frames(self, batches: Sequence[Frames]) -> None:
         """Keep the latest frame of each type that reports values of the sensor.
 
-        A frame with parts is ignored if it lacks values that an earlier frame reported.
+        A frame of several parts is ignored if it lacks values that an earlier frame reported.
         """
         for frames in batches:
             for name in self.sensor.info_frames:
@@ -83,7 +85,7 @@ class DeviceInput(Protocol):
                         self.info_frames = {**self.info_frames, name: item}
 
     def _lacks_values(self, item: Found) -> bool:
-        """Return whether a frame with parts lacks values that an earlier one reported."""
+        """Return whether a frame of several parts lacks values of an earlier frame."""
         earlier = self.info_frames.get(item.frame)
         if earlier is None or not schema(self.sensor.frames[item.frame].tree).parts:
             return False
@@ -99,11 +101,11 @@ class DeviceInput(Protocol):
 
     @property
     def warnings(self) -> list[str]:
-        """The present warnings about the source."""
+        """The current warnings about the source."""
 
     @property
     def stats(self) -> Counters:
-        """The counters of everything read so far, including those of the transports."""
+        """The counters of everything read so far, with the counters of the transports."""
 
     @property
     def queued(self) -> int | None:
@@ -111,15 +113,15 @@ class DeviceInput(Protocol):
         return None
 
     @property
-    def place(self) -> tuple[int, int] | None:
-        """The bytes of the stored file read so far, and its size.
-
-        None if they are not known.
-        """
+    def progress(self) -> tuple[int, int] | None:
+        """The number of bytes read from a file, and its size; None if unknown."""
         return None
 
-    def skip(self, at: int) -> bool:
-        """Skip data that arrived before a time, ns since 1970, if the source can seek.
+    def skip_until(self, time_ns: int) -> bool:
+        """Skip data that arrived before a time, if the source can seek.
+
+        Args:
+            time_ns: ns since 1970.
 
         Returns:
             Whether data was skipped.
@@ -129,49 +131,49 @@ class DeviceInput(Protocol):
     def read_ahead(self, size: int) -> None:
         """Read a file in portions of about `size` bytes from now on.
 
-        Live sources ignore this.
+        0 is the fastest size. Live sources ignore this.
         """
 
-    def gather(self, until: float) -> None:
-        """Let arriving data wait until a time of `time.monotonic`.
+    def delay_decoding(self, until: float) -> None:
+        """Collect arriving data until a time of `time.monotonic`, then decode it at once.
 
-        It is then decoded together. It does not wait longer than the `wait` of `next`.
+        `next` does not delay longer than its `wait`. Files ignore this.
         """
 
     def begin(self) -> None:
-        """Send the commands that the sensor declares for its start.
+        """Send the commands that the sensor declares for opening.
 
         Raises:
             CommandError: if the device does not start, unless it sends data nevertheless.
         """
 
-    def next(self, wait: float) -> Arrival | None:
-        """Return the next frames.
+    def next(self, wait: float) -> FrameBatch | None:
+        """Return the next batch of frames.
 
         Args:
             wait: seconds to wait.
 
         Returns:
-            None if none arrive in time, or at the end.
+            The batch, or None if no frame arrives in time, or at the end.
 
         Raises:
-            SourceError: if nothing can be read any more.
-            UsageError: if frames of several senders would be mixed.
+            SourceError: if the source cannot be read any more.
+            UsageError: if several sensors send frames in one file.
         """
 
     def mark(self) -> int:
-        """Return the amount of data produced so far, for `caught_up`."""
+        """Return the amount of data that has arrived so far, for `caught_up`."""
         return 0
 
     def caught_up(self, mark: int) -> bool:
-        """Return whether everything produced before a mark has been decoded.
+        """Return whether all data that arrived before a mark has been decoded.
 
-        For a file it is always true: each scan is processed in order.
+        Always True for a file, which has no newest scan to catch up with.
         """
         return True
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
-        """Send a command and return the reply; other threads may do the same.
+        """Send a command and return the reply; may be called in several threads.
 
         Raises:
             UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
@@ -184,12 +186,12 @@ class DeviceInput(Protocol):
         """Send bytes as they are; a reply is read like all other data.
 
         Raises:
-            UsageError: for a text, or a link that the sensor does not have.
+            UsageError: if `data` is a str, or if the sensor does not have the link.
             SourceError: if the connection is lost, or there is no device.
         """
 
     def first_frames(self) -> FirstFrames:
-        """Return the frames that apply from the first packet on; of a live sensor none."""
+        """Return the frames that apply from the first packet on; none for a live sensor."""
         return FirstFrames()
 
     def close(self) -> None:
@@ -220,18 +222,18 @@ def decode_chunks(decoder: Decoder, chunks: Sequence[Chunk]) -> list[Frames]:
 
 
 def _decode_stream(
-    decoder: Decoder, packets: CapturedDatagrams, size: int
+    decoder: Decoder, datagrams: CapturedDatagrams, size: int
 ) -> Iterator[list[Frames]]:
-    """Yield the frames that the packets of a byte stream complete.
+    """Yield the frames in captured datagrams that carry a byte stream.
 
-    Each frame has the arrival time of the packet that holds its last byte.
+    Each frame has the arrival time of the datagram that holds its last byte.
 
     Args:
-        size: bytes decoded together.
+        size: number of bytes decoded together.
     """
-    data = packets.joined
-    ends = decoder.stats.bytes_in + np.cumsum(packets.sizes)
-    times = np.where(packets.at, packets.at, -1)
+    data = datagrams.joined
+    ends = decoder.stats.bytes_in + np.cumsum(datagrams.sizes)
+    times = np.where(datagrams.at, datagrams.at, -1)
     for start in range(0, len(data), size):
         yield _set_arrival(decoder.frames(data[start : start + size]), ends, times)
 
@@ -239,11 +241,12 @@ def _decode_stream(
 def _set_arrival(
     batches: Iterable[Frames], ends: NDArray[np.int64], times: NDArray[np.int64]
 ) -> list[Frames]:
-    """Return frames with the arrival times of the pieces of input that hold their last bytes.
+    """Return frames with the arrival time of the piece that holds their last byte.
 
     Args:
-        ends: of the pieces, (n,) bytes from the start of the input.
-        times: of the pieces, (n,) ns since 1970; -1 if unknown.
+        batches: the frames.
+        ends: the ends of the pieces of input, (n,) bytes from the start of the input.
+        times: the arrival times of the pieces, (n,) ns since 1970; -1 if unknown.
     """
     return [
         frames.with_arrivals(times[ends.searchsorted(frames.offsets + frames.sizes)])
@@ -251,28 +254,28 @@ def _set_arrival(
     ]
 
 
-def select_frames(batches: Sequence[Frames], awaited: frozenset[str]) -> list[Found]:
-    """Return the frames of some types, one by one."""
-    picked = []
+def select_frames(batches: Sequence[Frames], names: frozenset[str]) -> list[Found]:
+    """Return a list of the frames of some types, in stream order."""
+    selected = []
     for frames in batches:
-        kinds = [index for index, name in enumerate(frames.names) if name in awaited]
-        picked += frames.select(np.isin(frames.kinds, kinds)).found()
-    return picked
+        kinds = [index for index, name in enumerate(frames.names) if name in names]
+        selected += frames.select(np.isin(frames.kinds, kinds)).found()
+    return selected
 
 
-#: bytes or datagrams decoded together.
+#: numbers of bytes and of chunks that are decoded together; the first limit that is reached counts.
 BATCH_BYTES = 1 << 18
 BATCH_CHUNKS = 1024
 
 
 class FileInput(DeviceInput):
-    """Input from a transport that ends, such as a file.
+    """Input from a file or standard input.
 
-    The consumer sets the pace, so nothing is ever dropped.
+    Data is read only when it is requested, so nothing is ever dropped.
 
     Attributes:
         state: "streaming", "ended" or "closed".
-        senders: the senders of its frames.
+        senders: checks that one sensor sends all frames.
     """
 
     state = "streaming"
@@ -285,8 +288,8 @@ class FileInput(DeviceInput):
         self._transport = opened
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=backend)
         self.senders = SenderCheck(source, sensor)
-        self._batch_bytes = 0  # in bytes; 0 for the fastest size
-        self._arrivals = self._read()
+        self._batch_bytes = 0  # 0: BATCH_BYTES
+        self._frame_batches = self._iter_frame_batches()
 
     @property
     def ended(self) -> bool:
@@ -317,21 +320,21 @@ class FileInput(DeviceInput):
         return stats
 
     @property
-    def place(self) -> tuple[int, int] | None:
-        return self._transport.place
+    def progress(self) -> tuple[int, int] | None:
+        return self._transport.progress
 
-    def next(self, wait: float) -> Arrival | None:
-        arrival = next(self._arrivals, None)
-        if arrival is None:
+    def next(self, wait: float) -> FrameBatch | None:
+        batch = next(self._frame_batches, None)
+        if batch is None:
             self.state = "ended"
         else:
-            self.store_info_frames(arrival.found)
-        return arrival
+            self.store_info_frames(batch.frames)
+        return batch
 
-    def skip(self, at: int) -> bool:
-        return self._transport.skip(at)
+    def skip_until(self, time_ns: int) -> bool:
+        return self._transport.skip_until(time_ns)
 
-    def gather(self, until: float) -> None:
+    def delay_decoding(self, until: float) -> None:
         """Do nothing: the data of a file does not arrive over time."""
 
     def read_ahead(self, size: int) -> None:
@@ -351,16 +354,17 @@ class FileInput(DeviceInput):
     def close(self) -> None:
         self.state = "closed"
         self._transport.close()
-        self._arrivals = iter(())  # it refers to this object and to the data that was read
+        self._frame_batches = iter(())  # the old generator holds this object and the read data
 
     def first_frames(self) -> FirstFrames:
-        """Find the frames that apply from the start of the file.
+        """Return the frames that apply from the start of the file.
 
-        They are the state of points and the reference of the clock.
+        The source is opened and read a second time. Returns no frames if the sensor needs none, or
+        if the source is not a file that can be read twice.
         """
         path = Path(str(self._source).partition("?")[0])
-        if not is_searched(self.sensor) or not (
-            is_stored(self._source) or path.is_file() or path.is_dir()
+        if not needs_first_frames(self.sensor) or not (
+            is_remote(self._source) or path.is_file() or path.is_dir()
         ):
             return FirstFrames()
         with contextlib.closing(transport(self._source)) as source:
@@ -375,45 +379,45 @@ class FileInput(DeviceInput):
                 self.sensor, (decode_chunks(decoder, [chunk]) for chunk in source.chunks())
             )
 
-    def _read(self) -> Iterator[Arrival]:
+    def _iter_frame_batches(self) -> Iterator[FrameBatch]:
         """Yield every incoming frame, in batches."""
         if isinstance(self._transport, CaptureTransport):
             for datagrams in self._transport.batches():
                 if datagrams.gap:
-                    yield Arrival(self.decoder.take_pending(), interrupted=True)
+                    yield FrameBatch(self.decoder.take_pending(), interrupted=True)
                 if self.decoder.stream:
                     yield from map(
-                        Arrival,
+                        FrameBatch,
                         _decode_stream(self.decoder, datagrams, self._batch_bytes or BATCH_BYTES),
                     )
                     continue
                 for part in (
                     datagrams.parts(self._batch_bytes) if self._batch_bytes else [datagrams]
                 ):
-                    spans = self.decoder.decode_placed(
+                    frames = self.decoder.decode_placed(
                         part.buffer, part.starts, part.sizes, part.at
                     )
-                    self.senders.check(part.sent(spans))
-                    yield Arrival([spans])
-            yield Arrival(self.decoder.take_pending())
+                    self.senders.check(part.sent(frames))
+                    yield FrameBatch([frames])
+            yield FrameBatch(self.decoder.take_pending())
             return
-        for batch in self._batches():
-            if batch[0].gap or batch[0].quiet:
-                yield Arrival(self.decoder.take_pending(), interrupted=batch[0].gap)
-            batches = decode_chunks(self.decoder, batch)
+        for chunks in self._iter_chunk_batches():
+            if chunks[0].gap or chunks[0].quiet:
+                yield FrameBatch(self.decoder.take_pending(), interrupted=chunks[0].gap)
+            batches = decode_chunks(self.decoder, chunks)
             if not self.decoder.stream:
-                self.senders.check(frame_senders(batch, batches[0], self.decoder.stats.bytes_in))
-            yield Arrival(batches)
-        yield Arrival(self.decoder.take_pending())
+                self.senders.check(frame_senders(chunks, batches[0], self.decoder.stats.bytes_in))
+            yield FrameBatch(batches)
+        yield FrameBatch(self.decoder.take_pending())
 
-    def _batches(self) -> Iterator[list[Chunk]]:
-        """Yield chunks in batches that are worth decoding together.
+    def _iter_chunk_batches(self) -> Iterator[list[Chunk]]:
+        """Yield the chunks in batches to decode together.
 
-        A batch ends before an interruption or silence of the line.
+        A batch ends before a gap or a silence, because an incomplete frame cannot continue there.
         """
         batch: list[Chunk] = []
         size = 0
-        for chunk in self._portions():
+        for chunk in self._iter_portions():
             if batch and (
                 chunk.gap
                 or chunk.quiet
@@ -428,8 +432,8 @@ class FileInput(DeviceInput):
         if batch:
             yield batch
 
-    def _portions(self) -> Iterator[Chunk]:
-        """Yield the chunks; chunks of a stream are cut to the size of `read_ahead`."""
+    def _iter_portions(self) -> Iterator[Chunk]:
+        """Yield the chunks; cut chunks of a stream to the size set by `read_ahead`."""
         for chunk in self._transport.chunks():
             rest = chunk
             while self.decoder.stream and 0 < (size := self._batch_bytes) < len(rest.data):

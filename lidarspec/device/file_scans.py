@@ -1,15 +1,13 @@
-"""The scans of a file in one pass that can be resumed at a bookmark.
-
-Another process can continue from a bookmark.
+"""Read the scans of a file, from its start or from a bookmark, also in another process.
 
 Decoding from the middle of a file needs state from the bytes before it: an incomplete frame, frames
 with state, the number of clock wraps, the packet counter, waiting packets, the direction of
-rotation. A bookmark is all of this, pickled, so that the scans after it are bit for bit those of
-one pass. Objects that no input changes, such as the functions, structs and rules of a sensor,
-cannot be pickled. The bookmark refers to them by name, and the resumed sensor supplies them.
+rotation. A bookmark is the pickled state, so that the scans after it are the same, bit for bit, as
+without a bookmark. The functions, structs and rules of a sensor cannot be pickled, and no input
+changes them. A bookmark refers to them by name, and the resumed sensor supplies them.
 
-A scan belongs to the piece in which it begins: the piece after a bookmark leaves out the incomplete
-scan, and the piece before it reads that scan to its end.
+A bookmark divides a file into pieces. A scan belongs to the piece in which it begins: the piece
+before a bookmark reads its last scan to the end, and the piece after it omits that scan.
 """
 
 from __future__ import annotations
@@ -40,17 +38,18 @@ from lidarspec.transports.files import CaptureTransport, FileTransport
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import ClosingContext, LiveTransport
 
-#: types that are pickled as they are.
-_PLAIN = (bool, int, float, str, bytes, type(None), type)
+#: types whose values are pickled, not referred to by name.
+_PLAIN_TYPES = (bool, int, float, str, bytes, type(None), type)
 
 
 class FileScans(ClosingContext):
-    """The scans of a file: an iterator, which `survey` can skip quickly.
+    """The scans of a file, as an iterable; `survey` can skip a piece quickly.
 
     Args:
         source: the file.
-        sensor: the sensor that recorded it.
-        bookmark: the start, as returned by `survey` for the same file and sensor.
+        sensor: the sensor that sent the data.
+        bookmark: the start, as returned by `survey` for the same file and sensor; None for the
+            start of the file.
 
     Raises:
         UsageError: for a source that is not a file.
@@ -70,7 +69,7 @@ class FileScans(ClosingContext):
                 self._reader = PacketReader(
                     sensor, None, self._input.decoder, self._input.first_frames()
                 )
-                self._stream = self._scan_stream()
+                self._stream = self._make_scan_stream()
             else:
                 self._resume(bookmark)
         except BaseException:
@@ -84,7 +83,7 @@ class FileScans(ClosingContext):
 
     @property
     def warnings(self) -> list[str]:
-        """The present warnings about the file."""
+        """The current warnings about the file."""
         return self._input.warnings
 
     def __iter__(self) -> Iterator[Scan]:
@@ -93,20 +92,22 @@ class FileScans(ClosingContext):
         yield from self._stream.finish()
 
     def survey(self, size: int) -> tuple[int, bytes | None]:
-        """Return the number of scans in the next piece of the file, and a bookmark.
-
-        The bookmark is the end of the piece. It is None if the file ends, or if none can be set.
+        """Read the next piece of the file and count its scans.
 
         Args:
-            size: bytes of the piece, at least.
+            size: minimum number of bytes of the piece.
+
+        Returns:
+            The number of scans that begin in the piece, and a bookmark of its end. The bookmark is
+            None at the end of the file, which is reached if no bookmark can be made.
         """
-        number = 0
-        end = self._place + size
+        scan_count = 0
+        end = self._offset + size
         while (scans := self._next()) is not None:
-            number += sum(1 for _ in scans)
-            if self._place >= end and (bookmark := self._bookmark()) is not None:
-                return number + self._stream.is_under_way, bookmark
-        return number + len(self._stream.finish()), None
+            scan_count += sum(1 for _ in scans)
+            if self._offset >= end and (bookmark := self._make_bookmark()) is not None:
+                return scan_count + self._stream.is_under_way, bookmark
+        return scan_count + len(self._stream.finish()), None
 
     def close(self) -> None:
         """Close the file."""
@@ -114,21 +115,21 @@ class FileScans(ClosingContext):
 
     def _next(self) -> Iterator[Scan] | None:
         """Return the scans that the next bytes complete, None at the end."""
-        arrival = self._input.next(0)
-        if arrival is None:
+        batch = self._input.next(0)
+        if batch is None:
             return None
-        return self._scans(arrival)
+        return self._iter_scans(batch)
 
-    def _scans(self, arrival: Any) -> Iterator[Scan]:
-        yield from self._reader.find_scans(self._stream, arrival)
-        if arrival.interrupted:
-            self._stream = self._scan_stream()
+    def _iter_scans(self, batch: Any) -> Iterator[Scan]:
+        yield from self._reader.find_scans(self._stream, batch)
+        if batch.interrupted:
+            self._stream = self._make_scan_stream()
 
-    def _scan_stream(self) -> ScanStream:
+    def _make_scan_stream(self) -> ScanStream:
         return ScanStream(self._sensor, imu=self._reader.waiting_imu)
 
     @property
-    def _place(self) -> int:
+    def _offset(self) -> int:
         """The approximate number of bytes read."""
         if isinstance(self._transport, CaptureTransport):
             reader = self._transport.reader
@@ -138,11 +139,8 @@ class FileScans(ClosingContext):
             return self._input.decoder.stats.bytes_in
         return reader.offset
 
-    def _bookmark(self) -> bytes | None:
-        """Return the state that is required to go on from here.
-
-        Returns None if it cannot be pickled, or if the file cannot seek.
-        """
+    def _make_bookmark(self) -> bytes | None:
+        """Return the pickled state; None if it cannot be pickled or the file cannot seek."""
         opened = self._transport
         if not isinstance(opened, FileTransport) or not opened.can_go_on:
             return None
@@ -171,10 +169,10 @@ class FileScans(ClosingContext):
             opened.file.seek(self._input.decoder.stats.bytes_in)
 
 
-def _constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
+def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
     """Return the objects that no input changes, by name.
 
-    They are the parts of a sensor, and objects derived from it alone.
+    They are the parts of a sensor, and objects that are made from the sensor only.
     """
     constants = dict[tuple[Any, ...], Any]()
     _name_parts(sensor, (), constants, set())
@@ -185,8 +183,8 @@ def _constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], Any]:
 def _name_parts(
     value: Any, name: tuple[Any, ...], names: dict[tuple[Any, ...], Any], seen: set[int]
 ) -> None:
-    """Add a value and its parts, each under the names that lead to it."""
-    if isinstance(value, _PLAIN) or id(value) in seen:
+    """Add a value and its parts to `names`; a name is the path of attributes and keys."""
+    if isinstance(value, _PLAIN_TYPES) or id(value) in seen:
         return
     names[name] = value
     seen.add(id(value))
@@ -206,16 +204,16 @@ class _StatePickler(pickle.Pickler):
 
     def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self._constants = _constants(sensor, decoder)
+        self._constants = _find_constants(sensor, decoder)
         self._names = {id(value): name for name, value in self._constants.items()} | {
             id(source): ("file",)
         }
         self._frames = {id(codec(frame).schema): name for name, frame in sensor.frames.items()}
 
     def persistent_id(self, obj: Any) -> Any:
-        """Return the name of an object that is not pickled.
+        """Return the name of a constant, None for an object that has to be pickled.
 
-        For a sensor that reads its time from another clock it is the name of that clock.
+        A copy of the sensor with another clock is identified by the name of that clock.
         """
         name = self._names.get(id(obj))
         if name is None and isinstance(obj, Sensor):
@@ -223,16 +221,16 @@ class _StatePickler(pickle.Pickler):
         return name
 
     def reducer_override(self, obj: Any) -> Any:
-        """Reduce tables to the bytes of their frames.
+        """Return how to pickle tables and packets; tables as the bytes of their frames.
 
-        Packets keep only the frames of other types that belong to them.
+        Of the frames of other types, only those that packets use are pickled.
         """
         if isinstance(obj, CompiledTable | ParsedTable):
             if id(obj.schema) not in self._frames:
                 raise pickle.PicklingError(
                     "parts of frames, whose layout is in what is around them"
                 )
-            return _table, (
+            return _make_table, (
                 self._constants[()],
                 self._frames[id(obj.schema)],
                 [obj.frame(index) for index in range(len(obj))],
@@ -252,7 +250,7 @@ class _Loader(pickle.Unpickler):
 
     def __init__(self, file: io.BytesIO, sensor: Sensor, decoder: Decoder, source: Any) -> None:
         super().__init__(file)
-        self._constants = {**_constants(sensor, decoder), ("file",): source}
+        self._constants = {**_find_constants(sensor, decoder), ("file",): source}
 
     def persistent_load(self, name: Any) -> Any:
         if name[0:1] == ("clock",) and name not in self._constants:
@@ -260,14 +258,16 @@ class _Loader(pickle.Unpickler):
         return self._constants[name]
 
 
-def _table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
+def _make_table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
     return codec(sensor.frames[frame]).table_of_structs(frames)
 
 
 def _take_states(table: Table | None, which: Any) -> StateOf:
-    """Return the state frames of some packets, and the row of each packet's frame.
+    """Return the frames that packets use, and the row of each packet's frame.
 
-    Frames that belong to no packet are left out.
+    Args:
+        table: frames of another type.
+        which: for each packet the row of its frame in `table`; -1 if it has none.
     """
     rows = np.unique(which[which >= 0])
     if table is None or not len(rows):

@@ -1,6 +1,6 @@
 """The frames of a file that apply from its start.
 
-They are the first frames with state for points, and the first reference of the clock.
+They are the first frame of each state type, and the first reference of the clock.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, reference_readings, reported_seconds
 from lidarspec.sensor_operations import Sensor
 
-#: bytes of a file to search for a frame type that could tell the turn of the clock.
+#: if no frame of the type that could date the clock is in this many bytes, the search ends.
 REFERENCE_SEARCH_BYTES = 64 << 20
 
 
@@ -25,16 +25,16 @@ class FirstFrames:
     """The frames that apply from the first packet on.
 
     Attributes:
-        state: the first frame of each type that `points` takes its state from, by name.
-        reference: the first frame that determines the turn of the clock; None if there is none.
+        state: the first frame of each type that `points` depends on, by name.
+        reference: the first frame that dates the clock; None if no frame does.
     """
 
     state: dict[str, bytes] = field(default_factory=dict)
     reference: ClockReference | None = None
 
 
-def is_searched(sensor: Sensor) -> bool:
-    """Return whether any frames of a sensor apply from the start."""
+def needs_first_frames(sensor: Sensor) -> bool:
+    """Return whether frames of a sensor can apply from the first packet on."""
     return bool(sensor.state) or (sensor.clock is not None and sensor.clock.reference is not None)
 
 
@@ -42,16 +42,17 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
     """Return the frames that apply from the start of a file.
 
     Args:
-        batches: its frames, which are read only as far as needed.
+        sensor: the sensor that sent them.
+        batches: the frames of the file; they are read only as far as needed.
     """
     first = FirstFrames()
     missing = set(sensor.state)
     clock = sensor.clock
+    needs_reference = clock is not None and clock.reference is not None
+    reference_frame = ""
     if clock is not None and clock.reference is not None:
-        teller = clock.reference[0]
-    else:
-        teller = ""
-    has_teller = False
+        reference_frame = clock.reference[0]
+    has_reference_frame = False
     seen_bytes = 0
     for batch in batches:
         for frames in batch:
@@ -61,16 +62,15 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
                 if len(rows):
                     first.state[name] = frames.data(int(rows[0]))
             missing -= set(first.state)
-            if teller in frames.names:
-                rows = np.flatnonzero(frames.kinds == frames.names.index(teller))
-                has_teller = has_teller or len(rows) > 0
+            if needs_reference and reference_frame in frames.names:
+                rows = np.flatnonzero(frames.kinds == frames.names.index(reference_frame))
+                has_reference_frame = has_reference_frame or len(rows) > 0
                 if first.reference is None and len(rows):
-                    first.reference = _find_reference(sensor, teller, frames, rows)
-        if teller and (
-            first.reference is not None or (not has_teller and seen_bytes > REFERENCE_SEARCH_BYTES)
-        ):
-            teller = ""
-        if not missing and not teller:
+                    first.reference = _find_reference(sensor, reference_frame, frames, rows)
+        is_hopeless = not has_reference_frame and seen_bytes > REFERENCE_SEARCH_BYTES
+        if first.reference is not None or is_hopeless:
+            needs_reference = False
+        if not missing and not needs_reference:
             break
     return first
 
@@ -78,7 +78,7 @@ def find_first_frames(sensor: Sensor, batches: Iterable[list[Frames]]) -> FirstF
 def _find_reference(
     sensor: Sensor, name: str, frames: Frames, rows: NDArray[np.intp]
 ) -> ClockReference | None:
-    """Return the first of some frames that determines the turn of the clock."""
+    """Return the first reference of the clock in some frames; None if none is valid."""
     assert sensor.clock is not None
     table = codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:

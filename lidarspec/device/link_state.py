@@ -1,6 +1,6 @@
-"""Watch the data link of a live sensor: data, silence, bytes without frames, or a lost device.
+"""Watch the data link of a live sensor.
 
-`LinkState` describes each problem in a warning, with the command to type next.
+`LinkState` reports silence, bytes without frames, and a lost device, each with the next command.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import LiveTransport, Sender, endpoint
 
-#: bytes without a frame for longer are reported.
+#: if bytes arrive without a frame for this time, a warning reports it.
 FRAMELESS_WARNING_S = 0.9
-#: a source is silent after this time, which is longer than a busy computer may stall.
+#: a source is silent after this time; a busy computer does not stall this long.
 SILENT_AFTER_S = 3.0
 
 
@@ -55,7 +55,7 @@ class LinkState:
         self.has_data = False
 
     def record_senders(self, *, is_sensor: bool) -> None:
-        """Record that datagrams arrived, from the sensor or from other senders alone."""
+        """Record that datagrams arrived, from the sensor or only from other senders."""
         if is_sensor:
             self._only_others_since = None
         elif self._only_others_since is None:
@@ -75,7 +75,7 @@ class LinkState:
     @property
     def silent_for(self) -> float:
         """Seconds since something last arrived from the sensor."""
-        last = self._capture.last
+        last = self._capture.last_arrival
         if self._only_others_since is not None:
             last = min(last, self._only_others_since)
         return time.monotonic() - last
@@ -84,8 +84,7 @@ class LinkState:
     def name(self) -> str:
         """The state in one or two words.
 
-        One of "disconnected", "silent", "no frames", "waiting" (for the first frame) and
-        "streaming".
+        It is "disconnected", "silent", "no frames", "waiting" (for the first frame) or "streaming".
         """
         if not self._capture.connected:
             return "disconnected"
@@ -99,7 +98,7 @@ class LinkState:
 
     @property
     def warnings(self) -> list[str]:
-        """The present problem of the link, with the next command; empty if there is none."""
+        """The current problem of the link, with the next command; empty without a problem."""
         name = self.name
         if name == "disconnected":
             text = "the device is gone; waiting for it to come back"
@@ -114,7 +113,7 @@ class LinkState:
         return [f"{self._source}: {text}; next: {self.suggest_command()}"]
 
     def suggest_command(self) -> str:
-        """Return the command that finds out more."""
+        """Return the command that diagnoses the current problem."""
         other = self._other_sender
         if other is not None and self.name == "silent":
             chosen = with_option(self._source, "src", endpoint(other))
@@ -128,7 +127,7 @@ class LinkState:
         return self._senders.other_sender or self._transport.other_sender
 
     def _describe_others(self) -> str:
-        """Return a part of a sentence about datagrams of other senders."""
+        """Return a clause about datagrams of other senders, "" if there are none."""
         other = self._other_sender
         if other is None:
             return ""
@@ -141,7 +140,10 @@ class LinkState:
         return self._decoder.stats.bytes_in - self._framed_bytes
 
     def _is_frameless(self) -> bool:
-        """Return whether bytes without a frame have arrived for long, and more than fit in one."""
+        """Return whether bytes without a frame have arrived for long.
+
+        Fewer bytes than the longest frame has do not count.
+        """
         if self._frameless_since is None:
             return False
         seconds = time.monotonic() - self._frameless_since

@@ -1,11 +1,11 @@
-"""Live input: decode queued chunks in the thread of the consumer.
+"""The input of a live source: decode queued chunks in the thread of the consumer.
 
 The capture threads queue chunks, which are decoded together every few milliseconds.
 
-`next` takes what has arrived, decodes it and returns it. While it waits it drives the `Session`: it
-sends requests, passes on the frames that may be replies, and reports the time. Only one thread may
-run the decoders at a time; `send` from another thread waits for its reply while they run.
-`LinkState` watches the data link.
+`next` decodes the chunks that have arrived and returns the frames. While it waits, it drives the
+`Session`: it sends requests, passes the session the frames that may be replies, and the current
+time. Only one thread may run the decoders at a time; `send` in another thread waits for its reply
+while they run. `LinkState` watches the data link.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.device.capture_thread import BoundedQueue, CaptureThread, Event, LinkEvent
-from lidarspec.device.device_input import Arrival, DeviceInput, decode_chunks, select_frames
+from lidarspec.device.device_input import DeviceInput, FrameBatch, decode_chunks, select_frames
 from lidarspec.device.link_state import LinkState
 from lidarspec.device.sender_filter import SenderFilter, frame_senders
 from lidarspec.device.session import OutgoingData, PendingReply, Reply, Session, learn_options
@@ -43,31 +43,33 @@ from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import control_link, has_control
 from lidarspec.transports.protocol import Chunk, LiveTransport
 
-#: seconds between two decodings of the data that has arrived.
-PERIOD = 0.02
+#: time between two decodings of the data that has arrived.
+PERIOD_S = 0.02
 #: the longest wait for data, after which another thread may run the decoders.
-MAX_TURN_S = 0.05
-#: how long `write` waits for the first datagram, if only that shows the address of the sensor.
+MAX_PUMP_S = 0.05
+#: how long `write` waits for a datagram if the address is known only from its first datagram.
 SENDER_TIMEOUT_S = 0.9
-#: chunks decoded together at most.
+#: maximum number of chunks that are decoded together.
 MAX_CHUNKS = 4096
-#: batches that are kept for the next iteration while commands are sent.
+#: maximum number of batches that are kept for `next` while commands are sent.
 MAX_READY_BATCHES = 4096
-#: the time for all commands at the end.
+#: time limit for all commands on closing.
 SHUTDOWN_TIMEOUT_S = 4.0
 
 
 class LiveInput(DeviceInput):
-    """A sensor on a live transport.
+    """The input of a sensor on a live transport.
 
     Args:
-        source, sensor: the source and its sensor.
+        source: the source.
+        sensor: its sensor.
         opened: the open transport of the data link.
-        policy: of the queue, "drop_oldest" or "block".
-        record: makes the recorder for the configured sensor, or returns None. It gets everything
-            that arrives and is sent, before the queue.
-        learns: whether `begin` will be called, in which the sensor may report options. Data before
-            that is discarded.
+        backend: calculates points: "auto", "numpy" or "jit".
+        policy: the policy of a full queue, "drop_oldest" or "block".
+        record: makes the recorder for the configured sensor, or returns None. The recorder gets
+            everything that is sent or arrives, before it is queued.
+        will_begin: whether `begin` will be called. If the sensor then reports options, all earlier
+            data is discarded.
         period: seconds between two decodings.
     """
 
@@ -82,55 +84,52 @@ class LiveInput(DeviceInput):
         backend: str = "auto",
         policy: str = "drop_oldest",
         record: Callable[[Sensor], TrafficLog | None] = lambda sensor: None,
-        learns: bool = False,
-        period: float = PERIOD,
+        will_begin: bool = False,
+        period: float = PERIOD_S,
     ) -> None:
         self._source = source
         self.sensor = sensor
         self._record = record
         self._period = period
-        if learns:
-            self._learning_sensors = [
+        self._learning_commands: list[str] = []
+        if will_begin:
+            self._learning_commands = [
                 name for name in sensor.on_open if sensor.commands[name].learns is not None
             ]
-        else:
-            self._learning_sensors = []
-        self._recorder = None if self._learning_sensors else record(sensor)
+        self._recorder = None if self._learning_commands else record(sensor)
         self.learned: dict[str, Any] = {}
         chosen = backend_named(backend)
         if chosen == "auto":
-            self._backend = "numpy"
+            self._backend = "numpy"  # compiling would delay the decoding of arriving data
         else:
-            self._backend = (
-                chosen  # "auto" does not compile here: nothing would be decoded meanwhile
-            )
+            self._backend = chosen
         self.queue = BoundedQueue(policy)
         self._session = Session(sensor)
         self.decoder: Decoder = sensor.decoder(stream=not opened.datagrams, backend=self._backend)
         self._decoders = {"data": self.decoder}
         self._captures = {}
         self._senders = SenderFilter(source, sensor, datagrams=opened.datagrams)
-        self._ready = deque[Arrival]()
-        self._answering: dict[str, SenderFilter] = {}  # senders of replies to broadcasts
+        self._ready = deque[FrameBatch]()
+        self._broadcast_senders: dict[str, SenderFilter] = {}  # link -> its replies' sender
         self._clock = HostClock()
-        self._turn = threading.RLock()
+        self._decoder_lock = threading.RLock()
         self._session_lock = threading.RLock()
-        self._due = 0.0
-        self._stops = False
+        self._due = 0.0  # time of the next decoding, by `time.monotonic`
+        self._was_opened = False  # whether the commands for opening were sent
         self._closed = False
         self._failure: SourceError | None = None
         self.stays_on = False
         self._reported_warnings: list[str] = []
         self._captures["data"] = CaptureThread(opened, self.queue, log=self._recorder)
-        self._checked = list[PendingReply]()
-        self._silent = list[CommandError]()
+        self._restart_replies = list[PendingReply]()
+        self._handled_silence = list[CommandError]()
         self._link_state = LinkState(
             source, sensor, opened, self._captures["data"], self.decoder, self._senders
         )
 
     @property
     def ended(self) -> bool:
-        """Whether it was closed; nothing else ends it."""
+        """Whether the input was closed and all batches were taken."""
         return self._closed and not self._ready
 
     @property
@@ -147,7 +146,7 @@ class LiveInput(DeviceInput):
             for capture in self._captures.values()
             for warning in (*capture.transport.warnings, *capture.warnings)
         ]
-        for senders in (self._senders, *self._answering.values()):
+        for senders in (self._senders, *self._broadcast_senders.values()):
             warnings += senders.warnings
         warnings += self._reported_warnings
         if self._recorder is not None and self._recorder.error is not None:
@@ -165,7 +164,7 @@ class LiveInput(DeviceInput):
         stats = self.decoder.stats
         captures = list(self._captures.values())
         stats.kernel_drops = sum(capture.transport.kernel_drops for capture in captures)
-        others = sum(sender_filter.foreign for sender_filter in self._answering.values())
+        others = sum(sender_filter.foreign for sender_filter in self._broadcast_senders.values())
         stats.foreign = (
             self._senders.foreign + others + sum(capture.transport.foreign for capture in captures)
         )
@@ -178,13 +177,13 @@ class LiveInput(DeviceInput):
         return len(self.queue)
 
     def begin(self) -> None:
-        self._stops = bool(self.sensor.on_open)
+        self._was_opened = bool(self.sensor.on_open)
         for name in self.sensor.on_open:
             try:
                 reply = self.send(name)
             except CommandError as error:
                 if (
-                    name in self._learning_sensors
+                    name in self._learning_commands
                     and self.sensor.data_frames
                     and not self.sensor.commands[name].starts
                 ):
@@ -197,18 +196,18 @@ class LiveInput(DeviceInput):
                     raise suggest(error, self._link_state.suggest_command()) from None
             else:
                 self.learned |= learn_options(self.sensor, reply)
-            if self._learning_sensors and name == self._learning_sensors[-1]:
-                self._adopt()
+            if self._learning_commands and name == self._learning_commands[-1]:
+                self._apply_learned_options()
 
-    def _adopt(self) -> None:
-        """Continue with the reported options, and discard all earlier data."""
+    def _apply_learned_options(self) -> None:
+        """Configure the sensor with the reported options, and discard all earlier data."""
         try:
             self.sensor = self.sensor.configure(**self.learned)
         except UsageError as error:
             raise CommandError(
                 f"{self.sensor.id}: what it says of itself cannot be: {error}"
             ) from error
-        with self._turn, self._session_lock:
+        with self._decoder_lock, self._session_lock:
             data = self._captures["data"]
             self._session.sensor = self.sensor
             self._senders.configure(self.sensor)
@@ -224,10 +223,10 @@ class LiveInput(DeviceInput):
                 self._source, self.sensor, data.transport, data, self.decoder, self._senders
             )
 
-    def next(self, wait: float) -> Arrival | None:
+    def next(self, wait: float) -> FrameBatch | None:
         deadline = time.monotonic() + wait
         while True:
-            with self._turn:
+            with self._decoder_lock:
                 if self._ready:
                     return self._ready.popleft()
                 if self._failure is not None:
@@ -235,11 +234,11 @@ class LiveInput(DeviceInput):
                 left = deadline - time.monotonic()
                 if self._closed or (left <= 0 and wait > 0):
                     return None
-                self._pump(min(max(left, 0.0), MAX_TURN_S))
+                self._pump(min(max(left, 0.0), MAX_PUMP_S))
                 if wait <= 0 and not self._ready:
                     return None
 
-    def gather(self, until: float) -> None:
+    def delay_decoding(self, until: float) -> None:
         self._due = max(self._due, until)
 
     def read_ahead(self, size: int) -> None:
@@ -270,8 +269,8 @@ class LiveInput(DeviceInput):
             return pending.result()
         except CommandError as error:
             link = self.sensor.commands[name].link
-            # The warnings of HTTP are about this request; those of a stream explain no more than
-            # silence.
+            # The warnings of a transport may explain why no reply arrived. The warnings of HTTP are
+            # about this request, so they also explain a refusal.
             is_explained = isinstance(error, ReplyTimeout) or isinstance(
                 self.sensor.links[link], Http
             )
@@ -304,7 +303,7 @@ class LiveInput(DeviceInput):
             self._write(OutgoingData(link, bytes(data)))
 
     def _await_sender(self, link: str, seconds: float) -> None:
-        """Wait for a first datagram if only that reveals the address of the sensor."""
+        """Wait for a datagram if the sensor's address is known only from its first one."""
         data = self._captures["data"].transport
         is_known = (
             link in self._captures
@@ -330,20 +329,20 @@ class LiveInput(DeviceInput):
                 capture.close()
 
     def _shut_down(self) -> None:
-        """Send the commands for the end, if the device is still connected."""
+        """Send the commands for closing, if the device is connected and was started."""
         if self.stays_on:
             return
         if (
             self._failure is not None
             or not self._captures["data"].connected
-            or not (self._stops or self._session.started)
+            or not (self._was_opened or self._session.started)
         ):
             return
         stopping = [
             name
             for name, command in self.sensor.commands.items()
             if command.stops and not command.args
-        ][:1]
+        ][:1]  # one command is enough to stop it
         with self._session_lock:
             self._session.abandon("the device is being closed")
             names = self.sensor.on_close or stopping
@@ -358,22 +357,27 @@ class LiveInput(DeviceInput):
                 pending.result()
 
     def _decode_if_idle(self, pending: PendingReply | None = None) -> None:
-        """Run the decoders once, unless another thread runs them."""
-        if not self._turn.acquire(timeout=MAX_TURN_S / 5):
+        """Run the decoders once, unless another thread runs them.
+
+        Args:
+            pending: if this is done, the decoders do not run.
+        """
+        if not self._decoder_lock.acquire(timeout=MAX_PUMP_S / 5):
             return
         try:
             if pending is None or not pending.done:
-                self._pump(MAX_TURN_S)
+                self._pump(MAX_PUMP_S)
         finally:
-            self._turn.release()
+            self._decoder_lock.release()
         while len(self._ready) > MAX_READY_BATCHES:
             self._ready.popleft()
 
     def _pump(self, wait: float) -> None:
         """Decode data that arrives within `wait` seconds, and drive the session.
 
-        A request only times out after the arrived data was checked for its reply. If this runs late
-        on a busy computer, replies were delayed as well.
+        A request times out only after the arrived data was searched for its reply. If its deadline
+        passed more than `MAX_PUMP_S` ago, the computer is busy and the reply may be late as well,
+        so this still waits the full time.
         """
         with self._session_lock:
             deadline = self._session.deadline
@@ -381,63 +385,63 @@ class LiveInput(DeviceInput):
             left = wait
         else:
             left = (deadline - self._clock.now()) / 1e9
-        wait = wait if left < -MAX_TURN_S else min(wait, max(left, 0.0))
+        wait = wait if left < -MAX_PUMP_S else min(wait, max(left, 0.0))
         events = self.queue.take(wait, until=self._due, chunks=MAX_CHUNKS)
         if events:
             self._due = time.monotonic() + self._period
-        for link, run in _runs(events):
-            self._take(link, run)
+        for link, item in _join_chunks(events):
+            self._handle(link, item)
         if deadline is not None:
             with self._session_lock:
                 self._session.tick(self._clock.now())
                 self._send_outgoing()
-        if self._checked:
+        if self._restart_replies:
             self._warn_if_changed()
-        elif (silent := list(self._session.unanswered.values())) and silent != self._silent:
-            # at each unanswered heartbeat, once: the sensor may have restarted and lost its
-            # settings
-            self._silent = silent
+        elif (
+            silent := list(self._session.unanswered.values())
+        ) and silent != self._handled_silence:
+            # Once for each unanswered heartbeat: the sensor may have restarted and lost its
+            # settings.
+            self._handled_silence = silent
             self._restart_sensor()
 
-    def _take(self, link: str, run: list[Chunk] | LinkEvent | BaseException) -> None:
+    def _handle(self, link: str, item: list[Chunk] | LinkEvent | BaseException) -> None:
         """Decode consecutive chunks of a link, or handle an event on it."""
-        if isinstance(run, list):
-            self._decode(link, run)
-        elif isinstance(run, LinkEvent):
-            self._hand_on(
-                link, self._decoders[link].take_pending(), interrupted=run is LinkEvent.LOST
+        if isinstance(item, list):
+            self._decode(link, item)
+        elif isinstance(item, LinkEvent):
+            self._deliver(
+                link, self._decoders[link].take_pending(), interrupted=item is LinkEvent.LOST
             )
-            if run is LinkEvent.LOST:
+            if item is LinkEvent.LOST:
                 with self._session_lock:
                     self._session.abandon(
                         "the connection was lost", None if link == "data" else link
                     )
-            elif run is LinkEvent.BACK:
+            elif item is LinkEvent.BACK:
                 self._restart_sensor()
         elif self._failure is None and not self._closed:
-            if isinstance(run, SourceError):
-                self._failure = run
+            if isinstance(item, SourceError):
+                self._failure = item
+                self._failure.__cause__ = None  # hides the context in the capture thread
             else:
-                self._failure = SourceError(f"{self._source}: nothing is read any more: {run}")
-            if run is self._failure:
-                self._failure.__cause__ = None
-            else:
-                self._failure.__cause__ = run
+                self._failure = SourceError(f"{self._source}: nothing is read any more: {item}")
+                self._failure.__cause__ = item
 
     def _decode(self, link: str, chunks: list[Chunk]) -> None:
         decoder = self._decoders[link]
         if chunks[0].gap:
-            self._hand_on(link, decoder.take_pending(), interrupted=True)
-        if link == "data" and chunks[0].sender is not None:  # then all of them have one
+            self._deliver(link, decoder.take_pending(), interrupted=True)
+        if link == "data" and chunks[0].sender is not None:  # then all chunks have a sender
             self._decode_senders(chunks)
             return
-        if link in self._answering:
+        if link in self._broadcast_senders:
             chunks = self._select_first_sender(link, chunks)
         if chunks:
-            self._hand_on(link, decode_chunks(decoder, chunks))
+            self._deliver(link, decode_chunks(decoder, chunks))
 
     def _decode_senders(self, chunks: list[Chunk]) -> None:
-        """Decode chunks of the data link from several senders, of which one is the sensor."""
+        """Decode the sensor's chunks among chunks of the data link from several senders."""
         chunks = self._select_sensor_chunks(chunks)
         if not chunks:
             return
@@ -448,41 +452,42 @@ class LiveInput(DeviceInput):
             batches = [self._senders.select_ports(senders, batches[0])]
         if self._senders.address is not None:
             self._captures["data"].transport.accept(self._senders.address)
-        self._hand_on("data", batches)
+        self._deliver("data", batches)
 
     def _select_sensor_chunks(self, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks that the sensor sent.
 
-        If another sensor is selected now, incomplete frames of the previous one are discarded.
+        If another sensor is selected now, incomplete frames of the previous sensor are discarded.
         """
         mine = self._senders.select(chunks)
         self._link_state.record_senders(is_sensor=bool(mine))
         if self._senders.has_changed:
             self.decoder.take_pending()
-            self._ready.append(Arrival(interrupted=True, replaced=True))
+            self._ready.append(FrameBatch(interrupted=True, replaced=True))
         return mine
 
     def _select_first_sender(self, link: str, chunks: list[Chunk]) -> list[Chunk]:
         """Return the chunks of the first sender that replied to a broadcast.
 
-        It is the sensor, on every link.
+        This sender is then selected as the sensor on every link.
         """
-        mine = self._answering[link].select(chunks)
-        if (address := self._answering[link].address) is not None:
+        mine = self._broadcast_senders[link].select(chunks)
+        if (address := self._broadcast_senders[link].address) is not None:
             self._captures[link].transport.accept(address)
             self._senders.choose(address)
         return mine
 
     def _host(self) -> str | None:
-        """Return the address of the sensor, None if unknown."""
-        answered = [
+        """Return the address of the sensor; None if unknown."""
+        replying_hosts = [
             sender_filter.address[0]
-            for sender_filter in self._answering.values()
+            for sender_filter in self._broadcast_senders.values()
             if sender_filter.address is not None
         ]
-        return self._captures["data"].transport.peer() or next(iter(answered), None)
+        return self._captures["data"].transport.peer() or next(iter(replying_hosts), None)
 
-    def _hand_on(self, link: str, batches: list[Frames], *, interrupted: bool = False) -> None:
+    def _deliver(self, link: str, batches: list[Frames], *, interrupted: bool = False) -> None:
+        """Pass frames to the session, and frames of the data link to `next`."""
         self.store_info_frames(batches)
         with self._session_lock:
             awaited = self._session.awaited_frames(link)
@@ -494,35 +499,39 @@ class LiveInput(DeviceInput):
         if link == "data":
             self._link_state.record_frames(batches)
             if interrupted or any(map(len, batches)):
-                self._ready.append(Arrival(batches, interrupted=interrupted))
+                self._ready.append(FrameBatch(batches, interrupted=interrupted))
 
     def _restart_sensor(self) -> None:
-        """Send the opening commands again: the device is back, and has lost its state."""
+        """Send the opening commands again, because the sensor may have lost its settings."""
         with self._session_lock:
-            names = self.sensor.on_open if self._stops else ()
-            self._checked += [self._session.request(name, self._clock.now()) for name in names]
+            names = self.sensor.on_open if self._was_opened else ()
+            self._restart_replies += [
+                self._session.request(name, self._clock.now()) for name in names
+            ]
             self._send_outgoing()
 
     def _warn_if_changed(self) -> None:
-        """Warn if the sensor that came back reports other values than before.
+        """Warn if the reconnected sensor reports other options than before.
 
-        It may be another sensor.
+        It may be another unit.
         """
-        done = [one for one in self._checked if one.done]
-        self._checked = [one for one in self._checked if not one.done]
+        done = [pending for pending in self._restart_replies if pending.done]
+        self._restart_replies = [pending for pending in self._restart_replies if not pending.done]
         for pending in done:
             with contextlib.suppress(CommandError):
-                again = learn_options(self.sensor, pending.result())
-                others = [
-                    name for name, value in again.items() if self.learned.get(name, value) != value
+                options = learn_options(self.sensor, pending.result())
+                changed = [
+                    name
+                    for name, value in options.items()
+                    if self.learned.get(name, value) != value
                 ]
                 self._reported_warnings += [
                     f"{self._source}: the sensor that came back has another {name}: open it again"
-                    for name in others
+                    for name in changed
                 ]
 
     def _send_outgoing(self) -> None:
-        """Send the outgoing data of the session."""
+        """Send the outgoing data of the session; fail its requests if that is impossible."""
         for outgoing in self._session.outgoing():
             try:
                 self._write(outgoing)
@@ -551,7 +560,9 @@ class LiveInput(DeviceInput):
                 self._source, link, self.sensor.links[link], self._host()
             )
             if _is_broadcast(self.sensor.links[link]):
-                self._answering[link] = SenderFilter(self._source, self.sensor, datagrams=True)
+                self._broadcast_senders[link] = SenderFilter(
+                    self._source, self.sensor, datagrams=True
+                )
             self._decoders[link] = self.sensor.decoder(
                 stream=not opened.datagrams, backend=self._backend
             )
@@ -563,17 +574,17 @@ def _is_broadcast(link: Link | None) -> bool:
     return isinstance(link, Udp) and bool(link.broadcast)
 
 
-def _runs(events: list[Event]) -> list[tuple[str, list[Chunk] | LinkEvent | BaseException]]:
-    """Join consecutive chunks of one link, up to each interruption."""
-    runs: list[tuple[str, list[Chunk] | LinkEvent | BaseException]] = []
-    run: list[Chunk] = []  # the last run of chunks; empty after another event
+def _join_chunks(events: list[Event]) -> list[tuple[str, list[Chunk] | LinkEvent | BaseException]]:
+    """Return events with consecutive chunks of one link as a list, up to each gap."""
+    joined: list[tuple[str, list[Chunk] | LinkEvent | BaseException]] = []
+    run: list[Chunk] = []  # the last list of chunks; empty after another event
     for link, item in events:
         if not isinstance(item, Chunk):
             run = []
-            runs.append((link, item))
-        elif run and runs[-1][0] == link and not item.gap:
+            joined.append((link, item))
+        elif run and joined[-1][0] == link and not item.gap:
             run.append(item)
         else:
             run = [item]
-            runs.append((link, run))
-    return runs
+            joined.append((link, run))
+    return joined

@@ -1,4 +1,4 @@
-"""Make packets of one type, and scans, from arriving frames.
+"""Make packets of one type, and scans, from batches of frames.
 
 A `PacketReader` keeps the state that a batch of packets needs from the batches before it.
 """
@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
-from lidarspec.device.device_input import Arrival
+from lidarspec.device.device_input import FrameBatch
 from lidarspec.device.first_frames import FirstFrames
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
@@ -20,24 +20,25 @@ from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import ScanStream, release_yielded
 from lidarspec.sensor_operations import Sensor
 
-#: Batches that are kept until the type of the data frames is known.
+#: Number of batches that are kept until the type of the data frames is known.
 _MAX_UNDECIDED_BATCHES = 256
-#: IMU samples that are kept for a scan that does not end.
+#: Number of IMU samples that are kept for a scan that does not end.
 _MAX_WAITING_IMU_SAMPLES = 1 << 16
 
 
 class PacketReader:
-    """Packets of one frame type, and the samples of the IMU.
+    """Makes packets of one frame type, and IMU samples, from batches of frames.
 
     Args:
-        frame: the frame type; by default the data frame, and for a sensor with several of them the
-            one that arrives first.
+        sensor: the sensor that sends the frames.
+        frame: the frame type; None for the data frame. If the sensor has several data frame types,
+            None selects the type that arrives first.
         decoder: the decoder that finds the frames.
         first: the frames that count as seen before the first packet.
 
     Attributes:
-        last: the packets of the last arrival.
-        imu_samples: the IMU samples of the last arrival.
+        last: the packets of the last batch.
+        imu_samples: the IMU samples of the last batch.
     """
 
     def __init__(
@@ -58,20 +59,23 @@ class PacketReader:
 
     @property
     def waiting_imu(self) -> WaitingSamples | None:
-        """The IMU samples that wait for the end of their scan, if scans have any."""
+        """The IMU samples of scans that have not ended; None if scans have no samples."""
         if self._imu is not None:
             return self._imu.waiting
         return None
 
-    def add(self, arrival: Arrival) -> Packets | None:
-        """Return the packets among the frames of an arrival; None while their type is unknown."""
-        if arrival.replaced:
+    def add(self, batch: FrameBatch) -> Packets | None:
+        """Return the packets in a batch of frames; None while their type is unknown.
+
+        Until the type is known, the frames are kept.
+        """
+        if batch.replaced:
             self._undecided.clear()
             if self._frame is None:
                 self._stream = None
             else:
                 self._stream = self._make_stream(self._frame)
-        self._undecided += arrival.found
+        self._undecided += batch.frames
         frames = list(self._undecided)
         if self._stream is None:
             name = data_frame(self._sensor, frames)
@@ -80,40 +84,46 @@ class PacketReader:
             self._stream = self._make_stream(name)
         self._undecided.clear()
         self.last = self._stream.add(frames)
-        if arrival.interrupted:
+        if batch.interrupted:
             self._stream.interrupt()
         return self.last
 
-    def add_imu(self, arrival: Arrival, packets: Packets | None) -> None:
-        """Read the IMU samples of an arrival and of its packets, which may have samples too."""
+    def add_imu(self, batch: FrameBatch, packets: Packets | None) -> None:
+        """Read the IMU samples of a batch, and store them in `imu_samples`.
+
+        Args:
+            packets: the packets of the batch; some sensors have IMU samples in their data frames.
+        """
         if self._imu is None:
             return
-        if arrival.replaced:
+        if batch.replaced:
             waiting = self._imu.waiting
             self._imu = self._make_imu_stream()
             assert self._imu is not None
             self._imu.waiting = waiting
-        self.imu_samples = self._imu.add(arrival.found, packets)
+        self.imu_samples = self._imu.add(batch.frames, packets)
         if self._imu.waiting is not None:
             self._imu.waiting.keep_newest(_MAX_WAITING_IMU_SAMPLES)
-        if arrival.interrupted:
+        if batch.interrupted:
             self._imu.interrupt()
 
     def find_scans(
-        self, stream: ScanStream, arrival: Arrival, *, is_added: bool = False
+        self, stream: ScanStream, batch: FrameBatch, *, is_added: bool = False
     ) -> Iterator[Scan]:
-        """Yield the scans that an arrival completes; an interruption ends the last one.
+        """Yield the scans that a batch completes; an interruption ends the last scan.
 
         Args:
-            is_added: the arrival is the one that was added last.
+            stream: the stream that divides packets into scans.
+            batch: the next frames.
+            is_added: whether `batch` was the argument of the last `add`, so its packets are `last`.
         """
         packets = self.last
         if not is_added:
-            packets = self.add(arrival)
-            self.add_imu(arrival, packets)
+            packets = self.add(batch)
+            self.add_imu(batch, packets)
         if packets is not None and len(packets):
             yield from release_yielded(stream.add(packets))
-        if arrival.interrupted:
+        if batch.interrupted:
             yield from stream.finish()
 
     def make_empty_batch(self) -> Packets:
@@ -122,7 +132,10 @@ class PacketReader:
         return stream.add([])
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the last packets: an unpickled reader continues with the next ones."""
+        """Return the state without the last packets and samples.
+
+        An unpickled reader continues with the next batch.
+        """
         return {**vars(self), "last": None, "imu_samples": join_samples([])}
 
     def _make_stream(self, frame: str) -> PacketStream:

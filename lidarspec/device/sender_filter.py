@@ -1,10 +1,10 @@
-"""Select the datagrams of one sensor, so that frames of two are never mixed.
+"""Select the datagrams of one sensor, so that frames of two sensors are never mixed.
 
-A sensor is an address: its data, calibration and replies come from there. The frames of one type
-come from one port of it, and from another port only after a restart; two ports that take turns are
-two sensors. A file with frames of two sensors is refused (`SenderCheck`): the user can select one.
-From a live source the first sender of data is read (`SenderFilter`): datagrams of others are left
-out before they are decoded.
+All data of a sensor comes from one IP address. The frames of one type come from one port, which can
+change after a restart. If two ports alternate, they belong to two sensors. In a file, frames of two
+sensors are an error (`SenderCheck`), and the user has to select one. From a live source, the first
+sender of data frames is read (`SenderFilter`), and datagrams of other senders are dropped before
+they are decoded.
 """
 
 from __future__ import annotations
@@ -22,32 +22,33 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.protocol import Chunk, Sender, endpoint
 
-#: limit of examined senders while the sensor is unknown, and of remembered ports.
+#: maximum number of senders that are examined to find the sensor, and of remembered ports.
 MAX_SENDERS = 16
 
 
 class SenderCheck:
-    """Checks that one sensor sends the frames of a file.
+    """Checks that one sensor sends all frames of a file.
 
     Args:
-        source: for messages.
+        source: the file, for messages.
+        sensor: the sensor.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor) -> None:
         self._source = source
         self._sensor = sensor
         self._owner: Sender | None = None
-        self._now: dict[str, Sender] = {}  # the current and previous senders of each frame type
-        self._before: dict[str, dict[Sender, None]] = {}
+        self._current: dict[str, Sender] = {}  # sender of each frame type
+        self._previous: dict[str, dict[Sender, None]] = {}  # its earlier senders, oldest first
 
     def check(self, sent: Iterable[tuple[str, Sender]]) -> None:
-        """Check the senders of frames.
+        """Check the senders of the next frames.
 
         Args:
             sent: the type and the sender of each frame.
 
         Raises:
-            UsageError: if two sensors send frames.
+            UsageError: if two sensors have sent frames.
         """
         for name, sender in sent:
             self._owner = self._owner or sender
@@ -57,25 +58,26 @@ class SenderCheck:
                 else self._find_concurrent_port(name, sender)
             )
             if other is not None:
-                raise self._warn_of_senders(other, sender)
+                raise self._make_error(other, sender)
 
     def _find_concurrent_port(self, name: str, sender: Sender) -> Sender | None:
-        """Return the port that took turns with this one for frames of a type.
+        """Return the port that alternates with `sender` for frames of a type.
 
-        Returns None if there is none. The frames then come from this port.
+        None if there is none; `sender` is then stored as the current port.
         """
-        port = self._now.setdefault(name, sender)
-        before = self._before.setdefault(name, {})
-        if sender == port or sender in before:
-            if sender == port:
-                return None
+        port = self._current.setdefault(name, sender)
+        previous = self._previous.setdefault(name, {})
+        if sender == port:
+            return None
+        if sender in previous:
             return port
-        if len(before) == MAX_SENDERS:
-            del before[next(iter(before))]
-        before[port], self._now[name] = None, sender
+        if len(previous) == MAX_SENDERS:
+            del previous[next(iter(previous))]
+        previous[port] = None
+        self._current[name] = sender
         return None
 
-    def _warn_of_senders(self, first: Sender, other: Sender) -> UsageError:
+    def _make_error(self, first: Sender, other: Sender) -> UsageError:
         one, two = (
             endpoint(sender) if first[0] == other[0] else sender[0] for sender in (first, other)
         )
@@ -90,15 +92,16 @@ class SenderCheck:
 class SenderFilter(SenderCheck):
     """Selects the datagrams of one sensor from a live source.
 
-    The sensor is the first sender of data frames, and before that the first sender of any frame.
+    The sensor is the first sender of data frames. Until a data frame arrives, it is the first
+    sender of any frame.
 
     Args:
         datagrams: whether each datagram is a whole frame, not a piece of a stream.
 
     Attributes:
-        foreign: number of datagrams of other senders so far; `other_sender` sent the first of them.
-        has_changed: whether the last call of `select` has selected another sender than the one read
-            before.
+        foreign: number of datagrams of other senders so far.
+        other_sender: the first other sender; None if there is none.
+        has_changed: whether the last call of `select` has changed the selected sender.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, *, datagrams: bool) -> None:
@@ -108,24 +111,23 @@ class SenderFilter(SenderCheck):
         self.other_sender: Sender | None = None
         self._is_sure = False
         self._datagrams = datagrams
-        self._first: Sender | None = None  # sender of a stream before its first frame
+        self._first: Sender | None = None  # first sender of a stream, until a frame arrives
         self._probes: dict[Sender, Decoder] = {}
-        self._other_senders: dict[
-            Sender, None
-        ] = {}  # ports of other sensors at the address of the sensor
+        # Ports of other sensors at the address of the sensor.
+        self._other_senders: dict[Sender, None] = {}
 
     @property
     def address(self) -> Sender | None:
-        """The address and port of the sensor, None until a frame has arrived."""
+        """The address and port of the sensor; None until a frame has arrived."""
         return self._owner
 
     def configure(self, sensor: Sensor) -> None:
-        """Continue with a sensor that has been configured."""
+        """Continue with the configured sensor."""
         self._sensor = sensor
         self._probes.clear()
 
     def choose(self, sender: Sender) -> None:
-        """Select a sender, since it has answered on another link."""
+        """Select a sender that has replied on another link, unless one is selected."""
         self._owner = self._owner if self._is_sure else sender
         self._is_sure = True
 
@@ -142,18 +144,18 @@ class SenderFilter(SenderCheck):
         return [f"{text}; next: the same with {other} to read that one"]
 
     def select(self, chunks: Sequence[Chunk]) -> list[Chunk]:
-        """Return the datagrams that the sensor sent.
+        """Return the datagrams that the sensor sent, and count the others.
 
-        Until a sender has sent a frame, all datagrams are returned, of a stream those of the first
-        sender.
+        Until a frame has arrived, all datagrams are returned. If the datagrams are pieces of a
+        stream, only the datagrams of the first sender are returned.
         """
         mine: list[Chunk] = []
         self.has_changed = False
         for chunk in chunks:
-            if chunk.sender is not None and self._replaces(chunk.sender, chunk):
+            if chunk.sender is not None and self._update_owner(chunk.sender, chunk):
                 self.has_changed = True
-                for one in mine:
-                    self._count_foreign(one.sender)
+                for earlier in mine:
+                    self._count_foreign(earlier.sender)
                 mine = []
             if chunk.sender is None or self._is_ours(chunk.sender):
                 mine.append(chunk)
@@ -162,19 +164,21 @@ class SenderFilter(SenderCheck):
         return mine
 
     def select_ports(self, sent: Sequence[tuple[str, Sender]], frames: Frames) -> Frames:
-        """Return those of the frames from the address of the sensor that its ports sent.
+        """Return the frames from the ports of the sensor, and count the others.
+
+        Other ports at the same address belong to other sensors.
 
         Args:
-            sent: the type and the sender of each frame, or of each type if one sender sent all.
+            sent: the type and the sender of each frame; if one sender sent all frames, each type
+                once.
+            frames: frames from the address of the sensor.
         """
         count_before = len(self._other_senders)
         for name, sender in sent:
             if sender not in self._other_senders:
-                self._take_turns(name, sender)
+                self._find_port(name, sender)
                 if self._sensor.frames[name].data:
                     self._owner = sender
-                else:
-                    self._owner = self._owner
         if len(self._other_senders) == count_before or len(sent) < len(frames):
             return frames
         mine = [sender not in self._other_senders for _, sender in sent]
@@ -183,11 +187,11 @@ class SenderFilter(SenderCheck):
                 self._count_foreign(sender)
         return frames.select(np.array(mine, np.bool_))
 
-    def _replaces(self, sender: Sender, chunk: Chunk) -> bool:
-        """Decide from a chunk which sender is the sensor.
+    def _update_owner(self, sender: Sender, chunk: Chunk) -> bool:
+        """Decide from a chunk whether its sender is the sensor, and store it if so.
 
         Returns:
-            Whether the sender replaces another one.
+            Whether the sender replaces another sender.
         """
         owner = self._owner
         if (
@@ -196,14 +200,14 @@ class SenderFilter(SenderCheck):
             and (self._datagrams or sender == owner or not self._may_be_same_device(sender, owner))
         ):
             return False
-        names = self._names(sender, chunk)
+        names = self._find_frame_types(sender, chunk)
         if self._is_sure:
-            if names:  # of a stream that comes from another port
-                self._owner = self._take_turns("", sender)
+            if names:  # the stream comes from another port
+                self._owner = self._find_port("", sender)
             return False
         self._is_sure = any(self._sensor.frames[name].data for name in names)
         if self._is_sure or (names and owner is None):
-            self._owner = self._now[""] = sender
+            self._owner = self._current[""] = sender
         current = owner or self._first
         return current is not None and self._owner is not None and not self._is_ours(current)
 
@@ -219,42 +223,46 @@ class SenderFilter(SenderCheck):
         """Return whether a sender may be the sensor at another port."""
         return sender[0] == owner[0] and sender not in self._other_senders
 
-    def _names(self, sender: Sender, chunk: Chunk) -> set[str]:
+    def _find_frame_types(self, sender: Sender, chunk: Chunk) -> set[str]:
         """Return the types of the frames that a datagram completes.
 
-        Only the first few senders are examined.
+        Only `MAX_SENDERS` senders are examined; the result is empty for others.
         """
         if sender not in self._probes and len(self._probes) >= MAX_SENDERS:
             return set()
         decoder = self._probes.setdefault(sender, self._sensor.decoder(stream=not self._datagrams))
         return {item.frame for item in decoder.feed(chunk.data)}
 
-    def _take_turns(self, name: str, sender: Sender) -> Sender:
+    def _find_port(self, name: str, sender: Sender) -> Sender:
         """Return the port that frames of a type come from.
 
-        If several ports take turns, it is the first one.
+        If `sender` alternates with other ports, it is the port, and the others are added to
+        `_other_senders`.
         """
-        younger = self._find_concurrent_port(name, sender)
-        if younger is not None:
-            self._other_senders |= dict.fromkeys([*self._before[name], younger])
+        concurrent_port = self._find_concurrent_port(name, sender)
+        if concurrent_port is not None:
+            self._other_senders |= dict.fromkeys([*self._previous[name], concurrent_port])
             del self._other_senders[sender]
             while len(self._other_senders) > MAX_SENDERS:
                 del self._other_senders[next(iter(self._other_senders))]
-            self._now[name], self._before[name] = sender, {}
-        return self._now[name]
+            self._current[name] = sender
+            self._previous[name] = {}
+        return self._current[name]
 
     def _count_foreign(self, sender: Sender | None) -> None:
-        self.foreign = self.foreign + 1
+        self.foreign += 1
         self.other_sender = self.other_sender or sender
 
 
 def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tuple[str, Sender]]:
     """Return the type and the sender of each frame found in datagrams.
 
-    If one sender sent all of them, each type is listed once. Returns [] if senders are not known.
+    If one sender sent all datagrams, each type is listed once. Empty if a sender is unknown.
 
     Args:
-        end: the end of these datagrams, in bytes since the start of the input.
+        chunks: the datagrams.
+        frames: the frames in them.
+        end: the end of the last datagram, in bytes since the start of the input.
     """
     senders = {chunk.sender for chunk in chunks}
     if None in senders:
@@ -267,9 +275,9 @@ def frame_senders(chunks: Sequence[Chunk], frames: Frames, end: int) -> list[tup
             for kind in np.unique(frames.kinds).tolist()
         ]
     ends = end - np.cumsum([len(chunk.data) for chunk in reversed(chunks)])[::-1]
-    places = np.searchsorted(ends, frames.offsets, side="right") - 1
+    indices = np.searchsorted(ends, frames.offsets, side="right") - 1
     chunk_senders = [chunk.sender for chunk in chunks if chunk.sender is not None]
     return [
-        (frames.names[kind], chunk_senders[place])
-        for kind, place in zip(frames.kinds.tolist(), places.tolist(), strict=True)
+        (frames.names[kind], chunk_senders[index])
+        for kind, index in zip(frames.kinds.tolist(), indices.tolist(), strict=True)
     ]

@@ -1,16 +1,16 @@
 """Commands and their replies, without I/O.
 
-Requests go in, and bytes to send come out; frames go in, and replies come out. All times are the
-caller's, in ns of one monotonic clock. Each link has one request at a time. Others wait in a queue,
-also while the device settles. All frames that arrive on the link, data or not, are compared with
-the expected reply.
+Requests go in, and bytes to send come out; frames go in, and replies come out. The caller passes
+all times, in ns of one monotonic clock. Each link has one current request. Further requests wait in
+a queue, also while the device settles. All frames that arrive on the link, data or not, are
+compared with the expected reply.
 
-A late reply must not be used for the next request. If a sent command gets no reply in time, the
-session still expects one, until twice the timeout has passed. If that late reply could also be the
-reply to the next request (a common frame type, and no field in which the two have to differ), the
-next request is held back. A late reply that does arrive is counted in `late`, and releases it. A
-frame that arrived before a request was sent is not its reply. After twice the timeout, only the
-fields in `matches` or `echoes` distinguish a late reply from the next one.
+A late reply must not be used as the reply to the next request. If no reply to a command arrives in
+time, the session still expects the reply until twice the timeout has passed. If this late reply
+could also be the reply to the next request (they share a frame type, and no field has to differ),
+the next request is held back. If the late reply arrives, it is counted in `late`, and the next
+request is sent. A frame that arrived before a request was sent is not its reply. After twice the
+timeout, only the fields in `matches` or `echoes` distinguish a late reply from the next reply.
 
 A running number (`Count`) is filled in when a request is made, so that a repeated command has the
 same number; `echoes` then distinguishes its reply from all others. The owner of the session
@@ -34,10 +34,10 @@ from lidarspec.spec.description import Command
 from lidarspec.spec.options import Learned
 from lidarspec.spec.tree import FieldInfo
 
-#: maximum number of fields in a reply's repr.
-SHOWN = 6
+#: maximum number of fields in the repr of a reply.
+MAX_SHOWN_FIELDS = 6
 _MISSING = object()
-SECOND = 1_000_000_000
+NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -51,17 +51,18 @@ class OutgoingData:
 
 @dataclass(frozen=True, repr=False)
 class Reply:
-    """The answer to a command.
+    """The reply to a command.
 
     Attributes:
         command: the name of the command.
-        frame: the type of the frame that answered; None if no answer is documented.
-        values: its fields, raw wire integers as `Sensor.parse` returns them; ``reply["path"]`` is
-            the physical value.
-        confirmed: whether the device answered.
-        at: the arrival time by the session's clock; without a reply, the time when the command was
-            sent.
+        frame: the type of the frame; None if the sensor documents no reply.
+        values: the fields of the frame as raw wire integers, as returned by `Sensor.parse`;
+            ``reply["path"]`` is the physical value.
+        confirmed: whether the device replied.
+        at: the arrival time by the session's clock, ns; if `confirmed` is False, the time when the
+            command was sent.
         data: the bytes of the frame.
+        fields: the fields of the frame type, by path.
     """
 
     command: str
@@ -73,7 +74,7 @@ class Reply:
     fields: Mapping[str, FieldInfo] = field(default_factory=dict, compare=False)
 
     def __getitem__(self, path: str) -> Any:
-        """Return the value of a field in its unit, a list if it is in an array.
+        """Return the physical value of a field; a list if the field is in an array.
 
         Raises:
             UnknownField: for a path that the frame does not have.
@@ -83,7 +84,7 @@ class Reply:
             raise UnknownField(
                 path, self.fields, place=f"{self.command} {self.frame or 'without a reply'}"
             )
-        return _physical(self.fields[path], value)
+        return _to_physical(self.fields[path], value)
 
     def __repr__(self) -> str:
         if not self.confirmed:
@@ -95,14 +96,14 @@ class Reply:
         ]
         texts = [
             f"{info.path} {self[info.path]}{' ' * bool(info.unit)}{info.unit}"
-            for info in free[:SHOWN]
+            for info in free[:MAX_SHOWN_FIELDS]
         ]
-        more = ", ..." if len(free) > SHOWN else ""
+        more = ", ..." if len(free) > MAX_SHOWN_FIELDS else ""
         return f"Reply({self.command}, {self.frame}: {', '.join(texts)}{more})"
 
 
 class PendingReply:
-    """The future result of a command: its reply or its failure."""
+    """The future result of a command: a reply or an error."""
 
     def __init__(self, place: str) -> None:
         self._place = place
@@ -115,7 +116,7 @@ class PendingReply:
 
     @property
     def failure(self) -> CommandError | None:
-        """The error if there is no reply; None for success, or if it is not done."""
+        """The error of the command; None if it succeeded or is not done."""
         if isinstance(self._outcome, CommandError):
             return self._outcome
         return None
@@ -124,9 +125,10 @@ class PendingReply:
         """Return the reply.
 
         Raises:
-            ReplyTimeout: if none came in time.
-            CommandError: if the device answered with something else, or the command was abandoned.
-            UsageError: if it is not done.
+            ReplyTimeout: if no reply arrived in time.
+            CommandError: if the device sent another reply or refused, or if the command was
+                abandoned.
+            UsageError: if the command is not done.
         """
         if self._outcome is None:
             raise UsageError(f"{self._place} is not answered yet")
@@ -146,7 +148,7 @@ class ExpectedReply:
     Attributes:
         tables: frame type -> fields by path.
         values: path -> required value; paths that a type does not have are ignored.
-        refusal: the type of the frame that refuses; None if there is none.
+        refusal: the frame type with which the sensor refuses; None if there is no such type.
     """
 
     tables: Mapping[str, Mapping[str, FieldInfo]]
@@ -154,7 +156,7 @@ class ExpectedReply:
     refusal: str | None = None
 
     def find_differences(self, frame: str, values: Any) -> list[str]:
-        """Return the differences between a frame and the reply; empty if there are none."""
+        """Return the differences between a frame and the reply in words; empty if equal."""
         if frame not in self.tables:
             return [f"a frame {frame}"]
         expected = {
@@ -166,10 +168,10 @@ class ExpectedReply:
             for path in expected
             if got[path] != expected[path]
         ]
-        return [f"{path} {there} instead of {expected[path]}" for path, there in wrong]
+        return [f"{path} {value} instead of {expected[path]}" for path, value in wrong]
 
     def overlaps(self, other: ExpectedReply) -> bool:
-        """Return whether one frame could be the reply to both."""
+        """Return whether one frame could be both replies."""
         return any(
             all(
                 other.values.get(path, value) == value
@@ -181,9 +183,9 @@ class ExpectedReply:
 
 
 def get_nested(values: Any, path: str) -> Any:
-    """Return the value at a path of a parsed frame.
+    """Return the value at a path of a parsed frame; `_MISSING` if there is none.
 
-    Below an array without an index, it is a list of values. If there is no value, it is `_MISSING`.
+    If the path leads through an array without an index, the result is a list of values.
     """
     for name in split_path(path):
         if isinstance(name, int):
@@ -200,9 +202,9 @@ def get_nested(values: Any, path: str) -> Any:
     return values
 
 
-def _physical(info: FieldInfo, value: Any) -> Any:
+def _to_physical(info: FieldInfo, value: Any) -> Any:
     if isinstance(value, list):
-        return [_physical(info, element) for element in value]
+        return [_to_physical(info, element) for element in value]
     if isinstance(value, int | float):
         return info.physical(value)
     return value
@@ -213,9 +215,9 @@ class _PendingCommand:
     """A command in progress.
 
     Attributes:
-        timeout: ns from the first sending until it fails.
-        sent: the times of its sendings.
-        wrong: the differences of the last frame that was almost the reply.
+        timeout: time from the first sending until the command fails, ns.
+        sent: the times of all sendings, ns.
+        wrong: the last frame of the reply's type that was not the reply, with the differences.
     """
 
     name: str
@@ -228,21 +230,21 @@ class _PendingCommand:
     wrong: str = ""
 
     @property
-    def gives_up(self) -> int:
+    def fails_at(self) -> int:
         return self.sent[0] + self.timeout
 
     @property
     def next_sending(self) -> int | None:
-        """The time at which it is sent again, None if it is not."""
-        again = self.sent[-1] + _ns(self.command.timeout)
-        if len(self.sent) <= self.command.retries and again < self.gives_up:
-            return again
+        """The time at which the command is sent again; None if it is not."""
+        next_time = self.sent[-1] + _to_ns(self.command.timeout)
+        if len(self.sent) <= self.command.retries and next_time < self.fails_at:
+            return next_time
         return None
 
     @property
-    def patience(self) -> int:
-        """The time after a sending in which a late reply is possible, in ns."""
-        return 2 * max(self.timeout, _ns(self.command.timeout))
+    def max_reply_delay(self) -> int:
+        """The time after a sending in which a late reply is possible, ns."""
+        return 2 * max(self.timeout, _to_ns(self.command.timeout))
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,25 +257,32 @@ class _LateReply:
 
 @dataclass(eq=False)
 class _LinkQueue:
-    """The state of one link; nothing is sent before `quiet`."""
+    """The requests of one link.
+
+    Attributes:
+        queue: requests that were not sent yet.
+        current: the sent request that waits for its reply.
+        late_replies: replies that may still arrive after their timeout.
+        quiet_until: time before which nothing is sent because the device settles, ns.
+    """
 
     queue: deque[_PendingCommand] = field(default_factory=deque)
     current: _PendingCommand | None = None
     late_replies: list[_LateReply] = field(default_factory=list)
-    quiet: int = 0
+    quiet_until: int = 0
 
-    def ready(self) -> int | None:
-        """Return the time at which the next request may be sent, None without one."""
+    def next_sending(self) -> int | None:
+        """Return the time at which the next request may be sent; None if none waits."""
         if self.current is not None or not self.queue:
             return None
         expected = self.queue[0].expected
         return max(
             [
-                self.quiet,
+                self.quiet_until,
                 *(
-                    owed.until
-                    for owed in self.late_replies
-                    if expected is not None and owed.expected.overlaps(expected)
+                    late.until
+                    for late in self.late_replies
+                    if expected is not None and late.expected.overlaps(expected)
                 ),
             ]
         )
@@ -281,7 +290,13 @@ class _LinkQueue:
 
 @dataclass(eq=False)
 class _Heartbeat:
-    """A command that is repeated."""
+    """A command that is sent regularly.
+
+    Attributes:
+        arguments: the arguments of the command.
+        due: the time of the next sending, ns.
+        pending: the reply to the last sending.
+    """
 
     arguments: dict[str, Any]
     due: int
@@ -291,15 +306,15 @@ class _Heartbeat:
 class Session:
     """The commands of one sensor on its links.
 
-    Pass every arriving frame to it, including those that `Decoder.idle` finds in silence: a device
-    that stops in the middle of a frame replies in bytes that look like the rest of it.
+    Pass every arriving frame to it, including the frames that `Decoder.idle` finds in silence: if a
+    device stops in the middle of a frame, its reply looks like the rest of that frame.
 
     Attributes:
         sensor: the sensor.
-        started: whether a command that starts the sensor was sent, and none since that stops it.
+        started: whether the last command that starts or stops the sensor was one that starts it.
         late: number of replies that arrived after their timeout.
-        unanswered: command -> error of a heartbeat that is not answered any more.
-        host: the address of this computer as the sensor sees it, None if unknown.
+        unanswered: command -> error, of heartbeats without a reply.
+        host: the address of this computer as seen by the sensor; None if unknown.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -321,11 +336,10 @@ class Session:
         It is sent as soon as its link is free.
 
         Args:
-            name: of the command.
-            now: the time in ns.
-            timeout: seconds to wait in total; by default the command's own timeout for each
-                sending.
-            arguments: of the command, in units.
+            name: the name of the command.
+            now: the current time, ns.
+            timeout: seconds to wait in total; by default the command's timeout for each sending.
+            arguments: the arguments of the command, in their units.
 
         Raises:
             UnknownCommand, UnknownField, MissingField, OutOfRange: for an invalid command; nothing
@@ -333,7 +347,7 @@ class Session:
         """
         filled = {
             path: self._fill_value(value)
-            for path, value in self._fill_values(name).items()
+            for path, value in self._find_filled(name).items()
             if path not in arguments
         }
         data = self.sensor.command(name, **arguments, **filled)
@@ -345,9 +359,9 @@ class Session:
             sent = None
         values = {**command.matches, **{path: get_nested(sent, path) for path in command.echoes}}
         if timeout is None:
-            wait = _ns(command.timeout) * (1 + command.retries)
+            wait = _to_ns(command.timeout) * (1 + command.retries)
         else:
-            wait = _ns(timeout)
+            wait = _to_ns(timeout)
         pending = PendingReply(f"{self.sensor.id} {name}")
         if tables:
             expected = ExpectedReply(tables, values, command.refusal)
@@ -357,28 +371,30 @@ class Session:
             _PendingCommand(name, command, data, expected, wait, pending)
         )
         if command.every:
-            self._heartbeats[name] = _Heartbeat(arguments, now + _ns(command.every), pending)
+            self._heartbeats[name] = _Heartbeat(arguments, now + _to_ns(command.every), pending)
         self._advance(command.link, now)
         return pending
 
     def outgoing(self) -> list[OutgoingData]:
-        """Return everything that has to be sent now, in order, once."""
+        """Return everything that has to be sent now, in order, and remove it."""
         out = self._out
         self._out = []
         return out
 
     def awaited_frames(self, link: str = "data") -> frozenset[str]:
-        """Return the frame types that `receive` needs from a link; it ignores others."""
+        """Return the frame types that `receive` needs from a link; it ignores all others."""
         line = self._lines.get(link)
         if line is None:
             return frozenset()
-        expected = [owed.expected for owed in line.late_replies] + (
-            [line.current.expected] if line.current and line.current.expected else []
+        replies = [late.expected for late in line.late_replies]
+        if line.current and line.current.expected:
+            replies.append(line.current.expected)
+        return frozenset(
+            name for reply in replies for name in (*reply.tables, reply.refusal) if name
         )
-        return frozenset(name for one in expected for name in (*one.tables, one.refusal) if name)
 
     def receive(self, frames: Iterable[Found], now: int, *, link: str = "data") -> None:
-        """Process frames that arrived on a link at the time `now`."""
+        """Compare frames that arrived on a link at the time `now` with expected replies."""
         line = self._lines.get(link)
         if line is None:
             return
@@ -386,22 +402,22 @@ class Session:
             if (
                 line.current is not None or line.late_replies
             ) and item.frame in self.awaited_frames(link):
-                self._take(line, item, now)
+                self._use_frame(line, item, now)
         self._advance(link, now)
 
     def tick(self, now: int) -> None:
-        """Send again, time out, end settling, and send heartbeats that are due."""
+        """Perform everything that is due: repeated commands, timeouts, heartbeats."""
         for name, beat in list(self._heartbeats.items()):
             if now >= beat.due:
-                beat.due = now + _ns(self.sensor.commands[name].every)
+                beat.due = now + _to_ns(self.sensor.commands[name].every)
                 if beat.pending.done:
                     if beat.pending.failure is not None:
                         self.unanswered[name] = beat.pending.failure
                     self.request(name, now, **beat.arguments)
         for link, line in self._lines.items():
             current = line.current
-            if current is not None and now >= current.gives_up:
-                self._give_up(line, current, _silence(self.sensor, current))
+            if current is not None and now >= current.fails_at:
+                self._fail(line, current, _make_timeout_error(self.sensor, current))
             elif (
                 current is not None
                 and current.next_sending is not None
@@ -412,26 +428,29 @@ class Session:
 
     @property
     def deadline(self) -> int | None:
-        """The time at which `tick` is needed next; None if there is none."""
+        """The time at which `tick` has to be called next, ns; None if it has not."""
         times = [beat.due for beat in self._heartbeats.values()]
         for line in self._lines.values():
             current = line.current
             if current is not None:
-                times.append(min(current.gives_up, current.next_sending or current.gives_up))
-            elif (ready := line.ready()) is not None:
+                times.append(min(current.fails_at, current.next_sending or current.fails_at))
+            elif (ready := line.next_sending()) is not None:
                 times.append(ready)
         return min(times, default=None)
 
     @property
     def busy(self) -> bool:
-        """Whether a request waits to be sent or answered; future heartbeats do not count."""
+        """Whether a request waits to be sent, or for its reply."""
         return any(line.current is not None or line.queue for line in self._lines.values())
 
     def abandon(self, reason: str, link: str | None = None) -> None:
-        """Fail every request and stop every heartbeat, or those on one link.
+        """Fail all requests and stop all heartbeats, because no reply is to be expected.
 
-        The link was lost, or no caller waits. Replies to commands that were sent are still
-        expected.
+        Late replies to commands that were sent are still recognised.
+
+        Args:
+            reason: the text of the error.
+            link: limits this to one link; None for all links.
         """
         for name in [
             name for name in self._heartbeats if link in (None, self.sensor.commands[name].link)
@@ -442,7 +461,7 @@ class Session:
             waiting = list(line.queue)
             line.queue.clear()
             if line.current is not None:
-                self._give_up(
+                self._fail(
                     line,
                     line.current,
                     CommandError(f"{self.sensor.id} {line.current.name}: {reason}"),
@@ -450,7 +469,7 @@ class Session:
             for request in waiting:
                 request.pending.settle(CommandError(f"{self.sensor.id} {request.name}: {reason}"))
 
-    def _fill_values(self, name: str) -> Mapping[str, Filled]:
+    def _find_filled(self, name: str) -> Mapping[str, Filled]:
         if name in self.sensor.commands:
             return self.sensor.commands[name].filled
         return {}
@@ -458,7 +477,7 @@ class Session:
     def _fill_value(self, value: Filled) -> Any:
         """Return a value that is known only when a command is sent.
 
-        It is our own address, or the next number, which all commands of the session share.
+        It is the address of this computer, or the next number of the session.
         """
         if isinstance(value, Address):
             return self.host
@@ -471,14 +490,14 @@ class Session:
     def _advance(self, link: str, now: int) -> None:
         """Send queued requests, up to the first that waits for a reply or is held back."""
         line = self._lines[link]
-        line.late_replies = [owed for owed in line.late_replies if owed.until > now]
-        while (ready := line.ready()) is not None and now >= ready:
+        line.late_replies = [late for late in line.late_replies if late.until > now]
+        while (ready := line.next_sending()) is not None and now >= ready:
             request = line.queue.popleft()
             self._send(request, now)
             if request.expected is not None:
                 line.current = request
             else:
-                line.quiet = now + _ns(request.command.settle)
+                line.quiet_until = now + _to_ns(request.command.settle)
                 request.pending.settle(Reply(request.name, None, None, False, now))
 
     def _send(self, request: _PendingCommand, now: int) -> None:
@@ -487,11 +506,11 @@ class Session:
         self._out.append(OutgoingData(command.link, request.data, command.lines))
         self.started = (self.started or command.starts) and not command.stops
 
-    def _take(self, line: _LinkQueue, item: Found, now: int) -> None:
+    def _use_frame(self, line: _LinkQueue, item: Found, now: int) -> None:
         """Use a frame as the reply to the current request, or as a late reply."""
         values = self.sensor.parse(item.data, item.frame)
         current = line.current
-        if self._is_refusal(line, item, values, now):
+        if self._use_refusal(line, item, values, now):
             return
         if current is None or current.expected is None:
             differs = ["not asked for"]
@@ -501,13 +520,13 @@ class Session:
             reply = Reply(
                 current.name, item.frame, values, True, now, item.data, self._table(item.frame)
             )
-            self._close(line, current, answers=1, since=now)
+            self._free_link(line, current, reply_count=1, since=now)
             current.pending.settle(reply)
             self.unanswered.pop(current.name, None)
             return
-        for owed in line.late_replies:
-            if not owed.expected.find_differences(item.frame, values):
-                line.late_replies.remove(owed)
+        for late in line.late_replies:
+            if not late.expected.find_differences(item.frame, values):
+                line.late_replies.remove(late)
                 self.late += 1
                 return
         if (
@@ -518,17 +537,20 @@ class Session:
         ):
             current.wrong = f"{item.frame} with {', '.join(differs)}"
 
-    def _is_refusal(self, line: _LinkQueue, item: Found, values: Any, now: int) -> bool:
-        """Return whether a frame refuses the oldest request without a reply.
+    def _use_refusal(self, line: _LinkQueue, item: Found, values: Any, now: int) -> bool:
+        """Fail the oldest request without a reply if a frame refuses it.
 
-        The frame does not tell which request it refuses.
+        The frame does not name the request that it refuses.
+
+        Returns:
+            Whether the frame is a refusal.
         """
-        owed = next(
-            (owed for owed in line.late_replies if owed.expected.refusal == item.frame), None
+        refused = next(
+            (late for late in line.late_replies if late.expected.refusal == item.frame), None
         )
         current = line.current
-        if owed is not None:
-            line.late_replies.remove(owed)
+        if refused is not None:
+            line.late_replies.remove(refused)
             self.late += 1
         elif (
             current is not None
@@ -536,8 +558,8 @@ class Session:
             and current.expected.refusal == item.frame
             and now >= current.sent[0]
         ):
-            self._close(line, current, answers=1, since=now)
-            why = _reasons(self._table(item.frame), values) or repr(
+            self._free_link(line, current, reply_count=1, since=now)
+            why = _describe_labels(self._table(item.frame), values) or repr(
                 Reply(current.name, item.frame, values, True, now, fields=self._table(item.frame))
             )
             current.pending.settle(
@@ -547,30 +569,37 @@ class Session:
             return False
         return True
 
-    def _give_up(self, line: _LinkQueue, request: _PendingCommand, error: CommandError) -> None:
-        self._close(line, request, answers=0, since=request.sent[-1])
+    def _fail(self, line: _LinkQueue, request: _PendingCommand, error: CommandError) -> None:
+        self._free_link(line, request, reply_count=0, since=request.sent[-1])
         request.pending.settle(error)
 
-    def _close(
-        self, line: _LinkQueue, request: _PendingCommand, *, answers: int, since: int
+    def _free_link(
+        self, line: _LinkQueue, request: _PendingCommand, *, reply_count: int, since: int
     ) -> None:
-        """Free the link; each sending without a reply may still get a late one."""
+        """Free the link of the current request.
+
+        Each sending without a reply may still get a late reply.
+
+        Args:
+            reply_count: number of replies that arrived, 0 or 1.
+            since: the time from which the device settles, ns.
+        """
         line.current = None
-        line.quiet = since + _ns(request.command.settle)
+        line.quiet_until = since + _to_ns(request.command.settle)
         if request.expected is not None:
             line.late_replies += [
-                _LateReply(request.expected, sent + request.patience)
-                for sent in request.sent[answers:]
+                _LateReply(request.expected, sent + request.max_reply_delay)
+                for sent in request.sent[reply_count:]
             ]
 
 
 def learn_options(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     """Return the options that a reply reports, by name.
 
-    Empty if the command learns nothing.
+    Empty if the command declares no `learns`, or if the reply is not confirmed.
 
     Raises:
-        CommandError: for a reply that cannot be learned from.
+        CommandError: if `learns` raises, or returns an invalid option.
     """
     learns = sensor.commands[reply.command].learns
     if learns is None or not reply.confirmed:
@@ -597,11 +626,8 @@ def learn_options(sensor: Sensor, reply: Reply) -> dict[str, Any]:
     }
 
 
-def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
-    """Return the labels of the values of labelled fields, with their numbers.
-
-    Returns "" if no value has a label.
-    """
+def _describe_labels(fields: Mapping[str, FieldInfo], values: Any) -> str:
+    """Return the labels and numbers of all values with a label; "" if there are none."""
     reasons = [
         f"{path} {name} ({number})"
         for path, info in fields.items()
@@ -611,8 +637,7 @@ def _reasons(fields: Mapping[str, FieldInfo], values: Any) -> str:
     return ", ".join(reasons)
 
 
-def _silence(sensor: Sensor, request: _PendingCommand) -> CommandError:
-    """Return the error for a request without a reply."""
+def _make_timeout_error(sensor: Sensor, request: _PendingCommand) -> CommandError:
     place = f"{sensor.id} {request.name}"
     if request.wrong:
         return CommandError(f"{place}: the device answered with {request.wrong}")
@@ -628,11 +653,11 @@ def _silence(sensor: Sensor, request: _PendingCommand) -> CommandError:
         hint = f"; it is answered only while the sensor is stopped: send {stop!r} first"
     else:
         hint = ""
-    waited = f"{request.timeout / SECOND:g} s{often}"
+    waited = f"{request.timeout / NS_PER_S:g} s{often}"
     return ReplyTimeout(
         f"{place}: no {' or '.join(request.command.replies)} frame came within {waited}{hint}"
     )
 
 
-def _ns(seconds: float) -> int:
-    return round(seconds * SECOND)
+def _to_ns(seconds: float) -> int:
+    return round(seconds * NS_PER_S)

@@ -1,10 +1,11 @@
-"""Record a source as data arrives.
+"""Record a source to a file.
 
-A live source is recorded until the recording is ended, a file as fast as the disk allows.
+A live source is recorded until a limit is reached or the caller stops. A file is copied as fast as
+the disk allows.
 
-A live source with a known sensor is a `Device`: it is started and stopped, and the data is decoded
-to be counted. Without a sensor a `CaptureThread` reads it and nothing is sent. The recorder is made
-after the source is opened, because its format depends on the source.
+If the sensor of a live source is known, a `Device` starts and stops it, and decodes the data to
+count packets. Otherwise a `CaptureThread` reads the source, and nothing is sent. The recorder is
+made after the source is opened, because the format depends on the source.
 """
 
 from __future__ import annotations
@@ -31,46 +32,56 @@ from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import is_live, transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
-#: seconds between two checks of the time and of the disk.
-TURN = 0.1
-#: the parts of a warning that change from one to the next.
-_FIGURES = re.compile(r"[\d.]+")
+#: time between two checks of the limits and of the disk.
+CHECK_PERIOD_S = 0.1
+#: the numbers in a warning, which are ignored to detect repeated warnings.
+_NUMBERS = re.compile(r"[\d.]+")
 
 
-def recorder_like(
+def make_recorder(
     opened: Transport, source: str, target: str, sensor: Sensor | str | None, *, overwrite: bool
 ) -> BackgroundWriter:
-    """Return the recorder of a new file for an open source.
+    """Create a recording of an open source, and return its recorder.
 
-    If the source is a recording, its sensor, source and baud rate are taken over.
+    If the source is a recording, its sensor, source and baud rate are copied to the new header.
+
+    Args:
+        opened: the open source.
+        source: its SOURCE, for the header.
+        target: the new file.
+        sensor: the sensor, or its id; None if unknown.
+        overwrite: whether the file may exist.
 
     Raises:
-        UnknownFormat, UsageError, SourceError: as `recorder`.
+        UnknownFormat, UsageError, SourceError: the same as `recorder`.
     """
     if isinstance(opened, RecordingTransport):
         header = opened.header
     else:
         header = Header(source=source, baud=opened.baud)
-    whose = sensor or header.sensor
-    link = opened.datagrams
     return recorder(
-        target, whose, header.source, datagrams=link, baud=header.baud, overwrite=overwrite
+        target,
+        sensor or header.sensor,
+        header.source,
+        datagrams=opened.datagrams,
+        baud=header.baud,
+        overwrite=overwrite,
     )
 
 
 class TimedLog:
-    """A recorder with a time limit, which starts at the first arrival.
+    """A recorder with a time limit, which begins at the first arrival.
 
-    Sent data is always recorded.
+    Sent data is recorded without limit.
 
     Args:
-        recorder: writes the file; closed with this one.
-        seconds: the limit; None for none.
+        recorder: writes the file; closed with this object.
+        seconds: the time limit; None for no limit.
 
     Attributes:
-        first, last: arrival times of the first and the last recorded chunk, ns; None before the
-            first.
-        is_over: whether it ignores all further arrivals.
+        first: arrival time of the first recorded chunk, ns; None if nothing has arrived.
+        last: arrival time of the last recorded chunk, ns; None if nothing has arrived.
+        is_over: whether all further arrivals are ignored.
     """
 
     def __init__(self, recorder: BackgroundWriter, seconds: float | None) -> None:
@@ -85,18 +96,18 @@ class TimedLog:
 
     @property
     def error(self) -> SourceError | None:
-        """The failure of the file; None if there was none."""
+        """The error of writing the file; None if there was none."""
         return self._recorder.error
 
     @property
     def seconds(self) -> float | None:
-        """The time from the first arrival in the file to the last; None if there is none."""
+        """The time from the first to the last arrival in the file; None if it has none."""
         if self.first is None or self.last is None:
             return None
         return (self.last - self.first) / 1e9
 
     def has(self, chunk: Chunk) -> bool:
-        """Return whether a chunk that was received is in the file."""
+        """Return whether a received chunk is in the file."""
         return chunk.at is None or (self.last is not None and chunk.at <= self.last)
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
@@ -112,7 +123,7 @@ class TimedLog:
         self._recorder.write(chunk, direction)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """Record an event of the line."""
+        """Record an event of the link."""
         self._recorder.event(name, at, **details)
 
     def end(self) -> None:
@@ -125,25 +136,26 @@ class TimedLog:
 
 
 class SourceRecording:
-    """Record everything that a source sends to one file.
+    """Records everything that a source sends to one file.
 
     Args:
         source: any SOURCE.
         target: an .lsr, .pcap, .pcapng or .bin file.
-        sensor: the sensor; without it raw bytes are recorded.
-        seconds, count: the limits: a time, and a number of data packets of the sensor, or of
-            datagrams; None for no limit.
-        start: whether the commands for its start and end are sent to the sensor.
+        sensor: the sensor; None to record raw bytes.
+        seconds: the time limit; None for no limit.
+        count: the maximum number of data packets (of datagrams, if the sensor is unknown); None for
+            no limit.
+        start: whether to send the sensor's commands for opening and closing.
         overwrite: whether the file may exist.
-        salvage: continue after damaged parts, if the source is a recording.
+        salvage: whether to continue after damaged parts, if the source is a recording.
 
     Attributes:
-        recorder: the file, None before the source is open.
+        recorder: writes the file; None before the source is open.
         device: reads a live source; None if its sensor is unknown.
-        packets: number of data packets of the sensor so far, or of datagrams; at the end, of those
-            in the file.
-        elapsed: seconds since the source was opened; at the end, between the first and the last
-            arrival in the file.
+        packets: number of data packets so far (of datagrams, if the sensor is unknown); at the end,
+            the number of packets in the file.
+        elapsed: seconds since the source was opened; at the end, the seconds between the first and
+            the last arrival in the file.
     """
 
     def __init__(
@@ -174,10 +186,10 @@ class SourceRecording:
         self._began = 0.0
 
     def run(self) -> Generator[str, None, None]:
-        """Record until the end; yield messages, or "" regularly.
+        """Record until the end or a limit; yield messages, and "" at regular intervals.
 
         Raises:
-            UsageError: for a file that exists, or cannot contain the data of the source.
+            UsageError: if the file exists, or its format cannot contain the data of the source.
             SourceError: if the source cannot be read, or the file cannot be written.
         """
         if self._sensor is not None and is_live(self._source):
@@ -185,11 +197,11 @@ class SourceRecording:
         return self._record_bytes()
 
     def _record_device(self, sensor: Sensor) -> Generator[str, None, None]:
-        """Record the data of a sensor, and decode it to be counted.
+        """Record the data of a sensor, and decode it to count packets.
 
-        A thread records. Failures of decoding do not stop it.
+        A thread records, so that errors of decoding do not stop the recording.
         """
-        news = list[str]()
+        device_warnings = list[str]()
         failures = dict[str, None]()
         printed = set[str]()
         with Device(
@@ -198,10 +210,10 @@ class SourceRecording:
             log = self._log
             assert log is not None
             try:
-                while self._goes_on(log):
+                while not self._is_finished(log):
                     try:
                         self._count_next(self.device, log)
-                        news = self.device.warnings
+                        device_warnings = self.device.warnings
                     except SourceError:
                         raise
                     except (Exception, SystemExit) as error:
@@ -209,9 +221,11 @@ class SourceRecording:
                             f"{sensor.id}: decoding fails ({type(error).__name__}: {error}); the"
                             " recording goes on"
                         ] = None
-                        time.sleep(TURN)
-                    current = {_FIGURES.sub("", text): text for text in [*news, *failures]}
-                    yield "\n".join(text for what, text in current.items() if what not in printed)
+                        time.sleep(CHECK_PERIOD_S)
+                    current = {
+                        _NUMBERS.sub("", text): text for text in [*device_warnings, *failures]
+                    }
+                    yield "\n".join(text for key, text in current.items() if key not in printed)
                     printed = set(current)
             finally:
                 self._end(log)
@@ -220,8 +234,12 @@ class SourceRecording:
                         pass
 
     def _count_next(self, device: Device, log: TimedLog) -> bool:
-        """Count the next packets that are in the file; return whether there may be more of them."""
-        packets = next(device.packets(wait=TURN), None)
+        """Count the next packets that are in the file.
+
+        Returns:
+            Whether the file may contain more packets.
+        """
+        packets = next(device.packets(wait=CHECK_PERIOD_S), None)
         if packets is None or len(packets) == 0:
             return False
         count = int(np.count_nonzero(packets.host_ns <= (log.last or 0)))
@@ -252,16 +270,16 @@ class SourceRecording:
             yield from source.warnings
 
     def _record_live(self, source: LiveTransport, log: TimedLog) -> Generator[str, None, None]:
-        """Count and discard the data that a thread records."""
+        """Count the data that a thread records, and discard it."""
         queue = BoundedQueue()
         with contextlib.closing(CaptureThread(source, queue, log=log)) as capture:
             try:
-                while self._goes_on(log):
+                while not self._is_finished(log):
                     yield ""
-                    for mark in self._count_queued(source, queue, log, TURN):
-                        if mark is LinkEvent.LOST:
+                    for event in self._count_queued(source, queue, log, CHECK_PERIOD_S):
+                        if event is LinkEvent.LOST:
                             yield f"{self._source}: the device is gone; waiting for it to come back"
-                        elif mark is LinkEvent.BACK:
+                        elif event is LinkEvent.BACK:
                             yield f"{self._source}: the device is back"
             finally:
                 self._end(log)
@@ -274,24 +292,24 @@ class SourceRecording:
         """Take all events from the queue, and count the recorded datagrams.
 
         Returns:
-            The interruptions of the line meanwhile.
+            The other events, such as a lost device.
         """
-        marks = list[LinkEvent]()
+        events = list[LinkEvent]()
         for _, item in queue.take(wait):
             if isinstance(item, BaseException):
                 raise item
             if isinstance(item, LinkEvent):
-                marks.append(item)
+                events.append(item)
             elif source.datagrams and log.has(item):
                 self.packets += 1
-        return marks
+        return events
 
     def _copy(self, source: Transport, log: TimedLog) -> Generator[str, None, None]:
-        """Copy a file; data of standard input gets the time of its arrival."""
+        """Copy a file; give data of standard input its time of arrival."""
         clock = HostClock()
         assert self.recorder is not None
         for chunk in source.chunks():
-            if not self._goes_on(log, timed=False):
+            if self._is_finished(log, is_timed=False):
                 return
             yield ""
             self.recorder.wait_for_room()
@@ -302,7 +320,7 @@ class SourceRecording:
             self.packets += source.datagrams
 
     def _open_log(self, source: Transport, sensor: Sensor | str | None) -> TimedLog:
-        """Return the recorder for an open source and its configured sensor."""
+        """Create the recording of an open source and its configured sensor."""
         counts = source.datagrams or (
             self._sensor is not None and isinstance(source, LiveTransport)
         )
@@ -311,23 +329,29 @@ class SourceRecording:
                 f"-n counts packets, and {self._source} is a byte stream: name the sensor with -s,"
                 " or give a time with -t"
             )
-        self.recorder = recorder_like(
+        self.recorder = make_recorder(
             source, self._source, self._target, sensor, overwrite=self._overwrite
         )
         self._log = TimedLog(self.recorder, self._seconds)
         self._began = time.monotonic()
         return self._log
 
-    def _goes_on(self, log: TimedLog, *, timed: bool = True) -> bool:
-        """Return whether neither the time nor the count of packets is reached.
+    def _is_finished(self, log: TimedLog, *, is_timed: bool = True) -> bool:
+        """Update `elapsed`, and return whether a limit is reached.
 
-        Raises the error of the recorder, if there is one.
+        Args:
+            is_timed: whether the time limit applies to the time since the source was opened.
+
+        Raises:
+            SourceError: if the recorder has failed.
         """
         assert self.recorder is not None
         if self.recorder.error is not None:
-            self.recorder.sync()
+            self.recorder.sync()  # raises the error
         self.elapsed = time.monotonic() - self._began
         is_late = (
-            timed and self._seconds is not None and (log.is_over or self.elapsed >= self._seconds)
+            is_timed
+            and self._seconds is not None
+            and (log.is_over or self.elapsed >= self._seconds)
         )
-        return not is_late and (self._count is None or self.packets < self._count)
+        return is_late or (self._count is not None and self.packets >= self._count)

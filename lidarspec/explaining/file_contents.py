@@ -40,7 +40,7 @@ from lidarspec.view.rate_meter import MeterReading
 
 #: Maximum number of bytes and of packets to read from the beginning of a file, and of bytes of a
 #: sensor to decode.
-LOOKED_AT = 1 << 26
+MAX_BEGINNING_BYTES = 1 << 26
 PACKETS = 1 << 18
 DECODED = 1 << 24
 #: Maximum number of senders to list.
@@ -243,7 +243,7 @@ def _size(path: Path) -> int:
 def _count(contents: FileContents, opened: Transport) -> None:
     """Count the beginning of the file, and find the last time."""
     flows = dict[tuple[Sender | None, Sender | None], PacketFlow]()
-    left = LOOKED_AT
+    left = MAX_BEGINNING_BYTES
     chunks = opened.chunks()
     for number, chunk in enumerate(chunks):
         flow = flows.setdefault(
@@ -269,7 +269,7 @@ def _count(contents: FileContents, opened: Transport) -> None:
 def _find_last_time(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
     """Return the time of the last packet, None if that requires reading everything."""
     last = None
-    for chunk in chunks if opened.skip(_END) else ():
+    for chunk in chunks if opened.skip_until(_END) else ():
         last = chunk.at or last
     return last
 

@@ -216,7 +216,7 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
             any_came = True
             yield chunk
         elif is_first and wanted.time_until_start > MIN_SKIP_S * 1e9:
-            source.skip(chunk.at + wanted.time_until_start)
+            source.skip_until(chunk.at + wanted.time_until_start)
         if wanted.ended:
             break
     if wanted.first is not None and not any_came:

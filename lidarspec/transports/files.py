@@ -31,7 +31,7 @@ from lidarspec.captures.pcap import CaptureStats, is_stream_capture
 from lidarspec.captures.records import is_capture
 from lidarspec.errors import SourceError, UnknownSensor, UsageError, system_errors
 from lidarspec.recording.format import MAGIC, Header, Record, Recording
-from lidarspec.remote_files import is_stored, open_stored
+from lidarspec.remote_files import is_remote, open_stored
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.addresses import parse_origin
 from lidarspec.transports.hex_text import hex_chunks, is_hexadecimal
@@ -130,8 +130,8 @@ class RecordingTransport(Transport):
                 " which have no name"
             )
 
-    def skip(self, at: int) -> bool:
-        self._has_skipped = self._recording.seek(at)
+    def skip_until(self, time_ns: int) -> bool:
+        self._has_skipped = self._recording.seek(time_ns)
         return self._has_skipped
 
     def write(self, data: bytes) -> None:
@@ -335,9 +335,9 @@ class CaptureTransport(FileTransport):
                 yield replace(mine, gap=True) if self._gap() else mine
         self._warn(reader.stats)
 
-    def skip(self, at: int) -> bool:
+    def skip_until(self, time_ns: int) -> bool:
         with system_errors(self._path):
-            self._has_skipped = self.reader is not None and self.reader.skip(at)
+            self._has_skipped = self.reader is not None and self.reader.skip_until(time_ns)
         return self._has_skipped
 
     def _gap(self) -> bool:
@@ -390,7 +390,7 @@ def open_file(
                 " read: give the file itself"
             )
         refuse_container(name, start)
-        if log is not None and is_stored(path):
+        if log is not None and is_remote(path):
             raise SourceError(
                 f"{path} is {log.what}, which is read from this computer alone: copy it here"
             )

@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qs
 
-from lidarspec.device.settings import find_device
+from lidarspec.device.named_devices import find_device
 from lidarspec.errors import SpecError, UnknownOption, UsageError
 from lidarspec.plugins import registry
-from lidarspec.remote_files import is_stored
+from lidarspec.remote_files import is_remote
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Http, Link, Tcp, Udp
 from lidarspec.transports.addresses import SourceAddress, resolve_host
@@ -101,7 +101,7 @@ def live_address(source: str | Path) -> SourceAddress | None:
     if is_port(text):
         return SourceAddress.parse(text, scheme="serial")
     scheme = _SCHEME.match(text)
-    is_file = scheme is None or is_stored(text) or os.path.exists(text)
+    is_file = scheme is None or is_remote(text) or os.path.exists(text)
     if is_file:
         return None
     return SourceAddress.parse(text)

@@ -185,7 +185,7 @@ class Transport(ABC):
         """
 
     @property
-    def place(self) -> tuple[int, int] | None:
+    def progress(self) -> tuple[int, int] | None:
         """The read bytes and the size of the stored file; None if unknown."""
         stored: Any = self.stored
         if stored is None or not stored.seekable():
@@ -195,11 +195,11 @@ class Transport(ABC):
         )  # in a store, or on this computer
         return stored.tell(), size
 
-    def skip(self, at: int) -> bool:
+    def skip_until(self, time_ns: int) -> bool:
         """Skip everything that arrived before a time, if that needs no reading.
 
         Args:
-            at: the time, ns since 1970.
+            time_ns: ns since 1970.
 
         Returns:
             Whether data was skipped.

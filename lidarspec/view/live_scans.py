@@ -67,7 +67,7 @@ class LiveScans:
         self.number = 0
         self.meter = self._make_meter()
         self._select = select or Selection()
-        self._sieve = ScanSelector(self._select, device.source, device.skip)
+        self._sieve = ScanSelector(self._select, device.source, device.skip_until)
         self._times = TimeSlice(self._select.times)
         self._batches = device.packets(wait=LOOK_S)
         self._stream = ScanStream(device.sensor, device.mount)

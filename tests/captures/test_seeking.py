@@ -36,7 +36,7 @@ SENT = Datagram(bytes(1000), 0, ("192.168.1.201", 2368), UNKNOWN_ENDPOINT)
 def _near(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lidarspec.captures.records, "NEAR", NEAR)
     monkeypatch.setattr(CaptureBatches, "largest", NEAR)
-    monkeypatch.setattr(contents, "LOOKED_AT", 4 * NEAR)
+    monkeypatch.setattr(contents, "MAX_BEGINNING_BYTES", 4 * NEAR)
 
 
 def written(
@@ -64,7 +64,7 @@ def rest(source: CaptureTransport, to: int, *, in_batches: bool) -> list[int]:
     if not in_batches:
         chunks = source.chunks()
         assert not next(chunks).gap
-        assert source.skip(to)
+        assert source.skip_until(to)
         left = list(chunks)
         assert [chunk.gap for chunk in left[:3]] == [True, False, False]
         assert all(
@@ -74,7 +74,7 @@ def rest(source: CaptureTransport, to: int, *, in_batches: bool) -> list[int]:
         return [chunk.at or 0 for chunk in left]
     batches = source.batches()
     assert not next(batches).gap
-    assert source.skip(to)
+    assert source.skip_until(to)
     parts = list(batches)
     assert [batch.gap for batch in parts] == [True, *[False] * (len(parts) - 1)]
     assert all(
@@ -94,7 +94,7 @@ def test_seeking_reads_everything_after_a_time_and_little_before(
     with contextlib.closing(opened(written(tmp_path / name, link=link))) as source:
         times = rest(source, START + number * STEP, in_batches=in_batches)
         assert not source.warnings
-        assert not source.skip(START)
+        assert not source.skip_until(START)
     assert times[0] <= START + min(number, NUMBER - 1) * STEP
     assert times == list(range(times[0], START + NUMBER * STEP, STEP))
     assert len(times) * 1000 < max(NUMBER - number, 0) * 1000 + NEAR + (1 << 16)
@@ -131,9 +131,9 @@ def test_seeking_never_goes_back(tmp_path: Path) -> None:
     with contextlib.closing(opened(written(tmp_path / "drive.pcap"))) as source:
         batches = source.batches()
         next(batches)
-        assert source.skip(START + NUMBER * 3 // 4 * STEP)
+        assert source.skip_until(START + NUMBER * 3 // 4 * STEP)
         seen = [next(batches)]
-        assert not source.skip(START + NUMBER // 6 * STEP)
+        assert not source.skip_until(START + NUMBER // 6 * STEP)
         times = np.concatenate([batch.at for batch in (*seen, *batches)])
     assert (np.diff(times) == STEP).all()
     assert times[-1] == START + (NUMBER - 1) * STEP
@@ -154,7 +154,7 @@ def test_no_seek_with_other_time_bases(tmp_path: Path) -> None:
     with contextlib.closing(opened(path)) as source:
         batches = source.batches()
         next(batches)
-        assert source.skip(end)
+        assert source.skip_until(end)
         times = np.concatenate([batch.at for batch in batches])
     assert times[0] < START + NUMBER * 2 // 3 * STEP
     assert np.count_nonzero(times == end) == NUMBER // 2
@@ -166,13 +166,13 @@ def test_a_packed_capture_is_read_from_its_beginning(tmp_path: Path) -> None:
     with contextlib.closing(opened(path)) as source:
         batches = source.batches()
         number = len(next(batches))
-        assert not source.skip(START + NUMBER * 2 // 3 * STEP)
+        assert not source.skip_until(START + NUMBER * 2 // 3 * STEP)
         assert number + sum(map(len, batches)) == NUMBER
 
 
 def test_the_duration_of_a_long_capture_is_known_without_reading_it(tmp_path: Path) -> None:
     path = written(tmp_path / "long.pcap")
-    assert path.stat().st_size > contents.LOOKED_AT
+    assert path.stat().st_size > contents.MAX_BEGINNING_BYTES
     assert contents.measure_duration(path) == pytest.approx((NUMBER - 1) * STEP * 1e-9)
 
 
@@ -219,7 +219,7 @@ def test_no_scan_continues_across_a_seek(captured: Path) -> None:
     with ls.open(captured, "velodyne-vlp16") as device:
         scans = device.scans()
         next(scans)
-        assert device.skip(START + 35 * 10**8)
+        assert device.skip_until(START + 35 * 10**8)
         left = list(scans)
         assert device.stats.lost == 0
     gap = int(np.diff([scan.host_ns for scan in left]).argmax())
@@ -240,7 +240,7 @@ def test_no_frame_continues_across_a_seek(tmp_path: Path) -> None:
     with ls.open(path, sensor) as device:
         packets = device.packets()
         next(packets)
-        assert device.skip(START + 1700 * STEP)
+        assert device.skip_until(START + 1700 * STEP)
         number = sum(map(len, packets))
         stats = device.stats
     assert stats.lost <= 1  # the one that is torn
@@ -255,7 +255,7 @@ def test_no_frame_continues_across_a_seek(tmp_path: Path) -> None:
 def test_a_stream_reader_seeks_as_well(tmp_path: Path) -> None:
     with written(tmp_path / "stream.pcap", link=USER0).open("rb") as file:
         reader = StreamReader(file)
-        assert not reader.skip(START)  # nothing was read
+        assert not reader.skip_until(START)  # nothing was read
         next(iter(reader))
-        assert reader.skip(START + 1700 * STEP)
+        assert reader.skip_until(START + 1700 * STEP)
         assert next(iter(reader)).at > START + NUMBER // 2 * STEP

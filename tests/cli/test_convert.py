@@ -336,12 +336,12 @@ def test_reading_a_stored_file_reports_progress(tmp_path: Path) -> None:
     packed.write_bytes(gzip.compress(plain.read_bytes()))
     for path in (plain, packed):
         with ls.open(path, "ldrobot-stl27l") as device:
-            assert device.place is not None
-            assert device.place[1] == path.stat().st_size
+            assert device.progress is not None
+            assert device.progress[1] == path.stat().st_size
             assert list(device.scans())
-            assert device.place == (path.stat().st_size, path.stat().st_size)
+            assert device.progress == (path.stat().st_size, path.stat().st_size)
     with ls.open("sim:ldrobot-stl27l", "ldrobot-stl27l") as device:
-        assert device.place is None
+        assert device.progress is None
 
 
 @pytest.mark.slow

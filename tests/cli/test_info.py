@@ -59,7 +59,7 @@ def test_a_capture_of_two_sensors_with_one_lost_packet(frames: list[bytes], tmp_
 @pytest.mark.slow
 def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) -> None:
     path = tmp_path / "long.lsr"
-    number, data = looking.LOOKED_AT // 60_000 * 3, bytes(60_000)
+    number, data = looking.MAX_BEGINNING_BYTES // 60_000 * 3, bytes(60_000)
     with Recorder(path, "ldrobot-stl27l", "/dev/ttyUSB0") as recorder:
         for place in range(number):
             recorder.wait_for_room()

@@ -72,7 +72,7 @@ def test_show_loads_one_plugin_and_no_device() -> None:
             "serial",
             "lidarspec.framing.decoder",
             "lidarspec.points",
-            "lidarspec.device.settings",
+            "lidarspec.device.named_devices",
         }
         & modules
     )

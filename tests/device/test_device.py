@@ -221,7 +221,7 @@ def test_a_slow_consumer_loses_the_oldest_and_knows_it(line: Port) -> None:
     frames = turning(WHOLE, 50)
     number = free_port()
     with ls.open(f"udp://127.0.0.1:{number}", WHOLE) as device, udp() as sender:
-        device._input.queue._most = 30  # type: ignore[union-attr]
+        device._input.queue._max_chunks = 30  # type: ignore[union-attr]
         for frame in frames:
             sender.sendto(frame, ("127.0.0.1", number))
         queue = device._input.queue  # type: ignore[union-attr]
@@ -237,7 +237,7 @@ def test_a_slow_consumer_loses_the_oldest_and_knows_it(line: Port) -> None:
 def test_a_blocking_queue_loses_nothing(line: Port) -> None:
     frames = turning(TURNING, 60)
     with ls.open(f"serial://{line.name}", TURNING, overflow="block") as device:
-        device._input.queue._largest = 64  # type: ignore[union-attr]
+        device._input.queue._max_bytes = 64  # type: ignore[union-attr]
         for frame in frames:
             line.send(frame)
         assert sum(map(len, packets(device, 60))) == 60
@@ -500,7 +500,7 @@ def test_everything_is_recorded_before_the_queue(line: Port, tmp_path: Path) -> 
     frames = turning(TURNING, 30)
     path = tmp_path / "all.lsr"
     with ls.open(f"serial://{line.name}", TURNING, record=path) as device:
-        device._input.queue._most = 1  # type: ignore[union-attr]
+        device._input.queue._max_chunks = 1  # type: ignore[union-attr]
         for number, frame in enumerate(frames):
             line.send(frame)
             wait_for_chunks(device, number + 1)

@@ -26,7 +26,7 @@ from lidarspec import Sensor
 from lidarspec.batch import MANIFEST, FilePiece, Manifest
 from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, StreamReader
-from lidarspec.device.settings import FILE as SETTINGS, devices
+from lidarspec.device.named_devices import FILE as SETTINGS, read_devices
 from lidarspec.frames.layout import Layout
 from lidarspec.framing.frame_engine import codec
 from lidarspec.recording.format import (
@@ -535,7 +535,7 @@ def _settings(folder: Path) -> Target:
         path = folder / SETTINGS
         path.write_bytes(data)
         try:
-            devices()
+            read_devices()
         finally:
             path.unlink()
 

@@ -198,7 +198,7 @@ class LidarNode(LifecycleNode):
                 feed.read(0.0 if device.is_live else time.monotonic() + LOOK_S)
                 self._publish(feed, topics)
                 expected = _predict_scan_end(expected, feed)
-                device.gather(
+                device.delay_decoding(
                     min(expected, time.monotonic() + SOON) if device.sensor.imu_frames else expected
                 )
                 self._watch(device)

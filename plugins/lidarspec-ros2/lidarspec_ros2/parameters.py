@@ -15,7 +15,7 @@ from typing import Any
 from lidarspec.cli.options import configure_sensor
 from lidarspec.detect.identification import detect, find_declared_sensor
 from lidarspec.device.device import Device
-from lidarspec.device.settings import find_device
+from lidarspec.device.named_devices import find_device
 from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount

@@ -6,11 +6,12 @@
     mount = {x = 0.2, yaw_deg = 90, inverted = true}
     options = {calibration = "./angles.csv"}
 
-A name can be used as any SOURCE; ``./front`` is the file of that name. The file in the user's
-configuration directory is read first, and then the nearest one of the user in the working directory
-or above it, which adds names but replaces none. A project may be untrusted, so its file runs no
-Python and refers to no path outside its folder, unless the user has allowed that folder. A mistake
-in a file disables the devices of that file only.
+A name can be used wherever a SOURCE is expected; write ``./front`` for a file called front. Two
+files are read: the file in the user's configuration directory, and the nearest file owned by the
+user in the working directory or above it. The second file cannot override names of the first. A
+project may be untrusted, so unless the user has allowed its folder, its file cannot run Python or
+refer to paths outside the folder. A mistake in a file disables only the devices of that file. The
+table [owners] in the user's own file decides which plugin provides a sensor; `plugins` reads it.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from typing import Any
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggest
 from lidarspec.plugins import names_file, sensor as named_sensor
 from lidarspec.points.mount import Mount
-from lidarspec.remote_files import is_stored
+from lidarspec.remote_files import is_remote
 from lidarspec.sensor_operations import Sensor
 from lidarspec.trusted_files import (
     FILE,
@@ -39,7 +40,7 @@ from lidarspec.trusted_files import (
     resolve_beside,
 )
 
-#: a valid name: no suffix, scheme or folder, and not the name of a port on Windows.
+#: a valid name: it cannot be mistaken for a file, a URL, or a port on Windows.
 _NAME = re.compile(r"(?!(?i:com|lpt)\d+$)[A-Za-z][A-Za-z0-9_-]*")
 _KEYS = ("source", "sensor", "mount", "options")
 
@@ -49,14 +50,15 @@ class NamedDevice:
     """A device of a settings file.
 
     Attributes:
-        name: its name.
-        source: a SOURCE.
-        sensor: id, alias or path of a module; None to detect it.
-        mount: its pose; None if not given.
+        name: the name of the device.
+        source: the SOURCE that is opened.
+        sensor: id, alias or path of a module; None to detect the sensor.
+        mount: the pose of the sensor; None if not given.
         options: options of the sensor.
         file: the settings file.
-        hidden: another file with a device of this name, which is not used.
-        is_trusted: whether the file is trusted: the user's own, or in a folder that the user has
+        shadowed_file: another settings file with a device of this name, which is ignored; "" if
+            there is none.
+        is_trusted: whether the settings file is the user's own, or in a folder that the user has
             allowed.
     """
 
@@ -66,11 +68,11 @@ class NamedDevice:
     mount: Mount | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     file: str = ""
-    hidden: str = ""
+    shadowed_file: str = ""
     is_trusted: bool = True
 
     def configure(self) -> Sensor | None:
-        """Return the sensor with its options, None if it has to be detected.
+        """Return the sensor with its options; None if it has to be detected.
 
         Raises:
             UsageError: for a sensor that is not installed, or an invalid option.
@@ -94,8 +96,8 @@ class NamedDevice:
             raise UsageError(f"{place}: {error}") from None
         return configured
 
-    def refusal(self) -> UsageError | None:
-        """Return the reason why an untrusted file cannot have this device, else None."""
+    def find_refusal(self) -> UsageError | None:
+        """Return the error if an untrusted file has this device; None if it is allowed."""
         if self.is_trusted:
             return None
         folder = Path(self.file).parent
@@ -103,7 +105,7 @@ class NamedDevice:
         reason = ""
         if self.sensor is not None and names_file(self.sensor):
             reason = f"sensor {self.sensor!r} is Python, which would run"
-        elif is_stored(self.source):
+        elif is_remote(self.source):
             reason = (
                 f"source {self.source!r} is a URL, which would be contacted or lead outside"
                 f" {folder}"
@@ -113,13 +115,14 @@ class NamedDevice:
                 resolve_beside(folder, os.path.abspath(file))
             except UsageError:
                 reason = f"source {self.source!r} is a file outside {folder}"
-        error = UsageError(
-            f"{self.file}: [device.{self.name}]: {reason}: that takes a folder that you have"
-            " allowed"
+        if not reason:
+            return None
+        return self._suggest_trust(
+            UsageError(
+                f"{self.file}: [device.{self.name}]: {reason}: that takes a folder that you have"
+                " allowed"
+            )
         )
-        if reason:
-            return self._suggest_trust(error)
-        return None
 
     def _suggest_trust(self, error: UsageError) -> UsageError:
         """Return the error with the command that allows the folder of the file."""
@@ -127,65 +130,68 @@ class NamedDevice:
 
 
 def find_device(source: str | Path) -> NamedDevice | None:
-    """Return the device with this name, None for every other SOURCE.
+    """Return the device with this name; None for every other SOURCE.
 
     Raises:
         UsageError: for a mistake in the device's file, with table and key; for a device that is
-            only allowed in a trusted folder; and for a word that is neither a name nor a file.
-        SourceError: for a settings file that cannot be read.
+            allowed only in a trusted folder; and for a word that is neither a name nor a file.
+        SourceError: if the settings file cannot be read.
     """
     word = str(source)
     if not isinstance(source, str) or not _NAME.fullmatch(word):
         return None
-    by_name, faults = _read_all()
+    by_name, errors = _read_all()
     if word not in by_name and not os.path.exists(word):
-        if faults:
-            raise faults[0]
+        if errors:
+            raise errors[0]
         if by_name:
-            places = sorted({device.file for device in by_name.values()})
-            closest = _closest(word, by_name)
-            raise UsageError(f"{word!r} is no file, and no device of {', '.join(places)}{closest}")
-    for fault in faults:
-        warnings.warn(f"{fault}; its devices are left out", stacklevel=2)
+            paths = sorted({device.file for device in by_name.values()})
+            suggestion = _suggestion(word, by_name)
+            raise UsageError(
+                f"{word!r} is no file, and no device of {', '.join(paths)}{suggestion}"
+            )
+    for error in errors:
+        warnings.warn(f"{error}; its devices are left out", stacklevel=2)
     device = by_name.get(word)
     if device is None:
         return None
-    if refused := device.refusal():
-        raise refused
-    if device.hidden:
+    if refusal := device.find_refusal():
+        raise refusal
+    if device.shadowed_file:
         warnings.warn(
-            f"{word}: the device of {device.file}, not that of {device.hidden}", stacklevel=2
+            f"{word}: the device of {device.file}, not that of {device.shadowed_file}", stacklevel=2
         )
     return device
 
 
-def devices() -> dict[str, NamedDevice]:
-    """Return all devices of files without a mistake, the user's own first."""
+def read_devices() -> dict[str, NamedDevice]:
+    """Return all devices of valid settings files by name, the user's own first."""
     return _read_all()[0]
 
 
 def _read_all() -> tuple[dict[str, NamedDevice], list[LidarSpecError]]:
-    """Return all devices, and the errors of files that could not be read."""
+    """Return all devices by name, and the errors of invalid files."""
     by_name: dict[str, NamedDevice] = {}
-    faults = []
-    for path in files():
+    errors = []
+    for path in find_settings_files():
         try:
-            devices = read(path)
-        except LidarSpecError as fault:
-            faults.append(fault)
+            devices = read_settings_file(path)
+        except LidarSpecError as error:
+            errors.append(error)
             continue
         for name, device in devices.items():
-            by_name[name] = (
-                replace(by_name[name], hidden=device.file) if name in by_name else device
-            )
-    return by_name, faults
+            if name in by_name:
+                by_name[name] = replace(by_name[name], shadowed_file=device.file)
+            else:
+                by_name[name] = device
+    return by_name, errors
 
 
-def files() -> list[Path]:
-    """Return the settings files that apply here.
+def find_settings_files() -> list[Path]:
+    """Return the settings files that apply in the working directory.
 
-    They are the user's own and the nearest one of a project. Files of other users are skipped with
-    a warning.
+    They are the user's own file and the nearest file of a project, if they exist. Files of other
+    users are skipped with a warning.
     """
     own = own_settings()
     here = Path.cwd()
@@ -199,12 +205,12 @@ def files() -> list[Path]:
     return paths
 
 
-def read(path: Path) -> dict[str, NamedDevice]:
-    """Return the devices of one file.
+def read_settings_file(path: Path) -> dict[str, NamedDevice]:
+    """Return the devices of one settings file by name.
 
     Raises:
-        UsageError: for a mistake in it, with table and key.
-        SourceError: if it cannot be read.
+        UsageError: for a mistake in the file, with table and key.
+        SourceError: if the file cannot be read.
     """
     content = read_document(path)
     is_own = path == own_settings()
@@ -218,12 +224,12 @@ def read(path: Path) -> dict[str, NamedDevice]:
         raise UsageError(f"{path}: devices are tables of their own: [device.front]")
     is_trusted_file = is_own or is_trusted(path.parent)
     return {
-        name: replace(_device(path, name, table), is_trusted=is_trusted_file)
+        name: replace(_make_device(path, name, table), is_trusted=is_trusted_file)
         for name, table in tables.items()
     }
 
 
-def _device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice:
+def _make_device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice:
     place = f"[device.{name}]"
     if not _NAME.fullmatch(name):
         raise UsageError(
@@ -245,7 +251,7 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice:
             raise UsageError(f"{path}: {place}: {key} is {expected}, not {shown(table[key])}")
     options = {key: _resolve_path(path, value) for key, value in table.get("options", {}).items()}
     if "mount" in table:
-        mount = _mount(path, place, table["mount"])
+        mount = _make_mount(path, place, table["mount"])
     else:
         mount = None
     sensor = table.get("sensor")
@@ -267,20 +273,20 @@ def _device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice:
     )
 
 
-def _mount(path: Path, place: str, table: Mapping[str, Any]) -> Mount:
+def _make_mount(path: Path, place: str, table: Mapping[str, Any]) -> Mount:
     kinds = {f.name: type(f.default) for f in fields(Mount)}
     _check_keys(path, f"{place} mount", table, kinds)
     for key, value in table.items():
         if kinds[key] is bool:
-            right = isinstance(value, bool)
+            is_valid = isinstance(value, bool)
         else:
-            right = isinstance(value, int | float) and not isinstance(value, bool)
-        if not right or value in (float("inf"), float("-inf")) or value != value:
+            is_valid = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_valid or value in (float("inf"), float("-inf")) or value != value:
             if kinds[key] is bool:
-                wanted = "true or false"
+                expected = "true or false"
             else:
-                wanted = "a number"
-            raise UsageError(f"{path}: {place}: mount.{key} is {wanted}, not {shown(value)}")
+                expected = "a number"
+            raise UsageError(f"{path}: {place}: mount.{key} is {expected}, not {shown(value)}")
     return Mount(**table)
 
 
@@ -289,18 +295,18 @@ def _check_keys(path: Path, place: str, keys: Iterable[str], allowed: Iterable[s
         if key not in allowed:
             raise UsageError(
                 f"{path}: {place + ': ' if place else ''}unknown {'key' if place else 'table'}"
-                f" {key!r}{_closest(key, allowed)}"
+                f" {key!r}{_suggestion(key, allowed)}"
             )
 
 
-def _closest(word: str, words: Iterable[str]) -> str:
+def _suggestion(word: str, words: Iterable[str]) -> str:
     return did_you_mean(word, words) or f" (known: {', '.join(words)})"
 
 
 def _resolve_path(path: Path, value: Any) -> Any:
-    """Return a path that begins with a dot relative to the file's folder.
+    """Resolve a path starting with ./ or ../ against the folder of the settings file.
 
-    Other values are unchanged.
+    Other values are returned unchanged.
     """
     if isinstance(value, str) and value.startswith(("./", "../")):
         return str(path.parent / value)

@@ -12,7 +12,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import Scan
-from lidarspec.device import settings
+from lidarspec.device import named_devices
 from lidarspec.points.mount import Mount
 from lidarspec.simulation.simulator import simulate
 from tests.cli.running import ran
@@ -114,17 +114,17 @@ def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: P
         folder,
         '[device.front]\nsource = "sim:ldrobot-stl27l"\n[device.desk]\nsource = "tcp://desk:2"\n',
     )
-    found = settings.devices()
+    found = named_devices.read_devices()
     assert list(found) == ["front", "desk", "rear"]
     assert found["front"].sensor is None
     assert found["desk"].file == str(user)
     project = folder / "lidarspec.toml"
     with pytest.warns(UserWarning, match=f"front: the device of {user}, not that of {project}"):
-        assert settings.find_device("front") == found["front"]
+        assert named_devices.find_device("front") == found["front"]
     said = ran("stats", "front", "-s", SENSOR, "-n", "1").stderr
     assert said.count(f"front: the device of {user}, not that of {project}") == 1
     (folder / "deep" / "lidarspec.toml").write_text("", encoding="utf-8")
-    assert list(settings.devices()) == ["front", "desk"]
+    assert list(named_devices.read_devices()) == ["front", "desk"]
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_a_file_of_another_user_is_skipped_with_one_warning(folder: Path, whose:
         place.chmod(0o777)
         reason = f"{place} is open to others: chmod 775 makes it yours"
     with pytest.warns(UserWarning, match=f"{file} is not read: {reason}"):
-        device = settings.find_device("front")
+        device = named_devices.find_device("front")
     assert device is not None
     assert device.sensor == SENSOR  # that of the folder above, which is the user's
     assert ran("stats", "front").stderr.count(f"{file} is not read: {reason}") == 1
@@ -265,17 +265,17 @@ def test_only_a_folder_of_ones_own_can_be_allowed(folder: Path) -> None:
 
 
 def test_paths_that_begin_with_a_dot_are_from_the_files_folder(folder: Path) -> None:
-    assert settings.devices()["front"].source == str(folder / "front.bin")
-    assert settings.devices()["rear"].source == "udp://:6699"
+    assert named_devices.read_devices()["front"].source == str(folder / "front.bin")
+    assert named_devices.read_devices()["rear"].source == "udp://:6699"
 
 
 def test_a_path_is_no_name(folder: Path) -> None:
-    assert settings.find_device("./front") is None
-    assert settings.find_device(Path("front")) is None
-    assert settings.find_device("udp://") is None
-    assert settings.find_device("-") is None
+    assert named_devices.find_device("./front") is None
+    assert named_devices.find_device(Path("front")) is None
+    assert named_devices.find_device("udp://") is None
+    assert named_devices.find_device("-") is None
     (folder / "deep" / "other").write_bytes(b"")
-    assert settings.find_device("other") is None
+    assert named_devices.find_device("other") is None
 
 
 def test_an_unknown_word_gets_a_suggestion(folder: Path) -> None:
