@@ -46,7 +46,7 @@ from lidarspec_livox import points as livox, sdk2
 from lidarspec_sick import compact, telegrams
 
 
-def placed(
+def make_sensor(
     struct: Construct, points: Any, size: int, *, scan: str, clock: str, stream: bool = False
 ) -> Sensor:
     """A sensor with frames of this size alone."""
@@ -105,7 +105,7 @@ def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
         "crc" / Int32ul,
     )
     sealed = Checksummed(struct, field="crc", algorithm=compact.CRC)
-    return placed(
+    return make_sensor(
         sealed, partial(compact.points, version=4), len(frame), scan="turn", clock="start_time[0]"
     )
 
@@ -160,7 +160,9 @@ def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
             invalid=first.samples < telegrams.LEAST,
         )
 
-    return placed(sealed, points, len(frame), scan="telegram_counter", clock="time", stream=True)
+    return make_sensor(
+        sealed, points, len(frame), scan="telegram_counter", clock="time", stream=True
+    )
 
 
 def livox_packet(sensor: ls.Sensor, frame: bytes) -> Sensor:
@@ -185,7 +187,7 @@ def livox_packet(sensor: ls.Sensor, frame: bytes) -> Sensor:
     sealed = Checksummed(
         struct, field="crc32", algorithm=sdk2.CRC32, over=("timestamp", "points"), absent=(0,)
     )
-    return placed(
+    return make_sensor(
         sealed,
         lambda f: livox.cartesian(f, sdk2.after(f)),
         len(frame),

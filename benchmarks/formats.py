@@ -153,17 +153,17 @@ def capture(inputs: Inputs, key: str, size: int) -> Path:
     if path.exists():
         return path
     if not made.period:
-        return simulated(path, made.sensor, max(0.2, size / made.rate))
+        return write_simulated_capture(path, made.sensor, max(0.2, size / made.rate))
     once = inputs.folder / f"{key}.pcap"
-    return repeated(
-        once if once.exists() else simulated(once, made.sensor, made.period),
+    return write_repeated_capture(
+        once if once.exists() else write_simulated_capture(once, made.sensor, made.period),
         path,
         size,
         made.period,
     )
 
 
-def simulated(path: Path, sensor: str, seconds: float) -> Path:
+def write_simulated_capture(path: Path, sensor: str, seconds: float) -> Path:
     """A capture of a simulated sensor."""
     line = [
         sys.executable,
@@ -180,7 +180,7 @@ def simulated(path: Path, sensor: str, seconds: float) -> Path:
     return path
 
 
-def repeated(once: Path, path: Path, size: int, period: int) -> Path:
+def write_repeated_capture(once: Path, path: Path, size: int, period: int) -> Path:
     """A capture of about so many bytes that holds another one again and again, each time a period
     later; its records have one length.
     """

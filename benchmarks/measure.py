@@ -61,7 +61,7 @@ Rates = dict[str, list[float]]
 LEAST_STEP = 1e-6
 
 
-def raced(
+def measure_contenders(
     contenders: Mapping[str, Timed], runs: int, least: float, clock: Clock = time.perf_counter
 ) -> Rates:
     """Seconds for each of the amount, by contender, one figure for each run.

@@ -217,7 +217,7 @@ def ouster(inputs: Inputs) -> Work:
     rows[:, -8:] = 0
     frames = [row.tobytes() for row in rows]
     points = len(sensor.decode(rows).points())
-    metadata = json.loads(nominal("OS1", 128, 1024, "RNG19_RFL8_SIG16_NIR16").told())
+    metadata = json.loads(nominal("OS1", 128, 1024, "RNG19_RFL8_SIG16_NIR16").to_metadata())
 
     def ours(backend: str) -> Any:
         cloud = sensor.decode(rows, backend=backend).points()

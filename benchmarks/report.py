@@ -23,7 +23,7 @@ WIDE = 180
 LEAST_SHARE = 1e-4
 
 
-def shown(
+def print_rows(
     rows: Sequence[Mapping[str, Any]], versions: Mapping[str, str], *, title: str, best: bool
 ) -> None:
     """Print the rows: medians, or the best run of each contender."""

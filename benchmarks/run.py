@@ -23,10 +23,10 @@ from formats import CONVERSIONS
 from inputs import Inputs
 from libraries import Missing
 from live_workloads import ON_LINES
-from measure import Clock, Contender, Rates, cpu_seconds, memcpy, raced, times
+from measure import Clock, Contender, Rates, cpu_seconds, measure_contenders, memcpy, times
 from packet_workloads import ON_BYTES, Work
 from remote_contender import RemoteContender
-from report import shown
+from report import print_rows
 
 import lidarspec as ls
 from lidarspec.framing.decoder import BACKENDS
@@ -92,7 +92,7 @@ def rows(
         for backend, owns in ours.items()
         for own, contender in owns.items()
     }
-    rates = raced({"memcpy": copy, **by_backend, **others}, runs, least, clock)
+    rates = measure_contenders({"memcpy": copy, **by_backend, **others}, runs, least, clock)
     for other in others.values():
         if isinstance(other, RemoteContender):
             other.close()
@@ -234,7 +234,7 @@ def main() -> int:
                 continue
             found += rows(name, work, backends, copy, runs=given.runs, least=least, clock=clock)
     what = f"{'best runs' if given.best else 'medians'}{', processor time' if given.cpu else ''}"
-    shown(
+    print_rows(
         found,
         versions(),
         title="quick: these figures mean nothing" if given.quick else what,

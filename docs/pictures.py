@@ -40,7 +40,7 @@ SIZE, SCHEME, SETTLED, COLOURS = (1280, 800), "dark", 9_000, 256
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
-def simulated(sensor: str, file: Path, duration: str) -> Path:
+def write_simulated_file(sensor: str, file: Path, duration: str) -> Path:
     """A file with what a simulated sensor sends in a while."""
     words = ["sim", sensor, "--to", str(file), "-t", duration, "--seed", "7", "-q"]
     subprocess.run(
@@ -52,7 +52,7 @@ def simulated(sensor: str, file: Path, duration: str) -> Path:
 def terminal(folder: Path) -> str:
     """The window of `view`, some seconds into a file."""
     with ls.open(
-        simulated("ldrobot-stl27l", folder / "room.pcap", "5s"), "ldrobot-stl27l"
+        write_simulated_file("ldrobot-stl27l", folder / "room.pcap", "5s"), "ldrobot-stl27l"
     ) as device:
         feed = LiveScans(device)
         window = Window(feed, "/dev/ttyUSB0")
@@ -92,7 +92,7 @@ def page(folder: Path, target: Path) -> None:
     if chromium is None:
         print("the picture of the page stays as it was: Chromium is not installed", file=sys.stderr)
         return
-    file = simulated("robosense-m1", folder / "room.lsr", "15s")
+    file = write_simulated_file("robosense-m1", folder / "room.lsr", "15s")
     command = [
         sys.executable,
         "-m",

@@ -34,7 +34,7 @@ GROUND, PLAIN = "#101218", "#d8dae0"
 PORT = "/dev/ttyUSB0"
 
 
-def screen(
+def draw_window(
     source: str,
     sensor: str,
     *,
@@ -124,7 +124,7 @@ def _colour(ink: int) -> str:
 
 def main() -> None:
     HERE.mkdir(exist_ok=True)
-    flat = screen(
+    flat = draw_window(
         "sim:ldrobot-stl27l?errors=0.0001",
         "ldrobot-stl27l",
         columns=80,
@@ -133,32 +133,34 @@ def main() -> None:
         called="/dev/ttyUSB0",
     )
     (HERE / "view-2d.svg").write_text(svg(flat), encoding="utf-8")
-    tall = screen(
+    tall = draw_window(
         "sim:velodyne-vlp16", "velodyne-vlp16", columns=110, lines=36, seconds=2.2, called=":2368"
     )
     (HERE / "view-3d.svg").write_text(svg(tall), encoding="utf-8")
     for name in ("find.md", "troubleshoot.md", "explain.md", "stats.md"):
         page = HERE.parent / name
-        page.write_text(printed(page.read_text(encoding="utf-8")), encoding="utf-8")
+        page.write_text(renew_page(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
-def printed(page: str) -> str:
+def renew_page(page: str) -> str:
     """A page with what its commands print now; a simulated sensor stands in for its port, made
     bytes for its file. Outputs that the page shortens with "..." are kept.
     """
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder, "port")
-        Path(folder, "unknown.bin").write_bytes(b"".join(sealed(index) for index in range(60)))
+        Path(folder, "unknown.bin").write_bytes(
+            b"".join(make_unknown_frame(index) for index in range(60))
+        )
         with virtual_port("ldrobot-stl27l", link=link, faults=Faults(errors=0.0001)):
             return re.sub(
                 r"(?<=```text\n)\$ lidarspec (.*)\n(?:(?!\.\.\.$).*\n)*?(?=```)",
-                lambda found: shown(found[1], link),
+                lambda found: run_command(found[1], link),
                 page,
                 flags=re.MULTILINE,
             )
 
 
-def shown(command: str, link: Path) -> str:
+def run_command(command: str, link: Path) -> str:
     """A command as the page has it, and what it prints."""
     words = [str(link) if word == PORT else word for word in command.split()]
     program = [sys.executable, "-m", "lidarspec", *words]
@@ -175,7 +177,7 @@ def shown(command: str, link: Path) -> str:
     return f"$ lidarspec {command}\n{text}"
 
 
-def sealed(index: int) -> bytes:
+def make_unknown_frame(index: int) -> bytes:
     """A frame of nobody's: two bytes of sync, a counter, noise, and a CRC."""
     body = b"\x9a\x51" + index.to_bytes(2, "little") + random.Random(index).randbytes(20)
     return body + Crc(16, 0x1021, 0xFFFF)(body).to_bytes(2, "little")

@@ -27,7 +27,7 @@ def cuts(found: Iterable[Found]) -> list[tuple[str, int, bytes]]:
 REJECTIONS = {"bad_constant", "bad_length", "bad_checksum", "implausible"}
 
 
-def counted(stats: Counters, *, by_reason: bool) -> dict[str, Any]:
+def list_counters(stats: Counters, *, by_reason: bool) -> dict[str, Any]:
     """Return counters by name, without those of rejected candidates unless `by_reason`."""
     left_out = set() if by_reason else REJECTIONS
     return {name: value for name, value in stats.to_dict().items() if name not in left_out}
@@ -47,7 +47,9 @@ def assert_same_packets(one: Packets, other: Packets, *, by_reason: bool = True)
         assert same(_lengths(one, array), _lengths(other, array)), f"the lengths of {array} differ"
     for name in ("offset", "time_ns", "host_ns", "index", "breaks"):
         assert same(getattr(one, name), getattr(other, name)), f"{name} differs"
-    assert counted(one.stats, by_reason=by_reason) == counted(other.stats, by_reason=by_reason)
+    assert list_counters(one.stats, by_reason=by_reason) == list_counters(
+        other.stats, by_reason=by_reason
+    )
     for axis, node in one.table.schema.parts.items():
         assert same(one.count(axis), other.count(axis)), f"the numbers of {axis} differ"
         for kind in node.kinds:

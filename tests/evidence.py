@@ -27,7 +27,7 @@ def capture(name: str) -> Path:
 
 
 @functools.cache
-def _listed(file: str) -> dict[str, dict[str, Any]]:
+def _read_vectors(file: str) -> dict[str, dict[str, Any]]:
     return {
         vector["id"]: vector
         for vector in json.loads((PROTOCOLS / file).read_text(encoding="utf-8"))
@@ -37,7 +37,7 @@ def _listed(file: str) -> dict[str, dict[str, Any]]:
 def vectors(file: str) -> dict[str, dict[str, Any]]:
     """The test vectors of a file by id; the test is skipped where it is absent."""
     _present(PROTOCOLS / file)
-    return _listed(file)
+    return _read_vectors(file)
 
 
 def vector_bytes(file: str, name: str) -> bytes:
@@ -59,7 +59,7 @@ def _present(path: Path) -> Path:
     return path
 
 
-def decoded(sensor: Sensor, data: Any, frame: str | None = None) -> Packets:
+def decode(sensor: Sensor, data: Any, frame: str | None = None) -> Packets:
     """Return the packets of an input.
 
     Construct has to read the same packets and points, and count the same.

@@ -59,7 +59,7 @@ class Port:
         """Throw away what was sent and nobody read; a sender that waits for room has it."""
         termios.tcflush(self._slave, termios.TCIFLUSH)
 
-    def received(self, size: int) -> bytes:
+    def receive(self, size: int) -> bytes:
         """The next bytes that the program on the other side wrote."""
         found = b""
         while len(found) < size:
@@ -93,7 +93,7 @@ def working(function: Callable[[threading.Event], None]) -> Iterator[threading.E
         thread.join()
 
 
-def paced(
+def send_paced(
     send: Callable[[bytes], object],
     frames: Sequence[bytes],
     rate: float,

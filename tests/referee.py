@@ -119,10 +119,10 @@ def _make_inputs(sensor: Sensor) -> dict[str, list[Any]]:
     stream = _make_stream(sensor)
     broken = [mutate(data, chance) if chance.random() < 0.1 else data for data in stream]
     return {
-        "frames": [(name, _encoded(data)) for name, data in frames],
-        "damaged": [(name, _encoded(data)) for name, data in damaged],
-        "stream": [_encoded(data) for data in stream],
-        "broken": [_encoded(data) for data in broken],
+        "frames": [(name, _encode(data)) for name, data in frames],
+        "damaged": [(name, _encode(data)) for name, data in damaged],
+        "stream": [_encode(data) for data in stream],
+        "broken": [_encode(data) for data in broken],
     }
 
 
@@ -152,13 +152,13 @@ def _results_of(name: str, inputs: dict[str, list[Any]]) -> Results:
         for kind in ("frames", "damaged"):
             for number, (frame, text) in enumerate(inputs[kind]):
                 found |= _results_of_frame(
-                    sensor, frame, f"{kind} {number}, {frame}", _decoded(text)
+                    sensor, frame, f"{kind} {number}, {frame}", _decode(text)
                 )
         for frame, texts in itertools.groupby(inputs["frames"], key=lambda pair: pair[0]):
-            parts = [_decoded(text) for _, text in texts]
+            parts = [_decode(text) for _, text in texts]
             found |= _results_of_table(sensor, frame, parts)
         for kind in ("stream", "broken"):
-            parts = [_decoded(text) for text in inputs[kind]]
+            parts = [_decode(text) for text in inputs[kind]]
             found |= _results_of_stream(
                 sensor, kind, parts if sensor.datagrams else b"".join(parts)
             )
@@ -235,11 +235,11 @@ def _digest(data: str | bytes) -> str:
     ).hexdigest()
 
 
-def _encoded(data: bytes) -> str:
+def _encode(data: bytes) -> str:
     return base64.b85encode(data).decode()
 
 
-def _decoded(text: str) -> bytes:
+def _decode(text: str) -> bytes:
     return base64.b85decode(text)
 
 

@@ -20,7 +20,7 @@ from lidarspec import batch
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.formats import write
 from tests.cli.running import ran
-from tests.device.test_file_scans import made
+from tests.device.test_file_scans import write_frames
 from tests.lines import until
 
 pq = pytest.importorskip("pyarrow.parquet")
@@ -34,9 +34,9 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three captures, one in a folder below, and one that is none."""
     folder = tmp_path_factory.mktemp("drives")
     (folder / "north").mkdir()
-    made(ls.sensor(SENSOR), folder / "long.bin", most=1_200_000, longest=10**6)
-    made(ls.sensor(SENSOR), folder / "north" / "a.bin")
-    made(ls.sensor(SENSOR), folder / "north" / "b.bin")
+    write_frames(ls.sensor(SENSOR), folder / "long.bin", most=1_200_000, longest=10**6)
+    write_frames(ls.sensor(SENSOR), folder / "north" / "a.bin")
+    write_frames(ls.sensor(SENSOR), folder / "north" / "b.bin")
     (folder / "bad.bin").write_bytes(b"no capture at all" * 100)
     return folder
 
@@ -66,7 +66,7 @@ def outputs(folder: Path) -> dict[str, bytes]:
     }
 
 
-def joined(folder: Path, name: str = "long") -> Any:
+def read_pieces(folder: Path, name: str = "long") -> Any:
     """The points of all pieces of a capture."""
     return pq.read_table([str(path) for path in sorted(folder.glob(f"{name}*.parquet"))])
 
@@ -91,7 +91,7 @@ def test_pieces_have_the_points_of_one_pass_and_a_bad_file_stops_no_other(
 ) -> None:
     done = run(drives / "**" / "*.bin", tmp_path)
     assert [old for _, old in done] == [False] * len(done)
-    assert joined(tmp_path).equals(whole)
+    assert read_pieces(tmp_path).equals(whole)
     assert len(list(tmp_path.glob("long-*.parquet"))) == 3
     assert {"north/a.parquet", "north/b.parquet"} < outputs(tmp_path).keys()
     failed = [record for record in records(tmp_path) if "error" in record]
@@ -119,7 +119,7 @@ def test_a_second_run_converts_only_missing_files(drives: Path, tmp_path: Path) 
     again = run(mine / "*.bin", tmp_path / "out")
     assert [record["piece"] for record, old in again if not old] == [2]
     assert outputs(tmp_path / "out") == first
-    made(ls.sensor(SENSOR), mine / "a.bin", longest=500)
+    write_frames(ls.sensor(SENSOR), mine / "a.bin", longest=500)
     assert [
         Path(record["source"]).name
         for record, old in run(mine / "*.bin", tmp_path / "out")
@@ -140,7 +140,7 @@ def test_processes_make_the_same_files(drives: Path, tmp_path: Path) -> None:
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is POSIX")
 def test_a_killed_run_is_resumed(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path) -> None:
     drives = tmp_path_factory.mktemp("long-drives")
-    made(ls.sensor(SENSOR), drives / "long.bin", most=4_000_000, longest=10**6)
+    write_frames(ls.sensor(SENSOR), drives / "long.bin", most=4_000_000, longest=10**6)
     (drives / "bad.bin").write_bytes(b"no capture at all" * 100)
     whole = read_whole(drives / "long.bin", drives / "whole.parquet")
     words = [
@@ -165,7 +165,7 @@ def test_a_killed_run_is_resumed(tmp_path_factory: pytest.TempPathFactory, tmp_p
     before = [record for record in records(tmp_path) if "error" not in record]
     kept = {record["output"]: os.stat(record["output"]).st_mtime_ns for record in before}
     subprocess.run(command, stderr=subprocess.PIPE, check=False)
-    assert joined(tmp_path).equals(whole)
+    assert read_pieces(tmp_path).equals(whole)
     after = [record for record in records(tmp_path) if "error" not in record]
     assert len({record["output"] for record in after}) == len(after)
     assert all(os.stat(path).st_mtime_ns == at for path, at in kept.items())

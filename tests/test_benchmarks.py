@@ -55,7 +55,7 @@ for key, (_, fixed, is_stream) in FIXED.items():
 """
 
 
-def measured(folder: Path, *options: str) -> list[dict[str, Any]]:
+def run_benchmarks(folder: Path, *options: str) -> list[dict[str, Any]]:
     record = folder / "record.json"
     command = [sys.executable, str(RUN), "--quick", "--runs", "5", "--json", str(record), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -66,7 +66,7 @@ def measured(folder: Path, *options: str) -> list[dict[str, Any]]:
 
 
 def test_single_frames_are_measured_beside_construct(tmp_path: Path) -> None:
-    rows = measured(tmp_path, "--only", "parse")
+    rows = run_benchmarks(tmp_path, "--only", "parse")
     assert {row["work"] for row in rows} == {
         f"parse-{key}" for key in ("stl27l", "m1c1", "vlp16", "xt32", "m1")
     }
@@ -78,7 +78,7 @@ def test_single_frames_are_measured_beside_construct(tmp_path: Path) -> None:
 
 
 def test_the_noisy_stream_loses_no_intact_frame(tmp_path: Path) -> None:
-    (row,) = measured(tmp_path, "--only", "stl27l-stream", "--backend", "numpy")
+    (row,) = run_benchmarks(tmp_path, "--only", "stl27l-stream", "--backend", "numpy")
     assert {"construct", "compiled", "plain", "by hand"} <= set(row["times"])
     assert row["facts"]["intact frames"] > 500
     assert row["facts"]["intact frames lost"] == 0
@@ -91,7 +91,7 @@ def test_frames_with_counts_and_parts_are_measured_beside_fixed_places(tmp_path:
         for name in ("livox", "multiscan", "picoscan", "colab", "scip")
         for word in ("--only", name)
     ]
-    rows = measured(tmp_path, "--backend", "numpy", *named)
+    rows = run_benchmarks(tmp_path, "--backend", "numpy", *named)
     compared = {"livox", "multiscan", "picoscan", "colab-tim", "colab-lms"}
     assert {row["work"]: set(row["facts"]) for row in rows} == {
         "scip": set(),
@@ -104,7 +104,8 @@ def test_conversions_are_compared_with_a_copy_and_plain_code(tmp_path: Path) -> 
     names = ("to-vlp16.npz", "to-stl27l.mcap", "to-many.parquet")
     only = [word for name in names for word in ("--only", name)]
     rows = {
-        row["work"]: row for row in measured(tmp_path, "--backend", "numpy", "--size", "1", *only)
+        row["work"]: row
+        for row in run_benchmarks(tmp_path, "--backend", "numpy", "--size", "1", *only)
     }
     beside = ({"np.savez", "velodyne-decoder and np.savez"}, set(), {"one process"})
     assert {name: {*row["times"], *row["not_installed"]} for name, row in rows.items()} == dict(

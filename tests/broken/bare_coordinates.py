@@ -6,7 +6,7 @@ import numpy as np
 from construct import Array, Int8ul, Int16sl, Struct, this
 
 from lidarspec.spec import Cartesian, Every, Simulation, hookimpl
-from tests.broken.sound import LONGEST, SIZE, frame, sealed, sensor, sweep
+from tests.broken.sound import LONGEST, SIZE, frame, make_frame, sensor, sweep
 
 SAMPLE = Struct("x" / Int16sl, "y" / Int16sl, "quality" / Int8ul)
 
@@ -21,7 +21,7 @@ def directions(i):
 
 @hookimpl
 def lidarspec_sensors():
-    placed = frame(sealed(samples=Array(this.count, SAMPLE)), max_length=SIZE + 2 * LONGEST)
+    placed = frame(make_frame(samples=Array(this.count, SAMPLE)), max_length=SIZE + 2 * LONGEST)
     return [
         sensor(
             placed,

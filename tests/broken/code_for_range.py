@@ -6,9 +6,9 @@ import numpy as np
 from construct import Array, Int8ul, Int16ul, Struct, this
 
 from lidarspec.spec import Polar, Scaled, hookimpl, spread
-from tests.broken.sound import frame, sealed, sensor
+from tests.broken.sound import frame, make_frame, sensor
 
-CODED = sealed(
+CODED = make_frame(
     samples=Array(
         this.count, Struct("error_code" / Scaled(Int16ul, 0.001, "m"), "quality" / Int8ul)
     )

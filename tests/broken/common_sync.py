@@ -5,7 +5,7 @@ from __future__ import annotations
 from construct import BitsInteger, BitStruct, Const
 
 from lidarspec.spec import hookimpl
-from tests.broken.sound import SIZE, frame, sealed, sensor
+from tests.broken.sound import SIZE, frame, make_frame, sensor
 
 
 @hookimpl
@@ -13,7 +13,7 @@ def lidarspec_sensors():
     return [
         sensor(
             frame(
-                sealed(
+                make_frame(
                     header=BitStruct("sync" / Const(1, BitsInteger(1)), "kind" / BitsInteger(7))
                 ),
                 max_length=SIZE - 2,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from construct import Int8ul, Int16ul, this
 
 from lidarspec.spec import hookimpl
-from tests.broken.sound import SIZE, frame, sealed, sensor
+from tests.broken.sound import SIZE, frame, make_frame, sensor
 
 EXTRA = Int8ul if hasattr(this, "extended") else Int16ul
 
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(sealed(extra=EXTRA), max_length=SIZE + 1))]
+    return [sensor(frame(make_frame(extra=EXTRA), max_length=SIZE + 1))]

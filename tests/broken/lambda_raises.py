@@ -5,7 +5,7 @@ from __future__ import annotations
 from construct import Bytes, Int8ul
 
 from lidarspec.spec import hookimpl
-from tests.broken.sound import SIZE, frame, sealed, sensor
+from tests.broken.sound import SIZE, frame, make_frame, sensor
 
 LENGTHS = {1: 1, 2: 2, 3: 3}
 
@@ -15,7 +15,7 @@ def lidarspec_sensors():
     return [
         sensor(
             frame(
-                sealed(kind=Int8ul, extra=Bytes(lambda this: LENGTHS[this.kind])),
+                make_frame(kind=Int8ul, extra=Bytes(lambda this: LENGTHS[this.kind])),
                 max_length=SIZE + 4,
             )
         )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from lidarspec.spec import Frame, hookimpl
-from tests.broken.sound import sealed, sensor
+from tests.broken.sound import make_frame, sensor
 
-DATA = Frame(sealed(), data=True)
+DATA = Frame(make_frame(), data=True)
 
 
 @hookimpl

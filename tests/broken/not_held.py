@@ -5,7 +5,7 @@ from __future__ import annotations
 from construct import Int16ul, Rebuild, this
 
 from lidarspec.spec import hookimpl
-from tests.broken.sound import FIELDS, SIZE, frame, sealed, sensor
+from tests.broken.sound import FIELDS, SIZE, frame, make_frame, sensor
 
 
 @hookimpl
@@ -13,7 +13,7 @@ def lidarspec_sensors():
     return [
         sensor(
             frame(
-                sealed(count=FIELDS["count"], length=Rebuild(Int16ul, this.count * 3 + 17)),
+                make_frame(count=FIELDS["count"], length=Rebuild(Int16ul, this.count * 3 + 17)),
                 max_length=SIZE + 2,
             )
         )

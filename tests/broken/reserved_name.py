@@ -5,9 +5,9 @@ from __future__ import annotations
 from construct import Int8ul
 
 from lidarspec.spec import hookimpl
-from tests.broken.sound import SIZE, frame, sealed, sensor
+from tests.broken.sound import SIZE, frame, make_frame, sensor
 
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(sealed(state=Int8ul), max_length=SIZE + 8))]
+    return [sensor(frame(make_frame(state=Int8ul), max_length=SIZE + 8))]

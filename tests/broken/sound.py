@@ -56,7 +56,7 @@ def struct(**changes: Any) -> Struct:
     return Struct(*(name / con for name, con in fields.items() if con is not None))
 
 
-def sealed(**changes: Any) -> Checksummed:
+def make_frame(**changes: Any) -> Checksummed:
     """The data frame with changes in its fields."""
     return Checksummed(struct(**changes), field="sum", algorithm=Sum(16))
 
@@ -99,7 +99,10 @@ SIZE = 15 + 3 * LONGEST
 def frame(con: Any = None, **changes: Any) -> Frame:
     """The data frame."""
     return Frame(
-        **(dict(struct=con or sealed(), data=True, max_length=SIZE, plausible=plausible) | changes)
+        **(
+            dict(struct=con or make_frame(), data=True, max_length=SIZE, plausible=plausible)
+            | changes
+        )
     )
 
 

@@ -89,7 +89,7 @@ def fragments(data: bytes, ident: int) -> list[bytes]:
     return parts
 
 
-def shuffled(*streams: list[bytes], seed: int = 1) -> list[bytes]:
+def interleave(*streams: list[bytes], seed: int = 1) -> list[bytes]:
     """The streams mixed, each in its own order."""
     draw = random.Random(seed)
     order = [index for index, each in enumerate(streams) for _ in each]
@@ -98,7 +98,7 @@ def shuffled(*streams: list[bytes], seed: int = 1) -> list[bytes]:
     return [next(turns[index]) for index in order]
 
 
-MIXED = shuffled(
+MIXED = interleave(
     stream(300),
     stream(80, 48, port=7503),
     stream(40, 100, host=202),
@@ -223,7 +223,7 @@ def test_link_layers(link: int) -> None:
 
 
 def test_more_senders_than_are_remembered() -> None:
-    capture = made.pcap(*shuffled(*(stream(20, 60 + host % 7, host=host) for host in range(100))))
+    capture = made.pcap(*interleave(*(stream(20, 60 + host % 7, host=host) for host in range(100))))
     found, _ = check(capture)
     assert len({source for _, _, source in found}) == 100
 
@@ -437,7 +437,9 @@ def test_packets_of_a_file_stay_right_while_the_file_is_read_on(
 
 def test_one_sender_of_several(tmp_path: Path) -> None:
     path = tmp_path / "two.pcap"
-    path.write_bytes(made.pcap(*shuffled(stream(50), stream(30, host=202), stream(20, port=9000))))
+    path.write_bytes(
+        made.pcap(*interleave(stream(50), stream(30, host=202), stream(20, port=9000)))
+    )
     opened = open_file(str(path), sender="192.168.1.201")
     assert isinstance(opened, CaptureTransport)
     assert sum(map(len, opened.batches())) == 70

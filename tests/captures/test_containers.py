@@ -39,7 +39,7 @@ def zstd(data: bytes) -> bytes:
     return packed
 
 
-def zipped(data: bytes, *names: str) -> bytes:
+def zip_bytes(data: bytes, *names: str) -> bytes:
     path = Path("made.zip")
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in names or ("drives/", "drives/a"):
@@ -54,9 +54,9 @@ PACKED: dict[str, Callable[[bytes], bytes]] = {
     "bzip2": bz2.compress,
     "xz": lzma.compress,
     "zstd": zstd,
-    "zip": zipped,
+    "zip": zip_bytes,
     "two gzip members": lambda data: gzip.compress(data[:5000]) + gzip.compress(data[5000:]),
-    "gzip in zip": lambda data: zipped(gzip.compress(data)),
+    "gzip in zip": lambda data: zip_bytes(gzip.compress(data)),
 }
 
 
@@ -122,17 +122,17 @@ def test_verbs_take_compressed_files_and_pipes() -> None:
     assert (
         piped.stdout.decode() == ran("read", "a.pcap", "--packets", "--json", "-s", SENSOR).stdout
     )
-    refused = process("read", "-", "--packets", "-s", SENSOR, given=zipped(capture()))
+    refused = process("read", "-", "--packets", "-s", SENSOR, given=zip_bytes(capture()))
     assert (refused.returncode, b"give its file, not a pipe" in refused.stderr) == (3, True)
 
 
 @pytest.mark.slow
 def test_one_of_several_captures_in_an_archive_is_named() -> None:
     Path("one.zip").write_bytes(
-        zipped(capture(), "read.md", "__MACOSX/drives/a.pcap", "drives/a.pcap", "notes.md")
+        zip_bytes(capture(), "read.md", "__MACOSX/drives/a.pcap", "drives/a.pcap", "notes.md")
     )
     assert len(read("one.zip")) == 40
-    Path("two.zip").write_bytes(zipped(capture(), "read.md", "drives/a b.pcap", "drives/b.pcap"))
+    Path("two.zip").write_bytes(zip_bytes(capture(), "read.md", "drives/a b.pcap", "drives/b.pcap"))
     said = ran("convert", "two.zip", "out.csv", "-s", SENSOR, code=2).stderr
     assert "two.zip holds 2 captures: drives/a b.pcap, drives/b.pcap" in said
     assert "next: the same with 'two.zip?file=drives/a b.pcap'" in said
@@ -143,19 +143,19 @@ def test_one_of_several_captures_in_an_archive_is_named() -> None:
         "unknown name 'drives/c.pcap'; did you mean 'drives/b.pcap'"
         in ran("read", "two.zip?file=drives/c.pcap", code=2).stderr
     )
-    Path("none.zip").write_bytes(zipped(capture(), "read.md", "notes.md"))
+    Path("none.zip").write_bytes(zip_bytes(capture(), "read.md", "notes.md"))
     said = ran("read", "none.zip", "-s", SENSOR, code=3).stderr
     assert (
         "none.zip is a zip archive, and is not read: there is no capture in it, but read.md,"
         " notes.md" in said
     )
-    Path("cut.zip").write_bytes(zipped(capture())[:3000])
+    Path("cut.zip").write_bytes(zip_bytes(capture())[:3000])
     said = ran("read", "cut.zip", "-s", SENSOR, code=3).stderr
     assert (
         "cut.zip is a zip archive, and is not read: File is not a zip file\n  next: zip -FF cut.zip"
         " --out mended.zip" in said
     )
-    locked = bytearray(zipped(capture()))
+    locked = bytearray(zip_bytes(capture()))
     for place in (locked.rindex(b"PK\x03\x04") + 6, locked.rindex(b"PK\x01\x02") + 8):
         locked[place] |= 1  # the flag of a file with a password
     Path("locked.zip").write_bytes(locked)

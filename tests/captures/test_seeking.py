@@ -53,7 +53,7 @@ def written(
     return path
 
 
-def opened(path: Path) -> CaptureTransport:
+def open_capture(path: Path) -> CaptureTransport:
     found = open_file(str(path))
     assert isinstance(found, CaptureTransport)
     return found
@@ -91,7 +91,7 @@ def rest(source: CaptureTransport, to: int, *, in_batches: bool) -> list[int]:
 def test_seeking_reads_everything_after_a_time_and_little_before(
     tmp_path: Path, name: str, link: int, number: int, in_batches: bool
 ) -> None:
-    with contextlib.closing(opened(written(tmp_path / name, link=link))) as source:
+    with contextlib.closing(open_capture(written(tmp_path / name, link=link))) as source:
         times = rest(source, START + number * STEP, in_batches=in_batches)
         assert not source.warnings
         assert not source.skip_until(START)
@@ -106,7 +106,7 @@ def test_damage_on_the_way_is_no_hindrance(tmp_path: Path) -> None:
     for place in range(len(data) // 4, len(data) * 3 // 4, 5000):
         data[place : place + 8] = bytes(byte ^ 0xFF for byte in data[place : place + 8])
     path.write_bytes(data)
-    with contextlib.closing(opened(path)) as source:
+    with contextlib.closing(open_capture(path)) as source:
         times = rest(source, START + 1900 * STEP, in_batches=True)
     assert START + NUMBER // 2 * STEP < times[0] <= START + 1900 * STEP
     assert times[-1] == START + (NUMBER - 1) * STEP
@@ -121,14 +121,14 @@ def test_damage_that_was_passed_over_is_not_counted(tmp_path: Path) -> None:
     place = len(WRITINGS[".pcapng"].head(ETHERNET)) + 50 * size
     data[place + 4 : place + 8] = (2 * size).to_bytes(4, "little")  # a block as long as two
     path.write_bytes(data)
-    with contextlib.closing(opened(path)) as source:
+    with contextlib.closing(open_capture(path)) as source:
         rest(source, START + 1700 * STEP, in_batches=True)
         assert not source.warnings
         assert source.unread == 0
 
 
 def test_seeking_never_goes_back(tmp_path: Path) -> None:
-    with contextlib.closing(opened(written(tmp_path / "drive.pcap"))) as source:
+    with contextlib.closing(open_capture(written(tmp_path / "drive.pcap"))) as source:
         batches = source.batches()
         next(batches)
         assert source.skip_until(START + NUMBER * 3 // 4 * STEP)
@@ -151,7 +151,7 @@ def test_no_seek_with_other_time_bases(tmp_path: Path) -> None:
         + ticks
         + made.packet(packet, ticks=end // 1000) * (NUMBER // 2)
     )
-    with contextlib.closing(opened(path)) as source:
+    with contextlib.closing(open_capture(path)) as source:
         batches = source.batches()
         next(batches)
         assert source.skip_until(end)
@@ -163,7 +163,7 @@ def test_no_seek_with_other_time_bases(tmp_path: Path) -> None:
 def test_a_packed_capture_is_read_from_its_beginning(tmp_path: Path) -> None:
     path = tmp_path / "drive.pcap.gz"
     path.write_bytes(gzip.compress(written(tmp_path / "drive.pcap").read_bytes(), 1))
-    with contextlib.closing(opened(path)) as source:
+    with contextlib.closing(open_capture(path)) as source:
         batches = source.batches()
         number = len(next(batches))
         assert not source.skip_until(START + NUMBER * 2 // 3 * STEP)

@@ -72,7 +72,7 @@ def taken() -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def refused() -> Iterator[str]:
+def find_unused_address() -> Iterator[str]:
     """An address where nobody listens."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as other:
         other.bind(("127.0.0.1", 0))

@@ -57,6 +57,6 @@ def ran_with_any_code(*words: object) -> int:
     return result.exit_code
 
 
-def printed(*words: object) -> Any:
+def run_json(*words: object) -> Any:
     """What ``--json`` prints."""
     return json.loads(ran(*words, "--json").stdout)

@@ -252,7 +252,7 @@ def test_standard_input_is_no_way_around_it(tmp_path: Path) -> None:
         assert (done.returncode, b"standard input is a tar archive" in done.stderr) == (3, True)
 
 
-def recorded(path: Path) -> list[Record]:
+def read_records(path: Path) -> list[Record]:
     with Recording(path) as recording:
         return list(recording)
 
@@ -285,11 +285,11 @@ def test_captures_and_recordings_on_standard_input_are_read_as_from_files(tmp_pa
             ), words
         ran("record", "-", "-o", copy, "--force", given=held)
         ran("record", file, "-o", recording, "--force") if file != recording else None
-        assert recorded(copy) == recorded(recording)
+        assert read_records(copy) == read_records(recording)
         said = ran("replay", "-", "--to", tmp_path / "played.lsr", "--force", given=held).stderr
         assert f"{number} chunks" in said
-        assert [each.data for each in recorded(tmp_path / "played.lsr")] == [
-            each.data for each in recorded(recording)
+        assert [each.data for each in read_records(tmp_path / "played.lsr")] == [
+            each.data for each in read_records(recording)
         ]
     assert "only once" in ran("replay", "-", "--loop", given=held, code=2).stderr
     done = process("read", "-", "--packets", "--json", "-s", M1, given=path.read_bytes())

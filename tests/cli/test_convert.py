@@ -23,7 +23,7 @@ from lidarspec.captures.records import WRITINGS
 from lidarspec.recording.background_writer import RecordFile
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.open_url import transport
-from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, process, ran
+from tests.cli.running import COIN_D4, EXAMPLE, LD06, process, ran, run_json
 from tests.evidence import capture
 from tests.shapes import SHAPES
 
@@ -100,14 +100,15 @@ def test_npz_holds_the_same_columns_and_the_stamps(tmp_path: Path) -> None:
 def test_all_keeps_points_without_a_return(tmp_path: Path) -> None:
     target = tmp_path / "out.csv"
     assert (
-        printed("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4", "--all")["points"] == 100
+        run_json("convert", capture(COIN_D4), target, "-s", "cspc-coin-d4", "--all")["points"]
+        == 100
     )
     assert np.isinf(read(target)["range"]).sum() == 3
     assert np.isnan(read(target)["x"]).sum() == 3
 
 
 def test_json_sums_up(tmp_path: Path) -> None:
-    found = printed("convert", capture(COIN_D4), tmp_path / "out.npz", "-s", "cspc-coin-d4")
+    found = run_json("convert", capture(COIN_D4), tmp_path / "out.npz", "-s", "cspc-coin-d4")
     assert (found["sensor"], found["points"], found["stats"]["frames"]["data"]) == (
         "cspc-coin-d4",
         97,
@@ -205,8 +206,8 @@ def test_options_of_a_sensor_that_cannot_be(tmp_path: Path, options: list[str], 
 def test_scans_can_be_limited(tmp_path: Path) -> None:
     name = "velodyne/vlp16_dual/packets.derived.pcap"
     sensor = ("-s", "velodyne-vlp16")
-    whole = printed("convert", capture(name), tmp_path / "a.npz", *sensor)
-    some = printed("convert", capture(name), tmp_path / "b.npz", "-n", 2, *sensor)
+    whole = run_json("convert", capture(name), tmp_path / "a.npz", *sensor)
+    some = run_json("convert", capture(name), tmp_path / "b.npz", "-n", 2, *sensor)
     assert (whole["scans"], some["scans"]) == (5, 2)
     with np.load(tmp_path / "a.npz") as every, np.load(tmp_path / "b.npz") as first:
         np.testing.assert_array_equal(first["x"], every["x"][every["scan"] < 2])
@@ -321,7 +322,7 @@ def test_a_terminal_shows_how_far_it_is(tmp_path: Path) -> None:
         with Terminal(
             "convert", "drive.bin", "out.npz", "-s", "ldrobot-stl27l", *more, cwd=tmp_path
         ) as terminal:
-            assert terminal.ended() == 0
+            assert terminal.wait_until_end() == 0
             shown = terminal.text()
         assert bool(
             re.search(r"out\.npz: \d+ points of 1 scan .*\d+%.*\d:\d|--:--", terminal.raw)
@@ -359,12 +360,12 @@ def test_packets_go_from_container_to_container_as_they_are(name: str, tmp_path:
             assert list(after.chunks()) == list(before.chunks())
     assert files[3].read_bytes() == files[0].read_bytes()
     part = tmp_path / "part.pcapng"
-    told = printed("convert", files[2], part, "--slice", "100ms:200ms", "-s", name)
-    assert told["packets"] < printed("info", files[0])["packets"] / 2
+    told = run_json("convert", files[2], part, "--slice", "100ms:200ms", "-s", name)
+    assert told["packets"] < run_json("info", files[0])["packets"] / 2
     with contextlib.closing(transport(part)) as opened:
         times = [chunk.at or 0 for chunk in opened.chunks()]
     assert len(times) == told["packets"]
-    assert 0 <= min(times) - printed("info", files[0])["first_ns"] - 100_000_000 < 20_000_000
+    assert 0 <= min(times) - run_json("info", files[0])["first_ns"] - 100_000_000 < 20_000_000
     assert max(times) - min(times) < 100_000_000
 
 
@@ -413,7 +414,9 @@ def test_further_columns_are_written_and_printed_with_their_units(tmp_path: Path
     told = ran("convert", bytes_, target, "-s", plugin).stderr
     assert "further columns: velocity [m/s], near_ir, signal [photons]" in told
     assert set(read(target)["signal"]) == {2**24 + 1 + number for number in range(4)}
-    assert printed("convert", bytes_, target, "-s", plugin, "--force")["units"]["velocity"] == "m/s"
+    assert (
+        run_json("convert", bytes_, target, "-s", plugin, "--force")["units"]["velocity"] == "m/s"
+    )
     assert "velocity [m/s]" in ran("read", bytes_, "-s", plugin, "-n", 1).stdout
     assert (
         "colours: velocity 0 to 0.001 m/s"
@@ -442,7 +445,9 @@ def test_imu_samples_are_written_instead_of_points(tmp_path: Path) -> None:
     assert next(iter(rows)) == "time_ns"
     np.testing.assert_allclose(rows["linear_acceleration_z"], 9.80665)
     assert (
-        printed("convert", bytes_, tmp_path / "imu.npz", "-s", plugin, "--imu", "-n", 10)["samples"]
+        run_json("convert", bytes_, tmp_path / "imu.npz", "-s", plugin, "--imu", "-n", 10)[
+            "samples"
+        ]
         == 10
     )
     with np.load(tmp_path / "imu.npz") as arrays:

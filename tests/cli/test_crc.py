@@ -9,7 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.simulation.simulator import simulate
-from tests.cli.running import EXAMPLE, printed, ran
+from tests.cli.running import EXAMPLE, ran, run_json
 
 FRAMES = simulate(ls.sensor("ldrobot-stl27l"), 20)
 PASTE = "Crc(width=8, poly=0x4D)"
@@ -17,7 +17,7 @@ PASTE = "Crc(width=8, poly=0x4D)"
 
 @pytest.mark.slow
 def test_words() -> None:
-    told = printed("crc", *(frame.hex() for frame in FRAMES))
+    told = run_json("crc", *(frame.hex() for frame in FRAMES))
     best = told["matches"][0]
     assert (told["frames"], best["paste"], best["field"]["offset"], best["right"]) == (
         20,

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from lidarspec.cli import inputs
-from tests.cli.places import babbling, busy, forbidden, nothing, refused, silent, taken
+from tests.cli.places import babbling, busy, find_unused_address, forbidden, nothing, silent, taken
 from tests.cli.running import EXAMPLE, ran
 from tests.lines import free_port
 from tests.view.terminal import Terminal
@@ -45,7 +45,7 @@ BROKEN: tuple[tuple[Place, int, str], ...] = (
     (busy, 3, "in use"),
     (forbidden, 3, "permission denied"),
     (taken, 3, "in use"),
-    (refused, 3, "refuses"),
+    (find_unused_address, 3, "refuses"),
     (silent, 5, "nothing"),
     (babbling, 4, "bytes"),
 )
@@ -104,7 +104,7 @@ def test_hexadecimal_digits_with_colons_are_no_address() -> None:
 @pytest.mark.parametrize("words", [("replay", "kept.lsr"), ("sim", "ldrobot-stl27l", *BRIEF)])
 def test_an_address_in_use_cannot_be_played_to(folder: Path, words: tuple[str, ...]) -> None:
     ran("record", SIM, *STL, "-n", "20", "-o", "kept.lsr")
-    with refused() as source:
+    with find_unused_address() as source:
         result = ran(*words, "--to", source, code=3)
     number = source.rpartition(":")[2]
     assert result.stderr.splitlines() == [
@@ -162,12 +162,12 @@ def test_an_interrupt_ends_every_verb_with_130(
     worked: list[tuple[str, Terminal]], tmp_path: Path
 ) -> None:
     for _, terminal in worked:
-        terminal.loaded()
+        terminal.wait_until_loaded()
     for _, terminal in worked:
         terminal.type("\x03")
     ends = {
         words: (
-            seen_by_a_shell(terminal.ended()),
+            seen_by_a_shell(terminal.wait_until_end()),
             "Traceback" in terminal.raw,
             terminal.is_as_before(),
         )
@@ -194,7 +194,7 @@ PRINTING: tuple[tuple[str, ...], ...] = (
 
 @pytest.mark.slow
 def test_a_closed_pipe_ends_every_verb_quietly(tmp_path: Path) -> None:
-    running = {words: _started(words, tmp_path) for words in PRINTING}
+    running = {words: _start(words, tmp_path) for words in PRINTING}
     ends = {}
     for words, process in running.items():
         with process:
@@ -207,7 +207,7 @@ def test_a_closed_pipe_ends_every_verb_quietly(tmp_path: Path) -> None:
     assert ends == dict.fromkeys(ends, (0, False))
 
 
-def _started(words: tuple[str, ...], folder: Path) -> subprocess.Popen[str]:
+def _start(words: tuple[str, ...], folder: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-u", "-m", "lidarspec", *words]
     return subprocess.Popen(
         command,

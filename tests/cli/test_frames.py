@@ -11,7 +11,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.cli.frames import plain
-from tests.cli.running import COIN_D4, EXAMPLE, LD06, printed, ran
+from tests.cli.running import COIN_D4, EXAMPLE, LD06, ran, run_json
 from tests.engine.streams import MEGABYTE, peak
 from tests.evidence import capture
 from tests.shapes import SHAPES
@@ -60,7 +60,7 @@ def test_a_frame_is_parsed_from_a_file_and_from_standard_input(tmp_path: Path) -
 
 
 def test_json_holds_the_integers_of_the_wire() -> None:
-    found = printed("parse", EXAMPLE.hex(), *SENSOR)
+    found = run_json("parse", EXAMPLE.hex(), *SENSOR)
     (frame,) = found["frames"]
     assert (found["sensor"], frame["frame"], frame["offset"], frame["size"]) == (
         "ldrobot-stl27l",
@@ -79,11 +79,11 @@ def test_the_sensors_that_fit_are_found_and_listed() -> None:
     result = ran("parse", EXAMPLE.hex())
     assert "ldrobot-ld06" in result.stderr
     assert "ldrobot-stl27l" in result.stderr
-    assert printed("parse", EXAMPLE.hex())["fits"] == [
+    assert run_json("parse", EXAMPLE.hex())["fits"] == [
         name for name in ls.sensors() if name.startswith("ldrobot-")
     ]
     assert (
-        printed("parse", ls.sensor("robosense-m1").example("data").hex())["sensor"]
+        run_json("parse", ls.sensor("robosense-m1").example("data").hex())["sensor"]
         == "robosense-m1"
     )
 
@@ -92,13 +92,16 @@ def test_a_stream_is_parsed_and_gaps_are_counted() -> None:
     data = b"\x00\x54" + EXAMPLE + b"\x54\x2c" + EXAMPLE
     result = ran("parse", data.hex(), *SENSOR)
     assert "4 bytes outside frames" in result.stderr
-    assert [frame["offset"] for frame in printed("parse", data.hex(), *SENSOR)["frames"]] == [2, 51]
-    assert len(printed("parse", data.hex(), "-n", 1, *SENSOR)["frames"]) == 1
+    assert [frame["offset"] for frame in run_json("parse", data.hex(), *SENSOR)["frames"]] == [
+        2,
+        51,
+    ]
+    assert len(run_json("parse", data.hex(), "-n", 1, *SENSOR)["frames"]) == 1
 
 
 def test_explain_names_every_byte_of_a_stream() -> None:
     data = b"\x00\x54" + EXAMPLE + b"\x54\x2c" + EXAMPLE + b"\xff"
-    frames = printed("explain", data.hex(), *SENSOR)["frames"]
+    frames = run_json("explain", data.hex(), *SENSOR)["frames"]
     named = b"".join(bytes.fromhex(row["hex"]) for frame in frames for row in frame["rows"])
     assert named == data
     assert [(frame["frame"], frame["offset"]) for frame in frames] == [
@@ -166,9 +169,10 @@ def test_explain_can_show_some_bytes_only(tmp_path: Path) -> None:
         "ldrobot-stl27l data at byte 940, 47 bytes; byte 946 is in points[0].distance\n"
     )
     assert [
-        frame["offset"] for frame in printed("explain", path, "--bytes", "46:95", *SENSOR)["frames"]
+        frame["offset"]
+        for frame in run_json("explain", path, "--bytes", "46:95", *SENSOR)["frames"]
     ] == [0, 47, 94]
-    assert len(printed("explain", path, "--bytes", "14000:", *SENSOR)["frames"]) == 3
+    assert len(run_json("explain", path, "--bytes", "14000:", *SENSOR)["frames"]) == 3
     assert (
         "14100 bytes: no byte 14100" in ran("explain", path, "--at", 14100, *SENSOR, code=2).stderr
     )
@@ -216,7 +220,7 @@ def test_explain_prints_while_input_arrives_and_stops_with_its_reader() -> None:
 
 
 def test_captures_are_explained() -> None:
-    frames = printed("explain", capture(COIN_D4), "-s", "cspc-coin-d4")["frames"]
+    frames = run_json("explain", capture(COIN_D4), "-s", "cspc-coin-d4")["frames"]
     assert (
         b"".join(bytes.fromhex(row["hex"]) for frame in frames for row in frame["rows"])
         == capture(COIN_D4).read_bytes()
@@ -312,7 +316,7 @@ def test_built_frames_go_to_files_and_back(tmp_path: Path) -> None:
         ran("build", "cspc-m1c1-mini", "command", "mode=0xf0", "-o", "-").stdout_bytes
         == raw.read_bytes()
     )
-    assert printed("build", "cspc-m1c1-mini", "command", "mode=240")["hex"] == "aa 55 f0 0f"
+    assert run_json("build", "cspc-m1c1-mini", "command", "mode=240")["hex"] == "aa 55 f0 0f"
     assert "0x0f ok (XOR-8 over 3 bytes)" in ran("explain", raw, "-s", "cspc-m1c1-mini").stdout
 
 

@@ -15,7 +15,7 @@ from lidarspec.explaining import file_contents as looking
 from lidarspec.recording.recorders import Recorder
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.protocol import Chunk
-from tests.cli.running import printed, ran
+from tests.cli.running import ran, run_json
 
 START, STEP = 1_700_000_000 * 10**9, 1_327_104
 
@@ -36,7 +36,7 @@ def test_a_capture_of_two_sensors_with_one_lost_packet(frames: list[bytes], tmp_
         for sender in senders[: 1 + (number < 200)]
     ]
     path.write_bytes(capture_head(ETHERNET) + b"".join(map(datagram_record, datagrams)))
-    told = printed("info", path)
+    told = run_json("info", path)
     assert (told["kind"], told["size"], told["whole"]) == ("a capture", os.path.getsize(path), True)
     assert (told["packets"], told["bytes"], told["first_ns"]) == (499, 499 * 1206, START)
     assert told["seconds"] == pytest.approx(298 * STEP * 1e-9)
@@ -64,7 +64,7 @@ def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) 
         for place in range(number):
             recorder.wait_for_room()
             recorder.write(Chunk(data, START + place * 10**8))
-    told = printed("info", path)
+    told = run_json("info", path)
     assert told["kind"] == "a recording"
     assert not told["whole"]
     assert told["bytes"] < os.path.getsize(path) / 2
@@ -79,7 +79,7 @@ def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) 
 @pytest.mark.slow
 def test_a_capture_of_a_byte_stream_is_called_so(tmp_path: Path) -> None:
     ran("sim", "ldrobot-stl27l", "--to", tmp_path / "line.pcap", "-t", "1s")
-    told = printed("info", tmp_path / "line.pcap")
+    told = run_json("info", tmp_path / "line.pcap")
     assert (told["kind"], told["packets"]) == ("a capture of a byte stream", 1800)
     assert told["contents"][0]["sensors"] == ["ldrobot-stl27l"]
 
@@ -89,7 +89,7 @@ def test_a_file_without_times_and_one_without_sensor(tmp_path: Path) -> None:
     raw.write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 100)))
     noise.write_bytes(bytes(range(256)) * 4)
     empty.write_bytes(b"")
-    told = printed("info", raw)
+    told = run_json("info", raw)
     assert (told["kind"], told["first_ns"], told["flows"][0]["sender"]) == (
         "raw bytes",
         None,

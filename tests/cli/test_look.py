@@ -16,7 +16,7 @@ from lidarspec.cli.options import SHARE
 from lidarspec.cli.root import VERBS, main
 from lidarspec.plugins import Registry
 from lidarspec.simulation.faults import faults_of
-from tests.cli.running import EXAMPLE, printed, ran
+from tests.cli.running import EXAMPLE, ran, run_json
 from tests.representatives import REPRESENTATIVES
 
 
@@ -47,7 +47,7 @@ def test_the_version_is_printed() -> None:
 
 
 def test_sensors_lists_installed_sensors() -> None:
-    known = {item["id"]: item for item in printed("sensors")}
+    known = {item["id"]: item for item in run_json("sensors")}
     assert list(known) == list(ls.sensors())
     stl = known["ldrobot-stl27l"]
     assert (stl["vendor"], stl["model"], stl["status"], stl["distribution"]) == (
@@ -73,7 +73,7 @@ def test_show_draws_the_wire_table_of_every_frame() -> None:
 
 
 def test_show_prints_commands_and_their_bytes() -> None:
-    found = printed("show", "cspc-m1c1-mini")
+    found = run_json("show", "cspc-m1c1-mini")
     assert found["commands"]["start"] == {
         "frame": "command",
         "arguments": {},
@@ -98,15 +98,15 @@ def test_show_works_for_every_sensor() -> None:
 
 def check_shown_sensor(sensor: str) -> None:
     """Compare what `show` prints with the frames of the sensor."""
-    assert set(printed("show", sensor)["frames"]) == set(ls.sensor(sensor).frames)
-    plans = printed("show", sensor, "--plan")
+    assert set(run_json("show", sensor)["frames"]) == set(ls.sensor(sensor).frames)
+    plans = run_json("show", sensor, "--plan")
     assert set(plans) == {name for name, frame in ls.sensor(sensor).frames.items() if frame.data}
     assert all("points a packet" in lines[0] for lines in plans.values()), plans
 
 
 @pytest.mark.slow
 def test_plugins_names_distributions() -> None:
-    found = {plugin["distribution"]: plugin for plugin in printed("plugins")}
+    found = {plugin["distribution"]: plugin for plugin in run_json("plugins")}
     assert found["lidarspec-ldrobot"]["sensors"] == [
         name for name in ls.sensors() if name.startswith("ldrobot-")
     ]
@@ -132,20 +132,20 @@ def test_demo_draws_and_sums_up() -> None:
 
 @pytest.mark.slow
 def test_demo_reads_a_stream_without_a_serial_link_over_tcp() -> None:
-    found = printed("demo", "-s", "quanergy-m8", "-n", 1, "--errors", 0)
+    found = run_json("demo", "-s", "quanergy-m8", "-n", 1, "--errors", 0)
     assert found["place"].startswith("tcp://127.0.0.1:")
     assert found["stats"]["bytes_skipped"] == 0
 
 
 @pytest.mark.parametrize("sensor", ["ldrobot-stl27l", "velodyne-vlp16"])
 def test_demo_counts_the_faults_of_the_line(sensor: str) -> None:
-    found = printed("demo", "-s", sensor, "-n", 3, "--errors", 0.005)
+    found = run_json("demo", "-s", sensor, "-n", 3, "--errors", 0.005)
     assert found["rate_hz"] == pytest.approx(10, rel=0.1)
     under_way = found["intact"] - sum(found["stats"]["frames"].values())
     assert under_way >= 0
     assert found["intact"] < found["sent"]
     assert found["same_when_replayed"]
-    clean = printed("demo", "-s", sensor, "-n", 1, "--errors", 0)
+    clean = run_json("demo", "-s", sensor, "-n", 1, "--errors", 0)
     assert clean["stats"]["bad_checksum"] == clean["stats"]["bytes_skipped"] == 0
     assert clean["sha256"] != found["sha256"]
 
@@ -196,7 +196,7 @@ def test_on_a_terminal_of_80_columns_ids_and_fields_stay_whole() -> None:
     shown = {}
     for words in (("sensors",), ("show", "cspc-m1c1-mini")):
         with Terminal(*words, columns=80, lines=80) as window:
-            assert window.ended() == 0
+            assert window.wait_until_end() == 0
             shown[words[0]] = window.raw.replace("\r", "").splitlines()
     assert set(ls.sensors()) <= {line.partition(" ")[0] for line in shown["sensors"]}
     assert all(

@@ -24,7 +24,7 @@ from tests.cli.running import ran
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def installed(folder: Path) -> dict[str, str]:
+def make_environment(folder: Path) -> dict[str, str]:
     """The environment of a process in which the distribution in this folder is installed, as pip
     leaves it behind.
     """
@@ -49,7 +49,7 @@ def run(folder: Path, *words: object, code: int = 0) -> str:
     done = subprocess.run(
         command,
         cwd=folder,
-        env=installed(folder),
+        env=make_environment(folder),
         capture_output=True,
         text=True,
         check=False,

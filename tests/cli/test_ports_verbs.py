@@ -25,8 +25,8 @@ from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Crc
 from lidarspec.testing.fixtures import virtual_port
 from lidarspec.transports.ports import SerialPort
-from tests.cli.running import printed, process, ran
-from tests.lines import TIMEOUT_S, paced, port, udp, working
+from tests.cli.running import process, ran, run_json
+from tests.lines import TIMEOUT_S, port, send_paced, udp, working
 
 
 class TestSend:
@@ -38,7 +38,7 @@ class TestSend:
             assert "reserved  00 00 00 00 00 00" in text
             time.sleep(0.2)
             assert made.device.commands_received == ["start"]  # and not stopped again
-            told = printed("send", made.path, "stop", "-s", "cspc-m1c1-mini")
+            told = run_json("send", made.path, "stop", "-s", "cspc-m1c1-mini")
         assert (told["confirmed"], told["frame"], told["fields"]["mode"]) == (True, "ack", 0x55)
         assert told["hex"] == "a5 5a 55 07 00 00 00 00 00 00 00 ad"
 
@@ -49,14 +49,14 @@ class TestSend:
                 in ran("send", made.path, "low_exposure", "-s", "cspc-m1c1-mini").stdout
             )
             assert (
-                printed("send", made.path, "high_exposure", "-s", "cspc-m1c1-mini")["confirmed"]
+                run_json("send", made.path, "high_exposure", "-s", "cspc-m1c1-mini")["confirmed"]
                 is False
             )
 
     def test_arguments_bring_their_units(self) -> None:
         with virtual_port("slamtec-rplidar-s2") as made:
             ran("send", made.path, "motor_speed", "speed=10Hz", "-s", "slamtec-rplidar-s2")
-            told = printed(
+            told = run_json(
                 "send", made.path, "get_max_distance", "mode=0x1", "-s", "slamtec-rplidar-s2"
             )
             assert {value["path"]: value.get("unit") for value in told["values"]}[
@@ -114,7 +114,7 @@ class TestDetect:
     def test_a_port(self) -> None:
         with virtual_port("ldrobot-stl27l") as made:
             found = ran("detect", made.path)
-            told = printed("detect", made.path)
+            told = run_json("detect", made.path)
         assert f"next: lidarspec view {made.path} -s ldrobot-stl27l" in found.stderr
         row = next(line.split() for line in found.stdout.splitlines() if "stl27l" in line)
         assert row[1:3] == ["ldrobot-stl27l", "yes"]
@@ -198,7 +198,7 @@ class TestDetect:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             frames = simulate(ls.sensor("robosense-m1"), 40)
             with working(
-                lambda stop: paced(
+                lambda stop: send_paced(
                     lambda data: sender.sendto(data, ("127.0.0.1", 6699)), frames, 200, stop
                 )
             ):
@@ -208,7 +208,7 @@ class TestDetect:
 
 class TestPorts:
     def test_udp_ports_of_sensors_and_their_users(self) -> None:
-        told = printed("ports")
+        told = run_json("ports")
         known = {one["port"]: one for one in told["udp"]}
         assert "robosense-m1" in known[6699]["sensors"]
         script = (
@@ -220,7 +220,7 @@ class TestPorts:
         ) as other:
             assert other.stdout is not None
             other.stdout.readline()
-            busy = {one["port"]: one for one in printed("ports")["udp"]}[7788]
+            busy = {one["port"]: one for one in run_json("ports")["udp"]}[7788]
             text = ran("ports").stdout
             assert f"kill {other.pid}" in ran("doctor", "udp://:7788", code=1).stdout
             assert other.stdin is not None
@@ -233,7 +233,7 @@ class TestPorts:
 
 
 class TestDoctor:
-    def _told(self, *words: object) -> list[dict[str, Any]]:
+    def _run_doctor(self, *words: object) -> list[dict[str, Any]]:
         result = process("doctor", *words, "--json")
         found: list[dict[str, Any]] = json.loads(result.stdout)
         assert result.returncode == int(not all(finding["ok"] for finding in found))
@@ -285,7 +285,7 @@ class TestDoctor:
 
     @pytest.mark.slow
     def test_a_missing_port_and_one_in_use(self) -> None:
-        assert self._told("/dev/ttyNONE7") == [
+        assert self._run_doctor("/dev/ttyNONE7") == [
             {
                 "ok": False,
                 "text": (
@@ -305,7 +305,9 @@ class TestDoctor:
                 assert other.stdout is not None
                 assert other.stdin is not None
                 other.stdout.readline()
-                texts = {finding["mend"]: finding["text"] for finding in self._told(made.path)}
+                texts = {
+                    finding["mend"]: finding["text"] for finding in self._run_doctor(made.path)
+                }
                 other.stdin.close()
         assert f"(process {other.pid})" in texts[f"kill {other.pid}"]
 
@@ -315,7 +317,9 @@ class TestDoctor:
         with (
             port(tmp_path) as made,
             working(
-                lambda stop: paced(made.offer, [source.randbytes(90) for _ in range(40)], 200, stop)
+                lambda stop: send_paced(
+                    made.offer, [source.randbytes(90) for _ in range(40)], 200, stop
+                )
             ),
         ):
             found = ran("doctor", made.name, "-t", "300ms", code=1).stdout
@@ -327,13 +331,15 @@ class TestDoctor:
             pytest.skip("root may open everything")
         with port(tmp_path) as made:
             os.chmod(os.path.realpath(made.name), 0)
-            assert any("may not open it" in finding["text"] for finding in self._told(made.name))
+            assert any(
+                "may not open it" in finding["text"] for finding in self._run_doctor(made.name)
+            )
 
     @pytest.mark.slow
     def test_udp_with_and_without_packets(self) -> None:
         with udp() as free:
             number = free.getsockname()[1]
-        silent = self._told(f"udp://127.0.0.1:{number}", "-t", "300ms")
+        silent = self._run_doctor(f"udp://127.0.0.1:{number}", "-t", "300ms")
         assert any("no data received" in finding["text"] for finding in silent)
         assert any(
             "only packets to 127.0.0.1 are listened to" in finding["text"] for finding in silent
@@ -341,14 +347,14 @@ class TestDoctor:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             frames = simulate(ls.sensor("robosense-m1"), 40)
             with working(
-                lambda stop: paced(
+                lambda stop: send_paced(
                     lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 200, stop
                 )
             ):
-                well = self._told(f"udp://127.0.0.1:{number}", "-t", "500ms")
+                well = self._run_doctor(f"udp://127.0.0.1:{number}", "-t", "500ms")
                 other = f"udp://127.0.0.1:{number}?src=127.0.0.9"
                 instead, detected = (
-                    self._told(other, "-t", "500ms"),
+                    self._run_doctor(other, "-t", "500ms"),
                     ran("detect", other, "-t", "500ms", code=5).stderr,
                 )
         assert any(finding["ok"] and "robosense-m1 sends" in finding["text"] for finding in well)
@@ -362,10 +368,10 @@ class TestDoctor:
     @pytest.mark.slow
     def test_files(self, tmp_path: Path) -> None:
         (tmp_path / "empty.bin").write_bytes(b"")
-        assert not self._told(tmp_path / "empty.bin")[0]["ok"]
-        assert not self._told(tmp_path / "none.bin")[0]["ok"]
+        assert not self._run_doctor(tmp_path / "empty.bin")[0]["ok"]
+        assert not self._run_doctor(tmp_path / "none.bin")[0]["ok"]
         (tmp_path / "good.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 30)))
-        assert self._told(tmp_path / "good.bin")[0]["ok"]
+        assert self._run_doctor(tmp_path / "good.bin")[0]["ok"]
 
     @pytest.mark.slow
     def test_the_whole_computer(self) -> None:
@@ -377,7 +383,7 @@ def test_bytes_sent_by_hand_are_answered_and_the_answer_is_explained() -> None:
     said = ran("send", "sim:slamtec-rplidar-a1", "--hex", "0xA5, 0x50  # get_info", *sensor)
     assert said.stdout.startswith("slamtec-rplidar-a1 info, 27 bytes\n0000  a5 5a ")
     assert said.stderr == "sent 2 bytes: a5 50\n"
-    told = printed("send", "sim:cspc-m1c1-mini", "--hex", "aa55f00f", "-s", "cspc-m1c1-mini")
+    told = run_json("send", "sim:cspc-m1c1-mini", "--hex", "aa55f00f", "-s", "cspc-m1c1-mini")
     assert (told["sent"], told["frames"][0]["frame"]) == (
         "aa 55 f0 0f",
         "ack",

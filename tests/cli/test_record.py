@@ -22,7 +22,7 @@ import lidarspec as ls
 from lidarspec.recording.format import Recording
 from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Chunk
-from tests.cli.running import printed, ran
+from tests.cli.running import ran, run_json
 from tests.lines import SLACK, port
 
 STREAM, DATAGRAMS = "ldrobot-stl27l", "velodyne-vlp16"
@@ -88,7 +88,7 @@ class Running:
         assert found is not None
         return found
 
-    def ended(self, code: int) -> str:
+    def wait_until_end(self, code: int) -> str:
         """What it said until its end; it has to end with this code."""
         self.child.wait(60)
         self._listener.join()
@@ -115,10 +115,10 @@ def started(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     for running in made:
         if running.child.poll() is None:
             running.child.kill()
-            running.ended(-signal.SIGKILL)
+            running.wait_until_end(-signal.SIGKILL)
 
 
-def received(path: Path) -> bytes:
+def read_received(path: Path) -> bytes:
     with Recording(path) as recording:
         return b"".join(item.data for item in recording if item.direction == "in")
 
@@ -126,10 +126,10 @@ def received(path: Path) -> bytes:
 def test_a_simulated_sensor_is_known_and_started(tmp_path: Path) -> None:
     """One that sends nothing before it is asked to."""
     target = tmp_path / "a.lsr"
-    result = printed("record", "sim:slamtec-rplidar-a1?rate=4", "-o", target, "-n", 20)
+    result = run_json("record", "sim:slamtec-rplidar-a1?rate=4", "-o", target, "-n", 20)
     assert result["sensor"] == "slamtec-rplidar-a1"
     assert result["packets"] >= 20
-    assert printed("stats", target)["packets"] >= 20
+    assert run_json("stats", target)["packets"] >= 20
 
 
 def test_no_start_sends_nothing_to_a_simulated_sensor(tmp_path: Path) -> None:
@@ -155,9 +155,10 @@ def test_recorded_replayed_and_recorded_again_it_is_the_same(
     assert player.hears("next: (.*)")[1] == f"lidarspec view {place} -s {STREAM}"
     again = tmp_path / "again.lsr"
     ran("record", place, "-s", STREAM, "-o", again, "-n", 40)
-    assert player.ended(0)
+    assert player.wait_until_end(0)
     assert (
-        hashlib.sha256(received(again)).hexdigest() == hashlib.sha256(received(stream)).hexdigest()
+        hashlib.sha256(read_received(again)).hexdigest()
+        == hashlib.sha256(read_received(stream)).hexdigest()
     )
     with Recording(again) as recording:
         assert (recording.header.sensor, recording.header.source, recording.header.baud) == (
@@ -184,7 +185,7 @@ def test_datagrams_recorded_from_a_socket_as_capture_and_recording(
         taker = started("record", place, "-s", DATAGRAMS, "-o", name, "-n", 30)
         taker.hears("nothing has arrived")
         ran("replay", datagrams, "--to", place)
-        assert "30 packets, 30 records" in taker.ended(0)
+        assert "30 packets, 30 records" in taker.wait_until_end(0)
         with ls.open(datagrams) as one, ls.open(tmp_path / name, DATAGRAMS) as other:
             before, after = (
                 b"".join(p.raw.tobytes() for p in device.packets()) for device in (one, other)
@@ -205,15 +206,15 @@ def test_ctrl_c_ends_a_recording_properly(tmp_path: Path, started: Callable[...,
         while received_so_far(tmp_path / "it.lsr") < len(data) and time.monotonic() < deadline:
             time.sleep(0.02)
         taker.child.send_signal(signal.SIGINT)
-        said = taker.ended(130)
+        said = taker.wait_until_end(130)
     assert "20 packets" in said
     assert "next: lidarspec view it.lsr" in said
-    assert received(tmp_path / "it.lsr") == data
+    assert read_received(tmp_path / "it.lsr") == data
 
 
 def received_so_far(path: Path) -> int:
     try:
-        return len(received(path))
+        return len(read_received(path))
     except ls.LidarSpecError:
         return 0
 
@@ -230,24 +231,26 @@ def test_without_a_sensor_bytes_are_recorded_as_they_come(
             time.sleep(0.02)
         time.sleep(0.2)
         line.send(b"what nobody knows")
-        assert "next: lidarspec detect raw.lsr" in taker.ended(0)
-    assert received(tmp_path / "raw.lsr") == b"what nobody knows"
+        assert "next: lidarspec detect raw.lsr" in taker.wait_until_end(0)
+    assert read_received(tmp_path / "raw.lsr") == b"what nobody knows"
     with Recording(tmp_path / "raw.lsr") as recording:
         assert (recording.header.sensor, recording.header.baud) == ("", 115200)
 
 
 def test_captures_become_recordings_and_back(datagrams: Path, tmp_path: Path) -> None:
     capture, back = tmp_path / "it.pcap", tmp_path / "back.lsr"
-    assert printed("record", datagrams, "-o", capture)["packets"] == 30
-    assert printed("record", capture, "-s", DATAGRAMS, "-o", back)["bytes"] == 30 * 1206
-    assert received(back) == received(datagrams)
-    assert printed("record", datagrams, "-o", tmp_path / "part.lsr", "-n", 7)["records"] == 7
-    assert printed("record", datagrams, "-o", tmp_path / "begin.lsr", "-t", "50ms")["records"] == 10
+    assert run_json("record", datagrams, "-o", capture)["packets"] == 30
+    assert run_json("record", capture, "-s", DATAGRAMS, "-o", back)["bytes"] == 30 * 1206
+    assert read_received(back) == read_received(datagrams)
+    assert run_json("record", datagrams, "-o", tmp_path / "part.lsr", "-n", 7)["records"] == 7
+    assert (
+        run_json("record", datagrams, "-o", tmp_path / "begin.lsr", "-t", "50ms")["records"] == 10
+    )
 
 
 def test_the_bytes_of_a_stream_can_be_taken_out(stream: Path, tmp_path: Path) -> None:
     ran("record", stream, "-o", tmp_path / "it.bin")
-    assert (tmp_path / "it.bin").read_bytes() == received(stream)
+    assert (tmp_path / "it.bin").read_bytes() == read_received(stream)
 
 
 def test_standard_input_gets_the_times_of_its_arrival(tmp_path: Path) -> None:
@@ -296,9 +299,9 @@ def test_nothing_is_overwritten_without_force(
     assert "--force" in result.stderr
     assert target.read_bytes() == b"precious"
     ran(verb[0], stream, verb[1], target, "--force")
-    assert received(target) == received(stream)
+    assert read_received(target) == read_received(stream)
     assert "would be overwritten" in ran(verb[0], target, verb[1], target, "--force", code=2).stderr
-    assert received(target) == received(stream)
+    assert read_received(target) == read_received(stream)
 
 
 def test_unrecordable_sources_give_a_reason(stream: Path, datagrams: Path, tmp_path: Path) -> None:
@@ -359,7 +362,7 @@ def test_a_full_disk_ends_it_with_one_line_and_a_whole_file(tmp_path: Path, stre
     try:
         shutil.copy(stream, tmp_path / "long.bin")
         with open(tmp_path / "long.bin", "wb") as file:
-            file.write(received(stream) * 100)
+            file.write(read_received(stream) * 100)
         result = ran("record", tmp_path / "long.bin", "-s", STREAM, "-o", disk / "it.lsr", code=3)
         assert re.fullmatch(
             r".*No space left on device; the recording is whole up to byte \d+\n  next: .*\n",
@@ -385,7 +388,7 @@ def test_impossible_replays_give_a_reason(stream: Path, datagrams: Path, tmp_pat
         in ran("replay", stream, "--to", tmp_path / "it.lsr", "--loop", code=2).stderr
     )
     raw = tmp_path / "it.bin"
-    raw.write_bytes(received(stream))
+    raw.write_bytes(read_received(stream))
     assert (
         "when its bytes arrived"
         in ran("replay", raw, "--speed", "1", "--to", tmp_path / "it.lsr", code=2).stderr
@@ -399,7 +402,7 @@ def test_a_replay_sums_up_with_a_digest(datagrams: Path) -> None:
     assert (found["chunks"], found["bytes"], found["sha256"]) == (
         30,
         36180,
-        hashlib.sha256(received(datagrams)).hexdigest(),
+        hashlib.sha256(read_received(datagrams)).hexdigest(),
     )
 
 
@@ -412,10 +415,10 @@ def test_a_loop_serves_one_reader_after_another_until_ctrl_c(
     place = player.hears(r"playing \S+ to (/dev/\S+),")[1]
     for number, name in enumerate(("one.lsr", "two.lsr"), start=1):
         ran("record", place, "-s", STREAM, "-o", tmp_path / name, "-n", 60)
-        assert received(tmp_path / name).startswith(received(stream))
+        assert read_received(tmp_path / name).startswith(read_received(stream))
         player.hears(f"(?s)(nobody reads.*){{{number}}}")
     player.child.send_signal(signal.SIGINT)
-    assert "stream.lsr to /dev/" in player.ended(130)
+    assert "stream.lsr to /dev/" in player.wait_until_end(130)
 
 
 def test_a_replay_prints_its_destination_on_standard_output(datagrams: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from lidarspec.recording.format import Recording
-from tests.cli.running import EXAMPLE, printed, ran
+from tests.cli.running import EXAMPLE, ran, run_json
 
 ID = "velodyne-vlp16"
 
@@ -45,7 +45,7 @@ def test_convert_writes_the_selection(drive: Path, tmp_path: Path) -> None:
     ranges = [float(row["range"]) for row in rows]
     assert 1.5 <= min(ranges) < max(ranges) <= 3
     assert (
-        printed("convert", drive, tmp_path / "all.npz", "--scans", "3:5", "--all")["points"]
+        run_json("convert", drive, tmp_path / "all.npz", "--scans", "3:5", "--all")["points"]
         == 57888
     )
 
@@ -113,9 +113,9 @@ def test_every_verb_takes_the_same_slice(drive: Path, tmp_path: Path) -> None:
             ran("view", drive, "--once", *selecting).stdout,
         )
         ran("plot", drive, "-o", tmp_path / "out.svg", *selecting)
-    frames = printed("parse", drive, "--slice", "1s:1.02s")["frames"]
+    frames = run_json("parse", drive, "--slice", "1s:1.02s")["frames"]
     assert [frame["frame"] for frame in frames].count("data") in range(13, 17)
-    assert len(printed("explain", drive, "--slice", "1s:1.02s")["frames"]) == len(frames)
+    assert len(run_json("explain", drive, "--slice", "1s:1.02s")["frames"]) == len(frames)
     ran("replay", drive, "--to", tmp_path / "part.lsr", "--slice", "500ms:1s")
     with Recording(drive) as whole, Recording(tmp_path / "part.lsr") as part:
         records = list(whole)

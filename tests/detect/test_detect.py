@@ -174,7 +174,7 @@ def old_firmware(
     return [packet[:1200] + tail for packet, tail in zip(data, tails, strict=True)]
 
 
-def swapped(data: list[bytes]) -> list[bytes]:
+def swap_pairs(data: list[bytes]) -> list[bytes]:
     return [data[i ^ 1] for i in range(len(data) & ~1)]
 
 
@@ -185,7 +185,7 @@ def swapped(data: list[bytes]) -> list[bytes]:
     [
         lambda data: [packet for packet in data if random.Random(packet[1200:1204]).random() > 0.1],
         lambda data: [packet for packet in data for _ in range(2)],
-        swapped,
+        swap_pairs,
     ],
     ids=["a tenth lost", "doubled", "swapped"],
 )

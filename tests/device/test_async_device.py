@@ -13,7 +13,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import ReplyTimeout, SourceError, UsageError
 from tests.device.test_commands import IMPATIENT, SENSOR, START, STOP, Obedient
-from tests.lines import TIMEOUT_S, Port, paced, port, turning, until, working
+from tests.lines import TIMEOUT_S, Port, port, send_paced, turning, until, working
 from tests.shapes import SHAPES
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
@@ -79,7 +79,7 @@ def test_a_wait_that_is_cancelled_loses_nothing(line: Port) -> None:
     async def use() -> list[int]:
         stamps: list[int] = []
         async with ls.open_async(f"serial://{line.name}", TURNING) as opened:
-            with working(lambda stop: paced(line.send, frames, 400, stop) and None):
+            with working(lambda stop: send_paced(line.send, frames, 400, stop) and None):
                 while len(stamps) < 8:
                     feed = opened.scans()
                     try:

@@ -65,7 +65,7 @@ SET = Command(
 )
 
 
-def linked(control: Link, **more: Any) -> Sensor:
+def make_linked_sensor(control: Link, **more: Any) -> Sensor:
     """The shape with its commands over another link, and free ports."""
     return dataclasses.replace(SENSOR, links={"data": Udp(free_port()), "control": control}, **more)
 
@@ -90,7 +90,7 @@ def with_pages(answers: dict[str, Any], link: Http | None = None) -> Sensor:
 
 @pytest.mark.parametrize("kind", [Udp, Tcp])
 def test_a_simulated_sensor_answers_over_a_link_of_its_own(kind: type[Udp | Tcp]) -> None:
-    sensor = linked(kind(free_port()))
+    sensor = make_linked_sensor(kind(free_port()))
     data = sensor.links["data"].ports[0]
     with (
         virtual_port(sensor, to=f"udp://127.0.0.1:{data}") as port,
@@ -115,7 +115,7 @@ ANGLES = [0.5, 1.0, 1.5, 2.0]
 
 def teaching(**more: Any) -> Sensor:
     """The shape, which is asked for its table on opening."""
-    return dataclasses.replace(linked(Udp(free_port())), on_open=("get_table",), **more)
+    return dataclasses.replace(make_linked_sensor(Udp(free_port())), on_open=("get_table",), **more)
 
 
 def angles(device: ls.Device) -> list[float]:
@@ -244,7 +244,7 @@ def test_a_sensor_that_no_longer_answers_its_heartbeat_is_started_again() -> Non
         "hello": dataclasses.replace(order, starts=True, timeout=1.0),
         "beat": beat,
     }
-    sensor = linked(Udp(free_port()), commands=commands, on_open=("hello", "beat"))
+    sensor = make_linked_sensor(Udp(free_port()), commands=commands, on_open=("hello", "beat"))
     with (
         virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port,
         ls.open(port.path, sensor) as device,
@@ -302,7 +302,7 @@ class Plugin:
 
 
 def test_a_plugin_opens_a_link_of_its_own_kind() -> None:
-    sensor, plugin = linked(Loop()), Plugin()
+    sensor, plugin = make_linked_sensor(Loop()), Plugin()
     source, plugins = f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", Registry()
     with use_registry(plugins):
         for opened, error, said in [
@@ -324,7 +324,7 @@ def test_a_plugin_opens_a_link_of_its_own_kind() -> None:
 
 def test_a_port_in_use_is_replaced_with_a_warning(server: socket.socket) -> None:
     taken = server.getsockname()[1]
-    sensor = linked(Tcp(taken))
+    sensor = make_linked_sensor(Tcp(taken))
     with (
         virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port,
         ls.open(port.path, sensor) as device,
@@ -344,7 +344,7 @@ def server() -> Iterator[socket.socket]:
     sys.platform != "linux", reason="other systems have no broadcast on the loopback"
 )
 def test_a_sensor_found_by_broadcast_gets_our_address() -> None:
-    sensor = linked(Udp(broadcast=free_port()))
+    sensor = make_linked_sensor(Udp(broadcast=free_port()))
     data = sensor.links["data"].ports[0]
     with (
         virtual_port(sensor, to=f"udp://127.0.0.1:{data}") as port,
@@ -360,7 +360,7 @@ def test_a_sensor_found_by_broadcast_gets_our_address() -> None:
 )
 def test_of_several_that_answer_a_broadcast_the_first_is_the_sensor() -> None:
     number = free_port()
-    sensor = linked(Udp(broadcast=number))
+    sensor = make_linked_sensor(Udp(broadcast=number))
     orders = list[Any]()
 
     def answer(stop: threading.Event) -> None:

@@ -31,9 +31,9 @@ from tests.lines import (
     TIMEOUT_S,
     Port,
     free_port,
-    paced,
     port,
     read_until,
+    send_paced,
     turning,
     udp,
     until,
@@ -163,17 +163,17 @@ def test_a_pause_inside_a_frame_costs_it_on_a_line_and_not_over_tcp(
         ) as device,
         server.accept()[0] as peer,
     ):
-        _paused(peer.sendall, first, second)
+        _send_with_pause(peer.sendall, first, second)
         assert sum(map(len, packets(device, 2))) == 2
     with ls.open(recorded, TURNING) as again:
         assert sum(map(len, again.packets())) == 2
     with ls.open(f"serial://{line.name}", TURNING, start=False) as device:
-        _paused(line.send, first, second)
+        _send_with_pause(line.send, first, second)
         assert sum(map(len, packets(device, 1))) == 1
         assert device.stats.bytes_skipped == len(first)
 
 
-def _paused(send: Callable[[bytes], object], first: bytes, second: bytes) -> None:
+def _send_with_pause(send: Callable[[bytes], object], first: bytes, second: bytes) -> None:
     """Send two frames, with a pause in the first."""
     send(first[:5])
     time.sleep(0.4)
@@ -186,7 +186,7 @@ def test_silence_is_a_state_and_a_warning_until_data_come(line: Port) -> None:
         until(lambda: device.state == "silent")
         (warning,) = device.warnings
         assert warning.endswith(f"next: lidarspec doctor serial://{line.name} -s {TURNING.id}")
-        with working(lambda stop: paced(line.send, turning(TURNING, 40), 100, stop) and None):
+        with working(lambda stop: send_paced(line.send, turning(TURNING, 40), 100, stop) and None):
             read_until(device, lambda: device.state == "streaming")
 
 
@@ -195,7 +195,7 @@ def test_bytes_without_frames_name_the_baud_rate(line: Port) -> None:
     noise = np.random.default_rng(1).integers(0, 256, 2000, np.uint8).tobytes()
     with (
         ls.open(f"serial://{line.name}?baud=9600", TURNING) as device,
-        working(lambda stop: paced(line.offer, [noise[:20]], 50, stop) and None),
+        working(lambda stop: send_paced(line.offer, [noise[:20]], 50, stop) and None),
     ):
         read_until(device, lambda: device.state == "no frames")
         (warning,) = device.warnings

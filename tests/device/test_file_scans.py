@@ -58,7 +58,7 @@ MORE = [
 CAPTURED = {"ydlidar-g4"}
 
 
-def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 900) -> None:
+def write_frames(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 900) -> None:
     """A file of frames, some lost, doubled, late or damaged, with frames of all other types and
     noise between them.
     """
@@ -99,7 +99,7 @@ def made(sensor: ls.Sensor, path: Path, *, most: int = 120_000, longest: int = 9
         )
 
 
-def told(scan: ls.Scan) -> list[object]:
+def pickle_scan(scan: ls.Scan) -> list[object]:
     """All that a scan says, as bytes."""
     columns = [
         (name, np.ascontiguousarray(column).tobytes())
@@ -127,18 +127,18 @@ def test_pieces_have_the_scans_of_one_pass(
     monkeypatch.setattr(lidarspec.device.device_input, "BATCH_BYTES", 1 << 13)
     sensor = SHAPES[name] if name in SHAPES else ls.sensor(name)
     path = tmp_path / ("made.pcap" if sensor.datagrams or name in CAPTURED else "made.bin")
-    made(sensor, path)
+    write_frames(sensor, path)
     with ls.open(path, sensor) as device:
         longest = max(len(packets.table.frame(0)) for packets in device.packets())
     with ls.open(path, sensor) as device:
-        whole = [told(scan) for scan in device.scans()]
+        whole = [pickle_scan(scan) for scan in device.scans()]
     bookmark, pieces, sizes = None, list[list[object]](), list[int]()
     while True:
         with FileScans(path, sensor, bookmark) as piece:
             number, following = piece.survey(path.stat().st_size // 6)
         with FileScans(path, sensor, bookmark) as piece:
             pieces += [
-                told(scan)
+                pickle_scan(scan)
                 for scan in itertools.islice(piece, None if following is None else number)
             ]
         if following is None:
@@ -156,7 +156,7 @@ def test_pieces_have_the_scans_of_one_pass(
 def test_another_process_continues_at_a_bookmark(tmp_path: Path) -> None:
     name, path, mark = "velodyne-vlp16", tmp_path / "made.pcap", tmp_path / "mark"
     sensor = ls.sensor(name)
-    made(sensor, path, most=9_000_000)
+    write_frames(sensor, path, most=9_000_000)
     with FileScans(path, sensor) as piece:
         number, bookmark = piece.survey(1)
     assert bookmark is not None

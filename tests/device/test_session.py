@@ -34,7 +34,7 @@ def sent(session: Session) -> list[str]:
     return [one.data.hex() for one in session.outgoing()]
 
 
-def received(sensor: Sensor, session: Session, data: bytes, now: int) -> None:
+def receive(sensor: Sensor, session: Session, data: bytes, now: int) -> None:
     decoder = sensor.decoder()
     session.receive(decoder.feed(data) + decoder.idle(), now)
 
@@ -45,14 +45,14 @@ def test_the_reply_is_found_among_data_and_fillers_and_has_its_values() -> None:
     pending = session.request("start", 0)
     assert sent(session) == ["aa55f00f"]
     assert not pending.done
-    received(
+    receive(
         sensor,
         session,
         b"\xfe\xff\xfe" + sensor.example("data") + b"\xff" + sensor.example("info"),
         10,
     )
     assert not pending.done
-    received(
+    receive(
         sensor,
         session,
         b"\xfe" + bytes.fromhex("a55a500703000000000000ab") + sensor.example("data"),
@@ -442,7 +442,7 @@ def test_a_command_for_a_stopped_sensor_gives_that_reason() -> None:
         dataclasses.replace(SENSOR, commands={"ask": asking}, on_open=(), on_close=())
 
 
-def conversed(session: Session) -> list[tuple[int, list[int]]]:
+def read_request(session: Session) -> list[tuple[int, list[int]]]:
     """The running number and the address in what is sent now."""
     sent = [CONVERSATION.parse(one.data, "order") for one in session.outgoing()]
     return [(one.head.number, list(one.host)) for one in sent]
@@ -466,20 +466,20 @@ def test_a_running_number_identifies_the_reply() -> None:
         )
 
     first = session.request("hello", 0)
-    assert conversed(session) == [(6, [10, 0, 0, 7])]
+    assert read_request(session) == [(6, [10, 0, 0, 7])]
     session.tick(SECOND)
-    assert conversed(session) == [(6, [10, 0, 0, 7])], "sent once more, it is the same request"
+    assert read_request(session) == [(6, [10, 0, 0, 7])], "sent once more, it is the same request"
     session.tick(2 * SECOND)
     with pytest.raises(ReplyTimeout):
         first.result()
     second = session.request("hello", 2 * SECOND)
-    assert conversed(session) == [(7, [10, 0, 0, 7])]
+    assert read_request(session) == [(7, [10, 0, 0, 7])]
     answered(6, 2 * SECOND + 1)  # which is late
     assert (second.done, session.late) == (False, 1)
     answered(7, 2 * SECOND + 2)
     assert second.result().values.head.number == 7
     session.request("hello", 3 * SECOND)
-    assert [number for number, _ in conversed(session)] == [0], "it has three bits"
+    assert [number for number, _ in read_request(session)] == [0], "it has three bits"
 
 
 def test_values_that_are_found_out_can_be_given() -> None:

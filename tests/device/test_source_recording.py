@@ -23,7 +23,7 @@ from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Fields
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.open_url import live
-from tests.lines import free_port, paced, turning, udp, until, working
+from tests.lines import free_port, send_paced, turning, udp, until, working
 from tests.shapes import SHAPES
 
 
@@ -73,7 +73,7 @@ def test_a_recording_ends_in_time_and_reports_its_content(tmp_path: Path, knows:
     with (
         udp() as sender,
         working(
-            lambda stop: paced(
+            lambda stop: send_paced(
                 lambda data: sender.sendto(data, ("127.0.0.1", number)), frames, 500, stop
             )
         ),

@@ -201,7 +201,7 @@ def test_a_package_docstring_lists_its_modules(package: str) -> None:
 CONTRIBUTING = (DOCS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
 
-def opened(section: str) -> list[tuple[str, str]]:
+def list_opened_names(section: str) -> list[tuple[str, str]]:
     """Module and name of everything that a table of CONTRIBUTING says to open; a name belongs to
     the module that was named last.
     """
@@ -219,6 +219,6 @@ def opened(section: str) -> list[tuple[str, str]]:
     return named
 
 
-@pytest.mark.parametrize(("module", "name"), opened("Where things are"))
+@pytest.mark.parametrize(("module", "name"), list_opened_names("Where things are"))
 def test_names_in_contributing_exist(module: str, name: str) -> None:
     assert operator.attrgetter(name)(importlib.import_module(f"lidarspec.{module}"))

@@ -24,7 +24,7 @@ nbformat = Library("nbformat")
 PAGE = DOCS / "how-to" / "notebook.ipynb"
 
 
-def shown(cell: Any) -> dict[str, str]:
+def list_outputs(cell: Any) -> dict[str, str]:
     """What a cell shows, by kind."""
     outputs = {
         "text": "".join(output.text for output in cell.outputs if output.output_type == "stream")
@@ -44,7 +44,7 @@ def test_the_notebook_runs_and_shows_its_outputs(
     nbclient.NotebookClient(
         notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}
     ).execute()
-    cells = [shown(cell) for cell in notebook.cells if cell.cell_type == "code"]
+    cells = [list_outputs(cell) for cell in notebook.cells if cell.cell_type == "code"]
     assert len([cell for cell in cells if cell.get("image/svg+xml", "").startswith("<svg")]) == 3
     tables = [cell["text/html"] for cell in cells if "text/html" in cell]
     assert [

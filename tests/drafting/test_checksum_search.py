@@ -30,7 +30,7 @@ from lidarspec.spec.checksums import CRCS, name_of
 HEAD = b"\xaa\x55"
 
 
-def sealed(
+def make_sealed_frames(
     checksum: Checksum,
     number: int = 12,
     length: int = 30,
@@ -49,7 +49,7 @@ def sealed(
     ]  # type: ignore[arg-type]
 
 
-def found(frames: list[bytes]) -> ChecksumMatch:
+def find_best(frames: list[bytes]) -> ChecksumMatch:
     return search(frames)[0]
 
 
@@ -63,7 +63,9 @@ def assert_found_by_name(
     find: Callable[[list[bytes]], ChecksumMatch], name: str, length: int
 ) -> None:
     crc = CRCS[name]
-    match = find(sealed(crc, length=length, order="big" if len(name) % 2 else "little", vary=3))
+    match = find(
+        make_sealed_frames(crc, length=length, order="big" if len(name) % 2 else "little", vary=3)
+    )
     assert (match.algorithm, match.name, match.place) == (
         crc,
         name,
@@ -93,7 +95,7 @@ def test_every_crc_of_the_catalogue_is_found_by_name(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["CRC-16/MODBUS", "CRC-8", "CRC-32/BZIP2"])
 def test_a_crc_is_found_behind_the_plain_checksums(name: str) -> None:
-    assert_found_by_name(found, name, 30)
+    assert_found_by_name(find_best, name, 30)
 
 
 def test_the_catalogue_agrees_with_crccheck() -> None:
@@ -120,7 +122,7 @@ def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
     poly, init, xorout = (source.getrandbits(width) | 1 for _ in range(3))
     crc = Crc(width, poly, init, reflected, reflected, xorout)
     assert name_of(crc) == ""
-    frames = sealed(crc, 24, 25, vary=5)
+    frames = make_sealed_frames(crc, 24, 25, vary=5)
     match = found_among_crcs(frames)
     assert isinstance(match.algorithm, Crc)
     assert (match.algorithm.poly, match.algorithm.refin, match.right) == (poly, reflected, 24)
@@ -135,8 +137,8 @@ def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
 @pytest.mark.slow
 def test_init_and_xorout_are_undetermined_for_frames_of_one_length() -> None:
     crc = Crc(16, 0x755B, 0x1234, xorout=0x4321)
-    frames = sealed(crc)
-    match = found(frames)
+    frames = make_sealed_frames(crc)
+    match = find_best(frames)
     assert isinstance(match.algorithm, Crc)
     assert match.algorithm.poly == crc.poly
     assert match.open
@@ -146,7 +148,7 @@ def test_init_and_xorout_are_undetermined_for_frames_of_one_length() -> None:
 
 @pytest.mark.slow
 def test_a_checksum_that_skips_the_first_bytes() -> None:
-    match = found(sealed(CRCS["CRC-16/MODBUS"], skip=2))
+    match = find_best(make_sealed_frames(CRCS["CRC-16/MODBUS"], skip=2))
     assert (match.name, match.span.head, match.span.describe(match.place, 34)) == (
         "CRC-16/MODBUS",
         2,
@@ -170,7 +172,7 @@ def test_a_checksum_that_skips_the_first_bytes() -> None:
     ids=lambda checksum: checksum.describe(),
 )
 def test_plain_checksums(checksum: Checksum) -> None:
-    frames = sealed(checksum, length=27 if not isinstance(checksum, WordXor) else 28)
+    frames = make_sealed_frames(checksum, length=27 if not isinstance(checksum, WordXor) else 28)
     at_end = [match for match in search(frames) if match.place.offset == -match.place.size]
     assert checksum in [match.algorithm for match in at_end]
     assert at_end[0].right == 12
@@ -191,8 +193,8 @@ def test_plain_checksums(checksum: Checksum) -> None:
     ],
 )
 def test_the_printed_python_computes_the_same_checksum(checksum: Checksum) -> None:
-    frames = sealed(checksum, 40, 27)
-    match = found(frames)
+    frames = make_sealed_frames(checksum, 40, 27)
+    match = find_best(frames)
     scope: dict[str, Any] = vars(lidarspec) | {
         name: getattr(lidarspec.spec, name) for name in ("Checksum", "Xor", "WordXor")
     }
@@ -209,14 +211,14 @@ def test_the_printed_python_computes_the_same_checksum(checksum: Checksum) -> No
 
 @pytest.mark.parametrize("number", [5, pytest.param(40, marks=pytest.mark.slow)])
 def test_grouped_words_around_a_field(number: int) -> None:
-    match = found(simulate(lidarspec.sensor("cspc-m1c1-mini"), 40)[-number:])
+    match = find_best(simulate(lidarspec.sensor("cspc-m1c1-mini"), 40)[-number:])
     assert (match.algorithm, match.place) == (WordXor(head=8, groups=(1, 2)), ChecksumPlace(8, 2))
     assert match.paste == "WordXor(head=8, groups=(1, 2))"
 
 
 @pytest.mark.slow
 def test_an_xor_with_a_constant_is_found_and_its_place_a_guess() -> None:
-    frames = sealed(MaskedChecksum(Xor(), 0x33), 40, 27)
+    frames = make_sealed_frames(MaskedChecksum(Xor(), 0x33), 40, 27)
     matches = search(frames)
     assert {match.algorithm for match in matches} == {MaskedChecksum(Xor(), 0x33)}
     assert ChecksumPlace(-1, 1) in [match.place for match in matches]
@@ -225,19 +227,21 @@ def test_an_xor_with_a_constant_is_found_and_its_place_a_guess() -> None:
 
 @pytest.mark.slow
 def test_an_xor_in_two_nibbles() -> None:
-    match = found(simulate(lidarspec.sensor("slamtec-rplidar-a1").configure(answer="express"), 20))
+    match = find_best(
+        simulate(lidarspec.sensor("slamtec-rplidar-a1").configure(answer="express"), 20)
+    )
     assert (match.algorithm, match.place) == (Xor(), ChecksumPlace(0, 2))
     assert "low nibbles" in match.remarks[0]
 
 
 @pytest.mark.slow
 def test_damaged_frames_do_not_hide_it() -> None:
-    frames = sealed(Crc(8, 0x4D), 60, 44)
+    frames = make_sealed_frames(Crc(8, 0x4D), 60, 44)
     damaged = [
         bytes([*frame[:9], frame[9] ^ 0x40, *frame[10:]]) if index % 5 == 0 else frame
         for index, frame in enumerate(frames)
     ]
-    match = found(damaged)
+    match = find_best(damaged)
     assert (match.algorithm, match.right, match.total) == (Crc(8, 0x4D), 48, 60)
 
 

@@ -45,7 +45,7 @@ VLP16, VLP16_RAW, HELIOS = (
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def drafted(name: str) -> Draft:
+def draft_file(name: str) -> Draft:
     opened = transport(str(capture(name)))
     try:
         return draft([chunk.data for chunk in opened.chunks()], datagrams=opened.datagrams)
@@ -80,7 +80,7 @@ def share(sensor: ls.Sensor, source: Path) -> float:
 
 @pytest.mark.slow
 def test_three_frames_of_one_length_and_a_crc() -> None:
-    found = drafted(LD06)
+    found = draft_file(LD06)
     assert (found.sync, found.size, len(found.frames), found.share) == (b"\x54\x2c", 47, 3, 1.0)
     assert found.seal is not None
     assert (found.seal.algorithm, found.seal.place, found.seal.right) == (
@@ -93,7 +93,7 @@ def test_three_frames_of_one_length_and_a_crc() -> None:
 
 @pytest.mark.slow
 def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
-    found = drafted(COIN_D4)
+    found = draft_file(COIN_D4)
     assert (found.sync, found.size, str(found.length), len(found.frames)) == (
         b"\xaa\x55",
         None,
@@ -119,7 +119,7 @@ def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
 def test_blocks_with_a_little_endian_angle_and_no_checksum(
     name: str, frames: int, clock: str
 ) -> None:
-    found = drafted(name)
+    found = draft_file(name)
     assert (found.sync, found.size, len(found.frames), found.seal) == (
         b"\xff\xee",
         1206,
@@ -138,7 +138,7 @@ def test_blocks_with_a_little_endian_angle_and_no_checksum(
 
 @pytest.mark.slow
 def test_blocks_with_a_big_endian_angle_among_packets_of_another_kind() -> None:
-    found = drafted(HELIOS)
+    found = draft_file(HELIOS)
     assert (found.sync, found.size, len(found.frames), found.seal) == (
         b"\x55\xaa\x05\x5a",
         1248,
@@ -215,8 +215,8 @@ def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> N
     sources = {
         "blocks": b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)),
         "count": b"".join(simulate(ls.sensor("cspc-coin-d4"), 60)),
-        "class": made(b"\x5a\xc3", MaskedChecksum(Sum(8), 0x55), skip=1),
-        "over": made(b"\x5a\xc3", Crc(16, 0x1021), skip=3),
+        "class": make_frames(b"\x5a\xc3", MaskedChecksum(Sum(8), 0x55), skip=1),
+        "over": make_frames(b"\x5a\xc3", Crc(16, 0x1021), skip=3),
         "angles": b"".join(simulate(ls.sensor("ldrobot-ld06"), 300)),
     }
     for name, data in sources.items():
@@ -244,7 +244,7 @@ def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> N
         assert done.returncode == 0, done.stdout
 
 
-def made(
+def make_frames(
     body: bytes,
     checksum: Checksum,
     *,
@@ -289,7 +289,7 @@ def test_made_frames_are_drafted_to_a_module_that_reads_them(
 ) -> None:
     (tmp_path / "some.bin").write_bytes(
         b"\x00\x11"
-        + made(b"\x5a\xc3", checksum, skip=skip, order=order, vary=vary)
+        + make_frames(b"\x5a\xc3", checksum, skip=skip, order=order, vary=vary)
         + b"\x5a\xc3\x01"
     )
     sensor = module(tmp_path, tmp_path / "some.bin")

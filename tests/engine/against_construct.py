@@ -49,7 +49,7 @@ def sensor(struct: Construct, *, max_length: int = 200) -> Sensor:
     )
 
 
-def expected(struct: Construct, data: bytes, *, max_length: int = 200) -> Any:
+def parse_by_construct(struct: Construct, data: bytes, *, max_length: int = 200) -> Any:
     """What construct reads from the author's struct; None where it does not read exactly these
     bytes.
     """
@@ -84,7 +84,7 @@ def agree(
     whole = list[tuple[bytes, Any]]()
     invalid = list[bytes]()
     for data in frames:
-        wanted = expected(struct, data, max_length=max_length)
+        wanted = parse_by_construct(struct, data, max_length=max_length)
         if wanted is None:
             with pytest.raises(WireError):
                 ours.parse(data)
@@ -145,7 +145,7 @@ def clouds_agree(
     Of those of the deepest arrays, whose lengths differ from frame to frame but not within one.
     """
     plain_sensor = sensor(struct, max_length=max_length)
-    whole = [(data, expected(struct, data, max_length=max_length)) for data in frames]
+    whole = [(data, parse_by_construct(struct, data, max_length=max_length)) for data in frames]
     kept = [(data, wanted) for data, wanted in whole if wanted is not None]
     if not has_raw_form(plain_sensor.decode([data for data, _ in kept])):
         return 0  # what is an array in one branch alone has no length in the others

@@ -18,8 +18,8 @@ from tests.engine.streams import (
     MANY_HEADERS,
     Books,
     clean,
-    damaged,
-    decoded,
+    damage,
+    decode_chunks,
     longest_example,
 )
 
@@ -31,7 +31,7 @@ QUICK_SPLITS = 16
 
 def assert_like_oracle(subject: SensorUnderTest, data: bytes, description: str) -> None:
     """Fail unless the decoder finds the same frames in a stream as the oracle."""
-    frames = decoded(subject.sensor, data)
+    frames = decode_chunks(subject.sensor, data)
     expected = Oracle(subject.sensor, data).frames()
     missed = [cut[:2] for cut in expected if cut not in frames]
     extra = [cut[:2] for cut in frames if cut not in expected]
@@ -80,10 +80,10 @@ def _assert_same_in_pieces(sensor: Sensor, data: bytes, splits: list[list[bytes]
 def every_recoverable_frame_is_recovered(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check the frames against the oracle at every byte error rate, single bytes and bursts."""
     for rate in ERROR_RATES:
-        data = damaged(_part(subject, length, f"{rate:g}"), rate, 1)
+        data = damage(_part(subject, length, f"{rate:g}"), rate, 1)
         assert_like_oracle(subject, data, f"error rate {rate:g}")
     for burst in BURST_BYTES:
-        data = damaged(_part(subject, length, f"{burst}"), 0.05, 2, burst=burst)
+        data = damage(_part(subject, length, f"{burst}"), 0.05, 2, burst=burst)
         assert_like_oracle(subject, data, f"bursts of {burst} bytes")
 
 
@@ -203,7 +203,7 @@ def idle_gives_up_pending_bytes(subject: SensorUnderTest, length: int = LENGTH) 
 
 def decoders_are_independent(subject: SensorUnderTest, length: int = LENGTH) -> None:
     """Check that two decoders fed in turn give what each gives alone."""
-    inputs = [damaged(clean(subject, seed=seed, length=length // 2), 1e-3, seed) for seed in (3, 4)]
+    inputs = [damage(clean(subject, seed=seed, length=length // 2), 1e-3, seed) for seed in (3, 4)]
     alone = []
     for data in inputs:
         decoder = subject.sensor.decoder()

@@ -46,7 +46,7 @@ class Oracle:
         found: list[Cut] = []
         spot, run = 0, ("", -1)
         while spot < len(self._data):
-            name = next((name for name in self._frames if self._accepted(name, spot, run)), None)
+            name = next((name for name in self._frames if self._is_accepted(name, spot, run)), None)
             if name is None:
                 spot += 1
                 continue
@@ -57,7 +57,7 @@ class Oracle:
             run = (name, spot)
         return found
 
-    def _accepted(self, name: str, spot: int, run: tuple[str, int]) -> bool:
+    def _is_accepted(self, name: str, spot: int, run: tuple[str, int]) -> bool:
         """Whether a type stands here: valid, and if it is weak, within a long enough run of its
         kind.
         """
@@ -69,7 +69,7 @@ class Oracle:
 
     def _earlier(self, name: str, spot: int, run: tuple[str, int]) -> bool:
         before = list(self._frames)[: list(self._frames).index(name)]
-        return any(self._accepted(other, spot, run) for other in before)
+        return any(self._is_accepted(other, spot, run) for other in before)
 
     def _valid(self, name: str, spot: int) -> int:
         """The size of the valid candidate of this type at this offset, 0 if there is none."""

@@ -30,10 +30,10 @@ def plain_row(form: Any, struct: Construct, data: bytes) -> tuple[bytes, int] | 
     """
     if isinstance(form, Tokens):
         return _tokens(form, struct, data)
-    return _escaped(form, data) if isinstance(form, Escaped) else _lines(form, struct, data)
+    return _unescape(form, data) if isinstance(form, Escaped) else _lines(form, struct, data)
 
 
-def _escaped(form: Escaped, data: bytes) -> tuple[bytes, int] | None:
+def _unescape(form: Escaped, data: bytes) -> tuple[bytes, int] | None:
     end = data.find(form.flag, 1)
     if not data or data[0] != form.flag or end < 2:
         return None

@@ -98,10 +98,10 @@ class Drawn:
         if kind < 0.52:
             return [f'"{name}" / {self.bits(name)}']
         if kind < 0.58 and depth < 3:
-            return [self.nested(name, depth)]
+            return [self.draw_struct(name, depth)]
         return [f'"{name}" / {self.part(depth)}']
 
-    def nested(self, name: str, depth: int) -> str:
+    def draw_struct(self, name: str, depth: int) -> str:
         """A struct whose fields those after it may ask for; sometimes a sealed one."""
         self.levels.append([])
         parts = [part for _ in range(self.source.randint(1, 3)) for part in self.member(depth + 1)]
@@ -135,7 +135,7 @@ class Drawn:
             )
         elif kind < 0.53:
             known.named, text = True, f"Enum(Const(1, {word}), {LABELS})"
-        elif kind < 0.56 and self.asked() is not None:
+        elif kind < 0.56 and self.draw_reference() is not None:
             text = f"Rebuild({word}, {self.count()})"
         self.levels[-1].append(known)
         return text
@@ -146,7 +146,7 @@ class Drawn:
         if depth < 3:
             kinds += [self.array, self.array, self.condition, self.switch]
         if self.interpreted:
-            kinds += [self.text, self.computed]
+            kinds += [self.text, self.draw_computed]
         return self.source.choice(kinds)(depth)
 
     def word(self, depth: int) -> str:
@@ -170,7 +170,7 @@ class Drawn:
             )
         )
 
-    def computed(self, depth: int) -> str:
+    def draw_computed(self, depth: int) -> str:
         return f"Computed({self.count()})"
 
     def array(self, depth: int) -> str:
@@ -186,7 +186,7 @@ class Drawn:
         return self.part(depth)
 
     def condition(self, depth: int) -> str:
-        asked, kind = self.asked(), self.source.random()
+        asked, kind = self.draw_reference(), self.source.random()
         if asked is None:
             return self.word(depth)
         path, known = asked
@@ -212,7 +212,7 @@ class Drawn:
         )
 
     def switch(self, depth: int) -> str:
-        asked = self.asked()
+        asked = self.draw_reference()
         if asked is None:
             return self.word(depth)
         path, known = asked
@@ -261,7 +261,7 @@ class Drawn:
             return f"Array(2, BitsInteger({width // 2}))"
         return f"BitsInteger({width})"
 
-    def asked(self) -> tuple[str, Known] | None:
+    def draw_reference(self) -> tuple[str, Known] | None:
         """A field that stands before, as it is written from here."""
         spots = [(up, one) for up, level in enumerate(reversed(self.levels)) for one in level]
         if not spots:
@@ -275,7 +275,7 @@ class Drawn:
 
     def count(self) -> str:
         """The number of something."""
-        asked = self.asked()
+        asked = self.draw_reference()
         if asked is None:
             return str(self.source.randint(0, 3))
         path, known = asked
@@ -298,6 +298,6 @@ def spec(number: int, *, interpreted: bool = False) -> str:
     return Drawn(source, 2 + number % 7, interpreted).struct(0)
 
 
-def made(text: str) -> construct.Construct:
+def make_struct(text: str) -> construct.Construct:
     """The struct that a text stands for."""
     return eval(text, NAMES)

@@ -25,7 +25,7 @@ MEGABYTE = 1 << 20
 MANY_HEADERS = 200
 
 
-def damaged(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
+def damage(data: bytes, rate: float, seed: int, *, burst: int = 1) -> bytes:
     """The stream with about this share of its bytes damaged, in runs of `burst`; at least one run,
     unless the rate is 0.
     """
@@ -163,13 +163,13 @@ class Books:
 
     def feed(self, chunk: bytes) -> Books:
         """Enter what a chunk brings."""
-        return self._entered(cuts(self.decoder.feed(chunk)))
+        return self._add(cuts(self.decoder.feed(chunk)))
 
     def finish(self) -> list[Cut]:
         """All frames, after the end of the input."""
-        return self._entered(cuts(self.decoder.finish())).found
+        return self._add(cuts(self.decoder.finish())).found
 
-    def _entered(self, found: list[Cut]) -> Books:
+    def _add(self, found: list[Cut]) -> Books:
         self.found += found
         stats: Counters = self.decoder.stats
         known = sum(len(data) for _, _, data in self.found)
@@ -178,7 +178,7 @@ class Books:
         return self
 
 
-def decoded(sensor: Sensor, data: bytes) -> list[Cut]:
+def decode_chunks(sensor: Sensor, data: bytes) -> list[Cut]:
     """The frames of a stream that comes in chunks of random sizes."""
     books = Books(sensor)
     for chunk in material.cut_randomly(data, random.Random(len(data))):

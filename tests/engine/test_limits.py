@@ -37,7 +37,7 @@ def garbage(length: int, seed: int = 0) -> bytes:
     return np.random.default_rng(seed).bytes(length)
 
 
-def fed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
+def feed(sensor: Sensor, data: bytes, times: int = 1, chunk: int = 4096) -> None:
     decoder = sensor.decoder()
     for _ in range(times):
         for start in range(0, len(data), chunk):
@@ -77,8 +77,8 @@ def test_garbage_and_the_worst_stream_take_little_memory(name: str) -> None:
 
 
 def assert_takes_little_memory(sensor: Sensor, data: bytes, bound: int) -> None:
-    fed(sensor, data[:8192])  # imports and tables that are made once
-    assert peak(lambda: fed(sensor, data)) < bound
+    feed(sensor, data[:8192])  # imports and tables that are made once
+    assert peak(lambda: feed(sensor, data)) < bound
 
 
 @pytest.mark.soak
@@ -97,7 +97,7 @@ def test_garbage_and_the_worst_stream_take_little_memory_on_every_sensor(module:
 def test_garbage_needs_no_memory(name: str, times: int) -> None:
     sensor = load_sensor(name)
     data = garbage(MEGABYTE)
-    assert peak(lambda: fed(sensor, data, times=times, chunk=MEGABYTE)) < MEGABYTE
+    assert peak(lambda: feed(sensor, data, times=times, chunk=MEGABYTE)) < MEGABYTE
 
 
 @pytest.mark.parametrize("name", STREAMS)

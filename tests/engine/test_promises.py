@@ -53,7 +53,7 @@ def digest(packets: list[ls.Packets]) -> str:
     return found.hexdigest()
 
 
-def received(device: ls.Device, number: int) -> list[ls.Packets]:
+def receive(device: ls.Device, number: int) -> list[ls.Packets]:
     found: list[ls.Packets] = []
     for batch in device.packets(wait=0.05):
         found += [batch] if len(batch) else []
@@ -73,13 +73,13 @@ class TestReplay:
         )
         with ls.open(f"serial://{line.name}", TURNING, start=False, record=first) as device:
             line.send(b"".join(frames[:6]) + frames[6][:5])
-            live = received(device, 6)
+            live = receive(device, 6)
             deadline = time.monotonic() + 5
             while device.stats.pending and time.monotonic() < deadline:
                 device.newest(0.05)
             assert device.stats.pending == 0, "what the silence cut off is given up"
             line.send(frames[6][5:] + b"".join(frames[7:]))
-            live += received(device, 5)
+            live += receive(device, 5)
         ran("replay", first, "--to", second)
         for path in (first, second):
             with ls.open(path, TURNING) as again:

@@ -17,9 +17,9 @@ from construct import Construct
 
 from lidarspec import Sensor, SpecError
 from tests.by_construct import reader
-from tests.engine.against_construct import BACKENDS, agree, clouds_agree, expected, sensor
+from tests.engine.against_construct import BACKENDS, agree, clouds_agree, parse_by_construct, sensor
 from tests.engine.engines import is_compiled
-from tests.engine.random_specs import made, spec
+from tests.engine.random_specs import make_struct, spec
 
 LONGEST = 150
 #: what compiles points, where it is installed.
@@ -55,7 +55,7 @@ def frames(ours: Sensor, struct: Construct, number: int) -> list[bytes]:
     return found
 
 
-def declared(struct: Construct) -> Sensor | None:
+def declare_sensor(struct: Construct) -> Sensor | None:
     """A sensor of a spec; None where one name has several units in it, which is refused."""
     try:
         return sensor(struct, max_length=LONGEST)
@@ -65,16 +65,16 @@ def declared(struct: Construct) -> Sensor | None:
         return None
 
 
-def tried(
+def try_spec(
     number: int, *, interpreted: bool = False, backends: Sequence[str] = ("numpy", "construct")
 ) -> None:
     """Try a spec, and put its text before what fails."""
     text = spec(number, interpreted=interpreted)
-    struct = made(text)
+    struct = make_struct(text)
     with contextlib.suppress(construct.SizeofError, KeyError):
         if struct.sizeof() == 0:
             return
-    ours = declared(struct)
+    ours = declare_sensor(struct)
     if ours is None:
         return
     try:
@@ -97,33 +97,33 @@ def numbers(quick: int, whole: int) -> list[Any]:
 
 @pytest.mark.parametrize("number", numbers(12, 35))
 def test_random_structs_parse_as_by_construct(number: int) -> None:
-    tried(number)
+    try_spec(number)
 
 
 @pytest.mark.parametrize("number", numbers(5, 15))
 def test_structs_without_layouts_parse_as_by_construct(number: int) -> None:
-    tried(number, interpreted=True)
+    try_spec(number, interpreted=True)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("block", range(20))
 def test_many_more_structs_parse_as_by_construct(block: int) -> None:
     for number in range(100 * block, 100 * block + 100):
-        tried(number, backends=("numpy", "construct", *JIT))
-        tried(number, interpreted=True)
+        try_spec(number, backends=("numpy", "construct", *JIT))
+        try_spec(number, interpreted=True)
 
 
 def test_most_random_specs_are_compiled_and_have_frames() -> None:
     """Else the tests above would try little."""
     structs = [
         struct
-        for struct in (made(spec(number)) for number in range(65))
-        if declared(struct) is not None
+        for struct in (make_struct(spec(number)) for number in range(65))
+        if declare_sensor(struct) is not None
     ]
     sensors = [sensor(struct, max_length=LONGEST) for struct in structs]
     assert sum(is_compiled(one.frames["data"]) for one in sensors) > 50
     valid = [
-        sum(expected(struct, data) is not None for data in frames(one, struct, 0))
+        sum(parse_by_construct(struct, data) is not None for data in frames(one, struct, 0))
         for one, struct in zip(sensors, structs, strict=True)
     ]
     assert sum(number > 5 for number in valid) > 50
@@ -139,7 +139,7 @@ def test_most_random_specs_are_compiled_and_have_frames() -> None:
 )
 def test_structs_that_lose_bits_are_refused(part: str) -> None:
     with pytest.raises(SpecError):
-        sensor(made(f'Struct("a" / Int8ub, "b" / {part})'))
+        sensor(make_struct(f'Struct("a" / Int8ub, "b" / {part})'))
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_structs_that_lose_bits_are_refused(part: str) -> None:
     ],
 )
 def test_a_frame_without_a_byte_is_never_found(text: str) -> None:
-    ours = sensor(made(text))
+    ours = sensor(make_struct(text))
     for backend in BACKENDS:
         assert len(reader(ours, backend).decode([b"", b"\0"])) == 0
 
@@ -161,6 +161,6 @@ def test_constants_of_missing_elements_are_not_checked() -> None:
         'Struct(Const(b"M"), "x" / Switch(this._.n, {7: Struct("y" / Int8ub)},'
         " default=Array(this._.n % 4, Const(5, Int16ul))))"
     )
-    ours = sensor(made(f'Struct("n" / Int8ub, "a" / Array(0, {element}), "z" / Int16ub)'))
+    ours = sensor(make_struct(f'Struct("n" / Int8ub, "a" / Array(0, {element}), "z" / Int16ub)'))
     for backend in BACKENDS:
         assert len(reader(ours, backend).decode([b"\x01\x02\x03", b"\x07M\x03"])) == 2

@@ -22,13 +22,18 @@ SHORT_SHAPES = [
 ]
 
 
-def flipped(offset: int, bit: int) -> FrameChange:
+def make_bit_flip(offset: int, bit: int) -> FrameChange:
     return FrameChange("flipped bit", offset, bit)
 
 
 def test_the_flipped_bit_of_a_damaged_frame_is_found() -> None:
     data = STL.example("data", seed=4)
-    for flip in (flipped(0, 3), flipped(7, 6), flipped(20, 0), flipped(46, 1)):
+    for flip in (
+        make_bit_flip(0, 3),
+        make_bit_flip(7, 6),
+        make_bit_flip(20, 0),
+        make_bit_flip(46, 1),
+    ):
         damaged = flip.repair(data)
         assert flip in find_changes(STL_FRAME, damaged)
         for change in find_changes(STL_FRAME, damaged):
@@ -69,13 +74,13 @@ def test_a_suggested_repair_makes_the_frame_valid(name: str) -> None:
     middle = len(data) // 2
     without = data[:middle] + data[middle + 1 :]
     inserted = data[:middle] + b"\x9b" + data[middle:]
-    for damaged in (flipped(middle, 2).repair(data), without, inserted):
+    for damaged in (make_bit_flip(middle, 2).repair(data), without, inserted):
         for change in find_changes(sensor.frames["data"], damaged):
             sensor.parse(change.repair(damaged), "data")
 
 
 def test_a_flipped_bit_is_reported_with_its_field() -> None:
-    notes = explain(flipped(46, 0).repair(EXAMPLE), STL).notes
+    notes = explain(make_bit_flip(46, 0).repair(EXAMPLE), STL).notes
     assert "a flipped bit would explain it: byte 46 bit 0, crc 81, sent as 80" in notes
     assert (
         "a flipped bit would explain it: byte 15 bit 7, points[3].distance 0.213 m, sent as 0.085 m"
@@ -87,7 +92,7 @@ def test_a_flipped_bit_is_reported_with_its_field() -> None:
 def test_damage_by_any_single_bit_is_summarized() -> None:
     sensor = ls.sensor("cspc-m1c1-mini")
     data = max((sensor.example("data", seed=seed) for seed in range(9)), key=len)
-    (note,) = explain(flipped(20, 2).repair(data), sensor, "data").notes
+    (note,) = explain(make_bit_flip(20, 2).repair(data), sensor, "data").notes
     assert re.fullmatch(
         r"one flipped bit would explain it, at any of \d+ places",
         note,

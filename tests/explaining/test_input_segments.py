@@ -21,7 +21,7 @@ FRAMES = ls.simulate(STL, 40)
 SPOT = 20
 
 
-def told(
+def list_damaged(
     sent: Iterable[bytes], *, sensor: ls.Sensor = STL, datagrams: bool = False
 ) -> list[tuple[str, int, str]]:
     """The type, length and verdict of each piece that is not a valid frame; all together are what
@@ -58,7 +58,7 @@ def test_kinds_of_damage_are_distinguished() -> None:
         (data[:SPOT] + b"\x77" + data[SPOT:], 48, "byte 20, 0x77"),
         (data[:11], 11, "frame ends at byte 11 of 47: points[1].intensity needs 1 byte, 0 left"),
     ):
-        ((frame, length, said),) = told(sent([damaged]))
+        ((frame, length, said),) = list_damaged(sent([damaged]))
         assert (frame, length) == ("data", size)
         assert verdict in said
 
@@ -66,26 +66,26 @@ def test_kinds_of_damage_are_distinguished() -> None:
 def test_consecutive_damaged_frames_are_listed_one_by_one() -> None:
     lost, flipped = (FRAMES[number][:SPOT] for number in (30, 31))
     lost, flipped = lost + FRAMES[30][SPOT + 1 :], flipped + b"\xfe" + FRAMES[31][SPOT + 1 :]
-    assert [size for _, size, _ in told(sent([lost, flipped, lost, FRAMES[32][:11]]))] == [
+    assert [size for _, size, _ in list_damaged(sent([lost, flipped, lost, FRAMES[32][:11]]))] == [
         46,
         47,
         46,
         11,
     ]
-    assert told(sent([b"\x01\x02\x03", flipped]))[0] == ("", 3, "valid")
+    assert list_damaged(sent([b"\x01\x02\x03", flipped]))[0] == ("", 3, "valid")
 
 
 def test_a_damaged_datagram_is_one_piece() -> None:
     sensor = ls.sensor("velodyne-vlp16")
     packets = ls.simulate(sensor, 4)
-    ((frame, size, said),) = told(
+    ((frame, size, said),) = list_damaged(
         [packets[0], packets[1][:1000], packets[2]], sensor=sensor, datagrams=True
     )
     assert (frame, size) == ("data", 1000)
     assert "frame ends at byte 1000 of 1206" in said
     assert [
         size
-        for _, size, _ in told(
+        for _, size, _ in list_damaged(
             [packets[0], b"abc", b"defg", packets[2]], sensor=sensor, datagrams=True
         )
     ] == [3, 4]
@@ -101,7 +101,9 @@ def test_every_byte_of_a_damaged_stream_is_in_one_piece(sensor: str) -> None:
     for _ in range(9):
         place = chance.randrange(len(stream))
         stream[place : place + chance.randrange(2)] = chance.randbytes(chance.randrange(3))
-    told([bytes(stream[start : start + 50]) for start in range(0, len(stream), 50)], sensor=value)
+    list_damaged(
+        [bytes(stream[start : start + 50]) for start in range(0, len(stream), 50)], sensor=value
+    )
 
 
 def test_pieces_are_yielded_before_the_input_ends() -> None:

@@ -12,7 +12,7 @@ import lidarspec as ls
 from lidarspec import explain
 from lidarspec.explaining.formatting import TextSpan, bit_picture
 from lidarspec.explaining.listing import fold, join_text, list_differences, parents
-from tests.cli.running import EXAMPLE, printed, process, ran
+from tests.cli.running import EXAMPLE, process, ran, run_json
 from tests.representatives import load_sensor
 
 STL = ls.sensor("ldrobot-stl27l")
@@ -110,7 +110,7 @@ def test_the_verb_compares_with_another_frame_or_the_next() -> None:
     said = ran("explain", EXAMPLE.hex(), "--diff", other.hex(), "-s", STL.id).stdout
     assert "0002  speed  2152 deg/s = 6.0 Hz -> 2153 deg/s = 6.0 Hz (+1 deg/s)" in said
     assert ran("explain", (EXAMPLE + other).hex(), "--diff", "next", "-s", STL.id).stdout == said
-    listed = printed("explain", EXAMPLE.hex(), "--diff", other.hex(), "-s", STL.id)["differences"]
+    listed = run_json("explain", EXAMPLE.hex(), "--diff", other.hex(), "-s", STL.id)["differences"]
     assert [part["path"] for part in listed] == ["speed", "crc"]
     assert (
         "no second data frame"
@@ -119,7 +119,7 @@ def test_the_verb_compares_with_another_frame_or_the_next() -> None:
 
 
 def test_damaged_frames_in_a_stream_are_explained_beside_the_others() -> None:
-    frames = printed("explain", (b"\x01" + DAMAGED + EXAMPLE + EXAMPLE[:9]).hex(), "-s", STL.id)[
+    frames = run_json("explain", (b"\x01" + DAMAGED + EXAMPLE + EXAMPLE[:9]).hex(), "-s", STL.id)[
         "frames"
     ]
     assert [(part["frame"], part["offset"], part["fault"] is None) for part in frames] == [

@@ -121,7 +121,7 @@ NUMBERS = Struct(
 )
 
 
-def sealed(number: int, algorithm: Any, field: Any) -> Checksummed:
+def make_sealed_sensor(number: int, algorithm: Any, field: Any) -> Checksummed:
     """A frame with a checksum in the middle."""
     body = Struct(
         "magic" / Const(bytes([0xF1, number])),
@@ -176,7 +176,7 @@ SENSOR = Sensor(
         "kinds": Frame(KINDS, max_length=20),
         "numbers": Frame(NUMBERS, max_length=70),
         **{
-            f"sealed{number}": Frame(sealed(number, *pair), max_length=110)
+            f"sealed{number}": Frame(make_sealed_sensor(number, *pair), max_length=110)
             for number, pair in enumerate(ALGORITHMS)
         },
     },

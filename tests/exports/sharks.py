@@ -21,7 +21,7 @@ TSHARK = shutil.which("tshark")
 _needs_tshark = pytest.mark.skipif(TSHARK is None, reason="tshark is not installed")
 
 
-def judged(test: Callable[..., None]) -> Callable[..., None]:
+def needs_tshark(test: Callable[..., None]) -> Callable[..., None]:
     """Mark a test that runs tshark: left to `make test-all`, and skipped if tshark is not
     installed.
     """
@@ -76,7 +76,7 @@ def written(sensor: Sensor, folder: Path) -> Path:
     return script
 
 
-def captured(sensor: Sensor, frames: Iterable[bytes], path: Path) -> Path:
+def write_capture(sensor: Sensor, frames: Iterable[bytes], path: Path) -> Path:
     """A capture of these frames, one to a packet, as the sensor's data link carries them."""
     link = sensor.links["data"]
     with path.open("wb") as file:

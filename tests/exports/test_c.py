@@ -27,8 +27,8 @@ from tests.exports.trees import (
     SHAPED,
     distinct_frames,
     distinct_sensors,
+    find_recoded,
     installed_sensors,
-    recoded,
     values,
 )
 from tests.shapes import SHAPES
@@ -47,7 +47,7 @@ REFUSED = {
     "shape-segments": f"segments: {_PARTS}",
     "shape-tags": f"tags: {_PARTS}",
     "shape-channels": f"channels: {_PARTS}",
-    **recoded(SHAPED.values()),
+    **find_recoded(SHAPED.values()),
 }
 #: the installed sensors that C cannot say, with the reason.
 REFUSED_INSTALLED = {
@@ -94,7 +94,7 @@ def subjects() -> dict[str, Sensor]:
     return {
         name: sensor
         for name, sensor in sensors.items()
-        if name not in refused and name not in recoded([sensor])
+        if name not in refused and name not in find_recoded([sensor])
     }
 
 
@@ -120,7 +120,7 @@ def test_sensors_that_c_cannot_express_are_refused() -> None:
     for name, reason in REFUSED_INSTALLED.items():
         with pytest.raises(ExportError, match=reason):
             export(lidarspec.sensor(name), "c")
-    for name, reason in recoded(installed_sensors().values()).items():
+    for name, reason in find_recoded(installed_sensors().values()).items():
         with pytest.raises(ExportError, match=reason):
             export(installed_sensors()[name], "c")
 
@@ -129,7 +129,7 @@ def test_sensors_that_c_cannot_express_are_refused() -> None:
 @needs_gcc
 def test_every_header_compiles_without_a_warning(tmp_path: Path) -> None:
     source = tmp_path / "all.c"
-    source.write_text(_included(tmp_path) + "int main(void) { return 0; }\n")
+    source.write_text(_include_headers(tmp_path) + "int main(void) { return 0; }\n")
     _compile(source, tmp_path / "all", *STRICT, "-fsyntax-only")
 
 
@@ -149,7 +149,7 @@ def test_an_id_that_begins_with_a_digit_makes_valid_names(tmp_path: Path) -> Non
 @pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
 def test_every_header_is_cplusplus_too(tmp_path: Path) -> None:
     source = tmp_path / "all.cpp"
-    source.write_text(_included(tmp_path) + "int main() { return 0; }\n")
+    source.write_text(_include_headers(tmp_path) + "int main() { return 0; }\n")
     done = subprocess.run(
         ["g++", "-std=c++11", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only", source],
         check=False,
@@ -172,7 +172,7 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         for sensor in subjects().values()
         for name in sensor.frames
     ]
-    source.write_text(_MAIN % (_included(folder), "\n".join(dumps), "".join(calls)))
+    source.write_text(_MAIN % (_include_headers(folder), "\n".join(dumps), "".join(calls)))
     _compile(source, program, "-std=c99", *SANITIZED * (request.param == "checked"))
     return program
 
@@ -228,14 +228,14 @@ def test_scaling(tmp_path: Path) -> None:
     source, program = tmp_path / "scaled.c", tmp_path / "scaled"
     lines = "".join(f'    printf("%.15g\\n", {call});\n' for call in calls)
     source.write_text(
-        f"#include <stdio.h>\n{_included(tmp_path)}int main(void)\n{{\n{lines}    return 0;\n}}\n"
+        f"#include <stdio.h>\n{_include_headers(tmp_path)}int main(void)\n{{\n{lines}    return 0;\n}}\n"
     )
     _compile(source, program, *STRICT)
     printed = subprocess.run([program], capture_output=True, text=True, check=True).stdout.split()
     assert [float(number) for number in printed] == pytest.approx(list(calls.values()), rel=1e-12)
 
 
-def _included(folder: Path) -> str:
+def _include_headers(folder: Path) -> str:
     for sensor in subjects().values():
         (folder / f"{sensor.id}.h").write_text(export(sensor, "c"))
     return "".join(f'#include "{name}.h"\n' for name in subjects())
@@ -264,11 +264,11 @@ def _dump(sensor: Sensor, name: str) -> str:
         f'    printf("%d %zu\\n", {prefix}_is_frame(p, n), {prefix}_frame_length(p, n));',
         f"    if (!{prefix}_is_frame(p, n)) return;",
     ]
-    lines += [line for path in table.fields for line in _printed(table, path, prefix, text)]
+    lines += [line for path in table.fields for line in _make_print_code(table, path, prefix, text)]
     return f"static void dump_{prefix}(const uint8_t *p, size_t n)\n{{\n" + "\n".join(lines) + "\n}"
 
 
-def _printed(table: Schema, path: str, prefix: str, text: str) -> Iterator[str]:
+def _make_print_code(table: Schema, path: str, prefix: str, text: str) -> Iterator[str]:
     info = table.fields[path]
     axes = info.axes[:-1] if info.kind == "bytes" else info.axes
     name, indices = (

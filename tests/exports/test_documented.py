@@ -12,7 +12,7 @@ import lidarspec
 from lidarspec.exports import export
 from tests.cli.running import EXAMPLE
 from tests.docs.pages import blocks
-from tests.exports.sharks import captured, judged, tshark, written
+from tests.exports.sharks import needs_tshark, tshark, write_capture, written
 
 PAGE, NAME = "how-to/export.md", "ldrobot-stl27l"
 
@@ -22,11 +22,13 @@ def first(language: str) -> str:
     return next(block.text for block in blocks(PAGE) if block.language == language)
 
 
-@judged
+@needs_tshark
 def test_the_page_shows_the_output_of_tshark(tmp_path: Path) -> None:
     sensor = lidarspec.sensor(NAME)
     printed = tshark(
-        captured(sensor, [EXAMPLE], tmp_path / "it.pcap"), "-V", scripts=[written(sensor, tmp_path)]
+        write_capture(sensor, [EXAMPLE], tmp_path / "it.pcap"),
+        "-V",
+        scripts=[written(sensor, tmp_path)],
     )
     lines = iter(printed.splitlines())
     for line in first("text").splitlines():

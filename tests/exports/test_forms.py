@@ -37,7 +37,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "spec-json.md"
 NAMED = {"links", "frames", "commands", "values", "args", "matches", "lines", "labels"}
 
 
-def installed() -> list[Sensor]:
+def list_exportable() -> list[Sensor]:
     """Load the installed sensors that other languages can read, one for each set of frames."""
     return [sensor for sensor in installed_sensors().values() if not is_recoded(sensor)]
 
@@ -49,8 +49,8 @@ def test_json_is_enough_to_decode_frames(name: str) -> None:
 
 @pytest.mark.slow
 def test_json_of_installed_sensors_is_enough_to_decode_frames() -> None:
-    frames = distinct_frames(installed())
-    for sensor in installed():
+    frames = distinct_frames(list_exportable())
+    for sensor in list_exportable():
         assert_json_is_enough(sensor, {name for one, name in frames if one is sensor})
 
 
@@ -94,7 +94,7 @@ def test_every_key_of_the_json_is_documented() -> None:
 
 @pytest.mark.slow
 def test_every_key_of_the_json_of_installed_sensors_is_documented() -> None:
-    assert_keys_are_documented(installed())
+    assert_keys_are_documented(list_exportable())
 
 
 def assert_keys_are_documented(sensors: list[Sensor]) -> None:
@@ -111,7 +111,7 @@ def test_diagrams_name_every_field_and_stay_within_their_rows(name: str) -> None
 
 @pytest.mark.slow
 def test_diagrams_of_installed_sensors_name_every_field() -> None:
-    for sensor in installed():
+    for sensor in list_exportable():
         assert_diagram_is_complete(sensor)
 
 
@@ -215,7 +215,7 @@ def test_stubs_are_python_that_names_every_field(name: str) -> None:
 
 @pytest.mark.slow
 def test_a_type_checker_takes_the_stubs_and_finds_misspelt_fields(tmp_path: Path) -> None:
-    sensors = [*(SHAPES[name] for name in SPOKEN), *installed()]
+    sensors = [*(SHAPES[name] for name in SPOKEN), *list_exportable()]
     for sensor in sensors:
         (tmp_path / f"{sensor.id.replace('-', '_')}.pyi").write_text(
             export(sensor, "pyi"), encoding="utf-8"

@@ -32,7 +32,7 @@ from lidarspec.exports.ksy import identifier, yaml
 from lidarspec.frames.schema import schema
 from lidarspec.spec import Every, Frame, Polar, Serial
 from tests.exports import kaitai, trees
-from tests.exports.trees import distinct_sensors, installed_sensors, recoded
+from tests.exports.trees import distinct_sensors, find_recoded, installed_sensors
 
 #: the shapes that are exported; of oddities there are own ones below.
 SHAPED = {name: sensor for name, sensor in trees.SHAPED.items() if name != "shape-oddities"}
@@ -41,7 +41,7 @@ _CONSTANTS = "Kaitai cannot distinguish parts by their constants"
 REFUSED = {
     "shape-text": "Decimal is Python code",
     "shape-tags": _CONSTANTS,
-    **recoded(SHAPED.values()),
+    **find_recoded(SHAPED.values()),
 }
 #: the installed sensors that Kaitai cannot say, and why.
 REFUSED_INSTALLED = dict.fromkeys(("livox-mid360", "livox-hap", "ti-iwr6843"), _CONSTANTS)
@@ -51,11 +51,11 @@ REFUSED_INSTALLED = dict.fromkeys(("livox-mid360", "livox-hap", "ti-iwr6843"), _
 def subjects() -> dict[str, Sensor]:
     """Load every sensor that Kaitai can say, one for each set of frames, by id."""
     sensors = distinct_sensors()
-    refused = {*REFUSED, *REFUSED_INSTALLED, *recoded(sensors.values()), "shape-oddities"}
+    refused = {*REFUSED, *REFUSED_INSTALLED, *find_recoded(sensors.values()), "shape-oddities"}
     return {name: sensor for name, sensor in sensors.items() if name not in refused}
 
 
-def made(*fields: Any, case: str = "odd") -> Sensor:
+def make_sensor(*fields: Any, case: str = "odd") -> Sensor:
     """A sensor of this one frame."""
     frame = Frame(Struct("sync" / Const(b"\x01\x02"), *fields), data=True, max_length=64)
     return Sensor(
@@ -91,7 +91,7 @@ ODD = {
 
 
 PARTS = bytes([1, 2, 200, 11, 12, 3, 150, 13, 14, 9])
-UNUSUAL = {case: made(*fields, case=case) for case, fields in ODD.items()}
+UNUSUAL = {case: make_sensor(*fields, case=case) for case, fields in ODD.items()}
 
 
 @pytest.fixture(scope="module")
@@ -169,19 +169,19 @@ def test_structs_that_kaitai_cannot_express_are_refused(name: str) -> None:
 
 @pytest.mark.slow
 def test_sensors_that_kaitai_cannot_express_are_refused() -> None:
-    for name, reason in (REFUSED_INSTALLED | recoded(installed_sensors().values())).items():
+    for name, reason in (REFUSED_INSTALLED | find_recoded(installed_sensors().values())).items():
         with pytest.raises(ExportError, match=reason):
             export(lidarspec.sensor(name), "ksy")
 
 
 def test_other_refusals_have_reasons_too() -> None:
     with pytest.raises(ExportError, match="a float of 2 bytes"):
-        export(made("half" / Float16b), "ksy")
+        export(make_sensor("half" / Float16b), "ksy")
     with pytest.raises(ExportError, match="two members with the Kaitai name 'speed'"):
-        export(made("speed" / Int8ul, "Speed" / Int8ul), "ksy")
+        export(make_sensor("speed" / Int8ul, "Speed" / Int8ul), "ksy")
     with pytest.raises(ExportError, match="Python function decides"):
         export(
-            made(
+            make_sensor(
                 "count" / Int8ul, "items_" / Array(lambda this: 2 if this.count > 3 else 1, Int8ul)
             ),
             "ksy",

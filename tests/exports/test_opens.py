@@ -18,13 +18,13 @@ from lidarspec.recording.recorders import FrameRecorder, recorder
 from lidarspec.transports.open_url import transport
 from lidarspec.transports.protocol import Chunk
 from tests.cli.running import ran
-from tests.exports.sharks import columns, judged, tshark, written
+from tests.exports.sharks import columns, needs_tshark, tshark, written
 
 SERIOUS = "_ws.malformed || _ws.expert || ip.checksum.status == 0 || udp.checksum.status == 0"
 CHECKED = ("-o", "ip.check_checksum:TRUE", "-o", "udp.check_checksum:TRUE")
 
 
-@judged
+@needs_tshark
 @pytest.mark.parametrize("suffix", WRITINGS)
 def test_the_writer_s_captures(suffix: str, tmp_path: Path) -> None:
     draw, capture, writing = random.Random(1), tmp_path / f"it{suffix}", WRITINGS[suffix]
@@ -49,7 +49,7 @@ def test_the_writer_s_captures(suffix: str, tmp_path: Path) -> None:
     assert not tshark(capture, "-Y", SERIOUS, *CHECKED)
 
 
-@judged
+@needs_tshark
 @pytest.mark.parametrize(("name", "time"), [("velodyne-vlp16", "30ms"), ("ldrobot-stl27l", "20ms")])
 def test_simulated_and_recorded_captures(name: str, time: str, tmp_path: Path) -> None:
     sensor, script = lidarspec.sensor(name), written(lidarspec.sensor(name), tmp_path)

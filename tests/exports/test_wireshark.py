@@ -19,8 +19,8 @@ from lidarspec.framing.frame_engine import codec
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests import made_captures as made
-from tests.exports.sharks import captured, columns, dissector, judged, tshark, written
-from tests.exports.trees import SHAPED, installed_sensors, is_recoded, recoded, values
+from tests.exports.sharks import columns, dissector, needs_tshark, tshark, write_capture, written
+from tests.exports.trees import SHAPED, find_recoded, installed_sensors, is_recoded, values
 from tests.installed import distinct_sensors_in, sensor_modules
 from tests.representatives import REPRESENTATIVES, load_sensor
 
@@ -28,7 +28,7 @@ from tests.representatives import REPRESENTATIVES, load_sensor
 REFUSED = {
     "shape-text": "Decimal is Python code",
     "shape-fragments": "messages in several datagrams",
-    **recoded(SHAPED.values()),
+    **find_recoded(SHAPED.values()),
 }
 #: the shapes that tshark reads in `make test-all`; the others are for the long run.
 FEW = {"shape-oddities", "shape-options", "shape-segments", "shape-tags", "shape-channels"}
@@ -72,18 +72,18 @@ def test_python_conditions_are_refused_with_the_reason() -> None:
 
 @pytest.mark.slow
 def test_sensors_that_the_dissector_cannot_express_are_refused() -> None:
-    for name, reason in recoded(installed_sensors().values()).items():
+    for name, reason in find_recoded(installed_sensors().values()).items():
         with pytest.raises(ExportError, match=reason):
             export(installed_sensors()[name], "wireshark")
 
 
-@judged
+@needs_tshark
 @pytest.mark.parametrize("name", READ)
 def test_every_field_of_a_shape_reads_as_lidarspec_reads_it(name: str, tmp_path: Path) -> None:
     assert_fields_are_read(SHAPED[name], tmp_path)
 
 
-@judged
+@needs_tshark
 @pytest.mark.parametrize("name", READ_REPRESENTATIVES)
 def test_every_field_of_a_representative_reads_as_lidarspec_reads_it(
     name: str, tmp_path: Path
@@ -91,7 +91,7 @@ def test_every_field_of_a_representative_reads_as_lidarspec_reads_it(
     assert_fields_are_read(load_sensor(name), tmp_path, rounds=1)
 
 
-@judged
+@needs_tshark
 @pytest.mark.soak
 @pytest.mark.parametrize("module", sensor_modules())
 def test_every_field_of_every_sensor_reads_as_lidarspec_reads_it(
@@ -114,7 +114,7 @@ def assert_fields_are_read(sensor: Sensor, tmp_path: Path, rounds: int | None = 
         (_answer(sensor, name, data), data)
         for name, data in [*SensorUnderTest(sensor).conversation(rounds=rounds), *outgoing]
     ]
-    capture = captured(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
+    capture = write_capture(sensor, [data for _, data in frames], tmp_path / "frames.pcap")
     script = written(sensor, tmp_path)
     assert_shown(sensor, capture, script, frames)
 
@@ -196,13 +196,16 @@ def _same(text: str, value: Any) -> bool:
     return int(text, 0) == int(value)
 
 
-@judged
+@needs_tshark
 def test_physical_values_are_fields_too(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("ldrobot-stl27l")
     frame = sensor.build(
         "data", sensor.parse(sensor.example("data")), units=False, start_angle=32427
     )
-    capture, script = captured(sensor, [frame], tmp_path / "it.pcap"), written(sensor, tmp_path)
+    capture, script = (
+        write_capture(sensor, [frame], tmp_path / "it.pcap"),
+        written(sensor, tmp_path),
+    )
     (row,) = columns(
         capture,
         script,
@@ -216,7 +219,7 @@ def test_physical_values_are_fields_too(tmp_path: Path) -> None:
     assert "start_angle: 32427 (324.27 deg)" in tshark(capture, "-V", scripts=[script])
 
 
-@judged
+@needs_tshark
 @pytest.mark.parametrize(
     "name", ["ldrobot-stl27l", "shape-nested", "shape-twice", "shape-nibbles", "shape-oddities"]
 )
@@ -231,10 +234,10 @@ def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
         place = next(
             spot
             for spot in reversed(range(len(good)))
-            if _only_the_checksum(sensor, kind, _flipped(good, spot))
+            if _only_the_checksum(sensor, kind, _flip(good, spot))
         )
-        frames += [good, _flipped(good, place)]
-    capture, script = captured(sensor, frames, tmp_path / "it.pcap"), written(sensor, tmp_path)
+        frames += [good, _flip(good, place)]
+    capture, script = write_capture(sensor, frames, tmp_path / "it.pcap"), written(sensor, tmp_path)
     prefix = name.replace("-", "_")
     rows = list(
         columns(
@@ -248,7 +251,7 @@ def test_a_wrong_checksum_is_marked(name: str, tmp_path: Path) -> None:
         assert ("0" in status) == bool(bad) == bool(number % 2), f"packet {number + 1}"
 
 
-def _flipped(data: bytes, spot: int) -> bytes:
+def _flip(data: bytes, spot: int) -> bytes:
     return bytes([*data[:spot], data[spot] ^ 0x01, *data[spot + 1 :]])
 
 
@@ -260,13 +263,13 @@ def _only_the_checksum(sensor: Sensor, kind: str, data: bytes) -> bool:
     return False
 
 
-@judged
+@needs_tshark
 def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("ldrobot-stl27l")
     frames = [sensor.example("data", seed=seed) for seed in range(3)]
-    packet = b"\x01\x02\x54" + frames[0] + frames[1] + _flipped(frames[2], 20) + b"\x54\x2c\x99"
+    packet = b"\x01\x02\x54" + frames[0] + frames[1] + _flip(frames[2], 20) + b"\x54\x2c\x99"
     capture, script = (
-        captured(sensor, [packet, bytes(40)], tmp_path / "it.pcap"),
+        write_capture(sensor, [packet, bytes(40)], tmp_path / "it.pcap"),
         written(sensor, tmp_path),
     )
     names = ["frame", "checksum.status", "skipped", "cut_off", "data.end_angle"]
@@ -282,7 +285,7 @@ def test_frames_one_after_another_and_bytes_between_them(tmp_path: Path) -> None
     assert second == [[]] * 5
 
 
-@judged
+@needs_tshark
 def test_a_frame_after_a_descriptor_is_recognized(tmp_path: Path) -> None:
     sensor = SHAPED["shape-modes"]
     frames = [
@@ -290,23 +293,23 @@ def test_a_frame_after_a_descriptor_is_recognized(tmp_path: Path) -> None:
         for name in ("begin_express", "express", "express", "begin_plain", "plain")
     ]
     capture, script = (
-        captured(sensor, [data for _, data in frames], tmp_path / "it.pcap"),
+        write_capture(sensor, [data for _, data in frames], tmp_path / "it.pcap"),
         written(sensor, tmp_path),
     )
     assert_shown(sensor, capture, script, frames)
-    run = captured(sensor, [b"".join(data for _, data in frames)], tmp_path / "run.pcap")
+    run = write_capture(sensor, [b"".join(data for _, data in frames)], tmp_path / "run.pcap")
     ((kinds,),) = columns(run, script, ["shape_modes.frame"])
     assert kinds == [name for name, _ in frames]
 
 
-@judged
+@needs_tshark
 def test_frames_without_a_descriptor_are_marked_uncertain(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("slamtec-rplidar-t1")
     capsule, announcement = (
         sensor.example("dense", seed=1),
         sensor.example("dense_descriptor", seed=1),
     )
-    capture = captured(sensor, [capsule, announcement, capsule], tmp_path / "it.pcap")
+    capture = write_capture(sensor, [capsule, announcement, capsule], tmp_path / "it.pcap")
     before, _, behind = columns(
         capture, written(sensor, tmp_path), ["slamtec_rplidar_t1.frame", "_ws.expert.message"]
     )
@@ -315,11 +318,11 @@ def test_frames_without_a_descriptor_are_marked_uncertain(tmp_path: Path) -> Non
     assert behind == [["dense"], []]
 
 
-@judged
+@needs_tshark
 def test_frames_of_one_size_are_distinguished_by_conditions(tmp_path: Path) -> None:
     sensor = lidarspec.sensor("robosense-m1")
     names = ["difop_guide", "difop", "difop_other", "difop_fov"]
-    capture = captured(
+    capture = write_capture(
         sensor, [sensor.example(name, seed=2) for name in names], tmp_path / "it.pcap"
     )
     shown = columns(
@@ -328,7 +331,7 @@ def test_frames_of_one_size_are_distinguished_by_conditions(tmp_path: Path) -> N
     assert list(shown) == [[[name], []] for name in names]
 
 
-@judged
+@needs_tshark
 def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:
     sensors = [
         lidarspec.sensor(name)
@@ -336,7 +339,7 @@ def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:
     ]
     scripts = [written(sensor, tmp_path) for sensor in sensors]
     for sensor in sensors:
-        capture = captured(
+        capture = write_capture(
             sensor, [sensor.example(sensor.data_frame)], tmp_path / f"{sensor.id}.pcap"
         )
         assert f"{sensor.vendor} {sensor.model}" in tshark(
@@ -344,7 +347,7 @@ def test_two_dissectors_share_ports_and_link_types(tmp_path: Path) -> None:
         )
 
 
-@judged
+@needs_tshark
 @pytest.mark.parametrize(
     ("name", "path"),
     [pytest.param(*case, id=case[0], marks=LONG if case[0] in LATER else ()) for case in CAPTURES],
@@ -359,7 +362,7 @@ def test_real_captures(name: str, path: str, tmp_path: Path) -> None:
     frames = [(found[0].frame, data) for data in datagrams if (found := sensor.split([data]))]
     assert frames
     script = written(sensor, tmp_path)
-    again = captured(sensor, [data for _, data in frames], tmp_path / "again.pcap")
+    again = write_capture(sensor, [data for _, data in frames], tmp_path / "again.pcap")
     assert_shown(sensor, again, script, frames)
     shown = tshark(
         capture,
@@ -374,7 +377,7 @@ def test_real_captures(name: str, path: str, tmp_path: Path) -> None:
     assert {name for name, _ in frames} <= set(shown.split())
 
 
-@judged
+@needs_tshark
 @pytest.mark.parametrize(
     ("name", "path"), [("ldrobot-ld06", "ldrobot/ld06_3_consecutive_frames.bin")]
 )
@@ -384,7 +387,7 @@ def test_a_real_serial_recording(name: str, path: str, tmp_path: Path) -> None:
         pytest.skip(f"no capture {path} in {made.CAPTURES} (set LIDARSPEC_CAPTURES)")
     sensor = lidarspec.sensor(name)
     frames = [(found.frame, found.data) for found in sensor.split(source.read_bytes())]
-    capture = captured(sensor, [source.read_bytes()], tmp_path / "it.pcap")
+    capture = write_capture(sensor, [source.read_bytes()], tmp_path / "it.pcap")
     ((kinds, angles),) = columns(
         capture, written(sensor, tmp_path), ["ldrobot_ld06.frame", "ldrobot_ld06.data.end_angle"]
     )

@@ -46,7 +46,7 @@ def is_recoded(sensor: Sensor) -> bool:
     return any(frame.wire is not None for frame in sensor.frames.values())
 
 
-def recoded(sensors: Iterable[Sensor]) -> dict[str, str]:
+def find_recoded(sensors: Iterable[Sensor]) -> dict[str, str]:
     """Return the reason of the refusal, by id, of those sensors that are recoded."""
     return {sensor.id: RECODED for sensor in sensors if is_recoded(sensor)}
 

@@ -37,7 +37,7 @@ def graph_of(function: Any) -> Node:
     return node
 
 
-def computed(node: Node, batch: Batch) -> Any:
+def compute_node(node: Node, batch: Batch) -> Any:
     fields = Fields(batch)
     return compute(node, {}, lambda node: node.function(fields) if node.kind == "field" else None)
 
@@ -56,7 +56,7 @@ def test_columns_and_arrays_give_equal_results() -> None:
             f.points.intensity > 100, f.points.distance + f.start_angle, f.end_angle % 7
         )
     )
-    column = computed(node, PACKETS.batch())
+    column = compute_node(node, PACKETS.batch())
     arrays = {
         "points.distance": PACKETS["points.distance"],
         "points.intensity": PACKETS["points.intensity"],

@@ -49,7 +49,7 @@ def points(message: Any) -> np.ndarray:
     )
 
 
-def simulated(name: str, packets: int) -> list[Scan]:
+def simulate_scans(name: str, packets: int) -> list[Scan]:
     sensor = SHAPES.get(name) or ls.sensor(name)
     return list(sensor.scans(simulate(sensor, packets)))
 
@@ -92,7 +92,7 @@ def test_foxglove_has_its_own_messages(tmp_path: Path, name: str) -> None:
     pytest.importorskip(
         "foxglove_schemas_protobuf", reason="foxglove-schemas-protobuf is not installed"
     )
-    scans = [dataclasses.replace(one, frame_id="front") for one in simulated(name, 120)]
+    scans = [dataclasses.replace(one, frame_id="front") for one in simulate_scans(name, 120)]
     write(tmp_path / "a.foxglove.mcap", scans)
     with (tmp_path / "a.foxglove.mcap").open("rb") as file:
         log = mcap.make_reader(file, decoder_factories=[decoding.DecoderFactory()])
@@ -154,7 +154,7 @@ def test_a_folder_is_a_valid_ros_2_bag(tmp_path: Path) -> None:
 
 def test_mcap_is_read_by_its_own_reader(tmp_path: Path) -> None:
     decoding = pytest.importorskip("mcap_ros2.decoder", reason="mcap is not installed")
-    scans = simulated("shape-extras", 60)
+    scans = simulate_scans("shape-extras", 60)
     write(tmp_path / "a.mcap", scans)
     with (tmp_path / "a.mcap").open("rb") as file:
         log = mcap.make_reader(file, decoder_factories=[decoding.DecoderFactory()])
@@ -194,7 +194,7 @@ def test_further_columns_keep_their_types_where_ros_has_them_and_come_with_units
 
 
 def test_organised_points_have_a_row_for_each_of_the_sensor(tmp_path: Path) -> None:
-    one, *_ = (one for one in simulated("velodyne-vlp16", 100) if one.points.shape)
+    one, *_ = (one for one in simulate_scans("velodyne-vlp16", 100) if one.points.shape)
     rows, columns = 16, len(one) // 16  # of which two stand in a column of the packet
     write(tmp_path / "a.bag", [one], every_point=True)
     ((_, _, message),) = messages(tmp_path / "a.bag")
@@ -204,7 +204,7 @@ def test_organised_points_have_a_row_for_each_of_the_sensor(tmp_path: Path) -> N
 
 
 def test_a_scan_of_one_plane_is_a_laserscan_as_well(tmp_path: Path) -> None:
-    scans = simulated("ldrobot-stl27l", 200)
+    scans = simulate_scans("ldrobot-stl27l", 200)
     write(tmp_path / "a.mcap", scans)
     found = [
         (at, message) for topic, at, message in messages(tmp_path / "a.mcap") if topic == "/scan"
@@ -226,7 +226,7 @@ def test_a_scan_of_one_plane_is_a_laserscan_as_well(tmp_path: Path) -> None:
         np.testing.assert_array_equal(message.intensities, planar.intensities)
     write(tmp_path / "b.mcap", [scan(0, intensity=False)])
     assert len(messages(tmp_path / "b.mcap")[1][2].intensities) == 0
-    write(tmp_path / "c.mcap", simulated("velodyne-vlp16", 100))
+    write(tmp_path / "c.mcap", simulate_scans("velodyne-vlp16", 100))
     assert {topic for topic, _, _ in messages(tmp_path / "c.mcap")} == {"/points"}
 
 

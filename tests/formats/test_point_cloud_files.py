@@ -52,7 +52,7 @@ PLY = {**PCD, "i1": "i4", "i2": "i4", "u2": "i4", "u4": "f8", "i8": "f8", "u8": 
 TYPES = {"a.pcd": PCD, "a.lzf.pcd": PCD, "a.ply": PLY, "a.npy": {code: code for code in CODES}}
 
 
-def expected(scans: Sequence[Scan], name: str, *, every_point: bool) -> np.ndarray:
+def join_column(scans: Sequence[Scan], name: str, *, every_point: bool) -> np.ndarray:
     return np.concatenate(
         [one.points.read(name)[name][one.points.valid | every_point] for one in scans]
     )
@@ -69,12 +69,12 @@ def test_files_read_back_equal(
     assert list(found) == {"a.bin": NAMES[:4], "a.xyz": NAMES[:3]}.get(name, [*NAMES, "scan"])
     for column, values in found.items():
         if column == "scan":
-            lengths = [len(expected([one], "x", every_point=every_point)) for one in scans]
+            lengths = [len(join_column([one], "x", every_point=every_point)) for one in scans]
             np.testing.assert_array_equal(values, np.repeat([0, 1, 2, 3], lengths))
         else:
             np.testing.assert_allclose(
                 values,
-                expected(scans, column, every_point=every_point),
+                join_column(scans, column, every_point=every_point),
                 rtol=5.1e-7 if name == "a.xyz" else 6e-8,
             )
 
@@ -162,7 +162,7 @@ def test_unorganized_points_are_one_row(tmp_path: Path, number: int, every_point
     header = pcd_header(tmp_path / "a.pcd")
     assert (header["WIDTH"], header["HEIGHT"]) == (header["POINTS"], ["1"])
     np.testing.assert_array_equal(
-        read_pcd(tmp_path / "a.pcd")["x"], expected(scans, "x", every_point=every_point)
+        read_pcd(tmp_path / "a.pcd")["x"], join_column(scans, "x", every_point=every_point)
     )
 
 

@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.slow, needs("rerun")]
 reading = Library("rerun.chunk")
 
 
-def logged(path: Path) -> dict[str, dict[str, list[Any]]]:
+def read_log(path: Path) -> dict[str, dict[str, list[Any]]]:
     """What is logged under each path: the values of each column, in the order of the scans."""
     found: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for chunk in reading.RrdReader(path).stream():
@@ -55,7 +55,7 @@ def test_scans_stand_on_both_clocks_with_their_points(tmp_path: Path) -> None:
         for number in range(3)
     ]
     write(tmp_path / "a.rrd", scans)
-    found = logged(tmp_path / "a.rrd")
+    found = read_log(tmp_path / "a.rrd")
     points = found["/ldrobot-stl27l/points"]
     assert points["scan"] == [0, 1, 2]
     assert ns(points["sensor_time"]) == [one.stamp_ns for one in scans]
@@ -80,7 +80,7 @@ def test_scans_stand_on_both_clocks_with_their_points(tmp_path: Path) -> None:
 def test_colours_follow_the_range_on_one_scale(tmp_path: Path) -> None:
     scans = [scan(number, points=300) for number in range(2)]
     write(tmp_path / "a.rrd", scans)
-    colours = logged(tmp_path / "a.rrd")["/ldrobot-stl27l/points"]["Points3D:colors"]
+    colours = read_log(tmp_path / "a.rrd")["/ldrobot-stl27l/points"]["Points3D:colors"]
     steps = [
         np.clip(
             ramp_positions(one.points[one.points.valid], choose_appearance(scans[0].points)) * 20,
@@ -101,7 +101,7 @@ def test_colours_follow_the_range_on_one_scale(tmp_path: Path) -> None:
 def test_the_mount_of_a_sensor_is_reported(tmp_path: Path) -> None:
     mount = Mount(x=1.0, z=2.0, yaw_deg=90.0)
     write(tmp_path / "a.rrd", [dataclasses.replace(scan(0), mount=mount)])
-    found = logged(tmp_path / "a.rrd")
+    found = read_log(tmp_path / "a.rrd")
     assert found["/ldrobot-stl27l/sensor"]["Transform3D:translation"] == [[[1.0, 0.0, 2.0]]]
     columns = np.array(found["/ldrobot-stl27l/sensor"]["Transform3D:mat3x3"][0][0]).reshape(3, 3).T
     np.testing.assert_allclose(columns, mount.rotation, atol=1e-7)
@@ -118,7 +118,7 @@ def test_a_device_hands_its_mount_on_with_its_scans(
     )
     monkeypatch.chdir(tmp_path)
     ran("convert", "front", "a.rrd")
-    found = logged(tmp_path / "a.rrd")
+    found = read_log(tmp_path / "a.rrd")
     assert found["/ldrobot-stl27l/sensor"]["Transform3D:translation"] == [[[0.0, 0.0, 0.5]]]
     assert np.array(found["/ldrobot-stl27l/points"]["Points3D:positions"][1])[
         :, 2
@@ -127,7 +127,7 @@ def test_a_device_hands_its_mount_on_with_its_scans(
 
 def test_view_writes_scans_and_figures(tmp_path: Path) -> None:
     ran("view", "sim:robosense-m1", "--rerun", "-o", tmp_path / "a.rrd", "-t", "2500ms")
-    found = logged(tmp_path / "a.rrd")
+    found = read_log(tmp_path / "a.rrd")
     assert len(found["/robosense-m1/points"]["scan"]) > 3
     assert found["/robosense-m1/statistics/packet_rate_hz"]["Scalars:scalars"][-1][0] > 100
     assert "/robosense-m1/statistics/loss_rate" in found

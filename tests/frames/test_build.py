@@ -22,7 +22,7 @@ ORDER = Frame(Struct(*(name / con for name, con in FIELDS.items())), direction="
 VALUES = {"key": b"abc", "v": [1, 2], "s": [{"x": 1}] * 2, "t.u": 1, "t.w": 0}
 
 
-def commanded(**args: Any) -> Sensor:
+def make_command_sensor(**args: Any) -> Sensor:
     """A sensor with a command that has these arguments."""
     return sound.sensor(
         frames={"data": sound.frame(), "order": ORDER},
@@ -47,22 +47,24 @@ def test_an_argument_that_cannot_stand_in_its_field_is_the_authors_fault(
     wrong: Any, named: str
 ) -> None:
     with pytest.raises(SpecError, match=named) as error:
-        commanded(rate=wrong).command("start", rate=3)
+        make_command_sensor(rate=wrong).command("start", rate=3)
     assert error.value.path == "commands.start.args.rate"
 
 
 def test_numbers_texts_addresses_and_bytes_go_to_their_places() -> None:
-    assert commanded(rate=("t.u", 0, 9)).command("start", rate=3) == b"abc\1\2\1\1\3\0\0\0\0"
     assert (
-        commanded(a=("v[1]", 0, 9), b=("s[0].x", 0, 9)).command("start", a=7, b=8)
+        make_command_sensor(rate=("t.u", 0, 9)).command("start", rate=3) == b"abc\1\2\1\1\3\0\0\0\0"
+    )
+    assert (
+        make_command_sensor(a=("v[1]", 0, 9), b=("s[0].x", 0, 9)).command("start", a=7, b=8)
         == b"abc\1\7\x08\1\1\0\0\0\0"
     )
-    assert commanded(name=("key", Text(3))).command("start", name="x")[:3] == b"x\0\0"
-    assert commanded(name=("key", Text(3, b" "))).command("start", name="x")[:3] == b"x  "
-    assert commanded(key=("key", bytes)).command("start", key=b"\1\2\3")[:3] == b"\1\2\3"
-    assert commanded(host=("t.w", Address())).command("start", host="192.168.1.10")[-4:] == bytes(
-        [192, 168, 1, 10]
-    )
+    assert make_command_sensor(name=("key", Text(3))).command("start", name="x")[:3] == b"x\0\0"
+    assert make_command_sensor(name=("key", Text(3, b" "))).command("start", name="x")[:3] == b"x  "
+    assert make_command_sensor(key=("key", bytes)).command("start", key=b"\1\2\3")[:3] == b"\1\2\3"
+    assert make_command_sensor(host=("t.w", Address())).command("start", host="192.168.1.10")[
+        -4:
+    ] == bytes([192, 168, 1, 10])
     assert VALUES["v"] == [1, 2]
 
 
@@ -76,7 +78,7 @@ def test_numbers_texts_addresses_and_bytes_go_to_their_places() -> None:
     ],
 )
 def test_an_invalid_argument_is_refused(kind: Any, wrong_values: list[Any]) -> None:
-    sensor = commanded(rate=kind)
+    sensor = make_command_sensor(rate=kind)
     for value in wrong_values:
         with pytest.raises(UsageError, match="start: rate"):
             sensor.command("start", rate=value)
@@ -85,7 +87,7 @@ def test_an_invalid_argument_is_refused(kind: Any, wrong_values: list[Any]) -> N
 def test_arguments_of_no_kind_are_refused_when_they_are_declared() -> None:
     for wrong in [("v",), ("v", 1), ("v", str), (3, 0, 9), ("v", "0", "9")]:
         with pytest.raises(SpecError, match=re.escape(repr(wrong))):
-            commanded(rate=wrong)
+            make_command_sensor(rate=wrong)
     for bits, first in [(0, 0), (8, 256), (8, -1)]:
         with pytest.raises(SpecError, match="Count"):
             Count(bits, first)

@@ -63,7 +63,7 @@ from tests.engine.engines import (
 )
 
 
-def inverted(data: bytes) -> bytes:
+def invert(data: bytes) -> bytes:
     return bytes(byte ^ 0xFF for byte in data)
 
 
@@ -470,7 +470,7 @@ def test_nameless_checks_are_refused_with_a_suggestion(part: Any, instead: str) 
         (Sequence(Int8ub, Int16ub), "say Struct('a'"),
         (RepeatUntil(obj_ == 0, Int8ub), "Array with a count"),
         (ProcessXor(0x55, Int16ub), "undo it in `points`"),
-        (Transformed(Int16ub, inverted, 2, inverted, 2), "undo it in `points`"),
+        (Transformed(Int16ub, invert, 2, invert, 2), "undo it in `points`"),
         (ExprAdapter(Int8ub, obj_ + 1, obj_ - 1), "say Scaled"),
         (Mapping(Int8ub, {100: 1, 200: 2}), "say Enum"),
         (PaddedString(8, "ascii"), "say Bytes(n)"),

@@ -314,12 +314,12 @@ def test_parts_know_which_frame_they_are_in(sensor: Sensor) -> None:
     assert (packets.index[which] == parts.index).all()
 
 
-#: Bytes of the longest frame of `numbered`, and false headers of a stream.
+#: Bytes of the longest frame of `make_numbered_sensor`, and false headers of a stream.
 LONGEST = 60
 FALSE_HEADERS = 300
 
 
-def numbered() -> Sensor:
+def make_numbered_sensor() -> Sensor:
     """Return a sensor whose frames say with four bytes how many parts there are."""
     kinds = {
         "short": Struct("type" / Const(b"\x01"), "value" / Int8ub),
@@ -337,7 +337,7 @@ def numbered() -> Sensor:
 def test_numbers_of_parts_above_the_longest_frame_are_one_layout(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    sensor = numbered()
+    sensor = make_numbered_sensor()
     walks = 0
     explore = HeaderTree._explore
 
@@ -361,7 +361,7 @@ def test_numbers_of_parts_above_the_longest_frame_are_one_layout(
 
 @pytest.mark.parametrize("count", [0, 1, 2, 26, 27, 54, 55, 2**31, 2**32 - 1])
 def test_errors_in_part_counts_match_construct(count: int) -> None:
-    sensor = numbered()
+    sensor = make_numbered_sensor()
     for part in (b"\x01\x07", b"\x02\x00", b"\x03"):
         data = b"\xaa\x55" + count.to_bytes(4, "big") + part * 40
         found = {

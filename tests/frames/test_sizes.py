@@ -228,13 +228,13 @@ INTERPRETED: dict[str, tuple[list[Any], dict[str, Any], str, dict[str, Any]]] = 
 ALL = {**MEASURED, **INTERPRETED}
 
 
-def declared(name: str) -> Any:
+def make_sensor(name: str) -> Any:
     return sensor(Struct("magic" / Const(b"\xf1\x5a"), *ALL[name][0]), max_length=300)
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_lengths_are_filled_in_and_round_trip(name: str) -> None:
-    ours, (_, values, data, more) = declared(name), ALL[name]
+    ours, (_, values, data, more) = make_sensor(name), ALL[name]
     assert is_compiled(ours.frames["data"]) is (name in MEASURED)
     built = ours.build("data", values)
     assert built == b"\xf1\x5a" + bytes.fromhex(data)
@@ -247,7 +247,7 @@ def test_lengths_are_filled_in_and_round_trip(name: str) -> None:
 
 @pytest.mark.parametrize("name", MEASURED)
 def test_frames_are_held_to_their_lengths_as_by_construct(name: str) -> None:
-    ours, source = declared(name), random.Random(name)
+    ours, source = make_sensor(name), random.Random(name)
     codecs = codec(ours.frames["data"]), codec(construct_frame(ours.frames["data"]))
     refused = 0
     for seed in range(8):
@@ -271,7 +271,7 @@ def test_frames_are_held_to_their_lengths_as_by_construct(name: str) -> None:
 
 
 def test_a_wrong_length_shows_the_expected_one() -> None:
-    ours = declared("a part")
+    ours = make_sensor("a part")
     with pytest.raises(WireError) as fault:
         ours.parse(bytes.fromhex(f"f15a 0009 02{POINTS}"))
     assert (fault.value.path, fault.value.offset, fault.value.expected, fault.value.got) == (
@@ -288,7 +288,7 @@ def test_a_wrong_length_shows_the_expected_one() -> None:
 
 
 def test_padding_is_kept_and_may_be_given() -> None:
-    ours = declared("FixedSized")
+    ours = make_sensor("FixedSized")
     data = bytes.fromhex(f"f15a 02{POINTS} abcd")
     assert ours.build("data", ours.parse(data)) == data
     assert ours.build("data", v=dict(points=TWO), v_padding=b"\xab\xcd") == data

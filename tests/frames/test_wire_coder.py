@@ -93,14 +93,14 @@ def test_a_status_of_scip_has_the_sum_of_the_specification() -> None:
     assert bytes(map(Scip(), (b"00", b"99", b"0E"))) == b"Pbe"
 
 
-def joined(steps: int, characters: bytes) -> bytes:
+def make_joined_frame(steps: int, characters: bytes) -> bytes:
     """A frame of shape-joined of these characters, in lines with their checks."""
     lines = Lines(32, head=(4, 3), bare=1, check=Scip())
     return lines.encode(b"NE0%d000" % steps + characters, ())
 
 
 def test_a_step_has_as_many_echoes_as_are_sent() -> None:
-    data = joined(4, b"1Dh055Dh05&1Dh07" + b"00000" + b"00001&00000&00002")
+    data = make_joined_frame(4, b"1Dh055Dh05&1Dh07" + b"00000" + b"00001&00000&00002")
     values = JOINED.parse(data)
     echoes = [[(echo.range, echo.strength) for echo in step.echoes] for step in values.steps]
     assert echoes == [
@@ -110,7 +110,7 @@ def test_a_step_has_as_many_echoes_as_are_sent() -> None:
         [(0, 1), (0, 0), (0, 2)],
     ]
     assert JOINED.build("data", tens=0, ones=4, time=0, sector=0, steps=values.steps) == data
-    spelled = joined(1, b"1Dh05&00000")  # an echo of nothing, which would not be sent
+    spelled = make_joined_frame(1, b"1Dh05&00000")  # an echo of nothing, which would not be sent
     assert JOINED.build("data", JOINED.parse(spelled)) == spelled
     shown = str(explain(data, JOINED)).splitlines()
     assert next(line for line in shown if "strength 7" in line).startswith("0015  31 44 68 30 37")
@@ -144,11 +144,11 @@ def test_a_step_has_as_many_echoes_as_are_sent() -> None:
     ],
 )
 def test_marks_that_join_no_echoes_make_no_frame(steps: int, characters: bytes, place: int) -> None:
-    data = joined(steps, characters)
+    data = make_joined_frame(steps, characters)
     with pytest.raises(WireError) as fault:
         JOINED.parse(data)
     assert fault.value.offset == place
-    good = joined(1, b"1Dh05")
+    good = make_joined_frame(1, b"1Dh05")
     assert JOINED.decode(data + good).stats.frames == {"data": 1}
 
 

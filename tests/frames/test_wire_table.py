@@ -21,7 +21,7 @@ from tests.shapes import SHAPES
 NO_FIELDS = ("array", "parts", "check", "no frame")
 
 
-def evaluated(formula: str, names: dict[str, object]) -> int:
+def evaluate_formula(formula: str, names: dict[str, object]) -> int:
     return int(eval(formula, {"__builtins__": {}}, names))
 
 
@@ -43,7 +43,7 @@ def assert_offsets_are_those_of_the_layout(
     values = dict(sensor.parse(data, frame))
     size = frame_size(sensor.frames[frame])
     if "(" not in size.replace("*(", ""):
-        assert evaluated(size, values) == len(data)
+        assert evaluate_formula(size, values) == len(data)
     checked = 0
     for row in wire_table(sensor.frames[frame]):
         leaf = layout.leaves.get(re.sub(r"\[\w\]", "", row.field))
@@ -56,11 +56,11 @@ def assert_offsets_are_those_of_the_layout(
         ):
             continue
         names = {**values, **dict.fromkeys(INDICES, 0)}
-        origin = evaluated(row.offset, names)
+        origin = evaluate_formula(row.offset, names)
         assert origin == leaf.offset, row
         for index, stride in zip(INDICES, leaf.strides, strict=False):
             if f"[{index}]" in row.field:
-                assert evaluated(row.offset, {**names, index: 1}) == origin + stride, row
+                assert evaluate_formula(row.offset, {**names, index: 1}) == origin + stride, row
         checked += 1
     assert checked
 

@@ -35,7 +35,7 @@ EXAMPLES = 10
 
 
 @functools.cache
-def damaged(name: str) -> NDArray[np.uint8]:
+def make_damaged_frames(name: str) -> NDArray[np.uint8]:
     """Return frames of one length, (n, size), with a byte changed in every fifth, at places all
     over the frame.
     """
@@ -63,7 +63,7 @@ def facts(spans: Frames) -> list[tuple[str, int, bytes, int]]:
 )
 def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance: str) -> None:
     sensor = load_sensor(name)
-    rows = damaged(name)
+    rows = make_damaged_frames(name)
     count, size = rows.shape
     one_by_one, together = sensor.decoder(stream=False), sensor.decoder(stream=False)
     wanted = [
@@ -86,7 +86,7 @@ def test_datagrams_in_one_buffer_are_those_one_after_another(name: str, distance
 @each_shape
 def test_the_rows_of_an_array_are_those_datagrams(name: str) -> None:
     sensor = load_sensor(name)
-    rows = damaged(name)
+    rows = make_damaged_frames(name)
     array, listed = sensor.decode(rows), sensor.decode([row.tobytes() for row in rows])
     assert array.stats == listed.stats
     assert array.raw.tobytes() == listed.raw.tobytes()
@@ -97,7 +97,7 @@ def test_the_rows_of_an_array_are_those_datagrams(name: str) -> None:
 @each_shape
 def test_arrays_of_sound_frames_alone_and_with_damaged_ones_in_turn(name: str) -> None:
     sensor = load_sensor(name)
-    mixed = damaged(name)
+    mixed = make_damaged_frames(name)
     judge = sensor.decoder(stream=False)
     sound = np.array([row for row in mixed if judge.feed(row.tobytes())]).reshape(
         -1, mixed.shape[1]

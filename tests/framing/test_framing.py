@@ -22,7 +22,7 @@ from tests.agreement import assert_backends_agree
 from tests.by_construct import reader
 from tests.engine import against_construct
 from tests.engine.oracle import Oracle
-from tests.engine.streams import Books, damaged, decoded
+from tests.engine.streams import Books, damage, decode_chunks
 from tests.shapes import SHAPES
 
 STREAMS = {name: sensor for name, sensor in SHAPES.items() if not sensor.datagrams}
@@ -137,12 +137,12 @@ def test_idle_between_chunks_is_the_rule_on_each_part(sensor: Sensor) -> None:
 @pytest.mark.slow
 def test_decoders_in_threads_do_not_know_of_each_other() -> None:
     work = [
-        (sensor, damaged(conversation(sensor, length=600), 5e-3, 1)[:1200])
+        (sensor, damage(conversation(sensor, length=600), 5e-3, 1)[:1200])
         for sensor in STREAMS.values()
     ]
-    alone = [decoded(*item) for item in work]
+    alone = [decode_chunks(*item) for item in work]
     with ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(lambda item: decoded(*item), work)) == alone
+        assert list(pool.map(lambda item: decode_chunks(*item), work)) == alone
 
 
 def test_a_frame_inside_a_frame_belongs_to_it() -> None:
@@ -173,9 +173,9 @@ def test_a_frame_inside_a_frame_belongs_to_it() -> None:
         extra=None,
     )
     assert inner[:8] in outer
-    assert [data for _, _, data in decoded(sensor, outer + inner)] == [outer, inner]
+    assert [data for _, _, data in decode_chunks(sensor, outer + inner)] == [outer, inner]
     broken = outer[:-1] + bytes([outer[-1] ^ 1])
-    assert [data for _, _, data in decoded(sensor, broken)] == [inner]
+    assert [data for _, _, data in decode_chunks(sensor, broken)] == [inner]
 
 
 def test_a_false_header_does_not_cost_valid_frames() -> None:
@@ -205,13 +205,13 @@ def test_the_longest_length_itself_is_allowed() -> None:
     samples = [dict(distance=index, quality=7) for index in range(40)]
     frame = sensor.build("data", first=0, last=100, samples=samples)
     assert len(frame) == sensor.frames["data"].max_length
-    assert [data for _, _, data in decoded(sensor, frame)] == [frame]
+    assert [data for _, _, data in decode_chunks(sensor, frame)] == [frame]
     too_many = dict(first=0, last=100, samples=[*samples, samples[0]])
     with pytest.raises(UsageError, match=r"samples: .* at most 129 bytes"):
         sensor.build("data", too_many)
     roomy = dataclasses.replace(sensor.frames["data"], max_length=len(frame) + 3)
     longer = dataclasses.replace(sensor, frames={"data": roomy}).build("data", too_many)
-    assert decoded(sensor, longer) == []
+    assert decode_chunks(sensor, longer) == []
 
 
 def test_rejections_are_counted_by_their_reason() -> None:
@@ -278,7 +278,7 @@ def test_a_descriptor_selects_the_frame_type() -> None:
         + begin_plain
         + plain
     )
-    assert decoded(sensor, data) == Oracle(sensor, data).frames()
+    assert decode_chunks(sensor, data) == Oracle(sensor, data).frames()
     assert [
         found.frame for found in sensor.split(begin_plain + plain + begin_express + express)
     ] == [
@@ -298,10 +298,10 @@ def test_runs_of_weak_frames_count_whole_or_not_at_all() -> None:
     frames = [sensor.example("data", seed=seed) for seed in range(6)]
     for number in range(7):
         data = b"\x00" * 7 + b"".join(frames[:number]) + b"\x00" * 7
-        assert [data for _, _, data in decoded(sensor, data)] == (
+        assert [data for _, _, data in decode_chunks(sensor, data)] == (
             frames[:number] if number >= 3 else []
         )
-        assert decoded(sensor, data) == Oracle(sensor, data).frames()
+        assert decode_chunks(sensor, data) == Oracle(sensor, data).frames()
 
 
 def test_a_frame_of_an_earlier_type_ends_a_run() -> None:
@@ -313,8 +313,8 @@ def test_a_frame_of_an_earlier_type_ends_a_run() -> None:
     assert sensor.parse(info, frame="data")
     for before in range(5):
         data = node * before + info + node * 2 + info + node * 3
-        assert decoded(sensor, data) == Oracle(sensor, data).frames()
-        assert [name for name, _, _ in decoded(sensor, data)] == ["data"] * (
+        assert decode_chunks(sensor, data) == Oracle(sensor, data).frames()
+        assert [name for name, _, _ in decode_chunks(sensor, data)] == ["data"] * (
             before if before >= 3 else 0
         ) + ["info", "info"] + ["data"] * 3
 

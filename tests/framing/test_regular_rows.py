@@ -17,7 +17,7 @@ from lidarspec.framing.results import Frames
 from lidarspec.simulation.simulator import make_opening_frame, simulate
 from lidarspec.spec import Checksummed, Frame, Xor
 from lidarspec.testing.sensor_under_test import SensorUnderTest
-from tests.engine.streams import Books, damaged
+from tests.engine.streams import Books, damage
 from tests.representatives import load_sensor
 from tests.shapes import SHAPES
 
@@ -75,7 +75,7 @@ def test_small_pieces_give_the_same_frames(name: str, rate: float) -> None:
         train += (
             b"".join(sensor.example(sensor.data_frame, seed=number) for number in range(20)) + other
         )
-        data = damaged(train, rate, seed)
+        data = damage(train, rate, seed)
         whole = Books(sensor).feed(data)
         expected = whole.finish()
         parts = Books(sensor)

@@ -21,7 +21,7 @@ from lidarspec.framing.variable_lengths import JointChecker
 from lidarspec.spec import Checksummed, Crc, Fields, Frame, Simulation, Sum, WordXor
 from lidarspec.spec.checksums import Checksum
 from tests.engine.oracle import Oracle
-from tests.engine.streams import Books, decoded
+from tests.engine.streams import Books, decode_chunks
 from tests.shapes import SHAPES
 
 COUNT = SHAPES["shape-count"]
@@ -127,7 +127,7 @@ def test_the_frames_and_counters_are_those_of_each_layout_by_itself(
 @pytest.mark.parametrize("name", ["behind", "absent", "before"])
 def test_the_frames_are_those_of_brute_force(name: str) -> None:
     data = false_headers(SENSORS[name], 1500, seed=1)
-    assert decoded(SENSORS[name], data) == Oracle(SENSORS[name], data).frames()
+    assert decode_chunks(SENSORS[name], data) == Oracle(SENSORS[name], data).frames()
 
 
 def test_checksums_are_computed_for_all_lengths_at_once() -> None:

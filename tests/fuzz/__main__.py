@@ -91,7 +91,7 @@ def main() -> int:
     if given.job or given.again:
         return child(given)
     with tempfile.TemporaryDirectory() as scratch:
-        chosen = listed(Path(scratch), given.only)
+        chosen = list_targets(Path(scratch), given.only)
     names = list(chosen)
     done = {
         path.stem: json.loads(path.read_text())
@@ -105,10 +105,10 @@ def main() -> int:
         f" {before} targets done before"
     )
     run(given, waiting, shares)
-    return told(given, names)
+    return print_results(given, names)
 
 
-def listed(folder: Path, only: list[str] | None) -> dict[str, float]:
+def list_targets(folder: Path, only: list[str] | None) -> dict[str, float]:
     """The targets that are asked for, and what an input of each costs."""
     from tests.every_sensor import every_sensor
     from tests.fuzz.targets import targets
@@ -160,7 +160,7 @@ def run(given: argparse.Namespace, waiting: list[str], shares: dict[str, int]) -
                     process.kill()
                     process.wait()
                 if process.returncode is not None:
-                    ended(given, name, shares[name], process)
+                    store_results(given, name, shares[name], process)
                     del running[name]
     except KeyboardInterrupt:
         print(
@@ -199,7 +199,7 @@ def start(given: argparse.Namespace, name: str, number: int) -> subprocess.Popen
         )
 
 
-def ended(
+def store_results(
     given: argparse.Namespace, name: str, asked: int, process: subprocess.Popen[bytes]
 ) -> None:
     """Keep what a job did; the input at which its process died is a finding of its own."""
@@ -249,7 +249,7 @@ def ended(
     )
 
 
-def told(given: argparse.Namespace, names: list[str]) -> int:
+def print_results(given: argparse.Namespace, names: list[str]) -> int:
     """Print what all jobs of this seed did, by group, and how each finding is had again; 1 where
     there is one.
     """
@@ -302,7 +302,7 @@ def child(given: argparse.Namespace) -> int:
             XDG_CONFIG_HOME=f"{scratch}/settings", LIDARSPEC_CACHE=str(given.folder / "kernels")
         )
         from tests.every_sensor import every_sensor
-        from tests.fuzz.campaign import Job, guided, seeded
+        from tests.fuzz.campaign import Job, run_guided, run_mutations
         from tests.fuzz.targets import targets
 
         warnings.simplefilter("ignore")  # they tell a user what was in the bytes
@@ -315,7 +315,7 @@ def child(given: argparse.Namespace) -> int:
             name = next(name for name in known if slug(name) == given.again.parent.name)
             known[name].run(given.again.read_bytes())
             return 0
-        (guided if atheris else seeded)(
+        (run_guided if atheris else run_mutations)(
             Job(known[given.job], given.folder, given.seed), given.inputs
         )
     return 0

@@ -19,7 +19,7 @@ from typing import Any
 
 from tests.fuzz import slug
 from tests.fuzz.targets import LONGEST, Target
-from tests.fuzz.trial import Finding, bound_memory, judged, limits
+from tests.fuzz.trial import Finding, bound_memory, judge, limits
 
 #: one input in so many is traced for the lines that it reaches, which makes it ten times as slow.
 TRACED = 20
@@ -65,7 +65,7 @@ class Job:
         """Read an input, keep what is found."""
         self._current.seek(0)
         self._current.write(len(data).to_bytes(4, "little") + data)
-        found = judged(self.target, data)
+        found = judge(self.target, data)
         self.inputs += 1
         if found is not None and found.place not in self.findings:
             self.findings[found.place] = found
@@ -115,7 +115,7 @@ def keep(folder: Path, found: Finding) -> Path:
     return path
 
 
-def seeded(job: Job, number: int) -> None:
+def run_mutations(job: Job, number: int) -> None:
     """Read so many inputs: mutations of the examples, and of those of a sample that reached new
     lines.
     """
@@ -123,7 +123,7 @@ def seeded(job: Job, number: int) -> None:
     lines: set[Any] = set()
     with job.running() as pool:
         for data in pool:
-            with _traced(lines):
+            with _trace(lines):
                 job.read(data)
         while job.inputs < number:
             data = job.target.mutation(source.choice(pool), source.choice(pool), source)
@@ -131,7 +131,7 @@ def seeded(job: Job, number: int) -> None:
                 job.read(data)
                 continue
             before = len(lines)
-            with _traced(lines):
+            with _trace(lines):
                 job.read(data)
             if len(lines) > before:
                 pool.append(data)
@@ -140,7 +140,7 @@ def seeded(job: Job, number: int) -> None:
 
 
 @contextlib.contextmanager
-def _traced(lines: set[Any]) -> Iterator[None]:
+def _trace(lines: set[Any]) -> Iterator[None]:
     """Add the lines of lidarspec and its plugins that run within."""
 
     def local(frame: FrameType, event: str, _: object) -> Callable[..., Any]:
@@ -158,7 +158,7 @@ def _traced(lines: set[Any]) -> Iterator[None]:
         sys.settrace(before)
 
 
-def guided(job: Job, number: int) -> None:
+def run_guided(job: Job, number: int) -> None:
     """Read so many inputs that atheris chooses by what they reach; it ends the process.
 
     lidarspec has to be imported within `atheris.instrument_imports`.

@@ -50,7 +50,7 @@ from lidarspec.transports.open_url import is_port, live_address
 from tests import made_captures as made
 from tests.calibration_files import write_velodyne_xml
 from tests.every_sensor import distinct_frames, distinct_sensors
-from tests.fuzz.words import HOSTILE, commanded, spoken
+from tests.fuzz.words import HOSTILE, run_command, spoken
 from tests.shapes import SHAPES
 from tests.transports import test_robotics_logs
 
@@ -178,7 +178,7 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
     found.append(
         Target(
             "source",
-            _named,
+            _resolve_text,
             lambda: [
                 b"udp://:2368?src=192.0.2.1",
                 b"serial:///dev/ttyUSB0?baud=9600&dtr=on",
@@ -188,7 +188,7 @@ def targets(folder: Path, sensors: Collection[Sensor]) -> dict[str, Target]:
             lambda: text,
         )
     )
-    found.append(Target("arguments", functools.partial(commanded, folder), spoken))
+    found.append(Target("arguments", functools.partial(run_command, folder), spoken))
     return {target.name: target for target in found}
 
 
@@ -374,18 +374,18 @@ def _file(folder: Path) -> Target:
         with tempfile.TemporaryDirectory() as place:
             topics = {"/p": ("nebula_msgs/msg/NebulaPackets", velodyne)}
             logs = [
-                test_robotics_logs.recorded(Path(place), kind, topics).read_bytes()
+                test_robotics_logs.write_log(Path(place), kind, topics).read_bytes()
                 for kind in ("bag", "mcap")
             ]
         return [
             *logs,
             made.pcap(*map(made.frame, velodyne)),
-            recorded(STL, frames),
-            recorded(VLP, velodyne),
+            write_recording(STL, frames),
+            write_recording(VLP, velodyne),
             b"".join(frames),
             frames[0].hex(" ").encode(),
             gzip.compress(made.pcap(*map(made.frame, velodyne))),
-            lzma.compress(recorded(VLP, velodyne)),
+            lzma.compress(write_recording(VLP, velodyne)),
         ]
 
     return Target(
@@ -410,7 +410,7 @@ def _log(folder: Path, kind: str) -> Target:
     def examples() -> list[bytes]:
         frames = [ls.sensor(VLP).example("data", seed=seed) for seed in range(3)]
         with tempfile.TemporaryDirectory() as place:
-            log = test_robotics_logs.recorded(
+            log = test_robotics_logs.write_log(
                 Path(place), kind, {"/p": ("nebula_msgs/msg/NebulaPackets", frames)}
             )
             return [log.read_bytes()]
@@ -453,7 +453,7 @@ def _manifest(folder: Path) -> Target:
     )
 
 
-def recorded(sensor: str, frames: Iterable[bytes]) -> bytes:
+def write_recording(sensor: str, frames: Iterable[bytes]) -> bytes:
     """A recording of these frames."""
     datagrams = ls.sensor(sensor).datagrams
     sender = {"sender": ("192.0.2.1", 2368), "receiver": ("192.0.2.2", 2368)} if datagrams else {}
@@ -501,7 +501,7 @@ def _recording(folder: Path) -> Target:
 
     def examples() -> list[bytes]:
         return [
-            recorded(name, [ls.sensor(name).example("data", seed=seed) for seed in range(2)])
+            write_recording(name, [ls.sensor(name).example("data", seed=seed) for seed in range(2)])
             for name in (STL, VLP)
         ]
 
@@ -695,7 +695,7 @@ def _calibration(sensor: Sensor, option: str, folder: Path) -> Target:
         if sensor.id == "hesai-at128" and option == "calibration":
             from lidarspec_hesai import at128
 
-            return [at128.TABLE.told()]
+            return [at128.TABLE.to_file()]
         if sensor.id.startswith("velodyne-hdl64e"):
             return [write_velodyne_xml(folder / "db.xml").read_bytes()]
         heading = (
@@ -772,7 +772,7 @@ def _metadata(rows: int) -> bytes:
     ).encode()
 
 
-def _named(data: bytes) -> None:
+def _resolve_text(data: bytes) -> None:
     """What a SOURCE's text says, as far as nothing is opened."""
     text = data.decode("utf-8", "replace")
     is_port(text)

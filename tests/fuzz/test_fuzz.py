@@ -15,7 +15,7 @@ import pytest
 import lidarspec as ls
 from tests.fuzz import trial
 from tests.fuzz.__main__ import ROOT, spread
-from tests.fuzz.campaign import Job, keep, seeded
+from tests.fuzz.campaign import Job, keep, run_mutations
 from tests.fuzz.targets import SHARES, Target, targets
 from tests.representatives import REPRESENTATIVES
 from tests.shapes import SHAPES
@@ -108,9 +108,9 @@ def test_failures_are_found_and_stored(
     monkeypatch.setattr(trial, "BUSY", 0.05)
     target = Target("invented one", run, lambda: [b"abc"])  # type: ignore[arg-type]
     with trial.limits():
-        found = trial.judged(target, b"abc")
+        found = trial.judge(target, b"abc")
         assert found is not None
-        assert trial.judged(Target("invented", lambda data: None, list), b"") is None
+        assert trial.judge(Target("invented", lambda data: None, list), b"") is None
     assert found.what.startswith(what)
     path = keep(tmp_path, found)
     assert (path.read_bytes(), path.parent.name) == (b"abc", "invented.one")
@@ -121,7 +121,7 @@ def test_an_input_that_reaches_new_lines_is_mutated_further(
     known: dict[str, Target], tmp_path: Path
 ) -> None:
     job = Job(known["frame shape-count data"], tmp_path / "kept", seed=1)
-    seeded(job, 100)
+    run_mutations(job, 100)
     assert job.inputs == 100
     assert job.lines > 50
     assert len(list(job.corpus.iterdir())) > 0

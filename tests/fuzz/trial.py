@@ -49,7 +49,7 @@ class Finding:
 
 @contextlib.contextmanager
 def limits() -> Iterator[None]:
-    """A process in which no input takes more memory than it may, and in which `judged` can count
+    """A process in which no input takes more memory than it may, and in which `judge` can count
     its time.
     """
     before = resource.getrlimit(resource.RLIMIT_AS)
@@ -77,7 +77,7 @@ def _late(number: int, frame: FrameType | None) -> NoReturn:
     raise TooLong(f"more than {told}")
 
 
-def judged(target: Target, data: bytes) -> Finding | None:
+def judge(target: Target, data: bytes) -> Finding | None:
     """What is wrong with how an input is read; None where nothing is."""
     signal.setitimer(signal.ITIMER_PROF, BUSY)
     signal.setitimer(signal.ITIMER_REAL, WAITING)

@@ -175,12 +175,12 @@ def _value(name: str, kind: int, choice: int) -> str:
     """A value for an argument or option: mostly one that fits."""
     if kind % 4 == 0:
         return HOSTILE[choice % len(HOSTILE)]
-    known = _known(name)
+    known = _list_known(name)
     return known[choice % len(known)]
 
 
 @functools.cache
-def _known(name: str) -> tuple[str, ...]:
+def _list_known(name: str) -> tuple[str, ...]:
     frames = tuple({frame for sensor in REPRESENTATIVES for frame in ls.sensor(sensor).frames})
     return {
         "verb": tuple(VERBS),
@@ -219,14 +219,14 @@ def _known(name: str) -> tuple[str, ...]:
     }.get(name, (*SOURCES, "1", "2", "10ms", "0:47", "54 2c 68", "points", "max"))
 
 
-def commanded(folder: Path, data: bytes) -> None:
+def run_command(folder: Path, data: bytes) -> None:
     """Run a command line; it ends with one of the documented codes, and nothing that it prints
     calls itself a bug.
 
     Args:
         folder: the working directory, in which the files that it names are made.
     """
-    _filled(folder)
+    _fill_folder(folder)
     line = words(data)
     done = CliRunner(catch_exceptions=False).invoke(main, line, input=b"")
     said = done.output
@@ -238,7 +238,7 @@ def commanded(folder: Path, data: bytes) -> None:
         raise AssertionError(f"{line} ends with {done.exit_code}: {said[-300:]}")
 
 
-def _filled(folder: Path) -> None:
+def _fill_folder(folder: Path) -> None:
     """Make the files that command lines name, where they are not there as they were."""
     for name, content in _contents().items():
         if not (folder / name).is_file() or (folder / name).stat().st_size != len(content):
@@ -250,7 +250,7 @@ def _filled(folder: Path) -> None:
 @functools.cache
 def _contents() -> dict[str, bytes]:
     from tests import made_captures as made
-    from tests.fuzz.targets import recorded
+    from tests.fuzz.targets import write_recording
 
     frames = [ls.sensor("ldrobot-stl27l").example("data", seed=seed) for seed in range(4)]
     datagrams = [ls.sensor("velodyne-vlp16").example("data", seed=seed) for seed in range(3)]
@@ -258,7 +258,7 @@ def _contents() -> dict[str, bytes]:
         "stl.bin": b"".join(frames),
         "stl.hex": frames[0].hex(" ").encode(),
         "vlp.pcap": made.pcap(*map(made.frame, datagrams)),
-        "stl.lsr": recorded("ldrobot-stl27l", frames),
+        "stl.lsr": write_recording("ldrobot-stl27l", frames),
         "empty.bin": b"",
         "noise.bin": bytes(range(256)) * 4,
         "scene.toml": b"[room]\nlow=[-3.0,-2.2,-1.2]\nhigh=[4.6,3.1,1.6]\n",

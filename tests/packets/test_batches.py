@@ -46,7 +46,7 @@ def column(batches: list[Packets], name: str) -> np.ndarray:
     return np.concatenate([getattr(batch, name) for batch in batches])
 
 
-def disturbed(datagrams: list[bytes], draw: random.Random, loss: float) -> list[bytes]:
+def disturb(datagrams: list[bytes], draw: random.Random, loss: float) -> list[bytes]:
     """The datagrams with some lost, some late, some twice, and noise between."""
     left = [datagram for datagram in datagrams if draw.random() >= loss]
     for _ in range(len(left) // 20 if loss else 0):
@@ -71,7 +71,7 @@ def disturbed(datagrams: list[bytes], draw: random.Random, loss: float) -> list[
 def test_batches_do_not_matter(name: str, loss: float) -> None:
     sensor = load_sensor(name)
     draw = random.Random(f"{name} {loss}")
-    datagrams = disturbed(simulate(sensor, 150), draw, loss)
+    datagrams = disturb(simulate(sensor, 150), draw, loss)
     whole, scans, stats = run(sensor, datagrams, [0, len(datagrams)])
     splits = [
         sorted({0, len(datagrams), *(draw.randrange(len(datagrams)) for _ in range(many))})

@@ -19,13 +19,13 @@ from tests.representatives import load_sensor
 UNCOUNTED = ["velodyne-vlp16", "velodyne-hdl32e", "hesai-pandar40p", "hesai-pandar64"]
 
 
-def counted(packets: Packets) -> tuple[int, int, int]:
+def list_losses(packets: Packets) -> tuple[int, int, int]:
     stats = packets.stats
     assert stats.plugin_errors == 0
     return stats.lost, stats.late, stats.duplicates
 
 
-def decoded(sensor: Sensor, frames: Sequence[bytes]) -> Packets:
+def decode(sensor: Sensor, frames: Sequence[bytes]) -> Packets:
     return sensor.decode(list(frames) if sensor.datagrams else b"".join(frames))
 
 
@@ -56,38 +56,38 @@ def test_sensors_with_datagrams_that_count_no_losses_are_known() -> None:
 def test_a_clock_gap_is_a_loss_without_a_counter(name: str, lost: int) -> None:
     sensor = load_sensor(name)
     frames = simulate(sensor, 600)
-    packets = decoded(sensor, frames[:250] + frames[250 + lost :])
-    assert counted(packets) == (lost, 0, 0)
+    packets = decode(sensor, frames[:250] + frames[250 + lost :])
+    assert list_losses(packets) == (lost, 0, 0)
     assert np.flatnonzero(packets.breaks).tolist() == [250]
     assert packets.index.tolist() == [
         int(packets.index[0]) + place for place in range(600) if not 250 <= place < 250 + lost
     ]
-    assert counted(decoded(sensor, frames)) == (0, 0, 0)
+    assert list_losses(decode(sensor, frames)) == (0, 0, 0)
 
 
 def test_a_declared_pace_finds_that_every_second_packet_is_missing() -> None:
     sensor = ls.sensor("velodyne-vlp16")
-    assert counted(sensor.decode(simulate(sensor, 600)[::2])) == (299, 0, 0)
+    assert list_losses(sensor.decode(simulate(sensor, 600)[::2])) == (299, 0, 0)
 
 
 def test_a_clock_too_coarse_for_single_packets_claims_no_more_than_is_sure() -> None:
     """A millisecond is two packets of an STL-27L."""
     sensor = ls.sensor("ldrobot-stl27l")
     frames = simulate(sensor, 3000)
-    assert counted(decoded(sensor, frames)) == (0, 0, 0)
+    assert list_losses(decode(sensor, frames)) == (0, 0, 0)
     for lost in (1, 3, 20, 400):
-        found = counted(decoded(sensor, frames[:2000] + frames[2000 + lost :]))[0]
+        found = list_losses(decode(sensor, frames[:2000] + frames[2000 + lost :]))[0]
         assert lost - 4 - lost // 25 <= found <= lost + lost // 25
 
 
-def swapped(frames: list[bytes]) -> list[bytes]:
+def swap(frames: list[bytes]) -> list[bytes]:
     changed = list(frames)
     for spot in range(50, len(frames) - 10, 37):
         changed[spot], changed[spot + 3] = changed[spot + 3], changed[spot]
     return changed
 
 
-def doubled(frames: list[bytes]) -> list[bytes]:
+def duplicate(frames: list[bytes]) -> list[bytes]:
     return [frame for place, frame in enumerate(frames) for _ in range(1 + (place % 10 == 3))]
 
 
@@ -100,7 +100,7 @@ def doubled_late(frames: list[bytes]) -> list[bytes]:
 
 
 @pytest.mark.parametrize("name", UNCOUNTED)
-@pytest.mark.parametrize("disturbed", [swapped, doubled, doubled_late])
+@pytest.mark.parametrize("disturbed", [swap, duplicate, doubled_late])
 def test_order_follows_the_clock_without_a_counter(
     name: str, disturbed: Callable[[list[bytes]], list[bytes]]
 ) -> None:
@@ -109,9 +109,9 @@ def test_order_follows_the_clock_without_a_counter(
     changed = disturbed(frames)
     assert changed != frames
     packets = sensor.decode(changed)
-    lost, late, duplicates = counted(packets)
+    lost, late, duplicates = list_losses(packets)
     assert (lost, duplicates) == (0, len(changed) - len(frames))
-    assert (late > 0) == (disturbed is swapped)
+    assert (late > 0) == (disturbed is swap)
     for scan, same in itertools.zip_longest(sensor.scans(changed), sensor.scans(frames)):
         assert (len(scan), scan.complete, scan.stamp_ns) == (
             len(same),
@@ -128,14 +128,14 @@ def test_packets_of_one_time_that_differ_are_not_doubles() -> None:
     sensor = ls.sensor("velodyne-vlp16")
     frames = simulate(sensor, 100)
     other = frames[51][:1200] + frames[50][1200:]
-    assert counted(sensor.decode([*frames[:51], other, *frames[52:]]))[2] == 0
+    assert list_losses(sensor.decode([*frames[:51], other, *frames[52:]]))[2] == 0
 
 
 @pytest.mark.parametrize("lost", [300, 629, 630, 631, 6300, 118_976])
 def test_losses_beyond_a_counter_wrap_are_counted_by_the_clock(lost: int) -> None:
     sensor = ls.sensor("robosense-m1")
     packets = sensor.decode(simulate(sensor, 700) + simulate(sensor, 700, start=700 + lost))
-    assert counted(packets) == (lost, 0, 0)
+    assert list_losses(packets) == (lost, 0, 0)
     assert int(packets.breaks.sum()) == 1
 
 
@@ -151,7 +151,7 @@ def test_a_counter_that_jumps_without_the_clock_is_damage_and_no_loss(counter: i
     frames = simulate(sensor, 300)
     damaged = sensor.build("data", {**sensor.parse(frames[100]), "number": counter})
     packets = sensor.decode([*frames[:100], damaged, *frames[101:]])
-    assert counted(packets) == (0, 0, 0)
+    assert list_losses(packets) == (0, 0, 0)
     assert np.diff(packets.index).tolist() == [1] * 299
     assert not packets.breaks.any()
 
@@ -161,7 +161,7 @@ def test_a_restarted_counter_with_a_continuing_clock() -> None:
     frames = simulate(sensor, 200) + [
         helios(number, number - 200) for number in range(200, 230) if number not in (210, 211)
     ]
-    assert counted(sensor.decode(frames)) == (2, 0, 0)
+    assert list_losses(sensor.decode(frames)) == (2, 0, 0)
 
 
 def test_one_damaged_reading_of_the_clock_loses_nothing() -> None:
@@ -170,7 +170,7 @@ def test_one_damaged_reading_of_the_clock_loses_nothing() -> None:
     for reading in (1_000_000_000, 3_000_000_000):
         damaged = frames[300][:1200] + reading.to_bytes(4, "little") + frames[300][1204:]
         packets = sensor.decode([*frames[:300], damaged, *frames[301:]])
-        assert counted(packets) == (0, 0, 0)
+        assert list_losses(packets) == (0, 0, 0)
         assert np.flatnonzero(packets.breaks).tolist() == [300, 301]
 
 
@@ -179,7 +179,7 @@ def test_clock_changes_and_restarts_are_no_loss() -> None:
         sensor = ls.sensor(name)
         frames = simulate(sensor, 2000)
         for again in (frames[:300] + frames[:300], frames[1000:1300] + frames[:300]):
-            assert counted(sensor.decode(again))[0] <= 630
+            assert list_losses(sensor.decode(again))[0] <= 630
 
 
 def test_a_clock_without_a_declared_pace_counts_no_loss() -> None:
@@ -188,7 +188,7 @@ def test_a_clock_without_a_declared_pace_counts_no_loss() -> None:
     sensor = dataclasses.replace(vlp16, clock=dataclasses.replace(vlp16.clock, pace=None))
     frames = simulate(vlp16, 600)
     packets = sensor.decode(frames[:300] + frames[310:])
-    assert counted(packets) == (0, 0, 0)
+    assert list_losses(packets) == (0, 0, 0)
     assert vlp16.counts_losses
     assert not sensor.counts_losses
 
@@ -201,7 +201,7 @@ def test_one_damaged_counter_without_a_pace_is_two_breaks_and_no_loss(
     sensor = ls.sensor("robosense-helios16p")
     frames = simulate(sensor, 300)
     packets = sensor.decode([*frames[:200], helios(200, counter), *frames[201 + lost :]])
-    assert counted(packets) == (0, 0, 0)
+    assert list_losses(packets) == (0, 0, 0)
     assert np.flatnonzero(packets.breaks).tolist() == [200, 201]
 
 
@@ -228,7 +228,7 @@ def test_pieces_do_not_matter(name: str, seed: int) -> None:
 def test_a_looped_recording_continues(name: str) -> None:
     sensor = ls.sensor(name)
     packets = sensor.decode(simulate(sensor, 630) * 4)
-    assert counted(packets) == (0, 0, 0)
+    assert list_losses(packets) == (0, 0, 0)
     assert packets.breaks.sum() == (0 if name == "robosense-m1" else 3)
     assert sum(len(scan) for scan in sensor.scans(simulate(sensor, 630) * 4)) == len(
         packets.points()

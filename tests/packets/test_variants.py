@@ -21,7 +21,7 @@ from tests.shapes import headed, lengths
 PLAIN, COUNTED = (lengths.SENSOR.configure(answer=name) for name in ("plain", "counted"))
 
 
-def counted(*numbers: int) -> list[bytes]:
+def make_frames(*numbers: int) -> list[bytes]:
     return [
         COUNTED.build(
             "counted", azimuth=100 * number % 36_000, distances=[1000] * 3, counter=number
@@ -72,7 +72,7 @@ def test_a_file_is_read_by_the_form_in_it(form: Sensor, tmp_path: Path) -> None:
 
 
 def test_only_frames_with_the_counter_are_counted() -> None:
-    assert lengths.SENSOR.decode(counted(3, 4, 9)).stats.lost == 4
+    assert lengths.SENSOR.decode(make_frames(3, 4, 9)).stats.lost == 4
     plain = lengths.SENSOR.decode(simulate(PLAIN, 5))
     assert plain.index.tolist() == [0, 1, 2, 3, 4]
     assert (plain.stats.lost, plain.stats.duplicates, plain.stats.plugin_errors) == (0, 0, 0)

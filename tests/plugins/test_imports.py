@@ -74,7 +74,7 @@ print(json.dumps(sorted(set(sys.modules) - before)))
 """
 
 
-def loaded(code: str) -> set[str]:
+def list_imported(code: str) -> set[str]:
     """The modules that a new process imports for this, beyond NumPy, construct and pluggy."""
     done = subprocess.run(
         [sys.executable, "-c", LOADED.format(code)],
@@ -87,7 +87,7 @@ def loaded(code: str) -> set[str]:
 
 
 def test_finding_a_sensor_imports_neither_the_engine_nor_other_plugins() -> None:
-    found = loaded("ls.sensor('ldrobot-stl27l')")
+    found = list_imported("ls.sensor('ldrobot-stl27l')")
     assert {name for name in found if name.startswith("lidarspec_")} == {"lidarspec_ldrobot"}
     assert {
         name.removeprefix("lidarspec.") for name in found if name.startswith("lidarspec.")
@@ -96,7 +96,7 @@ def test_finding_a_sensor_imports_neither_the_engine_nor_other_plugins() -> None
 
 
 def test_a_method_brings_the_engine() -> None:
-    assert "lidarspec.framing.decoder" in loaded("ls.sensor('ldrobot-stl27l').decoder()")
+    assert "lidarspec.framing.decoder" in list_imported("ls.sensor('ldrobot-stl27l').decoder()")
 
 
 def test_importing_the_package_imports_no_library() -> None:

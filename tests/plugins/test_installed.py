@@ -322,7 +322,7 @@ def test_hooks_apply_to_sensors_of_entry_points(
         found.sensor("acme-x1")
 
 
-def claimed(*claims: str, owners: dict[str, str] | None = None) -> Registry:
+def make_registry(*claims: str, owners: dict[str, str] | None = None) -> Registry:
     """A registry of sensors that distributions offer, each given as "distribution: name = module,
     ..."; an alias as "name = module:id".
     """
@@ -348,7 +348,7 @@ OWNED = "lidarspec-acme: acme-x1 = acme, acme-x2 = acme"
 def test_the_owner_of_an_id_has_it_and_the_other_keeps_the_rest(
     plugins: dict[str, SimpleNamespace], asked: list[str], stranger: str
 ) -> None:
-    found = claimed(f"{stranger}: acme-x2 = again, acme-x3 = again", OWNED)
+    found = make_registry(f"{stranger}: acme-x2 = again, acme-x3 = again", OWNED)
     for name in asked:
         found.sensor(name)
     assert {name: sensor.model for name, sensor in found.sensors().items()} == {
@@ -368,7 +368,7 @@ def test_the_owner_of_an_id_has_it_and_the_other_keeps_the_rest(
 
 
 def test_whom_the_user_names_comes_before_the_vendor(plugins: dict[str, SimpleNamespace]) -> None:
-    found = claimed(
+    found = make_registry(
         "my-fork: acme-x2 = again, acme-x3 = again", OWNED, owners={"acme-x2": "My_Fork"}
     )
     assert {name: sensor.model for name, sensor in found.sensors().items()} == {
@@ -401,7 +401,7 @@ def test_an_alias_without_entry_point_belongs_to_its_owner(
         plugins["liar"].by_name["liar_x1"], aliases=("b-one", "acme-x1")
     )
     strangers = "a-stranger: liar-x1 = liar"
-    found = claimed(strangers, "lidarspec-beta: beta-x1 = beta, b-one = beta:beta-x1", OWNED)
+    found = make_registry(strangers, "lidarspec-beta: beta-x1 = beta, b-one = beta:beta-x1", OWNED)
     for _ in range(2):  # before the stranger's is loaded, and after
         assert (found.sensor("b-one").id, found.sensor("acme-x1").model) == ("beta-x1", "acme")
         assert found.sensor("liar-x1").id == "liar-x1"
@@ -409,7 +409,7 @@ def test_an_alias_without_entry_point_belongs_to_its_owner(
     plugins["again"].by_name["b_one"] = replace(
         plugins["again"].by_name["acme_x3"], aliases=("b-one",)
     )
-    found = claimed(
+    found = make_registry(
         "a-stranger: b-one = again, acme-x3 = again",
         "lidarspec-beta: beta-x1 = beta, b-one = beta:beta-x1",
     )
@@ -420,7 +420,7 @@ def test_an_alias_without_entry_point_belongs_to_its_owner(
 def test_an_id_without_owner_is_an_error_only_when_used(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
-    found = claimed(
+    found = make_registry(
         "one-lidars: acme-x2 = again, acme-x3 = again", "two-lidars: acme-x1 = acme, acme-x2 = acme"
     )
     with pytest.raises(
@@ -439,7 +439,7 @@ def test_an_id_without_owner_is_an_error_only_when_used(
 def test_a_broken_owner_is_not_replaced(
     plugins: dict[str, SimpleNamespace],
 ) -> None:
-    found = claimed(
+    found = make_registry(
         "a-stranger: acme-x2 = again", "lidarspec-acme: acme-x2 = a_module_that_nobody_has"
     )
     with pytest.raises(UnknownSensor):

@@ -36,7 +36,7 @@ def turning(f: Fields) -> Any:
     return -np.deg2rad(spread(f.start_angle, f.end_angle, 12, full=360))
 
 
-def fixed(f: Fields) -> Any:
+def fixed_directions(f: Fields) -> Any:
     return np.deg2rad(f.start_angle + OFFSETS)
 
 
@@ -48,7 +48,7 @@ def alike(f: Fields) -> Any:
     return np.deg2rad(f.start_angle + np.full(12, 3.0))
 
 
-@pytest.mark.parametrize("azimuth", [turning, fixed, both, alike])
+@pytest.mark.parametrize("azimuth", [turning, fixed_directions, both, alike])
 @pytest.mark.parametrize("narrow", [True, False])
 def test_points_are_those_of_the_plain_evaluation(
     stl27l: Sensor, azimuth: Any, narrow: bool
@@ -63,7 +63,7 @@ def test_points_are_those_of_the_plain_evaluation(
     assert_same_points(evaluate(packets).cloud, evaluate_plainly(packets).cloud)
 
 
-@pytest.mark.parametrize("azimuth", [turning, fixed])
+@pytest.mark.parametrize("azimuth", [turning, fixed_directions])
 def test_cosines_and_sines_are_nearly_as_exact_as_float32_can_be(
     stl27l: Sensor, azimuth: Any
 ) -> None:

@@ -50,7 +50,7 @@ def values_of(name: str) -> list[Any]:
     return [0, 1, -1, least, -least - 1, 1234, -999]
 
 
-def moved(f: Any) -> Cartesian:
+def move_points(f: Any) -> Cartesian:
     """As an extrinsic calibration moves them, and by a row of numbers."""
     x, y, z = f.points.x, f.points.y, f.points.z
     return Cartesian(
@@ -64,7 +64,7 @@ def moved(f: Any) -> Cartesian:
 
 @BACKENDS
 @pytest.mark.parametrize("name", [sensor.id for sensor in SENSORS])
-@pytest.mark.parametrize("points", [None, moved])
+@pytest.mark.parametrize("points", [None, move_points])
 def test_coordinates_are_the_same_bit_by_bit(name: str, points: Any, backend: str) -> None:
     sensor = dataclasses.replace(SHAPES[name], points=points or SHAPES[name].points)
     edges = itertools.product(values_of(name), repeat=3)
@@ -129,7 +129,7 @@ def is_planned(cloud: LazyCloud) -> bool:
     return isinstance(cloud.lazy.source, BatchColumns)
 
 
-def scaled(backend: str, **values: Any) -> tuple[LazyCloud, LazyCloud]:
+def decode_scaled(backend: str, **values: Any) -> tuple[LazyCloud, LazyCloud]:
     """Return the points of two frames with a float scale, by both evaluators.
 
     The second frame has the given values.
@@ -153,7 +153,7 @@ def test_floating_point_fields_are_planned(backend: str) -> None:
         dict(strengths=[*ODD[:6]]),
         dict(strengths=[*ODD[6:]]),
     ):
-        found, plain = scaled(backend, **values)
+        found, plain = decode_scaled(backend, **values)
         assert is_planned(found)
         assert_same_points(found, plain)
     assert found.range[3] == 2.0
@@ -168,11 +168,11 @@ def test_floating_point_fields_are_planned(backend: str) -> None:
 @BACKENDS
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e-45, 3e38, -1.0])
 def test_extreme_floats_use_the_reference_evaluator(number: float, backend: str) -> None:
-    found, plain = scaled(backend, scale=number)
+    found, plain = decode_scaled(backend, scale=number)
     assert not is_planned(found)
     assert_same_points(found, plain)
     if number != -1:
-        found, plain = scaled(backend, tilt=number)
+        found, plain = decode_scaled(backend, tilt=number)
         assert not is_planned(found)
         assert_same_points(found, plain)
     assert_well_formed(found)

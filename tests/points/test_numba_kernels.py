@@ -137,7 +137,7 @@ def answers_in(module: str) -> list[tuple[Sensor, str]]:
     return list(answers.values())
 
 
-def simulated(sensor: Sensor, answer: str, backend: str, number: int = 2 * MANY) -> Packets:
+def decode_simulated(sensor: Sensor, answer: str, backend: str, number: int = 2 * MANY) -> Packets:
     configured = sensor if answer == sensor.data_frame else sensor.configure(answer=answer)
     frames = simulate(configured, number)
     data: Any = frames
@@ -151,7 +151,7 @@ def simulated(sensor: Sensor, answer: str, backend: str, number: int = 2 * MANY)
 def test_every_installed_sensor_has_a_kernel(module: str) -> None:
     for sensor, answer in answers_in(module):
         made = plan(
-            simulated(sensor, answer, "numpy", number=max(sensor.frames[answer].confirm, 2))
+            decode_simulated(sensor, answer, "numpy", number=max(sensor.frames[answer].confirm, 2))
         )
         assert "def kernel(" in write_kernel(made, tuple(made.expressions), made.varying).source, (
             sensor.id
@@ -173,7 +173,7 @@ def test_kernels_of_every_sensor_give_the_plain_points(module: str) -> None:
 
 
 def assert_kernel_gives_the_plain_points(sensor: Sensor, answer: str) -> None:
-    packets = simulated(sensor, answer, "jit")
+    packets = decode_simulated(sensor, answer, "jit")
     cloud = packets.points()
     assert_same_points(cloud, evaluate_plainly(packets).cloud, ulps=ULPS)
     assert cloud.valid.any(), sensor.id

@@ -27,7 +27,7 @@ from tests.agreement import assert_same_points
 from tests.broken import sound
 from tests.by_construct import reader
 from tests.engine.against_construct import clouds_agree, sensor
-from tests.engine.random_specs import made
+from tests.engine.random_specs import make_struct
 from tests.installed import distinct_sensors_in, sensor_modules
 from tests.points.backends import BACKENDS
 from tests.representatives import REPRESENTATIVES, load_sensor
@@ -175,7 +175,7 @@ def test_a_zero_or_negative_factor_gives_no_points() -> None:
 )
 def test_arrays_with_equal_layouts_are_distinguished(text: str) -> None:
     """Blocks of elements had the offset of any field of this form, and ran past the frame."""
-    struct = made(text)
+    struct = make_struct(text)
     frames = [sensor(struct).example("data", seed=seed) for seed in range(5)]
     assert clouds_agree(struct, frames, backends=("numpy",)) or "z" in text
 
@@ -227,7 +227,7 @@ def test_sensors_that_share_a_points_function_keep_their_own_scales(backend: str
     """
     for unit in (0.001, 0.002):
         sample = Struct("distance" / Scaled(Int16ul, unit, "m"), "quality" / Int8ul)
-        made = sound.sensor(sound.frame(sound.sealed(samples=Array(this.count, sample))))
+        made = sound.sensor(sound.frame(sound.make_frame(samples=Array(this.count, sample))))
         cloud = made.decode(b"".join(simulate(made, 40)), backend=backend).points()
         plain = reader(made, "construct").decode(b"".join(simulate(made, 40))).points()
         assert cloud.valid.any()

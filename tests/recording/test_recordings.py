@@ -336,7 +336,7 @@ for number in range(10**9):
 """
 
 
-def killed(path: Path, after: float) -> int:
+def kill_recorder(path: Path, after: float) -> int:
     """The last number that a recorder acknowledged before it was killed."""
     with subprocess.Popen(
         [sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE
@@ -357,7 +357,7 @@ def test_kill_9_loses_no_acknowledged_record(tmp_path: Path, times: int) -> None
     source = random.Random(times)
     for attempt in range(times):
         path = tmp_path / f"{attempt}.lsr"
-        last = killed(path, source.uniform(0, 0.1))
+        last = kill_recorder(path, source.uniform(0, 0.1))
         with Recording(path) as recording:
             numbers = [item.at for item in recording]
             assert numbers == list(range(len(numbers)))

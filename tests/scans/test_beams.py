@@ -17,7 +17,7 @@ from lidarspec.points.mount import Mount
 from lidarspec.scans.beams import PlanarScans
 
 
-def simulated(name: str, packets: int = 1000) -> list[Scan]:
+def simulate_scans(name: str, packets: int = 1000) -> list[Scan]:
     """The whole scans of a simulated sensor."""
     sensor = ls.sensor(name)
     return [scan for scan in sensor.scans(simulate(sensor, packets)) if scan.whole]
@@ -38,7 +38,7 @@ def beams_of(one: LaserScan, scan: Scan) -> np.ndarray:
 def test_a_sensor_that_looks_one_way_has_one_beam() -> None:
     for planes in (PlanarScans(), PlanarScans(beams=360), PlanarScans(field=(-1.0, 1.0))):
         for scan, one in zip(
-            scans := simulated("benewake-tfmini"), planar(planes, scans), strict=True
+            scans := simulate_scans("benewake-tfmini"), planar(planes, scans), strict=True
         ):
             assert one.ranges.tolist() == [scan.points.range[scan.points.valid].min()]
             assert one.angle_min == one.angle_max == 0
@@ -51,7 +51,7 @@ TEXT = [pytest.param(name, marks=pytest.mark.slow) for name in ("hokuyo-utm30lx"
 @pytest.mark.parametrize("name", ["ldrobot-stl27l", *TEXT])
 def test_each_beam_is_as_late_as_its_points(name: str) -> None:
     """Within three beams, and two steps of a clock that counts in ms."""
-    scans = simulated(name)
+    scans = simulate_scans(name)
     found = planar(PlanarScans(), scans)
     assert len(found) > 2
     assert (
@@ -72,7 +72,7 @@ def test_each_beam_is_as_late_as_its_points(name: str) -> None:
 
 
 def test_beams_cover_the_field_of_view() -> None:
-    scan, *_ = simulated("hokuyo-utm30lx")
+    scan, *_ = simulate_scans("hokuyo-utm30lx")
     (one,) = planar(PlanarScans(), [scan])
     assert (math.degrees(one.angle_min), math.degrees(one.angle_max)) == pytest.approx((-135, 135))
     assert len(one.ranges) == len(scan) == 1081
@@ -88,7 +88,7 @@ def test_beams_cover_the_field_of_view() -> None:
 
 
 def test_a_requested_field_has_its_share_of_the_beams() -> None:
-    scans = simulated("ldrobot-stl27l")
+    scans = simulate_scans("ldrobot-stl27l")
     (whole, *_), (half, *_) = (
         planar(PlanarScans(), scans),
         planar(PlanarScans(field=(-math.pi / 2, math.pi / 2)), scans),
@@ -101,7 +101,7 @@ def test_a_requested_field_has_its_share_of_the_beams() -> None:
 
 
 def test_a_sensor_upside_down_is_planar_and_mirrored() -> None:
-    scans = simulated("ldrobot-stl27l")
+    scans = simulate_scans("ldrobot-stl27l")
     over = [replace(scan, points=Mount(inverted=True).apply(scan.points)) for scan in scans]
     (one, *_), (other, *_) = (
         planar(PlanarScans(360, (-math.pi / 2, math.pi / 2)), scans),
@@ -112,7 +112,7 @@ def test_a_sensor_upside_down_is_planar_and_mirrored() -> None:
 
 
 def test_a_ring_or_a_layer_of_a_sensor_of_several_is_planar() -> None:
-    scans = [scan for scan in simulated("velodyne-vlp16") if scan.complete]
+    scans = [scan for scan in simulate_scans("velodyne-vlp16") if scan.complete]
     scan = scans[0]
     assert PlanarScans().project(scan) is None
     (ring, *_) = planar(PlanarScans(1800, ring=15), scans)
@@ -127,4 +127,4 @@ def test_a_ring_or_a_layer_of_a_sensor_of_several_is_planar() -> None:
     with pytest.raises(UsageError, match="ring 16"):
         PlanarScans(ring=16).project(scan)
     with pytest.raises(UsageError, match="ring 1 "):
-        PlanarScans(ring=1).project(simulated("ldrobot-stl27l")[0])
+        PlanarScans(ring=1).project(simulate_scans("ldrobot-stl27l")[0])

@@ -148,14 +148,16 @@ def test_scans_of_data_without_an_end_are_warned_of() -> None:
 
 
 @functools.cache
-def simulated(name: str, number: int) -> list[bytes]:
+def simulate_packets(name: str, number: int) -> list[bytes]:
     return simulate(ls.sensor(name), number)
 
 
 def scans_without(name: str, lost: Collection[int], number: int = 4000) -> list[Scan]:
     """The scans of simulated frames some of which are missing."""
     sensor = ls.sensor(name)
-    frames = [frame for place, frame in enumerate(simulated(name, number)) if place not in lost]
+    frames = [
+        frame for place, frame in enumerate(simulate_packets(name, number)) if place not in lost
+    ]
     return list(
         sensor.scans(
             frames if sensor.datagrams else b"".join([make_opening_frame(sensor), *frames])

@@ -46,7 +46,7 @@ def on(sensor: Sensor, **options: object) -> SimulatedDevice:
     return device
 
 
-def asked(device: SimulatedDevice, name: str, now: int, **arguments: object) -> bytes:
+def send_command(device: SimulatedDevice, name: str, now: int, **arguments: object) -> bytes:
     """What comes at once for a command."""
     command = device.sensor.commands[name]
     device.receive(device.sensor.command(name, **arguments), now, command.link)
@@ -60,7 +60,9 @@ def passing(device: SimulatedDevice, start: int, end: int, step: int = 10 * MS) 
 def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
     device = on(mini())
     assert passing(device, 0, 2 * SECOND) == b""
-    assert asked(device, "start", 2 * SECOND) == bytes.fromhex("A55A 50 07 03 000000000000 AB")
+    assert send_command(device, "start", 2 * SECOND) == bytes.fromhex(
+        "A55A 50 07 03 000000000000 AB"
+    )
     settling = passing(device, 2 * SECOND, 3 * SECOND)
     assert len(settling) == 14
     assert set(settling) == {0xFE, 0xFF}
@@ -68,7 +70,7 @@ def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
     information = bytes.fromhex("A55A 1400 0304 01 4D3143315F4D696E69000000 0C00 00 01 000000 04")
     assert rest.startswith(information + bytes.fromhex("A55A 0000 8001 81") + b"\xaa\x55")
     assert [item.frame for item in mini().split(rest)[:3]] == ["info", "scan_start", "data"]
-    stop = asked(device, "stop", 4 * SECOND)
+    stop = send_command(device, "stop", 4 * SECOND)
     assert stop == bytes.fromhex("A55A 55 07 00000000000000 AD")
     assert passing(device, 4 * SECOND, 5 * SECOND) == b""
     assert device.commands_received == ["start", "stop"]
@@ -76,7 +78,7 @@ def test_the_m1c1_mini_starts_as_its_manual_says() -> None:
 
 def test_a_simulated_coin_d4_starts_like_the_captured_one() -> None:
     device = on(ls.sensor("cspc-coin-d4"), seed=4)
-    started = asked(device, "start", 0) + passing(device, 0, SECOND + 5 * MS)
+    started = send_command(device, "start", 0) + passing(device, 0, SECOND + 5 * MS)
     captured = (
         bytes.fromhex("a55a500701000000000000a9 fafa a55a1400e30201")
         + b"COIN-D4"
@@ -89,16 +91,16 @@ def test_a_simulated_coin_d4_starts_like_the_captured_one() -> None:
 
 def test_commands_without_an_answer_get_none_and_noise_is_ignored() -> None:
     device = on(mini())
-    assert asked(device, "low_exposure", 0) == b""
+    assert send_command(device, "low_exposure", 0) == b""
     device.receive(b"\x00\xaa\x55garbage", 0)
-    assert asked(device, "get_version", SECOND)[2] == 0xFC ^ 0xA0
+    assert send_command(device, "get_version", SECOND)[2] == 0xFC ^ 0xA0
     assert device.commands_received == ["low_exposure", "get_version"]
 
 
 def test_answers_stand_in_the_form_of_their_frames() -> None:
     device = on(ls.sensor("hokuyo-ust10lx"))
-    assert asked(device, "stop", 0) == b"QT\n00P\n\n"
-    assert asked(device, "get_time", MS) == b"TM1\n00P\n00000\n\n"
+    assert send_command(device, "stop", 0) == b"QT\n00P\n\n"
+    assert send_command(device, "get_time", MS) == b"TM1\n00P\n00000\n\n"
 
 
 def test_half_a_command_is_forgotten_when_the_line_falls_silent() -> None:
@@ -106,31 +108,33 @@ def test_half_a_command_is_forgotten_when_the_line_falls_silent() -> None:
     device.receive(b"\xa5\xa5\xff", 0)  # the beginning of a request with a long payload
     device.receive(a1().command("get_info"), 10 * MS)
     assert device.outgoing(10 * MS) == []
-    assert a1().parse(asked(device, "get_health", 200 * MS)).status == 0
+    assert a1().parse(send_command(device, "get_health", 200 * MS)).status == 0
 
 
 def test_an_rplidar_reports_its_identity_and_scans_in_the_requested_mode() -> None:
     device = on(a1())
-    info = a1().parse(asked(device, "get_info", 0))
+    info = a1().parse(send_command(device, "get_info", 0))
     assert (info.model, info.firmware_major, info.firmware_minor, info.hardware) == (0x18, 1, 29, 7)
-    assert a1().parse(asked(device, "get_mode_count", 0)).value.mode_count == 4
+    assert a1().parse(send_command(device, "get_mode_count", 0)).value.mode_count == 4
     assert (
-        a1().parse(asked(device, "get_us_per_sample", 0, mode=3)).value.us_per_sample == 127 * 256
+        a1().parse(send_command(device, "get_us_per_sample", 0, mode=3)).value.us_per_sample
+        == 127 * 256
     )
     assert (
-        bytes(a1().parse(asked(device, "get_mode_name", 0, mode=3)).value.data) == b"Sensitivity\0"
+        bytes(a1().parse(send_command(device, "get_mode_name", 0, mode=3)).value.data)
+        == b"Sensitivity\0"
     )
-    assert asked(device, "get_mode_name", 0, mode=9) == b""
+    assert send_command(device, "get_mode_name", 0, mode=9) == b""
     types = [
-        a1().parse(asked(device, "get_answer_type", 0, mode=mode)).value.answer_type
+        a1().parse(send_command(device, "get_answer_type", 0, mode=mode)).value.answer_type
         for mode in range(4)
     ]
     kinds = {}
     for mode, kind in enumerate(types):
         started = (
-            asked(device, "express_scan", mode * SECOND, mode=mode)
+            send_command(device, "express_scan", mode * SECOND, mode=mode)
             if mode
-            else asked(device, "scan", 0)
+            else send_command(device, "scan", 0)
         )
         started += passing(device, mode * SECOND, mode * SECOND + SECOND // 2)
         assert a1().parse(started[:7])["type"] == kind
@@ -144,18 +148,18 @@ def test_an_rplidar_reports_its_identity_and_scans_in_the_requested_mode() -> No
         2: ["ultra", "ultra_descriptor"],
         3: ["ultra", "ultra_descriptor"],
     }
-    assert b"\xa5\x5a\x14" not in asked(
+    assert b"\xa5\x5a\x14" not in send_command(
         device, "get_info", 5 * SECOND
     )  # answered only while it does not scan
     assert device.commands_received[-1] == "get_info"
-    assert asked(device, "stop", 5 * SECOND).count(b"\xa5\x5a") == 0
-    assert a1().parse(asked(device, "get_info", 5 * SECOND)).hardware == 7
+    assert send_command(device, "stop", 5 * SECOND).count(b"\xa5\x5a") == 0
+    assert a1().parse(send_command(device, "get_info", 5 * SECOND)).hardware == 7
     assert passing(device, 5 * SECOND, 6 * SECOND) == b""
 
 
 def test_an_unsupported_scan_mode_starts_nothing() -> None:
     device = on(a1())
-    assert asked(device, "express_scan", 0, mode=9) + passing(device, 0, SECOND) == b""
+    assert send_command(device, "express_scan", 0, mode=9) + passing(device, 0, SECOND) == b""
 
 
 def test_other_frames_come_at_their_own_rate_with_the_defaults_of_the_spec() -> None:
@@ -321,15 +325,15 @@ def test_the_plug_is_pulled_and_put_in_again() -> None:
     device.receive(mini().command("start"), 3 * SECOND + SECOND // 2)
     assert passing(device, 3 * SECOND, 6 * SECOND) == b""
     assert device.present
-    assert asked(device, "start", 6 * SECOND + 10 * MS)
+    assert send_command(device, "start", 6 * SECOND + 10 * MS)
     assert passing(device, 6 * SECOND + 20 * MS, 7 * SECOND)
     assert device.outgoing(7 * SECOND) == []
 
 
 def test_a_start_begins_anew() -> None:
     device = on(a1())
-    first = asked(device, "scan", 0) + passing(device, 0, SECOND)
-    again = asked(device, "scan", SECOND) + passing(device, SECOND, 2 * SECOND)
+    first = send_command(device, "scan", 0) + passing(device, 0, SECOND)
+    again = send_command(device, "scan", SECOND) + passing(device, SECOND, 2 * SECOND)
     assert again[:7] == first[:7]
     assert a1().decode(first + again).stats.bytes_skipped == 0
 

@@ -38,7 +38,7 @@ REACH = {"short": 4.095, "one_short": 4.095}
 SHAPE = count.SENSOR
 
 
-def placed(cloud: ls.PointCloud, packets: int) -> NDArray[np.float64]:
+def take_coordinates(cloud: ls.PointCloud, packets: int) -> NDArray[np.float64]:
     """The coordinates of the valid points; those of the last packet are left out, where directions
     ask for what follows.
     """
@@ -64,7 +64,7 @@ def half_step(sensor: Sensor, frame: str) -> float:
     return float(max(metres, default=BY_HEADER) / 2 * corner)
 
 
-def streamed(sensor: Sensor, seconds: float, room: Room) -> tuple[list[bytes], SimulatedDevice]:
+def run_device(sensor: Sensor, seconds: float, room: Room) -> tuple[list[bytes], SimulatedDevice]:
     """What a device sends in so many seconds of its time, opened as a program would."""
     device = SimulatedDevice(sensor, scene=room)
     device.start(0)
@@ -78,7 +78,7 @@ def streamed(sensor: Sensor, seconds: float, room: Room) -> tuple[list[bytes], S
     return out, device
 
 
-def _seen(
+def _find_hits(
     sensor: Sensor, frame: str, cloud: ls.PointCloud, room: Room, numbers: range
 ) -> NDArray[np.bool_]:
     """Which beams meet something that is neither too near nor too far for the sensor, by the width
@@ -110,10 +110,11 @@ def assert_scene_comes_back(sensor: Sensor, frame: str, room: Room, *, number: i
         sensor = sensor.configure(answer=frame)
     frames = simulate(sensor, number, start=5, scene=room)
     cloud = sensor.decode(frames if sensor.datagrams else b"".join(frames)).points()
-    seen = _seen(sensor, frame, cloud, room, range(5, 5 + number))
+    seen = _find_hits(sensor, frame, cloud, room, range(5, 5 + number))
     assert cloud.valid[seen].mean() > 0.98
     assert (
-        distance_outside(room, placed(cloud, len(frames))).max() < half_step(sensor, frame) + EXACT
+        distance_outside(room, take_coordinates(cloud, len(frames))).max()
+        < half_step(sensor, frame) + EXACT
     )
 
 
@@ -136,7 +137,7 @@ def test_every_kind_of_data_frame_of_a_sensor_gives_the_scene_back(name: str) ->
 @pytest.mark.parametrize("name", REPRESENTATIVES)
 def test_the_bytes_of_a_device_decode_to_the_scene_without_a_byte_too_many(name: str) -> None:
     sensor, room = ls.sensor(name), Room()
-    out, device = streamed(
+    out, device = run_device(
         sensor, 0.12 if sensor.datagrams else 1.3, room
     )  # a turn is sent by then
     packets = sensor.decode(out if sensor.datagrams else b"".join(out))
@@ -148,7 +149,7 @@ def test_the_bytes_of_a_device_decode_to_the_scene_without_a_byte_too_many(name:
     )  # two stray bytes that a COIN-D4 was seen to send
     assert (packets.stats.lost, packets.stats.plugin_errors) == (0, 0)
     assert (
-        distance_outside(room, placed(cloud, len(packets))).max()
+        distance_outside(room, take_coordinates(cloud, len(packets))).max()
         < half_step(sensor, packets.frame) + EXACT
     )
     assert set(np.round(np.sign(np.diff(packets.time_ns))).tolist()) <= {0.0, 1.0}
@@ -199,7 +200,7 @@ def test_scenes_move_with_the_time_of_the_device() -> None:
         ls.sensor("ldrobot-stl27l"),
         Room(boxes=(), movers=(Mover((0.3, 0.3, 2), ((1.5, -1), (1.5, 1)), speed=1.0, floor=-1),)),
     )
-    out, _ = streamed(sensor, 2.05, scene)
+    out, _ = run_device(sensor, 2.05, scene)
     whole = [scan.points for scan in sensor.scans(b"".join(out)) if scan.complete]
     seen = [
         np.median(points.y[(points.range < 2) & (np.abs(points.y) < 1.3) & (points.x > 1)])
@@ -299,7 +300,7 @@ def test_coordinates_give_the_scene_back_along_the_directions_that_are_declared(
 ) -> None:
     room = make_room(3)
     room = Room(room.walls, room.boxes)
-    out, device = streamed(sensor, 1.3, room)
+    out, device = run_device(sensor, 1.3, room)
     packets = sensor.decode(out)
     cloud = packets.points()
     assert (packets.stats.frames, packets.stats.lost) == (dict(device.sent), 0)
@@ -312,7 +313,7 @@ def test_coordinates_give_the_scene_back_along_the_directions_that_are_declared(
     np.testing.assert_allclose(cloud.azimuth, declared, atol=step + 1e-6)
 
 
-def turned(f: Any) -> Cartesian:
+def turn_points(f: Any) -> Cartesian:
     """Two returns of each beam, in steps of the header, turned and shifted."""
     first, second = f.beams.first, f.beams.second
     x, y, z = (stack(getattr(first, axis), getattr(second, axis)) * f.step for axis in "xyz")
@@ -329,7 +330,7 @@ def turned_sensor(directions: Any) -> Sensor:
     simulated = Simulation(
         lambda i: dict(n=2 + i % 5, step=0.001 * (1 + i % 3)), directions=directions, rate=100
     )
-    return replace(sensor, points=turned, simulation=simulated)
+    return replace(sensor, points=turn_points, simulation=simulated)
 
 
 def test_coordinates_are_solved_for_linear_points_functions() -> None:

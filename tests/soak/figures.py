@@ -32,8 +32,8 @@ from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests import made_captures as made
 from tests.engine.oracle import Oracle
-from tests.engine.streams import Books, clean, damaged, decoded, hostile_streams, worst
-from tests.engine.test_limits import fed, garbage, peak
+from tests.engine.streams import Books, clean, damage, decode_chunks, hostile_streams, worst
+from tests.engine.test_limits import feed, garbage, peak
 from tests.engine.test_linear_time import seconds
 from tests.every_sensor import distinct_frames, every_sensor, stream_sensors
 from tests.lines import free_port
@@ -57,7 +57,7 @@ def streams() -> dict[str, Sensor]:
     return {sensor.id: sensor for sensor in stream_sensors(every_sensor().values())}
 
 
-def installed(sensors: dict[str, Sensor]) -> dict[str, Sensor]:
+def exclude_shapes(sensors: dict[str, Sensor]) -> dict[str, Sensor]:
     """Those that are no invented shapes."""
     return {name: sensor for name, sensor in sensors.items() if name in ls.sensors()}
 
@@ -83,14 +83,14 @@ def splits(share: float) -> Figure:
     )
 
 
-def recovered(share: float) -> Figure:
+def measure_recovery(share: float) -> Figure:
     """P2: the frames of the engine against those of the oracle, whatever is damaged."""
     frames = missed = extra = 0
     for sensor, seed in itertools.product(streams().values(), range(max(int(3 * share), 1))):
         data = clean(SensorUnderTest(sensor), seed=seed, length=int(2000 * share) + 200)[:4000]
         for rate, burst in itertools.product(RATES, BURSTS) if share == 1 else [(1e-3, 1)]:
-            noisy = damaged(data, rate, seed, burst=burst)
-            found, wanted = set(decoded(sensor, noisy)), set(Oracle(sensor, noisy).frames())
+            noisy = damage(data, rate, seed, burst=burst)
+            found, wanted = set(decode_chunks(sensor, noisy)), set(Oracle(sensor, noisy).frames())
             frames, missed, extra = (
                 frames + len(wanted),
                 missed + len(wanted - found),
@@ -102,7 +102,7 @@ def recovered(share: float) -> Figure:
     )
 
 
-def documented(share: float) -> Figure:
+def measure_errors(share: float) -> Figure:
     """P3: hostile inputs to everything that reads."""
     number = int(400_000 * share) + 300
     only = [] if share >= 0.1 else ["--only", "hex", "--only", "recording"]
@@ -139,13 +139,13 @@ def documented(share: float) -> Figure:
     )
 
 
-def bounded(share: float) -> Figure:
+def measure_memory(share: float) -> Figure:
     """P4: what a decoder holds while garbage goes through it, beyond the input."""
     size = int(50 * share) + 1
     data, held = garbage(1 << 20), {}
-    for name, sensor in few(installed(streams()), share):
-        fed(sensor, data, chunk=1 << 16)  # what is made once, and for all decoders
-        held[name] = peak(lambda sensor=sensor: fed(sensor, data, size, 1 << 16))
+    for name, sensor in few(exclude_shapes(streams()), share):
+        feed(sensor, data, chunk=1 << 16)  # what is made once, and for all decoders
+        held[name] = peak(lambda sensor=sensor: feed(sensor, data, size, 1 << 16))
     most = max(held, key=lambda name: held[name])
     return Figure(
         f"{size} MB of garbage: at most {held[most] / 1e3:,.0f} kB held ({most})",
@@ -156,7 +156,7 @@ def bounded(share: float) -> Figure:
 def linear(share: float) -> Figure:
     """P5: twice the input, how many times the seconds."""
     length, ratios = int(400_000 * share) + 20_000, {}
-    for name, sensor in few(installed(streams()), share):
+    for name, sensor in few(exclude_shapes(streams()), share):
         for what, data in (("garbage", garbage(length)), ("worst stream", worst(sensor, length))):
             half, whole = (
                 min(seconds(sensor, data[:size]) for _ in range(5))
@@ -244,7 +244,7 @@ def whole(sensor: Sensor, frames: Sequence[bytes]) -> list[Scan]:
         ]
 
 
-def blocked(share: float) -> Figure:
+def measure_blocked_rotors(share: float) -> Figure:
     """P19: sensors whose angle stands still."""
     told, kept = [], True
     cases: list[tuple[str, Callable[[Any], object]]] = [
@@ -288,7 +288,7 @@ def slowest(share: float) -> Figure:
     rates = {}
     held = {}
     fastest = line_rates()
-    for name, sensor in few(installed(streams()), share):
+    for name, sensor in few(exclude_shapes(streams()), share):
         subject = SensorUnderTest(sensor)
         line = fastest[_frames_key(sensor)]
         for what, data in hostile_streams(subject, int(16_000 * share) + 4000):

@@ -41,16 +41,20 @@ SCANS = "tests/scans/test_scans.py"
 
 EVERY = (
     Promise("P1", "any split of a stream gives the same result", (RULE,), "", figures.splits),
-    Promise("P2", "every recoverable frame is recovered", (RULE,), "", figures.recovered),
+    Promise("P2", "every recoverable frame is recovered", (RULE,), "", figures.measure_recovery),
     Promise(
         "P3",
         "only documented exceptions",
         ("tests/engine/test_hostile_input.py", "tests/fuzz"),
         "",
-        figures.documented,
+        figures.measure_errors,
     ),
     Promise(
-        "P4", "memory is bounded: under 1 MiB for 50 MB of garbage", (LIMITS,), "", figures.bounded
+        "P4",
+        "memory is bounded: under 1 MiB for 50 MB of garbage",
+        (LIMITS,),
+        "",
+        figures.measure_memory,
     ),
     Promise(
         "P5",
@@ -140,7 +144,7 @@ EVERY = (
         ("tests/framing/test_framing.py",),
         "in turns and in 8 threads: as alone",
     ),
-    Promise("P19", "a scan always ends", (SCANS,), "", figures.blocked),
+    Promise("P19", "a scan always ends", (SCANS,), "", figures.measure_blocked_rotors),
     Promise(
         "P20",
         "streams are decoded at 10 times the line rate or faster; under 64 bytes kept per byte",

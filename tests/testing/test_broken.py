@@ -137,7 +137,7 @@ LINES = {
 }
 
 
-def found(name: str) -> list[Finding]:
+def check_module(name: str) -> list[Finding]:
     """What `check` says of one of the modules."""
     file = HERE / f"{name}.py"
     return [
@@ -151,7 +151,7 @@ def found(name: str) -> list[Finding]:
     "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in EVERY]
 )
 def test_the_mistake_is_named_and_no_other(name: str) -> None:
-    findings = found(name)
+    findings = check_module(name)
     assert {finding.code for finding in findings} == EVERY[name], "\n".join(map(str, findings))
     if name in LINES:
         spots = [finding for finding in findings if finding.file]
@@ -166,7 +166,7 @@ def test_the_mistake_is_named_and_no_other(name: str) -> None:
     "name", ["sound", pytest.param("by_vectors/sound", marks=pytest.mark.slow)]
 )
 def test_without_a_mistake_nothing_is_found(name: str) -> None:
-    assert found(name) == []
+    assert check_module(name) == []
 
 
 def test_every_module_is_in_the_list() -> None:

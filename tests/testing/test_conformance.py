@@ -38,7 +38,7 @@ def test_shape_conforms(name: str) -> None:
     assert_conformance(SHAPES[name], examples=CONFORMANCE_EXAMPLES)
 
 
-def _interpreted(sensors: dict[str, ls.Sensor]) -> set[str]:
+def _list_plain_frames(sensors: dict[str, ls.Sensor]) -> set[str]:
     return {
         f"{sensor_id} {name}"
         for sensor_id, sensor in sensors.items()
@@ -48,13 +48,13 @@ def _interpreted(sensors: dict[str, ls.Sensor]) -> set[str]:
 
 
 def test_frames_of_shapes_compile_except_those_named_here() -> None:
-    assert _interpreted(SHAPES) == INTERPRETED
+    assert _list_plain_frames(SHAPES) == INTERPRETED
 
 
 @pytest.mark.slow
 def test_frames_of_installed_sensors_compile_except_those_named_here() -> None:
     sensors = dict(ls.sensors())
-    assert _interpreted(sensors) == {
+    assert _list_plain_frames(sensors) == {
         f"{sensor_id} {name}"
         for sensor_id in sensors
         if sensor_id.startswith("hokuyo-")

@@ -222,7 +222,7 @@ def test_a_long_length_that_a_count_in_the_header_can_reach_is_no_finding() -> N
     def plausible(f: Fields) -> Any:
         return (f.count >= 1) & (f.first < 360) & (f.last < 360) & (f.time < sound.WRAP)
 
-    struct = sound.sealed(count=Int16ul)
+    struct = sound.make_frame(count=Int16ul)
     assert (
         left(
             sound.sensor(Frame(struct, data=True, max_length=16 + 3 * 65_535, plausible=plausible))
@@ -316,7 +316,7 @@ def test_a_failing_edit_shrinks_to_the_field_at_fault() -> None:
 
 @pytest.mark.slow
 def test_an_edit_is_read_back_beside_integers_that_cannot_be_edited() -> None:
-    frame = sound.frame(sound.sealed(revision=Const(3, Int8ul)), max_length=sound.SIZE + 1)
+    frame = sound.frame(sound.make_frame(revision=Const(3, Int8ul)), max_length=sound.SIZE + 1)
     with pytest.raises(ViolationError, match="-101 is written, but 101 is read"):
         values_survive_building_and_parsing(
             SensorUnderTest(sound.sensor(frame, Lossy), 200), "data"
@@ -351,7 +351,7 @@ def test_intended_findings_are_acknowledged_with_a_reason() -> None:
 
 @pytest.mark.slow
 def test_acknowledged_findings_do_not_skip_checks() -> None:
-    coded = sound.sealed(
+    coded = sound.make_frame(
         samples=Array(this.count, Struct("distance" / Int16ul, "quality" / Int8ul))
     )
     bare = sound.sensor(sound.frame(coded), acknowledged={"LS201": "a code"})
@@ -373,7 +373,7 @@ def test_table_indices_need_no_unit() -> None:
 BY_VECTORS = Path(sound.__file__).parent / "by_vectors" / "vectors.json"
 
 
-def told(sensor: Sensor, vectors: list[dict[str, Any]] | None, *family: str) -> list[str]:
+def list_lacking(sensor: Sensor, vectors: list[dict[str, Any]] | None, *family: str) -> list[str]:
     """What the golden vectors of a sensor are said to lack."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "vectors.json"
@@ -396,12 +396,14 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
         sound.sensor(status="vectors"),
         json.loads(BY_VECTORS.read_text(encoding="utf-8")),
     )
-    assert told(proven, None) == ["LS710 : status is 'vectors', and no file of golden vectors"]
-    assert told(proven, [{**entry, "sensor": "broken-two"} for entry in known]) == [
+    assert list_lacking(proven, None) == [
+        "LS710 : status is 'vectors', and no file of golden vectors"
+    ]
+    assert list_lacking(proven, [{**entry, "sensor": "broken-two"} for entry in known]) == [
         "LS710 : status is 'vectors', and vectors.json has no vectors of broken-one"
     ]
     assert (
-        told(
+        list_lacking(
             proven,
             [{**entry, "sensor": ["broken-one", "broken-two"]} for entry in known],
             "broken-one",
@@ -409,15 +411,15 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
         )
         == []
     )
-    assert told(sound.sensor(), None) == []
-    assert told(sound.sensor(status="capture"), None) == []
+    assert list_lacking(sound.sensor(), None) == []
+    assert list_lacking(sound.sensor(status="capture"), None) == []
 
 
 def test_vectors_of_several_sensors_name_their_sensor() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
-    asked = told(sound.sensor(), known, "broken-one", "broken-two")
+    asked = list_lacking(sound.sensor(), known, "broken-one", "broken-two")
     assert 'sensor missing, such as "sensor": "broken-one"' in asked[0]
-    asked = told(
+    asked = list_lacking(
         sound.sensor(), [{**entry, "sensor": "borken-one"} for entry in known], "broken-one"
     )
     assert "no sensor 'borken-one'; the file is shared by broken-one" in asked[0]
@@ -431,20 +433,20 @@ def test_a_field_of_the_data_that_no_vector_pins_down_is_named() -> None:
         second["values"]["samples[1].distance"],
     )
     first["values"]["samples[2].distance"] = 0
-    assert told(sound.sensor(), [first, second]) == [
+    assert list_lacking(sound.sensor(), [first, second]) == [
         "LS711 data: no vector has a value of last; all vectors have 0 for samples.distance"
     ]
     ack = {"frame": "ack", "hex": sound.sensor().example("ack").hex(), "source": "made up"}
-    assert told(sound.sensor(), [ack]) == []
+    assert list_lacking(sound.sensor(), [ack]) == []
 
 
 def test_vectors_place_points_in_two_quadrants_within_reach() -> None:
     first, second = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
-    assert told(sound.sensor(range_limits=(0.05, 4.0)), [first, second]) == [
+    assert list_lacking(sound.sensor(range_limits=(0.05, 4.0)), [first, second]) == [
         "LS713 data: 4.66 m, but range_limits end at 4 m"
     ]
     del second["points"]
-    assert told(sound.sensor(), [first, second]) == [
+    assert list_lacking(sound.sensor(), [first, second]) == [
         "LS712 data.points: x and y of points are in 1 quadrant only"
     ]
 
@@ -477,7 +479,7 @@ def test_a_checksum_in_the_wrong_byte_order_is_reported() -> None:
     known = json.loads(BY_VECTORS.read_text(encoding="utf-8"))
     assert (
         "Sum(16) over all other bytes, in a field that is little-endian,"
-        in told(sound.sensor(swapped), known)[0]
+        in list_lacking(sound.sensor(swapped), known)[0]
     )
 
 
@@ -498,7 +500,7 @@ def test_the_checksum_that_is_offered_is_as_wide_as_its_field() -> None:
     vectors = [{"frame": "data", "hex": frame.hex(), "source": "made up"} for frame in frames]
     (said,) = {
         text.partition("; ")[2]
-        for text in told(data(Crc(16, 0x1021)), vectors)
+        for text in list_lacking(data(Crc(16, 0x1021)), vectors)
         if text.startswith("LS703 vectors[0]")
     }
     assert said == "Sum(16) over all other bytes, in a field that is big-endian, fits"
@@ -517,8 +519,8 @@ def test_a_checksum_of_another_name_is_found_in_the_vectors(samples: int) -> Non
         "LS212 data.end: Crc(width=16, poly=0x8005) over all other bytes,"
         " in a field that is little-endian, fits every vector"
     )
-    assert told(sound.sensor(plain), vectors)[0].startswith(said)
-    assert not any(text.startswith("LS212") for text in told(sound.sensor(sealed), vectors))
+    assert list_lacking(sound.sensor(plain), vectors)[0].startswith(said)
+    assert not any(text.startswith("LS212") for text in list_lacking(sound.sensor(sealed), vectors))
 
 
 def test_an_invalid_vector_does_not_hide_others() -> None:
@@ -530,7 +532,7 @@ def test_an_invalid_vector_does_not_hide_others() -> None:
         {"frame": "data", "hex": "zz", "source": "x"},
         {**known[1], "source": ""},
     ]
-    said = [text.partition(":")[0] for text in told(sound.sensor(), vectors)]
+    said = [text.partition(":")[0] for text in list_lacking(sound.sensor(), vectors)]
     assert said[:4] == [
         "LS702 vectors[0]",
         "LS706 vectors[1] data.number",
@@ -623,7 +625,7 @@ def test_vectors_contain_commands_and_replies(
 
 def test_scaled_floats_are_read_and_built_in_their_unit() -> None:
     for kind, offset in ((Float16b, 0.0), (Float32l, 0.0), (Float32l, 3.0), (Float64l, 0.0)):
-        fields = sound.sealed(warmth=Scaled(kind, 0.1, "degC", offset=offset))
+        fields = sound.make_frame(warmth=Scaled(kind, 0.1, "degC", offset=offset))
         subject = SensorUnderTest(
             sound.sensor(sound.frame(fields, max_length=sound.SIZE + kind.sizeof()))
         )

@@ -83,7 +83,7 @@ def test_components_of_a_direction_are_no_angle() -> None:
 
     def codes(component: Any) -> set[str]:
         sample = Struct("distance" / Scaled(Int16ul, 0.001, "m"), "x" / component, "y" / component)
-        frame = sound.frame(sound.sealed(samples=Array(this.count, sample)), max_length=200)
+        frame = sound.frame(sound.make_frame(samples=Array(this.count, sample)), max_length=200)
         return declared_codes(sound.sensor(frame, points=points))
 
     assert codes(Scaled(Int16sl, 1 / 32768, "")) == set()

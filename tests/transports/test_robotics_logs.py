@@ -56,7 +56,7 @@ def packets(number: int, name: str = "velodyne-vlp16", start: int = 0) -> list[b
     return ls.simulate(ls.sensor(name), number, start=start)
 
 
-def recorded(path: Path, kind: str, topics: dict[str, tuple[str, Sequence[bytes]]]) -> Path:
+def write_log(path: Path, kind: str, topics: dict[str, tuple[str, Sequence[bytes]]]) -> Path:
     """A log in which each topic has a type and packets, a list of ten or one a message, as rosbags
     writes it.
     """
@@ -108,19 +108,19 @@ def messages(store: Any, msgtype: str, data: Sequence[bytes]) -> Iterator[tuple[
         stamps = [START + STEP * number for number in range(first, min(first + each, len(data)))]
         items = zip(data[first : first + each], stamps, strict=True)
         if not lists:
-            yield stamps[0], made(store, msgtype, *next(items))
+            yield stamps[0], make_message(store, msgtype, *next(items))
             continue
         (*_, (element, _)) = dict(store.fielddefs[msgtype][1])["packets"]
         yield (
             stamps[-1],
             kind(
                 header=header(store, stamps[-1]),
-                packets=[made(store, element[1], *item) for item in items],
+                packets=[make_message(store, element[1], *item) for item in items],
             ),
         )
 
 
-def made(store: Any, name: str, data: bytes, at: int) -> Any:
+def make_message(store: Any, name: str, data: bytes, at: int) -> Any:
     values: dict[str, Any] = {
         "stamp": time(store, at),
         "header": header(store, at),
@@ -174,7 +174,7 @@ def test_recorded_packets_read_back_equal(tmp_path: Path, kind: str, msgtype: st
     sent = packets(
         25, "robosense-rs16" if msgtype == "rslidar_msgs/msg/rslidarScan" else "velodyne-vlp16"
     )
-    chunks = read(recorded(tmp_path, kind, {"/lidar/packets": (msgtype, sent)}))
+    chunks = read(write_log(tmp_path, kind, {"/lidar/packets": (msgtype, sent)}))
     assert [chunk.data for chunk in chunks] == sent
     assert {chunk.sender for chunk in chunks} == {None}
     stamps = [START + STEP * number for number in range(25)]
@@ -188,7 +188,9 @@ def test_recorded_packets_read_back_equal(tmp_path: Path, kind: str, msgtype: st
 def test_a_log_is_converted_as_a_capture_is(tmp_path: Path, kind: str) -> None:
     sent = packets(30)
     (tmp_path / "raw.bin").write_bytes(b"".join(sent))
-    path = recorded(tmp_path, kind, {"/velodyne_packets": ("velodyne_msgs/msg/VelodyneScan", sent)})
+    path = write_log(
+        tmp_path, kind, {"/velodyne_packets": ("velodyne_msgs/msg/VelodyneScan", sent)}
+    )
     for source in (path, tmp_path / "raw.bin"):
         ran("convert", source, tmp_path / f"{source.stem}.csv", "-s", "velodyne-vlp16")
     assert (tmp_path / "log.csv").read_bytes() == (tmp_path / "raw.csv").read_bytes()
@@ -200,7 +202,7 @@ def test_a_log_is_converted_as_a_capture_is(tmp_path: Path, kind: str) -> None:
 def test_packets_of_several_sensors_are_chosen_by_namespace_or_topic(tmp_path: Path) -> None:
     sent, other = packets(20), packets(20, start=1000)
     scan = "velodyne_msgs/msg/VelodyneScan"
-    path = recorded(
+    path = write_log(
         tmp_path, "mcap", {"/front/packets": (scan, sent), "/rear/packets": (scan, other)}
     )
     assert {chunk.sender for chunk in read(path)} == {("/front", 0), ("/rear", 0)}
@@ -220,7 +222,7 @@ def test_packets_of_several_sensors_are_chosen_by_namespace_or_topic(tmp_path: P
 def test_topics_of_one_namespace_are_one_sensor(tmp_path: Path) -> None:
     sent = packets(20)
     kind = "ouster_sensor_msgs/msg/PacketMsg"
-    path = recorded(
+    path = write_log(
         tmp_path,
         "db3",
         {"/ouster/lidar_packets": (kind, sent), "/ouster/imu_packets": (kind, [b"imu"] * 20)},
@@ -243,7 +245,7 @@ def test_a_log_of_points_says_that_it_has_no_packets(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("inputs", [10, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_damaged_log_is_a_source_error(tmp_path: Path, kind: str, inputs: int) -> None:
-    path = recorded(tmp_path, kind, {"/p": ("nebula_msgs/msg/NebulaPackets", packets(50))})
+    path = write_log(tmp_path, kind, {"/p": ("nebula_msgs/msg/NebulaPackets", packets(50))})
     target = next(iter(path.glob("*.mcap"))) if path.is_dir() else path
     whole, random = target.read_bytes(), np.random.default_rng(1)
     for number in range(inputs):
@@ -322,7 +324,7 @@ def test_packets_have_no_place_elsewhere(tmp_path: Path) -> None:
         "can be read only once: record it first"
         in ran("convert", "-", "o.mcap", "--packets", "-s", "velodyne-vlp16", code=2).stderr
     )
-    path = recorded(tmp_path, "mcap", {"/p": ("nebula_msgs/msg/NebulaPackets", packets(20))})
+    path = write_log(tmp_path, "mcap", {"/p": ("nebula_msgs/msg/NebulaPackets", packets(20))})
     said = ran(
         "convert", path, tmp_path / "out.csv", "--packets", "-s", "velodyne-vlp16", code=2
     ).stderr

@@ -19,7 +19,7 @@ from tests.shapes import SHAPES
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
 
 
-def opened(source: str, sensor: ls.Sensor | None = None) -> SerialTransport:
+def open_port(source: str, sensor: ls.Sensor | None = None) -> SerialTransport:
     made = transport(source, sensor)
     assert isinstance(made, SerialTransport)
     return made
@@ -31,14 +31,14 @@ def opened(source: str, sensor: ls.Sensor | None = None) -> SerialTransport:
 def test_a_port_is_read_and_written(tmp_path: Path, form: str) -> None:
     with port(tmp_path) as line:
         name = str(line.name) if "serial" in form else os.path.realpath(line.name)
-        one = opened(form.format(name))
+        one = open_port(form.format(name))
         line.send(b"\x01\x02\x03")
         before = time.time_ns()
         (chunk,) = one.read(5.0)
         assert chunk.data == b"\x01\x02\x03"
         assert abs((chunk.at or 0) - before) < 5e9
         one.write(b"\xff\x00")
-        assert line.received(2) == b"\xff\x00"
+        assert line.receive(2) == b"\xff\x00"
         assert one.read(0.01) == []
         one.close()
         one.close()
@@ -51,14 +51,14 @@ def test_the_sensor_says_the_baud_rate_and_the_source_overrides_it(tmp_path: Pat
             (f"serial://{line.name}", 115_200),
             (f"serial://{line.name}?baud=460800", 460_800),
         ):
-            one = opened(source, sensor)
+            one = open_port(source, sensor)
             assert one.baud == baud
             one.close()
 
 
 def test_control_lines_are_ignored_by_ports_without_them(tmp_path: Path) -> None:
     with port(tmp_path) as line:
-        one = opened(f"serial://{line.name}?baud=9600")
+        one = open_port(f"serial://{line.name}?baud=9600")
         one.lines(dtr=False, rts=True)
         one.close()
 
@@ -87,11 +87,11 @@ def test_a_port_that_cannot_be_opened_gives_a_reason(
 
 def test_a_port_is_for_one_program(tmp_path: Path) -> None:
     with port(tmp_path) as line:
-        one = opened(f"serial://{line.name}?baud=9600")
+        one = open_port(f"serial://{line.name}?baud=9600")
         with pytest.raises(SourceError, match="in use by another program"):
             transport(f"serial://{line.name}?baud=9600")
         one.close()
-        opened(f"serial://{line.name}?baud=9600").close()
+        open_port(f"serial://{line.name}?baud=9600").close()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
@@ -104,7 +104,7 @@ def test_a_port_without_permission(tmp_path: Path) -> None:
 
 def test_a_hang_up_is_a_disconnection_and_the_port_can_be_opened_again(tmp_path: Path) -> None:
     line = Port(tmp_path / "ttyTEST")
-    one = opened(f"serial://{line.name}?baud=9600")
+    one = open_port(f"serial://{line.name}?baud=9600")
     line.unplug()
     with pytest.raises(Disconnected, match="connection was lost"):
         until(lambda: one.read(0.1))
@@ -124,7 +124,7 @@ def test_no_descriptor_is_left_behind(tmp_path: Path) -> None:
     with port(tmp_path) as line:
         before = len(os.listdir("/dev/fd"))
         for _ in range(20):
-            opened(f"serial://{line.name}?baud=9600").close()
+            open_port(f"serial://{line.name}?baud=9600").close()
             with pytest.raises(SourceError):
                 transport("/dev/ttyNONE9?baud=9600")
         assert len(os.listdir("/dev/fd")) == before

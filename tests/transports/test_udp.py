@@ -29,7 +29,7 @@ from tests.shapes import SHAPES
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
 
 
-def opened(source: str, sensor: ls.Sensor | None = None) -> UdpTransport:
+def open_socket(source: str, sensor: ls.Sensor | None = None) -> UdpTransport:
     made = transport(source, sensor)
     assert isinstance(made, UdpTransport)
     return made
@@ -43,7 +43,7 @@ def read(one: UdpTransport, number: int) -> list[Chunk]:
 
 def test_datagrams_of_several_ports_with_their_senders_and_times() -> None:
     ports = free_port(), free_port()
-    one = opened(f"udp://?port={ports[0]},{ports[1]}")
+    one = open_socket(f"udp://?port={ports[0]},{ports[1]}")
     with udp() as sender:
         for index, port in enumerate(ports):
             sender.sendto(bytes([index]), ("127.0.0.1", port))
@@ -64,14 +64,14 @@ def test_datagrams_of_several_ports_with_their_senders_and_times() -> None:
 
 
 def test_the_sensor_says_the_ports() -> None:
-    one = opened("udp://127.0.0.1", SHAPES["shape-datagrams"])
+    one = open_socket("udp://127.0.0.1", SHAPES["shape-datagrams"])
     assert one.ports == (7001, 7002)
     one.close()
 
 
 def test_a_host_binds_only_that_interface() -> None:
     port = free_port()
-    one = opened(f"udp://127.0.0.1:{port}")
+    one = open_socket(f"udp://127.0.0.1:{port}")
     with udp("127.0.0.2") as sender:
         sender.sendto(b"wrong", ("127.0.0.2", port))
         sender.sendto(b"right", ("127.0.0.1", port))
@@ -114,13 +114,13 @@ def test_an_unknown_host_is_refused(source: str) -> None:
     with pytest.raises(
         UsageError, match=r"there is no host '(localhots.invalid|192.168.1|10.0.0.256|\\x00)'"
     ):
-        opened(source.format(port=free_port()))
+        open_socket(source.format(port=free_port()))
 
 
 def test_data_is_sent_to_the_requested_sender_only() -> None:
     port = free_port()
     with udp("127.0.0.2") as wanted, udp("127.0.0.3") as other:
-        one = opened(f"udp://:{port}?src=127.0.0.2:{wanted.getsockname()[1]}")
+        one = open_socket(f"udp://:{port}?src=127.0.0.2:{wanted.getsockname()[1]}")
         other.sendto(b"here!", ("127.0.0.1", port))
         until(lambda: one.read(0.01) or one.foreign)
         assert one.other_sender == other.getsockname()
@@ -132,12 +132,12 @@ def test_data_is_sent_to_the_requested_sender_only() -> None:
 
 def test_an_invalid_port_is_refused() -> None:
     with pytest.raises(UsageError, match="a sender is ADDRESS or ADDRESS:PORT"):
-        opened("udp://:2368?src=10.0.0.1:0")
+        open_socket("udp://:2368?src=10.0.0.1:0")
 
 
 def test_other_senders_count_as_foreign() -> None:
     port = free_port()
-    one = opened(f"udp://:{port}?src=127.0.0.2")
+    one = open_socket(f"udp://:{port}?src=127.0.0.2")
     with udp("127.0.0.2") as wanted, udp("127.0.0.3") as other:
         for sender in (other, wanted, other):
             sender.sendto(sender.getsockname()[0].encode(), ("127.0.0.1", port))
@@ -164,7 +164,7 @@ def test_without_recvmmsg_datagrams_come_one_by_one() -> None:
 @LINUX
 def test_many_datagrams_in_one_call() -> None:
     number = free_port()
-    one = opened(f"udp://127.0.0.1:{number}")
+    one = open_socket(f"udp://127.0.0.1:{number}")
     with udp() as sender, udp("127.0.0.2") as other:
         sent = [bytes([index % 256]) * (index % 1400) for index in range(700)]
         for index, data in enumerate(sent):
@@ -181,7 +181,7 @@ def test_many_datagrams_in_one_call() -> None:
 @LINUX
 def test_the_kernel_says_when_a_datagram_came() -> None:
     port = free_port()
-    one = opened(f"udp://127.0.0.1:{port}")
+    one = open_socket(f"udp://127.0.0.1:{port}")
     with udp() as sender:
 
         def waited() -> int:
@@ -219,7 +219,7 @@ def test_a_datagram_arrives_no_later_than_the_one_queued_behind_it() -> None:
 @LINUX
 def test_kernel_drops_are_counted_exactly() -> None:
     port = free_port()
-    one = opened(f"udp://127.0.0.1:{port}")
+    one = open_socket(f"udp://127.0.0.1:{port}")
     (inner,) = one._sockets
     inner.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
     with udp() as sender:
@@ -237,8 +237,8 @@ def test_kernel_drops_are_counted_exactly() -> None:
 
 def test_a_multicast_group_is_joined() -> None:
     port = free_port()
-    one = opened(f"udp://127.0.0.1:{port}?group=239.255.77.1")
-    second = opened(f"udp://127.0.0.1:{port}?group=239.255.77.1")
+    one = open_socket(f"udp://127.0.0.1:{port}?group=239.255.77.1")
+    second = open_socket(f"udp://127.0.0.1:{port}?group=239.255.77.1")
     with udp() as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
         sender.sendto(b"to all", ("239.255.77.1", port))
@@ -255,7 +255,7 @@ def test_a_small_buffer_is_a_warning_with_a_command() -> None:
 
 
 def test_the_buffer_is_read_back() -> None:
-    one = opened(f"udp://127.0.0.1:{free_port()}")
+    one = open_socket(f"udp://127.0.0.1:{free_port()}")
     (inner,) = one._sockets
     kernel = inner.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     assert inner.buffer == kernel // (2 if sys.platform == "linux" else 1)

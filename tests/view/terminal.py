@@ -94,7 +94,7 @@ class Terminal:
             self._read(0.05)
         return shown
 
-    def ended(self) -> int:
+    def wait_until_end(self) -> int:
         """The exit code, as soon as there is one."""
         end = time.monotonic() + DEADLINE
         while self.process.poll() is None:
@@ -103,7 +103,7 @@ class Terminal:
         self.text()
         return self.process.returncode
 
-    def loaded(self) -> None:
+    def wait_until_loaded(self) -> None:
         """Wait until the program has imported what it works with and sleeps now and then; where
         that cannot be seen, time has to do.
         """

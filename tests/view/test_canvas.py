@@ -81,7 +81,7 @@ def test_ascii_keeps_the_density_of_dots() -> None:
     assert cells.ascii().lines() == [".#^de"]
 
 
-def shown(before: list[str], text: str) -> list[str]:
+def emulate_terminal(before: list[str], text: str) -> list[str]:
     """What a terminal shows after some output: cursor addressing and characters, as ECMA-48 has
     them.
     """
@@ -109,7 +109,7 @@ def test_changes_bring_a_terminal_from_picture_to_picture() -> None:
                 int(source.integers(3)),
             )
         text = encode_changes(before, after, "256")
-        assert shown(before.lines(), text) == after.lines()
+        assert emulate_terminal(before.lines(), text) == after.lines()
         before = after
 
 

@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.slow, needs("matplotlib")]
 figures = Library("lidarspec.view.matplotlib_figures")
 
 
-def simulated(name: str, packets: int) -> Scan:
+def simulate_scan(name: str, packets: int) -> Scan:
     sensor = ls.sensor(name)
     return next(one for one in sensor.scans(simulate(sensor, packets)) if one.whole)
 
@@ -38,7 +38,7 @@ def offsets(axes: Any) -> np.ndarray:
 
 
 def test_a_planar_scan_is_drawn_from_above() -> None:
-    one = simulated("ldrobot-stl27l", 600)
+    one = simulate_scan("ldrobot-stl27l", 600)
     axes, bar = figures.of_scan(one, choose_appearance(one.points), "title").axes
     cloud = one.points[one.points.valid]
     np.testing.assert_array_equal(offsets(axes), np.stack([cloud.y, cloud.x], axis=1))
@@ -53,7 +53,7 @@ def test_a_planar_scan_is_drawn_from_above() -> None:
 
 
 def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
-    one = simulated("velodyne-vlp16", 160)
+    one = simulate_scan("velodyne-vlp16", 160)
     above, side, bar = figures.of_scan(
         one, choose_appearance(one.points, ramp="intensity"), "title"
     ).axes
@@ -69,7 +69,7 @@ def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
 
 
 def test_a_fitted_scan_fills_the_panel() -> None:
-    one = simulated("velodyne-vlp16", 160)
+    one = simulate_scan("velodyne-vlp16", 160)
     above, side, _ = figures.of_scan(
         one, fit_to_points(one.points, choose_appearance(one.points)), "title"
     ).axes

@@ -50,7 +50,7 @@ def cloud(*xyz: tuple[float, float, float], intensity: Iterable[float] | None = 
     )  # fmt: skip
 
 
-def drawn(
+def draw_lines(
     points: PointCloud, look: CloudAppearance = FLAT, width: int = 60, height: int = 30
 ) -> list[str]:
     return picture(points, width=width, height=height, look=look).lines()
@@ -73,7 +73,7 @@ def dots(lines: Iterable[str]) -> set[tuple[int, int]]:
 
 def of_points(points: PointCloud) -> set[tuple[int, int]]:
     """The dots that are not there without the points."""
-    return dots(drawn(points)) - dots(drawn(points[:0]))
+    return dots(draw_lines(points)) - dots(draw_lines(points[:0]))
 
 
 @pytest.mark.parametrize(
@@ -109,17 +109,19 @@ def test_points_beyond_the_picture_are_not_drawn() -> None:
     assert of_points(cloud((7, 0, 0))) == set()
     for points in (cloud((7, 0, 0)), cloud(), cloud((1, 1, 1))):
         for chosen in (FLAT, TALL):
-            assert [len(line) for line in drawn(points, chosen, 41, 13)] == [41] * 13
+            assert [len(line) for line in draw_lines(points, chosen, 41, 13)] == [41] * 13
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 2), (300, 4)])
 def test_any_window_has_a_picture(size: tuple[int, int]) -> None:
     for chosen in (FLAT, TALL):
-        assert [len(line) for line in drawn(cloud((1, 1, 1)), chosen, *size)] == [size[0]] * size[1]
+        assert [len(line) for line in draw_lines(cloud((1, 1, 1)), chosen, *size)] == [
+            size[0]
+        ] * size[1]
 
 
 def test_rings_and_directions_are_named() -> None:
-    lines = drawn(cloud())
+    lines = draw_lines(cloud())
     text = "\n".join(lines)
     assert "▲" in lines[15]
     assert all(label in text for label in ("2 m", "4 m", "0° forward", " -90°", "180°"))
@@ -128,17 +130,17 @@ def test_rings_and_directions_are_named() -> None:
 
 def test_a_label_hides_no_point() -> None:
     points = cloud(*((0, -y, 0) for y in np.linspace(0.3, 5, 200)))
-    assert "2 m" in drawn(points[:0])[15]
-    assert "2 m" not in drawn(points)[15]
-    assert "2 m" in "".join(drawn(points))
+    assert "2 m" in draw_lines(points[:0])[15]
+    assert "2 m" not in draw_lines(points)[15]
+    assert "2 m" in "".join(draw_lines(points))
 
 
 def test_the_middle_can_be_elsewhere() -> None:
     points = cloud((9, 3, 0))
     assert (
         len(
-            dots(drawn(points, CloudAppearance("range", 5, 5, middle=(8.5, 3.0))))
-            - dots(drawn(points[:0], CloudAppearance("range", 5, 5, (8.5, 3.0))))
+            dots(draw_lines(points, CloudAppearance("range", 5, 5, middle=(8.5, 3.0))))
+            - dots(draw_lines(points[:0], CloudAppearance("range", 5, 5, (8.5, 3.0))))
         )
         == 1
     )
@@ -201,7 +203,7 @@ def test_without_intensity_colours_show_the_range() -> None:
 
 def test_the_side_view_has_the_same_scale_and_up_is_up() -> None:
     wall = [(4.0, y, z) for y in np.linspace(-2, 2, 100) for z in np.linspace(0, 3, 60)]
-    lines = drawn(cloud(*wall), TALL, 60, 44)
+    lines = draw_lines(cloud(*wall), TALL, 60, 44)
     title = next(row for row, line in enumerate(lines) if "from the right" in line)
     above, side = dots(lines[:title]), dots(lines[title + 1 :])
     column = most(column for _, column in side)
@@ -216,7 +218,7 @@ def test_the_side_view_has_the_same_scale_and_up_is_up() -> None:
 
 
 def test_small_heights_are_enlarged_with_a_note() -> None:
-    lines = drawn(cloud(*((x, 0, 0.2) for x in np.linspace(-5, 5, 50))), TALL, 60, 30)
+    lines = draw_lines(cloud(*((x, 0, 0.2) for x in np.linspace(-5, 5, 50))), TALL, 60, 30)
     assert any("heights x10" in line for line in lines)
 
 

@@ -44,7 +44,7 @@ def test_a_sensor_is_drawn_and_q_leaves_the_terminal_clean(tmp_path: Path) -> No
         assert {"1049"} <= terminal.modes
         assert "25" not in terminal.modes
         terminal.type("q")
-        assert terminal.ended() == 0
+        assert terminal.wait_until_end() == 0
         assert terminal.is_clean()
 
 
@@ -66,7 +66,7 @@ def test_keys_match_the_help(tmp_path: Path) -> None:
         terminal.wait_for("● ldrobot-stl27l-")
         time.sleep(0.3)
         terminal.type("rq")
-        assert terminal.ended() == 0
+        assert terminal.wait_until_end() == 0
         (recording,) = tmp_path.glob("*.lsr")
         assert f"next: lidarspec view {recording.name}" in terminal.raw
     with ls.open(recording) as device:
@@ -88,7 +88,7 @@ def test_a_paused_picture_stays_while_data_arrives(tmp_path: Path) -> None:
         (recording,) = tmp_path.glob("*.lsr")
         assert recording.stat().st_size > 50_000
         terminal.type("q")
-        assert terminal.ended() == 0
+        assert terminal.wait_until_end() == 0
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_a_file_is_played_at_its_own_speed_and_stays_at_its_end(capture: Path) -
         terminal.wait_for("end")
         assert time.monotonic() - began > 1.5
         terminal.type("q")
-        assert terminal.ended() == 0
+        assert terminal.wait_until_end() == 0
         assert terminal.is_clean()
 
 
@@ -117,7 +117,7 @@ def test_the_picture_follows_the_window(tmp_path: Path) -> None:
         terminal.resize(5, 2)
         terminal.wait_for("l")
         terminal.type("q")
-        assert terminal.ended() == 0
+        assert terminal.wait_until_end() == 0
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_whatever_ends_it_leaves_the_terminal_clean(
     with Terminal(*LIVE, cwd=tmp_path) as terminal:
         terminal.wait_for("live")
         terminal.type(end) if isinstance(end, str) else terminal.process.send_signal(end)
-        assert terminal.ended() == code
+        assert terminal.wait_until_end() == code
         assert terminal.is_clean()
         assert "Traceback" not in terminal.raw
 
@@ -141,7 +141,7 @@ def test_an_error_is_printed_on_a_restored_terminal(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text(_FAILING, encoding="utf-8")
     (tmp_path / "raw.bin").write_bytes(b"".join(simulate(ls.sensor("ldrobot-stl27l"), 2000)))
     with Terminal("view", "raw.bin", "-s", "./failing.py", cwd=tmp_path) as terminal:
-        assert terminal.ended() == 1
+        assert terminal.wait_until_end() == 1
         assert terminal.is_clean()
         assert (
             "a bug in lidarspec: MemoryError: by hand" in terminal.raw.rpartition("\x1b[?1049l")[2]

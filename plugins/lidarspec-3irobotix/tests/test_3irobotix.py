@@ -9,7 +9,7 @@ import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.detect.identification import identify_sample
 from lidarspec.detect.sample_bytes import SampleBytes
-from tests.evidence import clockwise, decoded, vector_bytes, vectors
+from tests.evidence import clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 DELTA_2A, DELTA_2G = ls.sensor("3irobotix-delta2a"), ls.sensor("3irobotix-delta2g")
@@ -20,7 +20,7 @@ def test_the_packets_of_a_delta_2a() -> None:
         vector_bytes(FILE, "delta_2a_data_capture"),
         vectors(FILE)["delta_2a_data_capture"]["expected"],
     )
-    packets = decoded(DELTA_2A, data)
+    packets = decode(DELTA_2A, data)
     parsed, cloud = DELTA_2A.parse(data), packets.points()
     assert DELTA_2A.build("data", parsed) == data
     assert (parsed.length, parsed.size, parsed.sum) == (
@@ -47,7 +47,7 @@ def test_a_packet_with_contradictory_lengths_is_invalid() -> None:
     data = bytearray(vector_bytes(FILE, "delta_2a_data_capture"))
     data[7] -= 3
     data[-2:] = (sum(data[:-2]) & 0xFFFF).to_bytes(2, "big")
-    assert decoded(DELTA_2A, bytes(data)).stats.frames == {}
+    assert decode(DELTA_2A, bytes(data)).stats.frames == {}
 
 
 @pytest.mark.slow

@@ -76,17 +76,17 @@ def points(f: Fields) -> Polar:
     return Polar(range=f.distance, azimuth=f.distance * 0, intensity=f.strength, invalid=unreliable)
 
 
-def framed(size: int, *fields: Any, out: bool = False) -> Frame:
+def make_message(size: int, *fields: Any, out: bool = False) -> Frame:
     """A message of so many bytes, its length and sum among them."""
     struct = Struct(HEAD, "length" / Const(size, Int8ul), *fields, "checksum" / Int8ul)
     return Frame(
         Checksummed(struct, field="checksum", algorithm=Sum(8)),
         direction="out" if out else "in",
-        plausible=None if out or size > 5 else known,
+        plausible=None if out or size > 5 else is_known_reply,
     )
 
 
-def known(f: Fields) -> Any:
+def is_known_reply(f: Fields) -> Any:
     """What is answered with one byte: a reset, the format, the output, factory settings, and that
     settings are saved.
     """
@@ -103,16 +103,18 @@ def of(number: int) -> Any:
 RATE_FIELD = "rate" / Scaled(Int16ul, 1, "Hz") * "of frames; 0: one for each trigger"
 BAUD_FIELD = "baud" / Int32ul
 FRAMES = {
-    "version": framed(7, of(VERSION), "revision" / Int8ul, "minor" / Int8ul, "major" / Int8ul),
-    "rate": framed(6, of(RATE), RATE_FIELD),
-    "baud": framed(8, of(BAUD), BAUD_FIELD),
-    "setting": framed(
+    "version": make_message(
+        7, of(VERSION), "revision" / Int8ul, "minor" / Int8ul, "major" / Int8ul
+    ),
+    "rate": make_message(6, of(RATE), RATE_FIELD),
+    "baud": make_message(8, of(BAUD), BAUD_FIELD),
+    "setting": make_message(
         5, "id" / Int8ul, "value" / Int8ul * "what is set; of an action, 0: it succeeded"
     ),
-    "request": framed(4, "id" / Int8ul, out=True),
-    "set_rate": framed(6, of(RATE), RATE_FIELD, out=True),
-    "set_baud": framed(8, of(BAUD), BAUD_FIELD, out=True),
-    "set": framed(5, "id" / Int8ul, "value" / Int8ul, out=True),
+    "request": make_message(4, "id" / Int8ul, out=True),
+    "set_rate": make_message(6, of(RATE), RATE_FIELD, out=True),
+    "set_baud": make_message(8, of(BAUD), BAUD_FIELD, out=True),
+    "set": make_message(5, "id" / Int8ul, "value" / Int8ul, out=True),
 }
 
 

@@ -10,7 +10,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import OutOfRange
 from lidarspec.testing.fixtures import virtual_port
-from tests.evidence import decoded, vector_bytes, vectors
+from tests.evidence import decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 TFMINI = ls.sensor("benewake-tfmini")
@@ -38,7 +38,7 @@ def test_the_published_frame() -> None:
         vector_bytes(FILE, "tfmini_frame_synth"),
         vectors(FILE)["tfmini_frame_synth"]["expected"],
     )
-    packets = decoded(TFMINI, data)
+    packets = decode(TFMINI, data)
     assert packets["distance"].tolist() == [expected["dist_cm"] / 100]
     assert packets["strength"].tolist() == [expected["strength"]]
     assert packets["temperature"].tolist() == [expected["temp_c"]]
@@ -52,12 +52,12 @@ def test_a_command_is_the_manuals(name: str) -> None:
 
 
 def test_unreliable_measurements_are_not_points() -> None:
-    cloud = decoded(
+    cloud = decode(
         TFMINI, frame(300) + frame(300, 99) + frame(300, 0xFFFF) + frame(0xFFFF) + frame(0)
     ).points()
     assert cloud.valid.tolist() == [True, False, False, False, False]
     assert np.isnan(cloud.range[1:4]).all()
-    assert decoded(TFMINI, frame(4000)).stats.frames == {}
+    assert decode(TFMINI, frame(4000)).stats.frames == {}
 
 
 def test_the_millimetre_option_is_applied() -> None:

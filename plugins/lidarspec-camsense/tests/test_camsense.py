@@ -10,7 +10,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.detect.identification import identify_sample
 from lidarspec.detect.sample_bytes import SampleBytes
-from tests.evidence import capture, clockwise, decoded, vector_bytes, vectors
+from tests.evidence import capture, clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 X1, LDS08RR = ls.sensor("camsense-x1"), ls.sensor("camsense-lds08rr")
@@ -36,7 +36,7 @@ def test_a_published_packet_decodes_to_its_published_values(name: str) -> None:
         vector_bytes(FILE, name),
         vectors(FILE)[name]["expected"],
     )
-    packets, cloud = decoded(sensor, data), decoded(sensor, data).points()
+    packets, cloud = decode(sensor, data), decode(sensor, data).points()
     assert sensor.build("data", sensor.parse(data)) == data
     assert packets["start_angle"].tolist() == [expected["start_deg"]]
     assert packets["end_angle"].tolist() == [expected.get("end_deg", packets["end_angle"][0])]
@@ -53,7 +53,7 @@ def test_a_published_packet_decodes_to_its_published_values(name: str) -> None:
 def test_lds08rr_and_x1_packets_are_distinguished() -> None:
     expected = json.loads(capture("camsense/packets.json").read_text())
     data = b"".join(bytes.fromhex(one["hex"]) for one in expected)
-    cloud = decoded(LDS08RR, data).points()
+    cloud = decode(LDS08RR, data).points()
     points = np.array([point for one in expected for point in one["pts"]])
     np.testing.assert_allclose(clockwise(cloud), points[:, 0], atol=1e-4)
     np.testing.assert_allclose(cloud.range * 1000, points[:, 1], atol=1e-3)
@@ -66,7 +66,7 @@ def test_lds08rr_and_x1_packets_are_distinguished() -> None:
 
 
 def test_azimuths_advance_across_360_degrees() -> None:
-    angles = clockwise(decoded(X1, vector_bytes(FILE, "camsense_x1_wrap_capture")).points())
+    angles = clockwise(decode(X1, vector_bytes(FILE, "camsense_x1_wrap_capture")).points())
     np.testing.assert_allclose(
         angles, (354.03125 + np.arange(8) * (360.5625 - 354.03125) / 7) % 360, atol=1e-4
     )
@@ -74,8 +74,8 @@ def test_azimuths_advance_across_360_degrees() -> None:
 
 def test_angles_from_the_zero_of_the_housing() -> None:
     data = vector_bytes(FILE, "camsense_x1_capture")
-    turned = clockwise(decoded(X1.configure(zero="housing"), data).points()) - clockwise(
-        decoded(X1, data).points()
+    turned = clockwise(decode(X1.configure(zero="housing"), data).points()) - clockwise(
+        decode(X1, data).points()
     )
     np.testing.assert_allclose(turned, 21, atol=1e-4)
     with pytest.raises(ls.UsageError, match="'data' or 'housing'"):

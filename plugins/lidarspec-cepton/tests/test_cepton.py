@@ -8,7 +8,7 @@ import numpy as np
 
 import lidarspec as ls
 from lidarspec import simulate
-from tests.evidence import decoded, vector_bytes, vectors
+from tests.evidence import decode, vector_bytes, vectors
 
 VISTA = ls.sensor("cepton-vista")
 FILE, NAME = "vectors_udp3d.json", "cepton_point_unit"
@@ -27,7 +27,7 @@ def test_the_point_of_the_public_reader() -> None:
             + data
         )
         assert VISTA.build("data", VISTA.parse(packet)) == packet
-        cloud = decoded(VISTA, [packet]).points()
+        cloud = decode(VISTA, [packet]).points()
         right, ahead, up = expected["xyz"]
         np.testing.assert_allclose(cloud.xyz[0], (ahead, -right, up), rtol=1e-6)
         np.testing.assert_allclose(cloud.time, [2e-6, 4e-6], atol=1e-9)

@@ -294,7 +294,9 @@ def asking(mode: int, **more: Any) -> Command:
     )
 
 
-def started(firmware: int, model: bytes, revision: int, *noise: bytes) -> tuple[Any, ...]:
+def make_start_packets(
+    firmware: int, model: bytes, revision: int, *noise: bytes
+) -> tuple[Any, ...]:
     """What a sensor sends when it is started: fillers while the speed settles, noise, and what it
     is (manual 1b, 2.1.3 and 2.2).
     """
@@ -355,7 +357,7 @@ M1C1_MINI = Sensor(
         "info": {"correction": 1, "zero_angle": 12}
     },  # the device information printed in the manual, 2.2.2
     simulation=Simulation(
-        sweep, answers={"start": started(3, b"M1C1_Mini", 4), "get_version": VERSION}
+        sweep, answers={"start": make_start_packets(3, b"M1C1_Mini", 4), "get_version": VERSION}
     ),
     configure=partial(configure, points),
     on_open=("start",),
@@ -400,7 +402,7 @@ M1C1_MINI_V11 = Sensor(
     commands={name: M1C1_MINI.commands[name] for name in ("start", "stop")},
     fillers=M1C1_MINI.fillers,
     state=M1C1_MINI.state,
-    simulation=Simulation(older_sweep, answers={"start": started(0, b"M1C1_Mini", 4)}),
+    simulation=Simulation(older_sweep, answers={"start": make_start_packets(0, b"M1C1_Mini", 4)}),
     configure=partial(configure, older_points),
     on_open=("start",),
     on_close=("stop",),
@@ -440,7 +442,10 @@ def coin(model: str, **facts: Any) -> Sensor:
 
 def coin_simulation(model: str, **turns: Any) -> Simulation:
     """A simulated one, which says what it is when it is started."""
-    answers = {"start": started(1, model.encode(), 1, b"\xfa\xfa"), "get_version": VERSION}
+    answers = {
+        "start": make_start_packets(1, model.encode(), 1, b"\xfa\xfa"),
+        "get_version": VERSION,
+    }
     return Simulation(partial(sweep, **turns), answers=answers)
 
 

@@ -15,7 +15,7 @@ import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.detect.identification import SampleBytes, identify_sample
 from tests.agreement import assert_same_points
-from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
+from tests.evidence import assert_points, clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 SENSOR, COIN, COIN_D6 = (
@@ -98,7 +98,7 @@ def test_a_whole_frame_is_parsed_and_built_to_the_same_bytes(name: str) -> None:
     if frame != "command":
         found = SENSOR.split(data)
         assert [(item.frame, item.offset, item.data) for item in found] == [(frame, 0, data)]
-        assert len(decoded(SENSOR, data, frame)) == 1
+        assert len(decode(SENSOR, data, frame)) == 1
 
 
 def test_the_fields_of_the_answers_and_of_the_device_information() -> None:
@@ -129,7 +129,7 @@ def test_the_printed_sum_of_the_device_information_is_wrong() -> None:
         "0x0402",
     )
     assert SENSOR.parse(data, verify=False).model == b"M1C1_Mini\0\0\0"
-    assert decoded(SENSOR, data).stats.bad_checksum == 1
+    assert decode(SENSOR, data).stats.bad_checksum == 1
 
 
 @pytest.mark.parametrize("name", ["cspc_v11_ack_start", "cspc_v11_ack_stop"])
@@ -152,7 +152,7 @@ def test_the_samples_of_the_older_generation_have_two_bytes() -> None:
     """
     si = vector_bytes(FILE, "cspc_v11_si2")
     data = bytes.fromhex("aa55 0004 010f 0196 aeca a00f 401f") + si + bytes.fromhex("007d")
-    packets = decoded(
+    packets = decode(
         V11,
         vector_bytes(FILE, "cspc_v11_ack_start")
         + b"\xfe\xff"
@@ -202,14 +202,14 @@ def test_an_older_model_is_distinguished_from_a_ydlidar() -> None:
     ],
 )
 def test_implausible_bytes_are_no_frames(data: bytes) -> None:
-    packets = decoded(SENSOR, data)
+    packets = decode(SENSOR, data)
     assert packets.stats.frames == {}
     assert packets.stats.bytes_skipped == len(data)
 
 
 def test_a_packet_after_implausible_ones_is_found() -> None:
     noise = bytes.fromhex("aa55") * 7 + bytes.fromhex("aa55000001000100aa55")
-    packets = decoded(SENSOR, noise + QUADRANTS)
+    packets = decode(SENSOR, noise + QUADRANTS)
     assert packets.offset.tolist() == [len(noise)]
 
 
@@ -217,7 +217,7 @@ def test_the_first_fields_of_the_angle_example() -> None:
     expected = vectors(FILE)["cspc_angle_example"]["expected"]
     data = packet((expected["fsa_deg"], expected["lsa_deg"]), [1000, *[3000] * 23, 8000])
     assert data.startswith(vector_bytes(FILE, "cspc_angle_example"))
-    packets = decoded(SENSOR, data)
+    packets = decode(SENSOR, data)
     assert packets.raw["lsn"].tolist() == [expected["lsn"]]
     assert packets["fsa.angle"].tolist() == [expected["fsa_deg"]]
     assert packets["lsa.angle"].tolist() == [expected["lsa_deg"]]
@@ -230,7 +230,7 @@ def test_the_first_fields_of_the_angle_example() -> None:
 
 
 def test_points_by_hand_with_the_correction() -> None:
-    cloud = decoded(SENSOR, INFO + QUADRANTS).points()
+    cloud = decode(SENSOR, INFO + QUADRANTS).points()
     # Clockwise angle = raw - atan(19.16 (d - 90.15) / (90.15 d)), azimuth its negative:
     #   1000: 30 - 10.944468 = 19.055532;    x = cos = 0.94520,      y = -sin = -0.32648   front
     # right
@@ -263,20 +263,20 @@ def test_the_auxiliary_frame_of_a_coin_d6_is_no_noise() -> None:
 def test_points_by_hand_without_the_correction() -> None:
     # The raw angles 30, 120, 210, 300, clockwise: cos 30 = 0.86603, sin 30 = 0.5.
     expected = [(0.86603, -0.5, 0), (-1.0, -1.73205, 0), (-3.46410, 2.0, 0), (4.0, 6.92820, 0)]
-    assert_points(decoded(COIN, QUADRANTS).points(), enumerate(expected))
+    assert_points(decode(COIN, QUADRANTS).points(), enumerate(expected))
     assert COIN.parse(QUADRANTS).samples[3] == {"distance": 8000, "intensity": 100, "exposure": 2}
 
 
 def test_the_device_information_decides_about_the_correction() -> None:
     off = SENSOR.build("info", {**SENSOR.parse(INFO), "correction": 0, "sum": None})
     corrected, raw = (
-        decoded(SENSOR, INFO + QUADRANTS).points(),
-        decoded(SENSOR, off + QUADRANTS).points(),
+        decode(SENSOR, INFO + QUADRANTS).points(),
+        decode(SENSOR, off + QUADRANTS).points(),
     )
     np.testing.assert_allclose(clockwise(raw), [30, 120, 210, 300], atol=1e-4)
-    both = decoded(SENSOR, INFO + QUADRANTS + off + QUADRANTS).points()
+    both = decode(SENSOR, INFO + QUADRANTS + off + QUADRANTS).points()
     np.testing.assert_array_equal(both.azimuth, np.concatenate([corrected.azimuth, raw.azimuth]))
-    assert_points(decoded(COIN, INFO + QUADRANTS).points(), [(0, corrected.xyz[0])])
+    assert_points(decode(COIN, INFO + QUADRANTS).points(), [(0, corrected.xyz[0])])
 
 
 def test_nominal_until_the_device_information_is_known() -> None:
@@ -286,8 +286,8 @@ def test_nominal_until_the_device_information_is_known() -> None:
         not SENSOR.decode(QUADRANTS + INFO).points().nominal
     )  # of a whole input the first one applies from the start
     assert_same_points(
-        decoded(SENSOR, INFO + QUADRANTS).points()[:2],
-        decoded(SENSOR, QUADRANTS + INFO).points()[:2],
+        decode(SENSOR, INFO + QUADRANTS).points()[:2],
+        decode(SENSOR, QUADRANTS + INFO).points()[:2],
     )
     np.testing.assert_array_equal(
         SENSOR.decode(QUADRANTS).points().xyz, SENSOR.decode(INFO + QUADRANTS).points().xyz
@@ -297,7 +297,7 @@ def test_nominal_until_the_device_information_is_known() -> None:
 def test_the_correction_where_the_formula_is_delicate() -> None:
     # 90.15 mm would be corrected by nothing, less by a negative angle; 0 is not corrected at all,
     # nor divided by.
-    cloud = decoded(SENSOR, packet((100.0, 100.0), [0, 90, 1, 16383])).points()
+    cloud = decode(SENSOR, packet((100.0, 100.0), [0, 90, 1, 16383])).points()
     expected = [
         0.0,
         *(math.degrees(math.atan(19.16 * (d - 90.15) / (90.15 * d))) for d in (90, 1, 16383)),
@@ -313,7 +313,7 @@ def test_the_correction_where_the_formula_is_delicate() -> None:
 
 
 def test_one_sample_has_the_first_angle() -> None:
-    packets = decoded(SENSOR, vector_bytes(FILE, "cspc_start_packet_synth"))
+    packets = decode(SENSOR, vector_bytes(FILE, "cspc_start_packet_synth"))
     expected = vectors(FILE)["cspc_start_packet_synth"]["expected"]
     cloud = packets.points()
     np.testing.assert_allclose(
@@ -324,7 +324,7 @@ def test_one_sample_has_the_first_angle() -> None:
         500,
         200,
     )
-    apart = decoded(
+    apart = decode(
         SENSOR, packet((40.0, 80.0), [0])
     ).points()  # LSA of a single sample does not count
     np.testing.assert_allclose(clockwise(apart), [40])
@@ -334,11 +334,11 @@ def test_packets_that_cross_360_degrees_go_on_forward() -> None:
     # FSA b181: >> 1 = 22720, / 64 = 355.   LSA 0281: >> 1 = 320, / 64 = 5.   Step (5 + 360 - 355) /
     # 4 = 2.5.
     data = bytes.fromhex("aa550005 81b1 8102 59cd 920100 92a10f 92411f 920100 92813e")
-    cloud = decoded(COIN, data).points()
+    cloud = decode(COIN, data).points()
     np.testing.assert_allclose(clockwise(cloud), [355, 357.5, 0, 2.5, 5], atol=1e-5)
     assert cloud.valid.tolist() == [False, True, True, False, True]
     # Corrected: 357.5 - 10.944468 = 346.555532; 1 m: x = cos = 0.97260, y = -sin = +0.23249.
-    assert_points(decoded(SENSOR, data).points(), [(1, (0.97260, 0.23249, 0))])
+    assert_points(decode(SENSOR, data).points(), [(1, (0.97260, 0.23249, 0))])
 
 
 def test_angles_from_the_mark_on_the_housing() -> None:
@@ -352,7 +352,7 @@ def test_angles_from_the_mark_on_the_housing() -> None:
         "info", {**SENSOR.parse(INFO), "zero_angle": 20, "correction": 0, "sum": None}
     )
     np.testing.assert_allclose(
-        clockwise(decoded(housing, other + QUADRANTS).points()), [50, 140, 230, 320], atol=1e-4
+        clockwise(decode(housing, other + QUADRANTS).points()), [50, 140, 230, 320], atol=1e-4
     )
     np.testing.assert_allclose(
         clockwise(COIN.configure(zero="housing").decode(QUADRANTS).points())[0], 30, atol=1e-4

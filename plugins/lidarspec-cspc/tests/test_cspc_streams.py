@@ -24,7 +24,7 @@ from construct import (
 
 import lidarspec as ls
 from lidarspec.spec import Checksummed, Fields, Frame, OnFlag, Polar, Scaled, WordXor, spread
-from tests.evidence import capture, clockwise, decoded, vector_bytes, vectors
+from tests.evidence import capture, clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 SENSOR, COIN = ls.sensor("cspc-m1c1-mini"), ls.sensor("cspc-coin-d4")
@@ -59,7 +59,7 @@ def test_a_start_up_in_order(name: str) -> None:
     sensor = SENSOR if name.startswith("cspc") else COIN
     data, expected = vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
     assert [event(found) for found in sensor.split(data)] == expected["events"]
-    stats = decoded(sensor, data).stats
+    stats = decode(sensor, data).stats
     assert (stats.bytes_filler, stats.bytes_skipped - stats.bytes_filler) == (
         expected["fill"],
         expected["skipped"],
@@ -82,7 +82,7 @@ def test_the_scan_of_the_start_up_vector() -> None:
 def test_a_captured_start_up() -> None:
     data = capture("cspc/coin_d4_ludovatech_issue2_partial.bin").read_bytes()
     expected = json.loads(capture("cspc/coin_d4_ludovatech_issue2_expected.json").read_text())
-    packets = decoded(COIN, data)
+    packets = decode(COIN, data)
     assert packets.stats.frames == {"info": 1, "scan_start": 1, "data": 4}
     assert [found.frame for found in COIN.split(data)] == ["info", "scan_start", *["data"] * 4]
     assert packets.stats.bytes_skipped == 2 + 20  # FA FA in front, and a packet that is cut off
@@ -111,7 +111,7 @@ def test_a_captured_start_up() -> None:
 
 def test_points_of_the_capture_by_hand() -> None:
     data = capture("cspc/coin_d4_ludovatech_issue2_partial.bin").read_bytes()
-    cloud = decoded(COIN, data).points()
+    cloud = decode(COIN, data).points()
     # Packet 1, cb 6f 77 76: FSA 6fcb >> 1 = 14309, / 64 = 223.578125; LSA 7677 >> 1 = 15163, / 64 =
     # 236.921875.
     #   Sample 24, f4 e6 0a: 10 * 64 + (e6 >> 2 = 57) = 697 mm at the LSA: x = .697 cos = -0.38041,
@@ -141,7 +141,7 @@ def test_turns_are_cut_at_start_packets() -> None:
 def test_points_of_a_packet_are_apart_by_the_scan_frequency() -> None:
     # 5.5 Hz in the start packet: 25 samples over 24 * 360 / 380 degrees take 24 / 380 / 5.5 s;
     # before it no rate is known.
-    cloud = decoded(SENSOR, turn(start=1, number=1) + turn(number=2)).points()
+    cloud = decode(SENSOR, turn(start=1, number=1) + turn(number=2)).points()
     assert cloud.time[:26].tolist() == [0.0] * 26
     assert cloud.time[50] == pytest.approx(24 / 380 / 5.5, rel=1e-3)
     np.testing.assert_allclose(np.diff(cloud.time[26:]), 1 / 380 / 5.5, rtol=1e-2)
@@ -223,7 +223,7 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
     )
     assert data[2:4] == b"\x04\x00"
     assert other.build("data", other.parse(data)) == data
-    cloud = decoded(other, b"\xfe" + data + data).points()
+    cloud = decode(other, b"\xfe" + data + data).points()
     np.testing.assert_allclose(clockwise(cloud), [30, 120, 210, 300] * 2, atol=1e-4)
     assert cloud.range.tolist() == [1, 2, 4, 8] * 2
     with pytest.raises(ls.WireError) as caught:

@@ -111,7 +111,7 @@ class Mirror(Calibration):
     azimuth_adjust: Table | None = None
     elevation_adjust: Table | None = None
 
-    def measured(self, path: str | Path | Learned) -> Mirror:
+    def with_file(self, path: str | Path | Learned) -> Mirror:
         """With the angles of one unit, out of its file (.dat), or out of what it said.
 
         Raises:
@@ -140,7 +140,7 @@ class Mirror(Calibration):
             nominal=False,
         )
 
-    def told(self) -> bytes:
+    def to_file(self) -> bytes:
         """The angles as a unit says them: its file."""
         start = np.rint(self.faces * STEPS).astype(int).tolist()
         none = bytes(LASERS * 180)
@@ -159,7 +159,7 @@ class Mirror(Calibration):
         data: bytes = FILE.build(values | {"sha256": bytes(32)})[:-32]
         return data + hashlib.sha256(data).digest()
 
-    def adjusted(self, table: Table | None, azimuth: Any) -> Any:
+    def find_adjustment(self, table: Table | None, azimuth: Any) -> Any:
         """What is added at azimuths of the mirror: degrees, for every channel; evenly between the
         steps.
         """
@@ -205,12 +205,14 @@ def points(f: Fields, channels: Mirror) -> Polar:
     turned = np.mod(mirror - channels.faces[0], 360)
     for face in channels.faces[1:]:
         turned = np.minimum(turned, np.mod(mirror - face, 360))
-    azimuth = 2 * turned + channels.azimuth + channels.adjusted(channels.azimuth_adjust, mirror)
+    azimuth = (
+        2 * turned + channels.azimuth + channels.find_adjustment(channels.azimuth_adjust, mirror)
+    )
     return Polar(
         range=distance(f),
         azimuth=np.deg2rad(90 - azimuth),
         elevation=np.deg2rad(
-            channels.elevation + channels.adjusted(channels.elevation_adjust, mirror)
+            channels.elevation + channels.find_adjustment(channels.elevation_adjust, mirror)
         ),
         intensity=blocks.channels.reflectivity,
         time=LAST - SHOT * ((BLOCKS - block + returns - 1) // returns) + channels.firing,

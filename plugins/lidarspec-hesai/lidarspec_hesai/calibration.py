@@ -77,7 +77,7 @@ class Calibration:
     def __len__(self) -> int:
         return len(self.elevation)
 
-    def measured(self, path: str | Path | Learned) -> Calibration:
+    def with_file(self, path: str | Path | Learned) -> Calibration:
         """With the angles of one unit, out of a correction file or out of what it said.
 
         Raises:
@@ -86,7 +86,7 @@ class Calibration:
         elevation, azimuth = columns(path, {ELEVATION: self.elevation, AZIMUTH: self.azimuth})
         return dataclasses.replace(self, elevation=elevation, azimuth=azimuth, nominal=False)
 
-    def told(self) -> bytes:
+    def to_file(self) -> bytes:
         """The angles as a unit says them: a file of corrections."""
         rows = zip(self.elevation, self.azimuth, strict=True)
         return "".join(
@@ -133,7 +133,7 @@ def configure(
     angles = calibration or sensor.options.get("calibration")
     times = firing_times or sensor.options.get("firing_times")
     if angles:
-        table = table.measured(angles)
+        table = table.with_file(angles)
     if times:
         table = dataclasses.replace(
             table, firing=columns(times, {FIRING: table.firing * 1e6})[0] * 1e-6

@@ -47,7 +47,7 @@ def spinning(
         on_open=("get_calibration",),
         sequence=Sequence("sequence"),
         simulation=Simulation(
-            sweep, answers={"get_calibration": (("answer", {"payload": table.told()}),)}
+            sweep, answers={"get_calibration": (("answer", {"payload": table.to_file()}),)}
         ),
         configure=partial(configure, points, table),
         **(defaults | facts),

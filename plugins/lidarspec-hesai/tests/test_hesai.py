@@ -22,7 +22,7 @@ from lidarspec.testing.fixtures import virtual_port
 from lidarspec_hesai import at128
 from lidarspec_hesai.xt import TABLE_32
 from tests.agreement import assert_same_points
-from tests.evidence import PROTOCOLS, assert_points, decoded, vector_bytes, vectors
+from tests.evidence import PROTOCOLS, assert_points, decode, vector_bytes, vectors
 from tests.lines import SLACK, free_port
 
 FILE = "vectors_udp3d.json"
@@ -140,7 +140,7 @@ def test_a_captured_packet_has_the_fields_and_points_of_its_vector(
         + "".join(f"{i},{e},{a}\n" for i, (e, a) in enumerate(angles, start=1))
     )
     sensor = VECTORS[name].configure(calibration=file, frame="vendor")
-    parsed, packets = sensor.parse(data), decoded(sensor, [data])
+    parsed, packets = sensor.parse(data), decode(sensor, [data])
     assert len(data) == expected["length"]
     assert sensor.build(packets.frame, parsed) == data
     body = packets.raw["body"] if sensor.id == "hesai-qt128" else packets.raw
@@ -168,7 +168,7 @@ def test_points_by_hand(name: str) -> None:
         {block: azimuth for block, azimuth, *_ in golden},
         {(block, channel): raw for block, _, channel, raw, _ in golden},
     )
-    cloud = decoded(SENSORS[name], [packet(name, azimuths, raw)]).points()
+    cloud = decode(SENSORS[name], [packet(name, azimuths, raw)]).points()
     places = [block * channels + channel for block, _, channel, *_ in golden]
     assert np.flatnonzero(cloud.valid).tolist() == places
     assert_points(
@@ -194,7 +194,7 @@ def test_firing_times_and_echoes(name: str) -> None:
         name: value for name, value in dual.items() if name == "return_count"
     }  # the most that there can be
     single, double = (
-        decoded(SENSORS[name], [packet(name, **more)]).points() for more in (alone, dual)
+        decode(SENSORS[name], [packet(name, **more)]).points() for more in (alone, dual)
     )
     for block, channel, one, two in TIMES[name]:
         place = block * channels + channel
@@ -222,7 +222,7 @@ def test_the_header_gives_blocks_unit_and_counter(name: str) -> None:
         sequence=None,
     )
     assert len(fewer) == 12 + 2 * (2 + 4 * channels) + 24
-    packets = decoded(sensor, [fewer, packet(name, raw={(1, 2): 1000}), fewer])
+    packets = decode(sensor, [fewer, packet(name, raw={(1, 2): 1000}), fewer])
     cloud = packets.points()
     assert cloud.range[cloud.valid].tolist() == pytest.approx([2.0, 4.0, 2.0])
     assert len(cloud) == channels * (2 + FORM[name][0] + 2)
@@ -458,8 +458,7 @@ def test_points_and_times_of_a_pandar64_by_hand() -> None:
                 2500 if (block, channel) == (4, 6) else 0
             )
     single, dual = (
-        decoded(P64, [P64.build("data", parsed, return_mode=mode)]).points()
-        for mode in (0x37, 0x39)
+        decode(P64, [P64.build("data", parsed, return_mode=mode)]).points() for mode in (0x37, 0x39)
     )
     # channel 6: E 1.686 (cos .999567, sin .029422), 1.042 to the right: A = 88.96 + 1.042 = 90.002;
     # 10 m
@@ -475,7 +474,7 @@ def test_the_echoes_of_an_xt32m_are_as_many_as_its_return_mode_says() -> None:
     parsed = XT32M.parse(simulate(XT32M, 1)[0])
     echoes = {
         mode: (
-            decoded(XT32M, [XT32M.build("data", parsed, return_mode=mode, return_count=3)]).points()
+            decode(XT32M, [XT32M.build("data", parsed, return_mode=mode, return_count=3)]).points()
         )
         for mode in (0x37, 0x3C, 0x3D)
     }
@@ -492,13 +491,13 @@ def test_each_crc_of_a_qt128_is_held(place: int) -> None:
     data = bytearray(vector_bytes(FILE, "hesai_qt128_real"))
     assert len(QT128.decode([bytes(data)])) == 1
     data[place] ^= 1
-    assert len(decoded(QT128, [bytes(data)], "data")) == 0
+    assert len(decode(QT128, [bytes(data)], "data")) == 0
 
 
 def test_the_loops_of_a_qt128_take_turns() -> None:
     parsed = QT128.parse(simulate(QT128, 1)[0])
-    single = decoded(QT128, [QT128.build("data", parsed, return_count=2)]).points()
-    odd = decoded(QT128, [QT128.build("data", parsed, return_mode=0x39, mode_flag=1)]).points()
+    single = decode(QT128, [QT128.build("data", parsed, return_count=2)]).points()
+    odd = decode(QT128, [QT128.build("data", parsed, return_mode=0x39, mode_flag=1)]).points()
     # channel 65 fires 1.456 us after the shot in the first loop, and 0.6 in the second; shots are
     # 111.11 us apart, the first at 9
     assert [single.time[block * 128 + 64] * 1e6 for block in (0, 1)] == [
@@ -621,7 +620,7 @@ def test_points_and_times_by_hand_of_models_named_in_the_status(name: str) -> No
             azimuth,
             raw,
         )
-    cloud = decoded(sensor, [sensor.build("data", parsed, operational_state=0)]).points()
+    cloud = decode(sensor, [sensor.build("data", parsed, operational_state=0)]).points()
     for _, block, channel, raw, xyz, fired in STATED[name]:
         place = block * 128 + channel
         assert cloud.valid[place] == (raw > 0)
@@ -656,20 +655,20 @@ def test_channels_have_the_further_bytes_that_the_header_says() -> None:
             channel.confidence, channel.environment = 7, 9
     data = sensor.build("data", parsed)
     assert len(data) == 861 + 2 * 2 * 128
-    packets = decoded(sensor, [data, simulate(sensor, 1)[0]])
+    packets = decode(sensor, [data, simulate(sensor, 1)[0]])
     assert len(packets) == 2
     np.testing.assert_array_equal(packets.points().range[:256], packets.points().range[256:])
 
 
 @pytest.mark.slow
 def test_reported_angles_survive_a_bad_network() -> None:
-    unit = on_free_ports(XT32, TABLE_32.told())
+    unit = on_free_ports(XT32, TABLE_32.to_file())
     data = f"udp://127.0.0.1:{unit.links['data'].ports[0]}"
     with (
         virtual_port(unit, to=data, faults=Faults(loss=0.5, reorder=3)) as port,
         ls.open(port.path, unit) as device,
     ):
-        assert device.learned == {"calibration": TABLE_32.told()}
+        assert device.learned == {"calibration": TABLE_32.to_file()}
 
 
 AT128 = ls.sensor("hesai-at128")
@@ -694,7 +693,7 @@ def test_points_and_times_of_an_at128_by_hand() -> None:
     first = of_mirror(173.445, {(0, 0): 2500, (1, 0): 2500})
     # across 0: 20 is 116.867 after the face at 263.133, the beam 233.734 + 0.65 = 234.384
     across = of_mirror(20.0, {(1, 17): 2500})
-    cloud = decoded(AT128, [first, across]).points()
+    cloud = decode(AT128, [first, across]).points()
     assert_points(
         cloud,
         [(0, (8.639747, 4.514825, 2.229640)), (128, (8.639747, 4.514825, 2.229640))],
@@ -707,7 +706,7 @@ def test_points_and_times_of_an_at128_by_hand() -> None:
     assert (cloud.time[[0, 2, 128]] * 1e6).tolist() == pytest.approx(
         [-92.581, -84.341, -50.915], abs=1e-3
     )
-    dual = decoded(AT128, [of_mirror(173.445, {}, return_mode=0x39)]).points()
+    dual = decode(AT128, [of_mirror(173.445, {}, return_mode=0x39)]).points()
     assert (dual.time[[0, 128]] * 1e6).tolist() == pytest.approx([-50.915, -50.915], abs=1e-3)
     assert dual.return_index is not None
     assert dual.return_index[[0, 128]].tolist() == [0, 1]
@@ -720,7 +719,7 @@ def of_a_mirror(**values: Any) -> bytes:
     return data + hashlib.sha256(data).digest()
 
 
-AT128_FILE = at128.TABLE.told()
+AT128_FILE = at128.TABLE.to_file()
 
 
 def test_an_at128_has_the_angles_of_its_file(tmp_path: Path) -> None:
@@ -737,7 +736,7 @@ def test_an_at128_has_the_angles_of_its_file(tmp_path: Path) -> None:
     file.write_bytes(told)
     data = [of_mirror(173.5, {(0, 0): 2500})]
     for source in (file, Learned(told)):
-        cloud = decoded(AT128.configure(calibration=source), data).points()
+        cloud = decode(AT128.configure(calibration=source), data).points()
         # 30.06 degrees after the face, 60.12 + 4.8 of the channel; a quarter of 0.2 and three of
         # -0.08 degrees: -0.01
         assert np.rad2deg(cloud.azimuth[0]) == pytest.approx(90 - (60.12 + 4.8 - 0.01), abs=2e-4)
@@ -786,7 +785,7 @@ def test_a_jt16_is_read_from_its_line_and_a_broken_byte_costs_one_packet(tmp_pat
         bytes.fromhex(vector["hex"]) for vector in own if vector.get("sensor") == "hesai-jt16"
     )
     broken = felt[:20] + bytes([felt[20] ^ 1]) + felt[21:]
-    packets = decoded(sensor, data + felt + broken + b"\xee\xff" + data)
+    packets = decode(sensor, data + felt + broken + b"\xee\xff" + data)
     assert (len(data), len(felt), dict(packets.stats.frames)) == (80, 34, {"data": 2, "imu": 1})
     assert packets.stats.bad_checksum == 1
     assert packets.points().nominal

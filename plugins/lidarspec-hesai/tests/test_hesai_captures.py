@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import lidarspec as ls
 from lidarspec import PointCloud, Sensor
 from lidarspec.captures.pcap import CaptureReader
-from tests.evidence import capture, decoded
+from tests.evidence import capture, decode
 
 pytestmark = pytest.mark.slow  # captures of many megabytes
 
@@ -36,13 +36,13 @@ def datagrams(path: Path) -> list[bytes]:
         return [datagram.data for datagram in CaptureReader(file)]
 
 
-def calibrated(name: str, **more: Any) -> Sensor:
+def configure_sensor(name: str, **more: Any) -> Sensor:
     file = next(capture(f"hesai/{name}").glob("*.csv"))
     sensor: Sensor = ls.sensor(PUBLISHED[name]).configure(calibration=file, **more)
     return sensor
 
 
-def published(name: str) -> Points:
+def read_published_points(name: str) -> Points:
     data = next(capture(f"hesai/{name}").glob("*.pcd")).read_bytes()
     _, _, binary = data.partition(b"DATA binary\n")
     return np.frombuffer(binary, "<f4").reshape(-1, 3).astype(np.float64)
@@ -86,8 +86,10 @@ def places(cloud: PointCloud, which: NDArray[np.bool_]) -> Points:
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_the_points_of_a_turn_are_those_that_were_published(name: str) -> None:
-    theirs = published(name)
-    packets = calibrated(name).decode(datagrams(capture(f"hesai/{name}/packets.derived.pcap")))
+    theirs = read_published_points(name)
+    packets = configure_sensor(name).decode(
+        datagrams(capture(f"hesai/{name}/packets.derived.pcap"))
+    )
     cloud = packets.points()
     assert not cloud.nominal
     near = cloud.range >= np.linalg.norm(theirs, axis=1).min() - 1e-4
@@ -96,7 +98,7 @@ def test_the_points_of_a_turn_are_those_that_were_published(name: str) -> None:
     assert nearest(ours, theirs).max() < 1e-5
     assert nearest(theirs, ours).max() < 1e-5
     vendor = (
-        calibrated(name, frame="vendor")
+        configure_sensor(name, frame="vendor")
         .decode(datagrams(capture(f"hesai/{name}/packets.derived.pcap")))
         .points()
     )
@@ -114,10 +116,10 @@ def test_a_capture_is_five_pieces_and_nothing_is_lost(name: str) -> None:
     assert [scan.complete for scan in scans] == [False, True, True, True, False]
     assert [round(scan.rate_hz, 1) for scan in scans[1:4]] == [10.0, 10.0, 10.0]
     assert (device.stats.lost, device.stats.bytes_skipped, device.stats.plugin_errors) == (0, 0, 0)
-    theirs = len(published(name))
+    theirs = len(read_published_points(name))
     for scan in scans[1:4]:
         cloud = scan.points
-        kept = cloud.range >= np.linalg.norm(published(name), axis=1).min() - 1e-4
+        kept = cloud.range >= np.linalg.norm(read_published_points(name), axis=1).min() - 1e-4
         assert abs(len(places(cloud, kept)) - theirs) < 0.001 * theirs
 
 
@@ -128,7 +130,10 @@ def test_compiled_and_interpreted_agree_on_captured_packets(name: str) -> None:
         if name == "40p_20hz"
         else f"hesai/{name}/packets.derived.pcap"
     )
-    assert len(decoded(FAST if name == "40p_20hz" else calibrated(name), datagrams(path)[:8])) == 8
+    assert (
+        len(decode(FAST if name == "40p_20hz" else configure_sensor(name), datagrams(path)[:8]))
+        == 8
+    )
 
 
 def test_the_sequence_of_the_20_hz_pandar40p_is_unbroken() -> None:

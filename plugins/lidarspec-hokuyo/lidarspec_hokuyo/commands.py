@@ -87,7 +87,7 @@ def line(name: str, begin: str) -> Construct:
     return name / Checksummed(struct, field="check", algorithm=LineCheck(), over=("name", "text"))
 
 
-def told(command: bytes, lines: Mapping[str, str]) -> Frame:
+def make_reply(command: bytes, lines: Mapping[str, str]) -> Frame:
     """An answer in such lines."""
     struct = Struct(
         "head" / Const(command + b"\n00P\n"),
@@ -165,7 +165,7 @@ def messages(kind: str, *, is_urg: bool) -> dict[str, Frame]:
             if name == "get_time":
                 clock = ("time" / Scaled(Int32ub, 0.001, "s") * "24 bits",)
             found[f"{name}_answer"] = answer(command, *clock, size=size, told=(4,) if clock else ())
-    return found | {name: told(*row) for name, row in TOLD.items()}
+    return found | {name: make_reply(*row) for name, row in TOLD.items()}
 
 
 def commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command]:

@@ -11,7 +11,7 @@ import lidarspec as ls
 from lidarspec.detect.identification import identify_sample
 from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.simulation.device import SimulatedDevice
-from tests.evidence import decoded, vector_bytes
+from tests.evidence import decode, vector_bytes
 
 URG, UST, UTM = (
     ls.sensor("hokuyo-urg04lx"),
@@ -98,7 +98,7 @@ def test_a_step_with_several_echoes_has_a_point_for_each() -> None:
         + b"?\n1Dh1Dh&0Vh&0CB1Dh6\n\n"
     )
     for sensor in (asked, UTM):
-        cloud = decoded(sensor, scan).points()
+        cloud = decode(sensor, scan).points()
         assert cloud.return_index.tolist() == [0, 1, 2] * 3
         np.testing.assert_allclose(
             cloud.range[cloud.valid], [5.432, 5.432, 2.488, 1.234, 5.432], rtol=1e-6
@@ -116,7 +116,7 @@ def test_a_cluster_of_00_is_one_step_and_the_numbers_of_errors_are_no_points() -
     values = UST.parse(next(iter(ls.simulate(UST, 1))))
     values.cluster.ones = 0
     values.points[3].distance = 5
-    cloud = decoded(UST, UST.build("distances", values)).points()
+    cloud = decode(UST, UST.build("distances", values)).points()
     assert (len(cloud), cloud.valid[2:5].tolist()) == (1081, [True, False, True])
 
 

@@ -58,12 +58,12 @@ RATES = {
 CRC8 = Crc(width=8, poly=0x4D)
 
 
-def sealed(*members: Any) -> Checksummed:
+def with_crc(*members: Any) -> Checksummed:
     """A frame that ends with its CRC."""
     return Checksummed(Struct(*members, "crc" / Int8ul), field="crc", algorithm=CRC8)
 
 
-DATA = sealed(
+DATA = with_crc(
     "header" / Const(b"\x54\x2c") * "start byte 0x54; type 1 and 12 points",
     "speed" / Scaled(Int16ul, 1, "deg/s"),
     "start_angle" / Scaled(Int16ul, 0.01, "deg"),
@@ -78,11 +78,11 @@ DATA = sealed(
     "end_angle" / Scaled(Int16ul, 0.01, "deg"),
     "timestamp" / Scaled(Int16ul, 0.001, "s") * "restarts at 30 s",
 )
-HEALTH = sealed(
+HEALTH = with_crc(
     "header" / Const(b"\x54\xe0"),
     "error" / Int8ul * "1: motor blocked, 2: occluded, 3: both",
 )
-INFO = sealed(
+INFO = with_crc(
     "header" / Const(b"\x54\x0f"),
     "speed" / Scaled(Int16ul, 1, "deg/s"),
     "product_version" / Int16ul,
@@ -91,7 +91,7 @@ INFO = sealed(
     "hardware_version" / Int32ul,
     "firmware_version" / Int32ul,
 )
-COMMAND = sealed(
+COMMAND = with_crc(
     "header" / Const(b"\x54"),
     "command" / Int8ul * "A0 start, A1 stop, A2 speed, A8 firmware of the motor's board",
     "length" / Const(4, Int8ul),

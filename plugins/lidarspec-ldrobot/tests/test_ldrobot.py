@@ -17,7 +17,7 @@ import lidarspec as ls
 from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, Polar, Scaled, Serial, spread
 from lidarspec_ldrobot import RATES, keeps_pace
-from tests.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
+from tests.evidence import assert_points, capture, clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 SENSOR, LD06, LD14P = (ls.sensor(f"ldrobot-{name}") for name in ("stl27l", "ld06", "ld14p"))
@@ -71,7 +71,7 @@ def test_a_whole_frame_is_parsed_and_built_to_the_same_bytes(name: str) -> None:
     data, expected = vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
     parsed = SENSOR.parse(data)
     assert SENSOR.build("data", parsed) == data
-    packets = decoded(SENSOR, data)
+    packets = decode(SENSOR, data)
     known = {"speed_dps": "speed", "start_deg": "start_angle", "end_deg": "end_angle"}
     for printed, path in known.items():
         assert packets[path][0] == pytest.approx(expected[printed], abs=1e-9)
@@ -113,7 +113,7 @@ def test_the_decode_table_of_the_manual_is_wrong() -> None:
         f"0x{expected['crc_calc']:02x}",
         f"0x{expected['crc']:02x}",
     )
-    packets = decoded(SENSOR, data + QUADRANTS)
+    packets = decode(SENSOR, data + QUADRANTS)
     assert (len(packets), packets.stats.bad_checksum, packets.stats.bytes_skipped) == (1, 1, 47)
 
 
@@ -141,7 +141,7 @@ def test_an_ld14_looks_from_aside() -> None:
     # 1 m at 30 degrees: atan((0.11923 * 1000 - 18.975571) / 1005.9) = 5.69167 degrees less:
     # 24.30833. 3 m at 120 degrees: atan((357.69 - 18.975571) / 3005.9) = 6.42915 degrees less:
     # 113.57085.
-    cloud = decoded(LD14P, QUADRANTS).points()
+    cloud = decode(LD14P, QUADRANTS).points()
     np.testing.assert_allclose(clockwise(cloud)[[0, 4]], [24.30833, 113.57085], atol=1e-4)
     assert_points(cloud, [(0, (0.91134, -0.41165, 0))])
 
@@ -181,7 +181,7 @@ def test_the_crc_has_all_256_entries() -> None:
 
 
 def test_points_by_hand() -> None:
-    cloud = decoded(SENSOR, QUADRANTS).points()
+    cloud = decode(SENSOR, QUADRANTS).points()
     # Clockwise, so azimuth is the negative: x = d cos a, y = -d sin a.
     #   point 0:  30 deg, 1 m:      x = 0.86603,   y = -0.5        front right
     #   point 4:  120 deg, 3 m:     x = -1.5,      y = -2.59808    back right
@@ -194,7 +194,7 @@ def test_points_by_hand() -> None:
         (11, (0.84842, 6.44439, 0)),
     ]
     assert_points(cloud, expected)
-    assert_points(decoded(LD06, QUADRANTS).points(), expected)
+    assert_points(decode(LD06, QUADRANTS).points(), expected)
     assert_points(
         SENSOR.configure(frame="vendor").decode(QUADRANTS).points(),
         [(0, (0.86603, 0.5, 0)), (8, (-4.33013, -2.5, 0))],
@@ -207,14 +207,14 @@ def test_points_of_real_frames_by_hand() -> None:
     # 86.76 deg, 01f2 = 498 mm: x = .498 cos = 0.02815, y = -0.49720.   114.35 deg, 0229 = 553 mm: x
     # = -0.22801, y = -0.50380. 324.27 deg, 00e0 = 224 mm (the manual): x = 0.18184, y = +0.13081.
     assert_points(
-        decoded(LD06, vector_bytes(FILE, "ld06_capture_1")).points(), [(0, (0.02815, -0.49720, 0))]
+        decode(LD06, vector_bytes(FILE, "ld06_capture_1")).points(), [(0, (0.02815, -0.49720, 0))]
     )
     assert_points(
-        decoded(LD06, vector_bytes(FILE, "ld06_capture_3")).points(),
+        decode(LD06, vector_bytes(FILE, "ld06_capture_3")).points(),
         [(11, (-0.22801, -0.50380, 0))],
     )
     assert_points(
-        decoded(LD06, vector_bytes(FILE, "ld_manual_example")).points(),
+        decode(LD06, vector_bytes(FILE, "ld_manual_example")).points(),
         [(0, (0.18184, 0.13081, 0))],
     )
 
@@ -222,7 +222,7 @@ def test_points_of_real_frames_by_hand() -> None:
 def test_three_consecutive_frames() -> None:
     data = capture("ldrobot/ld06_3_consecutive_frames.bin").read_bytes()
     assert data == vector_bytes(FILE, "ld06_stream_3_capture")
-    packets = decoded(LD06, data)
+    packets = decode(LD06, data)
     assert (packets.stats.frames, packets.stats.bytes_skipped) == ({"data": 3}, 0)
     assert np.diff(packets.time_ns).tolist() == [2_000_000, 3_000_000]
     angles = clockwise(packets.points())
@@ -234,7 +234,7 @@ def test_three_consecutive_frames() -> None:
 def test_six_real_frames() -> None:
     expected = json.loads(capture("ldrobot/ld_frames.json").read_text())
     assert len(expected) == 6
-    packets = decoded(LD06, b"\x54".join(bytes.fromhex(item["hex"]) for item in expected))
+    packets = decode(LD06, b"\x54".join(bytes.fromhex(item["hex"]) for item in expected))
     assert (len(packets), packets.stats.bytes_skipped) == (6, 5)
     assert packets.raw["points"]["distance"].tolist() == [
         [point[0] for point in item["pts"]] for item in expected
@@ -248,7 +248,7 @@ def test_six_real_frames() -> None:
 
 
 def test_points_without_a_return_have_no_coordinates() -> None:
-    cloud = decoded(LD06, vector_bytes(FILE, "ld20_capture")).points()
+    cloud = decode(LD06, vector_bytes(FILE, "ld20_capture")).points()
     assert cloud.intensity is not None
     assert not cloud.valid.any()
     assert np.isinf(cloud.range).all()
@@ -260,7 +260,7 @@ def test_points_without_a_return_have_no_coordinates() -> None:
     ("start", "end"), [(359.5, 1.33), (359.99, 0.0), (10.0, 10.0), (0.0, 359.99)]
 )
 def test_frames_that_cross_360_degrees_go_on_forward(start: float, end: float) -> None:
-    angles = clockwise(decoded(SENSOR, frame(start, end)).points())
+    angles = clockwise(decode(SENSOR, frame(start, end)).points())
     steps = (angles - start + 0.005) % 360 - 0.005
     np.testing.assert_allclose(steps, (end - start) % 360 * np.arange(12) / 11, atol=1e-4)
 
@@ -278,7 +278,7 @@ def test_frames_that_cross_360_degrees_go_on_forward(start: float, end: float) -
     ],
 )
 def test_implausible_bytes_are_no_frames(data: bytes) -> None:
-    packets = decoded(SENSOR, data)
+    packets = decode(SENSOR, data)
     assert (packets.stats.frames, packets.stats.bytes_skipped) == ({}, len(data))
 
 
@@ -286,7 +286,7 @@ def test_implausible_bytes_are_no_frames(data: bytes) -> None:
 def test_the_clock_runs_on_over_100_wraps() -> None:
     # 9.7 s apart, so that every part of the 30 s is met: 320 frames pass 30 s 103 times.
     milliseconds = np.arange(320) * 9_700
-    packets = decoded(
+    packets = decode(
         SENSOR, b"".join(frame(seconds=float(now % 30_000) / 1000) for now in milliseconds)
     )
     assert milliseconds[-1] // 30_000 > 100
@@ -305,7 +305,7 @@ def test_the_clock_runs_on_between_batches() -> None:
 
 @pytest.mark.parametrize(("sensor", "rate"), [(SENSOR, 21_600), (LD06, 4_500)])
 def test_points_of_a_frame_are_apart_by_the_rate_of_the_model(sensor: ls.Sensor, rate: int) -> None:
-    np.testing.assert_allclose(decoded(sensor, QUADRANTS).points().time, np.arange(12) / rate)
+    np.testing.assert_allclose(decode(sensor, QUADRANTS).points().time, np.arange(12) / rate)
 
 
 @pytest.mark.parametrize(("sensor", "number"), [(SENSOR, 2160), (LD06, 450)])
@@ -361,7 +361,7 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
     echoes = [dict(far=1 + k / 2, strength=10 + k) for k in range(12)]
     data = other.build("data", units=True, clock=1.0, since=30, to=277.5, speed=3600, echoes=echoes)
     assert (len(data), data[3:5]) == (47, (1000).to_bytes(2, "little"))
-    cloud, same = decoded(other, data).points(), decoded(SENSOR, QUADRANTS).points()
+    cloud, same = decode(other, data).points(), decode(SENSOR, QUADRANTS).points()
     np.testing.assert_array_equal(cloud.xyz, same.xyz)
     np.testing.assert_array_equal(cloud.intensity, same.intensity)
     assert cloud.stamp_ns == same.stamp_ns == 10**9

@@ -116,7 +116,7 @@ def clock(f: Fields) -> tuple[Any, ...]:
     )
 
 
-def known(f: Fields) -> Any:
+def is_known(f: Fields) -> Any:
     """A type of timestamp that there is, and a slot and a number as a hub counts them; a Lidar by
     itself has such numbers too.
     """
@@ -156,8 +156,8 @@ def data_frame(name: str, rate: float, **more: Any) -> Frame:
 
     def plausible(f: Fields) -> Any:
         if by_angles:
-            return known(f) & (f.points[0].zenith <= 180) & (f.points[0].azimuth <= 360)
-        return known(f)
+            return is_known(f) & (f.points[0].zenith <= 180) & (f.points[0].azimuth <= 360)
+        return is_known(f)
 
     shot = Struct(*members)
     return Frame(
@@ -183,14 +183,14 @@ def simulation(name: str, rate: float, view: View, **more: Any) -> Simulation:
             "points.azimuth": np.ravel(azimuth) % 360,
             "points.zenith": 90 - np.ravel(elevation),
         }
-        return {**stamped(round(i * count * 1e9 / rate)), **angles}
+        return {**make_header(round(i * count * 1e9 / rate)), **angles}
 
     return Simulation(
         sweep, directions=lambda i: tuple(np.deg2rad(angle) for angle in look(i)), **more
     )
 
 
-def stamped(ns: int) -> dict[str, Any]:
+def make_header(ns: int) -> dict[str, Any]:
     """The header of a packet of this time since power-up."""
     pieces = {"low": ns % 2**32, "middle": (ns >> 32) % 2**16, "high": ns >> 48}
     header = {"slot": 1, "lidar_id": 1, "reserved": 0, "status_code": 0, "timestamp_type": 0}
@@ -267,8 +267,8 @@ CONTROL: dict[str, Frame] = {
     "imu": Frame(
         packet(6, *INERTIAL),
         imu=imu,
-        plausible=known,
-        simulation=Simulation(lambda i: stamped(i * 10**9 // IMU_RATE), rate=IMU_RATE),
+        plausible=is_known,
+        simulation=Simulation(lambda i: make_header(i * 10**9 // IMU_RATE), rate=IMU_RATE),
     ),
     "broadcast": Frame(
         message(

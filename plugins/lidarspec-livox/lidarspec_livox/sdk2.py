@@ -112,7 +112,7 @@ def after(f: Fields) -> Any:
     return steps(f.dot_num) * (f.time_interval / f.dot_num)
 
 
-def filled(f: Fields) -> Any:
+def has_points(f: Fields) -> Any:
     """A packet has points."""
     return f.dot_num >= 1
 
@@ -129,7 +129,7 @@ def points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Frame:
         struct,
         data=True,
         max_length=LONGEST,
-        plausible=filled,
+        plausible=has_points,
         points=points,
         **more,
     )
@@ -514,7 +514,7 @@ MODELS: dict[str, tuple[str, int, int, int, Ports, int, View, tuple[float, float
 }
 
 
-def told(request: Mapping[str, Any]) -> tuple[Any, ...]:
+def answer_state(request: Mapping[str, Any]) -> tuple[Any, ...]:
     """What a simulated one answers where it is asked for its state."""
     return (("parameters", {"result": 0, **state(request["head.seq"])}),)
 
@@ -554,7 +554,7 @@ def lidar(name: str) -> Sensor:
         clock=Clock("timestamp", pace=lambda f: f.time_interval),
         sequence=Sequence("udp_cnt"),
         simulation=simulation(
-            rate, view, answers={"discover": (("discovery", found),), "get_state": told}
+            rate, view, answers={"discover": (("discovery", found),), "get_state": answer_state}
         ),
         on_open=("discover", "get_state", *(f"set_{what}_host" for what in ports), "start"),
         on_close=("stop",),
@@ -575,7 +575,7 @@ def lidar(name: str) -> Sensor:
     )
 
 
-def hurried(f: Fields) -> Any:
+def is_fast(f: Fields) -> Any:
     """452 000 points a second, 2.2 us each, and not 200 000."""
     return f.time_interval < 3.3e-6 * f.dot_num
 
@@ -584,7 +584,7 @@ RELATIVES: dict[str, str | Relative] = {
     "livox-mid360": Relative(
         "5 us from a point to the next", lambda f: f.time_interval >= 3.3e-6 * f.dot_num
     ),
-    "livox-hap": Relative("2.2 us from a point to the next", hurried),
+    "livox-hap": Relative("2.2 us from a point to the next", is_fast),
     "livox-mid360s": "the device type in its answer to a discovery, 35",
 }
 MID360, HAP = SENSORS = [lidar(name) for name in MODELS]

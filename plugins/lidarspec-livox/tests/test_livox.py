@@ -15,7 +15,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.detect.identification import identify_sample
 from lidarspec.detect.sample_bytes import SampleBytes
-from tests.evidence import decoded, vector_bytes, vectors
+from tests.evidence import decode, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 MID360, HAP = ls.sensor("livox-mid360"), ls.sensor("livox-hap")
@@ -64,21 +64,21 @@ def test_the_handshake_is_the_published_one() -> None:
 
 def test_published_points_of_the_second_generation() -> None:
     expected = vectors(FILE)["livox2_data_cart32"]["expected"]
-    packets = decoded(MID360, [vector_bytes(FILE, "livox2_data_cart32")])
+    packets = decode(MID360, [vector_bytes(FILE, "livox2_data_cart32")])
     cloud = packets.points()
     assert len(cloud) == expected["dot_num"]
     assert cloud.xyz[0].tolist() == pytest.approx(expected["points"][0]["xyz"])
     assert cloud.intensity[0] == expected["points"][0]["reflectivity"]
     stamps = packets.time_ns[0] + np.rint(cloud.time[:2] * 1e9).astype(np.int64)
     assert stamps.tolist() == [point["t_ns"] for point in expected["points"][:2]]
-    spherical = decoded(MID360, [vector_bytes(FILE, "livox2_data_spherical")]).points()
+    spherical = decode(MID360, [vector_bytes(FILE, "livox2_data_spherical")]).points()
     place = vectors(FILE)["livox2_data_spherical"]["expected"]["points"][0]["xyz"]
     assert spherical.xyz[0].tolist() == pytest.approx(place, abs=1e-4)
 
 
 def test_published_points_of_the_first_generation_and_their_date() -> None:
     expected = vectors(FILE)["livox1_data_type1_gps"]["expected"]
-    packets = decoded(MID40, [vector_bytes(FILE, "livox1_data_type1_gps")])
+    packets = decode(MID40, [vector_bytes(FILE, "livox1_data_type1_gps")])
     cloud = packets.points()
     assert packets.time_ns.tolist() == [expected["timestamp_ns"]]
     assert len(cloud) == expected["points_n"]
@@ -95,7 +95,7 @@ def header(kind: int, time_type: int, stamp: bytes) -> bytes:
 def test_times_of_the_first_generation_are_exact() -> None:
     points = bytes(100 * 13)
     for ns in (0, 1_700_000_000_123_456_789, 2**32 - 1, 2**61 + 1):
-        assert decoded(MID40, [header(0, 1, struct.pack("<Q", ns)) + points]).time_ns.tolist() == [
+        assert decode(MID40, [header(0, 1, struct.pack("<Q", ns)) + points]).time_ns.tolist() == [
             ns
         ]
     for year, month, day in (
@@ -107,7 +107,7 @@ def test_times_of_the_first_generation_are_exact() -> None:
     ):
         stamp = struct.pack("<BBBBI", year - 2000, month, day, 23, 3_599_999_999)
         seconds = int(datetime(year, month, day, 23, tzinfo=UTC).timestamp())
-        assert decoded(MID40, [header(0, 3, stamp) + points]).time_ns.tolist() == [
+        assert decode(MID40, [header(0, 3, stamp) + points]).time_ns.tolist() == [
             seconds * 10**9 + 3_599_999_999_000
         ]
 
@@ -159,7 +159,7 @@ TYPES: dict[int, tuple[int, bytes, list[list[float]], int | None]] = {
 def test_points_of_each_type_of_the_first_generation(kind: int) -> None:
     shots, first, places, tag = TYPES[kind]
     packet = header(kind, 0, bytes(8)) + first + bytes(len(first) * (shots - 1))
-    cloud = decoded(AVIA, [packet]).points()
+    cloud = decode(AVIA, [packet]).points()
     assert len(packet) == {0: 1318, 1: 918, 2: 1362, 3: 978, 4: 1362, 5: 786, 7: 1278, 8: 678}[kind]
     assert cloud.xyz[: len(places)] == pytest.approx(np.array(places, np.float32), abs=1e-5)
     assert int(cloud.valid.sum()) == len(places)

@@ -84,7 +84,7 @@ CLOCK = Clock(
 )
 
 
-def summed(size: Construct, samples: Construct, *rest: Construct) -> Frame:
+def make_packet(size: Construct, samples: Construct, *rest: Construct) -> Frame:
     """A packet of the N family: 16 samples between two angles."""
     struct = Struct(
         "header" / START,
@@ -116,7 +116,7 @@ def sized_plausible(f: Fields) -> Any:
     return (f.start_angle <= 360) & (f.length > 20) & (f.length % 2 == 0)
 
 
-def seen(distance: Any) -> Any:
+def mask_no_return(distance: Any) -> Any:
     """A distance, 0 where all its bits say that there is none."""
     return np.where(distance >= 65.535, 0, distance)
 
@@ -131,7 +131,10 @@ def n10_points(f: Fields) -> Polar:
     """Even steps from the start angle to the end angle."""
     azimuth, time = from_to(f)
     return Polar(
-        range=seen(f.samples.distance), azimuth=azimuth, intensity=f.samples.intensity, time=time
+        range=mask_no_return(f.samples.distance),
+        azimuth=azimuth,
+        intensity=f.samples.intensity,
+        time=time,
     )
 
 
@@ -139,7 +142,7 @@ def n10p_points(f: Fields) -> Polar:
     """The same with two returns of each sample."""
     azimuth, time = from_to(f)
     return Polar(
-        range=stack(seen(f.samples.first), seen(f.samples.second)),
+        range=stack(mask_no_return(f.samples.first), mask_no_return(f.samples.second)),
         azimuth=azimuth,
         intensity=stack(f.samples.first_intensity, f.samples.second_intensity),
         time=time,
@@ -197,10 +200,10 @@ def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dic
     }
 
 
-N10_DATA = summed(
+N10_DATA = make_packet(
     Const(58, Int8ub), Array(N_SAMPLES, Struct("distance" / DISTANCE, "intensity" / Int8ub))
 )
-N10P_DATA = summed(
+N10P_DATA = make_packet(
     Int8ub,
     Array(
         N_SAMPLES,

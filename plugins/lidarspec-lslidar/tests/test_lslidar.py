@@ -9,7 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from tests.evidence import clockwise, decoded, vector_bytes, vectors
+from tests.evidence import clockwise, decode, vector_bytes, vectors
 
 N10, N10P, M10P, C16 = (ls.sensor(f"lslidar-{name}") for name in ("n10", "n10p", "m10p", "c16"))
 
@@ -17,7 +17,7 @@ N10, N10P, M10P, C16 = (ls.sensor(f"lslidar-{name}") for name in ("n10", "n10p",
 def test_the_published_packet_of_an_n10() -> None:
     data = vector_bytes("vectors_serial2d.json", "lslidar_n10_synth")
     expected = vectors("vectors_serial2d.json")["lslidar_n10_synth"]["expected"]
-    packets = decoded(N10, data)
+    packets = decode(N10, data)
     cloud = packets.points()
     assert 1 / (24 * packets["period"][0]) == pytest.approx(expected["hz"], abs=1e-4)
     assert np.round(cloud.range * 1000).tolist() == expected["dist_mm"]
@@ -29,7 +29,7 @@ def test_the_published_packet_of_an_n10() -> None:
 
 
 def test_the_returns_of_an_n10p_share_their_direction() -> None:
-    cloud = decoded(N10P, b"".join(simulate(N10P, 40))).points()
+    cloud = decode(N10P, b"".join(simulate(N10P, 40))).points()
     assert cloud.return_index is not None
     assert cloud.return_index[:4].tolist() == [0, 1, 0, 1]
     assert cloud.azimuth[0] == cloud.azimuth[1] != cloud.azimuth[2]
@@ -45,11 +45,11 @@ def test_m10p_packets_have_their_declared_length_and_cross_midnight() -> None:
         )
         for count in (69, 70, 74)
     ]
-    assert len(decoded(M10P, b"".join(packets)).points()) == 69 + 70 + 74
+    assert len(decode(M10P, b"".join(packets)).points()) == 69 + 70 + 74
     late = M10P.build(
         "data", M10P.parse(packets[0]), hour=23, minute=59, second=59, millisecond=0, microsecond=0
     )
-    assert np.diff(decoded(M10P, late + packets[1]).time_ns).tolist() == [1_000_000_000]
+    assert np.diff(decode(M10P, late + packets[1]).time_ns).tolist() == [1_000_000_000]
 
 
 def test_no_return_is_no_point_and_a_strong_reflection_is_one() -> None:
@@ -61,7 +61,7 @@ def test_no_return_is_no_point_and_a_strong_reflection_is_one() -> None:
     time = dict.fromkeys(
         ("year", "month", "day", "hour", "minute", "second", "millisecond", "microsecond"), 0
     )
-    cloud = decoded(
+    cloud = decode(
         M10P, M10P.build("data", length=26, start_angle=0, period=4167, samples=samples, **time)
     ).points()
     assert cloud.intensity is not None
@@ -74,7 +74,7 @@ def test_a_captured_packet_of_a_c16() -> None:
         vectors("vectors_udp3d.json")["lslidar_c16_like_vli16"]["expected"],
     )
     assert C16.build("data", C16.parse(data)) == data
-    packets = decoded(C16, [data])
+    packets = decode(C16, [data])
     assert packets.raw["blocks"]["azimuth"][0].tolist() == expected["azimuths"]
     first = packets.raw["blocks"]["groups"]["channels"][0, 0].reshape(32)
     assert [first["distance"][slot] for _, slot, _, _ in expected["first"]] == [
@@ -94,14 +94,14 @@ def test_a_c16_with_two_returns_and_with_steps_of_another_size() -> None:
     parsed.return_mode = 0x39
     for first, second in zip(parsed.blocks[::2], parsed.blocks[1::2], strict=True):
         second.azimuth = first.azimuth
-    dual = decoded(C16, [C16.build("data", parsed)]).points()
+    dual = decode(C16, [C16.build("data", parsed)]).points()
     assert dual.return_index is not None
     assert dual.return_index.reshape(12, 32)[:, 0].tolist() == [0, 1] * 6
     np.testing.assert_array_equal(dual.azimuth[:32], dual.azimuth[32:64])
     np.testing.assert_allclose([dual.time[0], dual.time[-1]], [-191 * 3.125e-6, 0], atol=1e-9)
     single, fine = (
         C16.decode([data]).points(),
-        decoded(C16.configure(distance_unit=0.25), [data]).points(),
+        decode(C16.configure(distance_unit=0.25), [data]).points(),
     )
     np.testing.assert_allclose(
         fine.range[fine.valid], single.range[single.valid] * 0.625, rtol=1e-6

@@ -9,7 +9,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import simulate
-from tests.evidence import decoded, vector_bytes, vectors
+from tests.evidence import decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 XV11, LDS02RR, LFCD = (
@@ -22,7 +22,7 @@ XV11, LDS02RR, LFCD = (
 def test_the_published_packet() -> None:
     data, expected = vector_bytes(FILE, "neato_synth"), vectors(FILE)["neato_synth"]["expected"]
     samples = XV11.parse(data).samples
-    packets = decoded(XV11, data)
+    packets = decode(XV11, data)
     assert packets["speed"].tolist() == [expected["rpm"]]
     assert [sample.range.distance for sample in samples] == expected["dist_mm"]
     assert [sample.range.invalid for sample in samples] == expected["invalid"]
@@ -34,10 +34,10 @@ def test_the_published_packet() -> None:
 def test_the_xv11_counts_counter_clockwise_and_the_lds02rr_clockwise() -> None:
     data = vector_bytes(FILE, "neato_synth")
     np.testing.assert_allclose(
-        np.rad2deg(decoded(XV11, data).points().azimuth), [0, 1, 2, 3], atol=1e-4
+        np.rad2deg(decode(XV11, data).points().azimuth), [0, 1, 2, 3], atol=1e-4
     )
     np.testing.assert_allclose(
-        np.rad2deg(decoded(LDS02RR, data).points().azimuth) % 360, [0, 359, 358, 357], atol=1e-4
+        np.rad2deg(decode(LDS02RR, data).points().azimuth) % 360, [0, 359, 358, 357], atol=1e-4
     )
 
 
@@ -49,5 +49,5 @@ def test_a_turn_has_a_point_to_the_degree(sensor: ls.Sensor) -> None:
 
 def test_packets_of_an_lfcd2_are_taken_whatever_their_trailer_is_and_never_alone() -> None:
     packets = [bytes([*packet[:40], i, 255 - i]) for i, packet in enumerate(simulate(LFCD, 5))]
-    assert len(decoded(LFCD, b"".join(packets))) == 5
-    assert len(decoded(LFCD, packets[0] + bytes(40))) == 0
+    assert len(decode(LFCD, b"".join(packets))) == 5
+    assert len(decode(LFCD, packets[0] + bytes(40))) == 0

@@ -125,7 +125,7 @@ def sweep(unit: Unit, i: int) -> dict[str, Any]:
     }
 
 
-def shaped(sensor: Sensor, unit: Unit) -> Sensor:
+def with_unit(sensor: Sensor, unit: Unit) -> Sensor:
     """The sensor with the layout and the beams of a unit."""
     turned = tuple(map(tuple, unit.imu[:3, :3].tolist()))
     frames = {
@@ -150,7 +150,7 @@ def shaped(sensor: Sensor, unit: Unit) -> Sensor:
         info={} if legacy else {"serial": "data.serial"},
         simulation=Simulation(
             partial(sweep, unit),
-            answers={"get_metadata": (("reply", {"status": 200, "body": unit.told()}),)},
+            answers={"get_metadata": (("reply", {"status": 200, "body": unit.to_metadata()}),)},
         ),
     )
 
@@ -220,7 +220,7 @@ def configure(
                 f"{sensor.id}: these are metadata of an {unit.product}: -s"
                 f" ouster-{known[0].lower()}"
             )
-        return dataclasses.replace(shaped(sensor, unit), on_open=())
+        return dataclasses.replace(with_unit(sensor, unit), on_open=())
     layout = {
         **LAYOUT,
         **{name: value for name, value in sensor.options.items() if name in LAYOUT},
@@ -235,7 +235,7 @@ def configure(
         raise UsageError(
             f"{sensor.id}: profile is one of {', '.join(PROFILES)}, not {layout['profile']!r}"
         )
-    return shaped(sensor, nominal(sensor.model, **layout))
+    return with_unit(sensor, nominal(sensor.model, **layout))
 
 
 #: a layout to begin with: few rows, so that a simulation of it is quick.
@@ -246,25 +246,27 @@ HTTP = {
 }
 
 
-def asked(method: str, path: str, body: str = "", **more: Any) -> Command:
+def make_request(method: str, path: str, body: str = "", **more: Any) -> Command:
     """A request to the web server."""
     values = {"method": method, "path": f"/api/v1/{path}".encode(), "body": body.encode()}
     return Command("ask", values, reply="reply", link="http", timeout=6.0, **more)
 
 
 COMMANDS = {
-    "get_metadata": asked("GET", "sensor/metadata", learns=lambda reply: {"metadata": reply.body}),
-    "get_config": asked("GET", "sensor/config"),
-    "set_config": dataclasses.replace(
-        asked("POST", "sensor/config"), args={"json": ("body", Text(4096))}
+    "get_metadata": make_request(
+        "GET", "sensor/metadata", learns=lambda reply: {"metadata": reply.body}
     ),
-    "start": asked("POST", "sensor/config", '{"operating_mode": "NORMAL"}'),
-    "standby": asked("POST", "sensor/config", '{"operating_mode": "STANDBY"}'),
-    "send_here": asked("POST", "sensor/cmd/set_udp_dest_auto"),
-    "reinitialize": asked("POST", "sensor/cmd/reinitialize"),
-    "save_config": asked("POST", "sensor/cmd/save_config_params"),
-    "get_firmware": asked("GET", "system/firmware"),
-    "get_network": asked("GET", "system/network"),
+    "get_config": make_request("GET", "sensor/config"),
+    "set_config": dataclasses.replace(
+        make_request("POST", "sensor/config"), args={"json": ("body", Text(4096))}
+    ),
+    "start": make_request("POST", "sensor/config", '{"operating_mode": "NORMAL"}'),
+    "standby": make_request("POST", "sensor/config", '{"operating_mode": "STANDBY"}'),
+    "send_here": make_request("POST", "sensor/cmd/set_udp_dest_auto"),
+    "reinitialize": make_request("POST", "sensor/cmd/reinitialize"),
+    "save_config": make_request("POST", "sensor/cmd/save_config_params"),
+    "get_firmware": make_request("GET", "system/firmware"),
+    "get_network": make_request("GET", "system/network"),
 }
 
 
@@ -294,7 +296,7 @@ def model(name: str, status: str) -> Sensor:
             " captures"
         ),
     )
-    return shaped(bare, unit)
+    return with_unit(bare, unit)
 
 
 OS0, OS1, OS2, OSDOME = (

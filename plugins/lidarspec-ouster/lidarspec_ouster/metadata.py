@@ -112,7 +112,7 @@ class Unit:
         turned = self.lidar[:3, :3].T
         return directions @ turned, (starts @ turned + self.lidar[:3, 3]) / 1000
 
-    def told(self) -> bytes:
+    def to_metadata(self) -> bytes:
         """The metadata, as the web server of such a sensor would give them."""
         first, last = self.window
         return json.dumps(

@@ -271,11 +271,11 @@ def imu(samples: int, turned: Rotation) -> Frame:
         sealed,
         imu=felt,
         clock=Clock("samples[0].timestamp"),
-        simulation=Simulation(partial(sampled, samples), rate=100),
+        simulation=Simulation(partial(sample_times, samples), rate=100),
     )
 
 
-def sampled(samples: int, i: int) -> dict[str, Any]:
+def sample_times(samples: int, i: int) -> dict[str, Any]:
     """The times of packet i, 100 a second."""
     return {"samples.timestamp": (i + np.arange(samples) / samples) * 10_000_000}
 
@@ -297,10 +297,10 @@ def feel(f: Fields, path: str, turned: Rotation) -> Imu:
         time = 0
         rates = [np.deg2rad(getattr(values, f"gyro_{axis}")) for axis in AXES]
     accelerations = [getattr(values, f"acceleration_{axis}") for axis in AXES]
-    return Imu(rotated(turned, rates), rotated(turned, accelerations), time)
+    return Imu(rotate(turned, rates), rotate(turned, accelerations), time)
 
 
-def rotated(turned: Rotation, vector: Any) -> tuple[Any, ...]:
+def rotate(turned: Rotation, vector: Any) -> tuple[Any, ...]:
     """A vector of columns, turned."""
     parts = list(vector)
     return tuple(

@@ -24,7 +24,7 @@ from lidarspec_ouster import nominal
 from lidarspec_ouster.metadata import read
 from lidarspec_ouster.packets import NOT_FILLED, PROFILES, size
 from lidarspec_ouster.recognition import recognise
-from tests.evidence import capture, decoded, vector_bytes, vectors
+from tests.evidence import capture, decode, vector_bytes, vectors
 
 OS0, OS1, OS2 = (ls.sensor(f"ouster-os{number}") for number in range(3))
 #: capture, the metadata beside it, and the layout that packets alone tell.
@@ -121,7 +121,7 @@ def test_points_are_those_of_the_vendor(name: str, backend: str) -> None:
 @pytest.mark.parametrize("name", CAPTURES)
 def test_a_capture_is_read_whole(name: str) -> None:
     sensor, data = unit(name)
-    packets = decoded(sensor, data[:4] + data[-4:])
+    packets = decode(sensor, data[:4] + data[-4:])
     assert packets.stats.bytes_skipped == 0
     stats = sensor.decode(data).stats
     assert (stats.frames["data"] + stats.frames.get("imu", 0), stats.bytes_skipped, stats.lost) == (
@@ -138,7 +138,7 @@ def test_published_packets(name: str) -> None:
     params, expected = vector["params"], vector["expected"]
     assert size(params["profile"], params["H"]) == len(data)
     sensor = OS0.configure(metadata=Learned(json.dumps(metadata_of(params)).encode()))
-    packets = decoded(sensor, [data])
+    packets = decode(sensor, [data])
     fields = packets.raw["columns"]["pixels"]
     shift = {"RANGE": 3, "RANGE2": 3, "NEAR_IR": 4} if "RNG15" in params["profile"] else {}
     sums = {
@@ -261,7 +261,7 @@ def test_length_alone_does_not_identify_a_packet(data: bytes) -> None:
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_profile_is_simulated_and_read(profile: str) -> None:
     sensor = OS2.configure(rows=16, turn=512, profile=profile)
-    packets = decoded(sensor, simulate(sensor, 2))
+    packets = decode(sensor, simulate(sensor, 2))
     cloud = packets.points()
     assert (len(packets), cloud.shape) == (2, (32, 16))
     assert cloud.nominal
@@ -278,13 +278,13 @@ def test_metadata_are_learned_from_the_web_server_of_a_simulated_sensor() -> Non
 
 def test_older_and_newer_metadata_are_equivalent(tmp_path: Path) -> None:
     made = dataclasses.replace(nominal("OS1", 16, 512, "LEGACY"), nominal=False, serial="7")
-    sections = json.loads(made.told())
+    sections = json.loads(made.to_metadata())
     flat = {key: value for section in sections.values() for key, value in section.items()}
     flat["data_format"] = {key: flat.pop(key) for key in sections["lidar_data_format"]}
     for name, data in (("new", sections), ("old", flat)):
         (tmp_path / name).write_text(json.dumps(data))
     new, old = read(tmp_path / "new"), read(tmp_path / "old")
-    assert new.told() == old.told() == made.told()
+    assert new.to_metadata() == old.to_metadata() == made.to_metadata()
     assert (
         OS1.configure(metadata=tmp_path / "old").configure(frame="vendor").frames["data"]
         is OS1.configure(metadata=tmp_path / "new").frames["data"]
@@ -293,7 +293,7 @@ def test_older_and_newer_metadata_are_equivalent(tmp_path: Path) -> None:
 
 def test_keys_are_read_from_whichever_section_has_them(tmp_path: Path) -> None:
     unit = dataclasses.replace(nominal("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=8)
-    data = json.loads(unit.told())
+    data = json.loads(unit.to_metadata())
     data["imu_data_format"] = {
         "imu_measurements_per_packet": data["lidar_data_format"].pop("imu_measurements_per_packet")
     }
@@ -315,7 +315,7 @@ def test_missing_offsets_are_those_of_the_model_and_nominal(
     tmp_path: Path, product: str, distance_mm: float
 ) -> None:
     """The values that ouster-sdk takes (sensor_info.cpp, metadata.cpp)."""
-    data = json.loads(nominal("OS1", 16, 512, "LEGACY").told())
+    data = json.loads(nominal("OS1", 16, 512, "LEGACY").to_metadata())
     data["sensor_info"]["prod_line"] = product
     del data["beam_intrinsics"]["beam_to_lidar_transform"]
     del data["lidar_intrinsics"]
@@ -329,7 +329,7 @@ def test_missing_offsets_are_those_of_the_model_and_nominal(
 def test_imu_measurements_come_in_si_units() -> None:
     """Captured values of ACCEL32_GYRO32_NMEA are multiples of 9.80665/2048 and (pi/180)/16.4."""
     unit = dataclasses.replace(nominal("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=2)
-    sensor = OS1.configure(metadata=Learned(unit.told()))
+    sensor = OS1.configure(metadata=Learned(unit.to_metadata()))
     gravity = 2048 * 9.80665 / 2048
     rate = 164 * np.deg2rad(1) / 16.4
     measurement = {f"{name}_{axis}": 0.0 for name in ("acceleration", "gyro") for axis in "xyz"}
@@ -367,7 +367,7 @@ def test_metadata_that_cannot_be_are_refused_by_name(
 ) -> None:
     data = {
         key: value
-        for section in json.loads(nominal("OS1", 16, 512, "LEGACY").told()).values()
+        for section in json.loads(nominal("OS1", 16, 512, "LEGACY").to_metadata()).values()
         for key, value in section.items()
     }
     (tmp_path / "unit.json").write_text(json.dumps({**data, **change}))

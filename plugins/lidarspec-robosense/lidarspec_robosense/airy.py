@@ -63,7 +63,7 @@ from lidarspec_robosense.rotor import (
     Rotor,
     angles,
     beams,
-    signed,
+    laser_degrees,
     signs,
     sweep,
     sweep_difop,
@@ -203,8 +203,10 @@ def points(f: Fields) -> Polar:
     dual = f.returns == DUAL
     low = f.blocks.index % 2 == 0
     ahead = np.where(dual, following(azimuth, 4), following(azimuth, 2))
-    vertical = np.where(low, signed(difop.vertical_low), signed(difop.vertical_high))
-    horizontal = np.where(low, signed(difop.horizontal_low), signed(difop.horizontal_high))
+    vertical = np.where(low, laser_degrees(difop.vertical_low), laser_degrees(difop.vertical_high))
+    horizontal = np.where(
+        low, laser_degrees(difop.horizontal_low), laser_degrees(difop.horizontal_high)
+    )
     delay = np.where(
         difop.install_mode == 1, SIDEWAYS, np.where(difop.install_mode == 2, AIRY_M, UPRIGHT)
     )

@@ -159,16 +159,16 @@ def plausible(f: Fields) -> Any:
 def points_16p(f: Fields) -> Polar:
     """Two firings in a block; lasers are numbered as in it."""
     polar = halves(f, f.state.difop.return_mode == DUAL, HELIOS_16P_ROTOR, directions(f))
-    return dataclasses.replace(polar, range=resolved(f, polar), ring=np.arange(16))
+    return dataclasses.replace(polar, range=scale_range(f, polar), ring=np.arange(16))
 
 
 def points_32(f: Fields, model: Rotor) -> Polar:
     """One firing in a block."""
     polar = pairs(f, f.state.difop.return_mode == DUAL, model)
-    return dataclasses.replace(polar, range=resolved(f, polar))
+    return dataclasses.replace(polar, range=scale_range(f, polar))
 
 
-def resolved(f: Fields, polar: Polar) -> Any:
+def scale_range(f: Fields, polar: Polar) -> Any:
     """Metres, by the step that the header says."""
     return polar.range * np.where(f.range_resolution == 0, 2, 1)
 

@@ -185,7 +185,7 @@ def signs(name: str, values: NDArray[np.float64]) -> dict[str, Any]:
     return {f"{name}.sign": values < 0, f"{name}.value": np.abs(values)}
 
 
-def signed(entry: Any) -> Any:
+def laser_degrees(entry: Any) -> Any:
     """Degrees of each laser, on the lasers' axis; nan, so no point, where the sensor is not
     calibrated.
     """
@@ -196,7 +196,7 @@ def signed(entry: Any) -> Any:
 
 def directions(f: Fields) -> tuple[Any, Any]:
     """Degrees above the horizon, and clockwise of the rotor's direction, of each laser."""
-    return signed(f.state.difop.vertical), signed(f.state.difop.horizontal)
+    return laser_degrees(f.state.difop.vertical), laser_degrees(f.state.difop.horizontal)
 
 
 def pairs(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:

@@ -119,7 +119,7 @@ def pace(f: Fields, shots: int, period: float) -> Any:
     return np.where(f.wave_mode.returns == DUAL, shots / 2, shots) * period
 
 
-def staged(times: Any, counts: Any) -> NDArray[np.float64]:
+def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
     """Seconds of lasers of which so many fire at each of some times in microseconds."""
     return np.repeat(np.asarray(times, np.float64), counts) * 1e-6
 
@@ -128,7 +128,7 @@ def steps(*counts: int) -> NDArray[np.float64]:
     """Seconds of lasers of which so many fire at each of 16 times, 3.236 us apart, in two rows
     (rs_driver).
     """
-    return staged(np.tile(np.arange(16) * 3.236, 2), counts)
+    return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)
 
 
 def rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
@@ -203,9 +203,11 @@ RS128_ROTOR = rotor(steps(*[4] * 32), 55.55e-6, 0.03615)
 RS80_COUNTS = ((3, 2, 4, 3, 3, 3, 3, *[2] * 8, 3), (3, 3, 3, 2, 4, 2, 3, 3, 2, 2, 2, 3, 2, 1, 2, 3))
 RS80_ROTOR = rotor(steps(*RS80_COUNTS[0], *RS80_COUNTS[1]), 55.552e-6, 0.03615)
 RS48_ROTOR = rotor(steps(*[1, 1, 1, 1, 2, 2, 2, 2] * 4), 55.552e-6, 0.03615)
-PLUS_128_ROTOR = rotor(staged(TIMES_128, [4] * 15 + [5] + [4] * 15 + [2, 1]), 55.56e-6, 0.02892)
-PLUS_80_ROTOR = rotor(staged(TIMES, COUNTS_80), 55.56e-6, 0.02892)
-PLUS_48_ROTOR = rotor(staged(TIMES[:24], [2] * 24), 55.56e-6, 0.02892)
+PLUS_128_ROTOR = rotor(
+    firing_times(TIMES_128, [4] * 15 + [5] + [4] * 15 + [2, 1]), 55.56e-6, 0.02892
+)
+PLUS_80_ROTOR = rotor(firing_times(TIMES, COUNTS_80), 55.56e-6, 0.02892)
+PLUS_48_ROTOR = rotor(firing_times(TIMES[:24], [2] * 24), 55.56e-6, 0.02892)
 
 RS128 = model("robosense-rs128", "RS-LiDAR-128", RS128_ROTOR, "robosense-ruby-plus-128")
 RS80 = model("robosense-rs80", "RS-LiDAR-80", RS80_ROTOR, "robosense-ruby-plus-80")
@@ -221,7 +223,7 @@ RUBY_PLUS_80 = model(
     "RS-Ruby Plus 80",
     PLUS_80_ROTOR,
     "robosense-rs80",
-    variant=staged(TIMES[:20], [4] * 20),
+    variant=firing_times(TIMES[:20], [4] * 20),
 )
 RUBY_PLUS_48 = model(
     "robosense-ruby-plus-48",

@@ -168,7 +168,7 @@ def pace(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
     return 1 / (FRAME_RATE * (packets(f, model, dual) - model.first + 1))
 
 
-def counted(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
+def make_counter(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
     """Return the counter of a model, which restarts with each frame, and its clock.
 
     Args:
@@ -291,7 +291,7 @@ M2 = dataclasses.replace(
         ),
     },
     points=partial(points, returns=True),
-    **counted(M2_SCANNER, (DUAL,)),
+    **make_counter(M2_SCANNER, (DUAL,)),
     simulation=Simulation(partial(sweep, model=M2_SCANNER)),
     range_limits=(0.2, 250.0),  # rs_driver's limits for these models
     status="manual",
@@ -311,7 +311,7 @@ MX = dataclasses.replace(
         "difop": Frame(MX_DIFOP, simulation=Simulation(lambda i: {}, rate=1)),
     },
     points=points_mx,
-    **counted(MX_SCANNER),
+    **make_counter(MX_SCANNER),
     simulation=Simulation(
         partial(sweep, model=MX_SCANNER, mode=DUAL)
     ),  # whose packets have a second radius that is used
@@ -333,7 +333,7 @@ E1 = dataclasses.replace(
         "difop": Frame(E1_DIFOP, imu=imu, simulation=Simulation(sweep_e1, rate=1)),
     },
     points=points,
-    **counted(E1_SCANNER, (9, 10, 11)),
+    **make_counter(E1_SCANNER, (9, 10, 11)),
     simulation=Simulation(partial(sweep, model=E1_SCANNER)),
     range_limits=(0.1, 200.0),  # E1 user manual, Table 1; rs_driver's
     info={"serial": "difop.serial_number", "firmware": "difop.software"},

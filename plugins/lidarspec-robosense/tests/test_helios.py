@@ -17,7 +17,7 @@ from lidarspec import simulate
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.packets.stream import PacketStream
 from tests.agreement import assert_same_points
-from tests.evidence import assert_points, capture, clockwise, decoded, vector_bytes, vectors
+from tests.evidence import assert_points, capture, clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 SENSOR = ls.sensor("robosense-helios16p")
@@ -33,7 +33,7 @@ OTHER_MODELS = {"rs_temp_be_2310", "rs_temp_be_a310"}  # the byte order of RS128
 Channels = Mapping[tuple[int, int], tuple[int, int]]
 
 
-def patched(data: bytes, offset: int, new: bytes | str) -> bytes:
+def patch(data: bytes, offset: int, new: bytes | str) -> bytes:
     """The packet with other bytes from an offset on."""
     new = bytes.fromhex(new) if isinstance(new, str) else new
     return data[:offset] + new + data[offset + len(new) :]
@@ -72,9 +72,9 @@ def msop(
 def difop(angles: Mapping[int, str] | None = None, *, mode: int = 4, rpm: int = 600) -> bytes:
     """A DIFOP packet with all angles 0 but those given by the offset of their three bytes."""
     data = bytes.fromhex("a5ff005a11115555") + bytes(SIZE - 10) + b"\x0f\xf0"
-    data = patched(patched(data, 8, struct.pack(">H", rpm)), 300, bytes([mode]))
+    data = patch(patch(data, 8, struct.pack(">H", rpm)), 300, bytes([mode]))
     for offset, text in (angles or {}).items():
-        data = patched(data, offset, text)
+        data = patch(data, offset, text)
     return data
 
 
@@ -105,25 +105,25 @@ def test_every_vector_of_the_model_is_used() -> None:
 
 
 def test_time() -> None:
-    parsed = SENSOR.parse(patched(msop(steady(0, 40)), 20, vector_bytes(FILE, "rs_time_utc_us")))
+    parsed = SENSOR.parse(patch(msop(steady(0, 40)), 20, vector_bytes(FILE, "rs_time_utc_us")))
     expected = vectors(FILE)["rs_time_utc_us"]["expected"]
     assert (parsed.seconds, parsed.microseconds) == (expected["seconds"], expected["sub"])
-    packets = decoded(SENSOR, [msop(steady(0, 40), time=1_700_000_000.25)])
+    packets = decode(SENSOR, [msop(steady(0, 40), time=1_700_000_000.25)])
     assert packets.time_ns.tolist() == [1_700_000_000_250_000_000]
 
 
 @pytest.mark.parametrize("name", sorted(TEMPERATURES))
 def test_temperature(name: str) -> None:
-    packets = decoded(SENSOR, [patched(msop(steady(0, 40)), 38, vector_bytes(FILE, name))])
+    packets = decode(SENSOR, [patch(msop(steady(0, 40)), 38, vector_bytes(FILE, name))])
     sign = 1 - 2 * packets["temperature.negative"][0]
     assert sign * packets["temperature.magnitude"][0] == vectors(FILE)[name]["expected"]["celsius"]
 
 
 @pytest.mark.parametrize("name", ANGLES)
 def test_calibration_angles(name: str) -> None:
-    info = patched(difop(), ANGLES[name], vector_bytes(FILE, name))
-    cloud = decoded(SENSOR, [info, msop(steady(0, 40))]).points()
-    plain = decoded(SENSOR, [difop(), msop(steady(0, 40))]).points()
+    info = patch(difop(), ANGLES[name], vector_bytes(FILE, name))
+    cloud = decode(SENSOR, [info, msop(steady(0, 40))]).points()
+    plain = decode(SENSOR, [difop(), msop(steady(0, 40))]).points()
     turned = np.rad2deg(
         plain.azimuth - cloud.azimuth + cloud.elevation
     )  # one of the two is 0; clockwise counts positive
@@ -162,7 +162,7 @@ def test_points_by_hand() -> None:
             steady(2000, 40), {(0, 12): (65_535, 255)}, count=150
         ),  # laser 13: R 20.1312, H 16.1712
     ]
-    cloud = decoded(SENSOR, [info, *data]).points()
+    cloud = decode(SENSOR, [info, *data]).points()
     places = [at(12 * packet, slot) for packet, slot in enumerate((0, 19, 31, 12))]
     expected = [
         (0.78542, 0.18906, 0.20625),
@@ -183,7 +183,7 @@ def test_points_by_hand() -> None:
 
 
 def test_firing_times_of_single_return() -> None:
-    cloud = decoded(SENSOR, [difop(), msop(steady(0, 40))]).points()
+    cloud = decode(SENSOR, [difop(), msop(steady(0, 40))]).points()
     assert cloud.time[at(0, 15)] == pytest.approx(43.91e-6)
     assert cloud.time[at(1, 0)] == pytest.approx(2 * FIRING)
     assert cloud.time[at(11, 17)] == pytest.approx(23 * FIRING + 3.15e-6)
@@ -195,7 +195,7 @@ def test_dual_return_has_one_firing_a_block() -> None:
     / 55.56 degrees on.
     """
     channels = {(3, 8): (400, 5), (3, 24): (800, 6)}
-    cloud = decoded(SENSOR, [difop(mode=0), msop(steady(9000, 20), channels)]).points()
+    cloud = decode(SENSOR, [difop(mode=0), msop(steady(9000, 20), channels)]).points()
     first, second = at(3, 8), at(3, 24)
     assert cloud.return_index is not None
     assert cloud.return_index[[first, second]].tolist() == [0, 1]
@@ -207,7 +207,7 @@ def test_dual_return_has_one_firing_a_block() -> None:
 
 
 def test_two_firings_share_the_step_to_the_following_block_also_over_a_packets_border() -> None:
-    cloud = decoded(
+    cloud = decode(
         SENSOR, [difop(), msop(steady(35_600, 40), count=7), msop(steady(80, 36), count=8)]
     ).points()
     turned = clockwise(cloud)
@@ -223,7 +223,7 @@ def test_two_firings_share_the_step_to_the_following_block_also_over_a_packets_b
 
 def test_a_lost_packet_and_a_gap_in_the_field_of_view_keep_the_step_before() -> None:
     azimuths = [*steady(8000, 30)[:6], *steady(24_000, 30)[:6]]
-    cloud = decoded(
+    cloud = decode(
         SENSOR, [difop(), msop(azimuths, count=1), msop(steady(24_220, 10), count=3)]
     ).points()
     turned = clockwise(cloud)
@@ -237,22 +237,21 @@ def test_a_lost_packet_and_a_gap_in_the_field_of_view_keep_the_step_before() -> 
 @pytest.mark.parametrize(("rpm", "step"), [(600, 0.4), (1200, 0.8)])
 def test_without_any_neighbour_the_step_is_that_of_the_speed(rpm: int, step: float) -> None:
     azimuths = [*steady(0, 3000)]
-    turned = clockwise(decoded(SENSOR, [difop(rpm=rpm), msop(azimuths)]).points())
+    turned = clockwise(decode(SENSOR, [difop(rpm=rpm), msop(azimuths)]).points())
     np.testing.assert_allclose(turned[16::32], np.array(azimuths) / 100 + step / 2, atol=1e-3)
 
 
 def test_the_header_says_how_long_a_step_of_distance_is() -> None:
     channels = {(0, 0): (400, 1)}
     fine, coarse = (
-        decoded(SENSOR, [msop(steady(0, 40), channels, resolution=step)]).points()
-        for step in (1, 0)
+        decode(SENSOR, [msop(steady(0, 40), channels, resolution=step)]).points() for step in (1, 0)
     )
     assert (fine.range[0], coarse.range[0]) == (1.0, 2.0)
 
 
 def test_lasers_without_calibration_have_no_points() -> None:
     channels = {(0, 0): (400, 1), (0, 1): (400, 1), (0, 2): (400, 1)}
-    cloud = decoded(
+    cloud = decode(
         SENSOR, [difop({468: "ffffff", 567: "ffffff"}), msop(steady(0, 40), channels)]
     ).points()
     assert cloud.valid[:3].tolist() == [False, False, True]
@@ -306,8 +305,8 @@ def test_a_file_is_read_with_the_first_device_information_from_its_start() -> No
 def test_the_capture_is_the_same_on_both_paths_and_built_again() -> None:
     data = datagrams()
     some = [*data[:12], data[DIFOP_AT], *data[730:]]
-    decoded(SENSOR, some)
-    decoded(SENSOR, some, "difop")
+    decode(SENSOR, some)
+    decode(SENSOR, some, "difop")
     for datagram in some:
         assert (
             SENSOR.build("difop" if datagram[0] == 0xA5 else "data", SENSOR.parse(datagram))

@@ -11,7 +11,7 @@ from construct import Array, Bytes, Const, Int8ub, Int16ub, Int32ub, Struct
 
 import lidarspec as ls
 from lidarspec.spec import Clock, Fields, Frame, OnRewind, Polar, Scaled, Sequence, Udp
-from tests.evidence import assert_points, decoded, vector_bytes, vectors
+from tests.evidence import assert_points, decode, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 SENSOR = ls.sensor("robosense-m1")
@@ -59,7 +59,7 @@ def test_a_whole_packet_is_parsed_and_built_to_the_same_bytes(name: str) -> None
     parsed = SENSOR.parse(data, frame)
     assert SENSOR.build(frame, parsed) == data
     assert [(found.frame, found.data) for found in SENSOR.split([data])] == [(frame, data)]
-    assert len(decoded(SENSOR, [data], None if frame == "data" else frame)) == 1
+    assert len(decode(SENSOR, [data], None if frame == "data" else frame)) == 1
 
 
 def test_the_header_of_the_manual() -> None:
@@ -76,7 +76,7 @@ def test_the_header_of_the_manual() -> None:
     ):
         assert parsed[name] == expected[name], name
     assert parsed.mems_tmp == expected["temp_raw"]
-    packets = decoded(SENSOR, [SENSOR.build("data", parsed)])
+    packets = decode(SENSOR, [SENSOR.build("data", parsed)])
     assert packets.time_ns.tolist() == [77633816_804541_000]
     assert packets["microseconds"].tolist() == [pytest.approx(0.804541)]
 
@@ -84,7 +84,7 @@ def test_the_header_of_the_manual() -> None:
 def test_the_first_five_blocks_of_the_manuals_capture() -> None:
     data = beginning(vector_bytes(FILE, "rsm1_msop_blocks0_4_manual"))
     expected = vectors(FILE)["rsm1_msop_blocks0_4_manual"]["expected"]
-    packets = decoded(SENSOR, [data])
+    packets = decode(SENSOR, [data])
     cloud = packets.points()
     names = {
         "radius_m": "radius",
@@ -112,7 +112,7 @@ def test_points_by_hand() -> None:
     data = beginning(vector_bytes(FILE, "rsm1_msop_blocks0_4_manual"))
     data = with_channel(data, 5, 1, "03e8 7c18 8bb8 11 0000")
     data = with_channel(data, 6, 3, "0fa0 7f9c 7448 22 0000")
-    cloud = decoded(SENSOR, [data]).points()
+    cloud = decode(SENSOR, [data]).points()
     # (raw - 32768) / 100 degrees, radius * 5 mm; x = r cosE cosA, y = r cosE sinA, z = r sinE.
     #   block 0, channel 1: 0a77 = 2679: 13.395 m; 83a2 = 33698: E 9.30; 94df = 38111: A 53.43
     #     x = 13.395 * .986856 * .595805 = 7.87591, y = 13.395 * .986856 * .803131 = 10.61651, z =
@@ -142,7 +142,7 @@ def test_points_by_hand() -> None:
 def test_a_point_of_the_manual(name: str) -> None:
     expected = vectors(FILE)[name]["expected"]
     header = vector_bytes(FILE, "rsm1_msop_header_manual")
-    packets = decoded(
+    packets = decode(
         SENSOR, [with_channel(beginning(header), 0, 0, vector_bytes(FILE, name).hex())]
     )
     for path in ("elevation", "azimuth"):
@@ -156,7 +156,7 @@ def test_a_point_of_the_manual(name: str) -> None:
 
 
 def test_no_return_by_its_radius_not_by_its_angles() -> None:
-    packets = decoded(
+    packets = decode(
         SENSOR,
         [
             with_channel(
@@ -176,7 +176,7 @@ def test_no_return_by_its_radius_not_by_its_angles() -> None:
 
 
 def test_points_have_the_times_of_their_blocks() -> None:
-    cloud = decoded(SENSOR, [beginning(vector_bytes(FILE, "rsm1_msop_blocks0_4_manual"))]).points()
+    cloud = decode(SENSOR, [beginning(vector_bytes(FILE, "rsm1_msop_blocks0_4_manual"))]).points()
     assert cloud.stamp_ns == 77633816_804541_000
     np.testing.assert_allclose(
         cloud.time[:25], np.repeat([0, 3e-6, 7e-6, 10e-6, 13e-6], 5), atol=1e-12
@@ -190,7 +190,7 @@ def test_dual_return() -> None:
     assert (values.wave_mode, [block.return_seq for block in values.blocks]) == (0, [1] * 25)
     blocks = [{**block, "return_seq": 2} for block in values.blocks]
     second = SENSOR.build("data", {**values, "pkt_psn": 2, "blocks": blocks})
-    packets = decoded(SENSOR, [first, second])
+    packets = decode(SENSOR, [first, second])
     cloud = packets.points()
     assert cloud.return_index is not None
     assert len(cloud) == 250
@@ -198,7 +198,7 @@ def test_dual_return() -> None:
     np.testing.assert_array_equal(
         cloud.xyz[:125], cloud.xyz[125:]
     )  # two echoes at one distance are both kept
-    single = decoded(SENSOR, [beginning(vector_bytes(FILE, "rsm1_msop_header_manual"))]).points()
+    single = decode(SENSOR, [beginning(vector_bytes(FILE, "rsm1_msop_header_manual"))]).points()
     assert single.return_index is not None
     assert single.return_index.tolist() == [0] * 125
 
@@ -245,7 +245,7 @@ def test_device_information_layouts_are_distinguished() -> None:
 @pytest.mark.parametrize("size", [0, 1, 255, 257, 1209, 1211, 62152])
 def test_datagrams_of_another_size_are_rejected(size: int) -> None:
     whole = vector_bytes(FILE, "rsm1_msop_full_dual_1") + bytes(62152)
-    packets = decoded(SENSOR, [whole[:size], whole[:SIZE]])
+    packets = decode(SENSOR, [whole[:size], whole[:SIZE]])
     assert (len(packets), packets.stats.bad_length, packets.stats.bytes_skipped) == (1, 1, size)
 
 
@@ -259,7 +259,7 @@ def test_errors_name_the_field() -> None:
             SENSOR.parse(wrong, "data")
         assert (caught.value.path, caught.value.offset) == (path, offset)
     assert (
-        decoded(
+        decode(
             SENSOR, [SENSOR.build("data", {**SENSOR.parse(data), "pkt_psn": 0})]
         ).stats.implausible
         == 1
@@ -328,7 +328,7 @@ def test_decoding_follows_a_struct_with_renamed_and_reordered_fields() -> None:
     ]
     data = other.build("data", units=True, groups=groups, micros=0.5, turn=7)
     assert other.build("data", other.parse(data)) == data
-    cloud = decoded(other, [data]).points()
+    cloud = decode(other, [data]).points()
     np.testing.assert_allclose(cloud.range, np.repeat([1, 2, 3], 5))
     np.testing.assert_allclose(
         np.rad2deg(cloud.azimuth), np.tile([0, 10, 20, 30, 40], 3), atol=1e-4

@@ -13,7 +13,7 @@ import lidarspec as ls
 from lidarspec.packets.stream import PacketStream
 from lidarspec.scans.stream import ScanStream
 from tests.agreement import assert_same_points
-from tests.evidence import decoded, vector_bytes, vectors
+from tests.evidence import decode, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 SENSOR = ls.sensor("robosense-m1")
@@ -87,7 +87,7 @@ def test_frames_are_cut_where_the_vendors_driver_cuts(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("last", [630, 1260])
 def test_frames_of_single_and_dual_return(last: int) -> None:
-    packets = decoded(SENSOR, frames(2, last=last)[last - 20 : last + 10])
+    packets = decode(SENSOR, frames(2, last=last)[last - 20 : last + 10])
     assert (packets.stats.lost, packets.stats.late, packets.stats.duplicates) == (0, 0, 0)
     scans = list(SENSOR.scans(frames(3, last=last)[last - 40 : -20]))
     assert [(len(scan) // 125, scan.complete) for scan in scans] == [
@@ -99,7 +99,7 @@ def test_frames_of_single_and_dual_return(last: int) -> None:
     assert scans[1].points.shape == (25 * last, 5)
 
 
-def shuffled(data: list[bytes], seed: int) -> list[bytes]:
+def shuffle(data: list[bytes], seed: int) -> list[bytes]:
     """Some packets up to five places late."""
     source = random.Random(seed)
     return [
@@ -110,7 +110,7 @@ def shuffled(data: list[bytes], seed: int) -> list[bytes]:
     ]
 
 
-def doubled(data: list[bytes], seed: int) -> list[bytes]:
+def duplicate(data: list[bytes], seed: int) -> list[bytes]:
     """Some packets twice, at once or a few places later."""
     source = random.Random(seed)
     again = [
@@ -122,7 +122,7 @@ def doubled(data: list[bytes], seed: int) -> list[bytes]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("disturbed", [shuffled, doubled])
+@pytest.mark.parametrize("disturbed", [shuffle, duplicate])
 def test_late_and_doubled_packets_give_the_same_scans(
     disturbed: Callable[[list[bytes], int], list[bytes]], seed: int
 ) -> None:
@@ -133,7 +133,7 @@ def test_late_and_doubled_packets_give_the_same_scans(
     same_scans(list(SENSOR.scans(changed)), list(SENSOR.scans(data)))
     assert packets.stats.lost == 0
     assert packets.stats.duplicates == len(changed) - len(data)
-    assert (packets.stats.late > 0) == (disturbed is shuffled)
+    assert (packets.stats.late > 0) == (disturbed is shuffle)
 
 
 def test_a_late_packet_is_part_of_its_own_scan() -> None:
@@ -145,7 +145,7 @@ def test_a_late_packet_is_part_of_its_own_scan() -> None:
 def test_lost_packets_are_counted() -> None:
     data = frames(3)
     kept = [item for place, item in enumerate(data) if place not in {5, 6, 7, 629, 630, 1000}]
-    packets = decoded(SENSOR, kept[:10])
+    packets = decode(SENSOR, kept[:10])
     assert packets.stats.lost == 3
     assert packets.breaks.tolist() == [place == 5 for place in range(10)]
     scans = list(SENSOR.scans(kept))
@@ -161,14 +161,14 @@ def test_a_long_loss_is_counted_by_the_length_of_the_frame() -> None:
 
 
 def test_no_point_remains_from_the_previous_scan() -> None:
-    for earlier, later in pairwise(SENSOR.scans(shuffled(frames(4), 9))):
+    for earlier, later in pairwise(SENSOR.scans(shuffle(frames(4), 9))):
         assert {number // 1000 for number in numbers(earlier)} == {numbers(earlier)[-1] // 1000}
         assert later.stamp_ns - earlier.stamp_ns == 100_000_000
 
 
 @pytest.mark.slow
 def test_packets_fed_one_by_one_give_the_same_scans() -> None:
-    data = shuffled(frames(2), 4)
+    data = shuffle(frames(2), 4)
     decoder = SENSOR.decoder()
     packets, scans = PacketStream(SENSOR, "data", decoder.stats), ScanStream(SENSOR)
     found = [scan for item in data for scan in scans.add(packets.add(decoder.frames(item)))]

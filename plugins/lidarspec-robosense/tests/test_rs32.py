@@ -15,7 +15,7 @@ import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.detect.identification import identify_sample
 from lidarspec.detect.sample_bytes import SampleBytes
-from tests.evidence import assert_points, decoded, vector_bytes, vectors
+from tests.evidence import assert_points, decode, vector_bytes, vectors
 from tests.installed import sensor_ids
 
 FILE = "vectors_udp3d.json"
@@ -59,7 +59,7 @@ def difop(*, mode: int = 1, vertical: bytes = b"", horizontal: bytes = b"") -> b
 
 def test_points_of_an_rs32_by_hand() -> None:
     cells = {(0, 14): (2000, 9), (5, 16): (1000, 7)}
-    cloud = decoded(RS32, [msop([9000 + 20 * block for block in range(12)], cells)]).points()
+    cloud = decode(RS32, [msop([9000 + 20 * block for block in range(12)], cells)]).points()
     assert cloud.nominal
     # laser 14: 40.32 of 55.52 us, 0.14525 of 0.20: R 90.14525, E 15.0167, H = R - 6.9439 =
     # 83.20135; 10 m, the lens 39.97 mm out along R
@@ -89,7 +89,7 @@ def test_the_angles_of_a_unit_come_with_difop() -> None:
         (RS32, 2, 1, -2, 0.03997, 0),
         (BPEARL, 0, 10, -20, 0.01473, 0.09427),
     ):
-        cloud = decoded(
+        cloud = decode(
             sensor, [data[0], msop([0] * 12, {(0, 0): (1000, 1)}, lidar_type=lidar_type)]
         ).points()
         e, h = np.deg2rad([vertical, horizontal])
@@ -112,7 +112,7 @@ def test_the_angles_of_a_unit_come_with_difop() -> None:
 def test_pairs_of_blocks_are_the_two_returns() -> None:
     cells = {(block, 0): (1000, 1) for block in range(12)}
     data = [difop(mode=0), msop([20 * (block // 2) for block in range(12)], cells)]
-    cloud = decoded(RS32, data).points()
+    cloud = decode(RS32, data).points()
     assert cloud.return_index is not None
     assert cloud.return_index[::32].tolist() == [0, 1] * 6
     np.testing.assert_allclose(cloud.time[::32], np.repeat(np.arange(6), 2) * 55.52e-6, atol=1e-12)
@@ -161,7 +161,7 @@ def test_the_date_is_read_as_utc() -> None:
     moment = datetime.datetime(2021, 10, 1, 1, 2, 3, tzinfo=datetime.UTC)
     data = msop([0] * 12, {})
     assert vector_bytes(FILE, "rs_time_ymd") in data
-    packets = decoded(RS32, [data])
+    packets = decode(RS32, [data])
     assert packets.time_ns.tolist() == [int(moment.timestamp()) * 10**9 + 273_546_000]
 
 
@@ -212,7 +212,7 @@ def ruby(azimuths: Sequence[int], distances: Sequence[int], *, returns: int) -> 
 
 def test_three_blocks_of_dual_return_are_a_shot_and_a_half() -> None:
     sensor = ls.sensor("robosense-ruby-plus-128")
-    cloud = decoded(
+    cloud = decode(
         sensor,
         [
             ruby([0, 0, 40], [200, 400, 600], returns=3),
@@ -225,7 +225,7 @@ def test_three_blocks_of_dual_return_are_a_shot_and_a_half() -> None:
         cloud.time[::128], np.array([0, 0, 1, 0, 1, 1]) * 55.56e-6, atol=1e-12
     )
     assert cloud.range[::128].tolist() == [1, 2, 3, 4, 5, 6]
-    single = decoded(sensor, [ruby([0, 40, 80], [200, 400, 600], returns=1)]).points()
+    single = decode(sensor, [ruby([0, 40, 80], [200, 400, 600], returns=1)]).points()
     assert single.return_index is not None
     assert not single.return_index.any()
     # the last laser fires 53.771 us of 55.56 after its block: 0.4 degrees on by the step to the
@@ -242,7 +242,7 @@ def test_pairs_of_blocks_of_an_airy_are_one_shot_and_its_imu_is_in_steps_of_its_
     packet = sensor.parse(simulate(sensor, 1)[0])
     for number, block in enumerate(packet.blocks):
         block.azimuth = 40 * (number // 4)
-    cloud = decoded(sensor, [sensor.build("data", {**packet, "returns": 3})]).points()
+    cloud = decode(sensor, [sensor.build("data", {**packet, "returns": 3})]).points()
     assert cloud.return_index is not None
     assert cloud.ring is not None
     assert cloud.return_index[::48].tolist() == [0, 0, 1, 1] * 2

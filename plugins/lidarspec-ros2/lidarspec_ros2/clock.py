@@ -104,7 +104,9 @@ class MessageStamps:
 
         It follows from the sensor's time and the arrival time of the first point.
         """
-        return self._wanted(device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings)
+        return self._choose_stamp(
+            device_ns, self.clock.stamp(device_ns, host_ns), host_ns, settings
+        )
 
     def at(self, time_ns: int, settings: Settings, *, by_clock: bool) -> int:
         """The stamp of something that is not a scan, ns.
@@ -114,9 +116,9 @@ class MessageStamps:
             by_clock: whether it is by the sensor's clock; else it is when it arrived.
         """
         estimated = time_ns + self.clock.offset_ns * by_clock
-        return self._wanted(time_ns, estimated, estimated, settings)
+        return self._choose_stamp(time_ns, estimated, estimated, settings)
 
-    def _wanted(self, own: int, estimated: int, arrival: int, settings: Settings) -> int:
+    def _choose_stamp(self, own: int, estimated: int, arrival: int, settings: Settings) -> int:
         """What the parameters want of the three: the sensor's time, what is made of it, and the
         arrival.
         """

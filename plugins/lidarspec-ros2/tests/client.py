@@ -98,7 +98,7 @@ class Client:
         (value,) = self.call(GetParameters, "get_parameters", names=[name]).values
         return Value.from_parameter_msg(Parameter(name=name, value=value)).value
 
-    def described(self, *names: str) -> list[Any]:
+    def describe_parameters(self, *names: str) -> list[Any]:
         """The descriptors of parameters."""
         return list(
             self.call(DescribeParameters, "describe_parameters", names=list(names)).descriptors
@@ -116,7 +116,7 @@ class Client:
 GRID: dict[str, Any] = {"beams": 720, "angle_min": -3.0, "angle_max": 3.0}
 
 
-def given(**parameters: Any) -> list[str]:
+def format_parameters(**parameters: Any) -> list[str]:
     """Parameters in ROS's words."""
     return [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
 
@@ -126,7 +126,7 @@ def message(data: bytes, kind: str) -> Any:
     return STORE.deserialize_cdr(data, kind)
 
 
-def ended(process: subprocess.Popen[str], by: int = signal.SIGINT) -> tuple[int, str]:
+def end_node(process: subprocess.Popen[str], by: int = signal.SIGINT) -> tuple[int, str]:
     """The exit code and the complaints of a node that is told to end."""
     process.send_signal(by)
     _, complaints = process.communicate(timeout=PATIENCE)

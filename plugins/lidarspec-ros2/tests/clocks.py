@@ -63,7 +63,7 @@ class Run:
         return np.array(self.times % SET >= SETTLING)
 
 
-def simulated(
+def simulate_stamps(
     seed: int,
     jitter: str,
     *,
@@ -116,7 +116,7 @@ def main(runs: int) -> None:
         cells = []
         for rate, each, drift in CASES:
             made = [
-                simulated(seed, jitter, rate=rate, each=each, drift_ppm=drift)
+                simulate_stamps(seed, jitter, rate=rate, each=each, drift_ppm=drift)
                 for seed in range(runs)
             ]
             errors = np.abs(np.concatenate([run.errors[run.is_settled] for run in made])) * 1e3

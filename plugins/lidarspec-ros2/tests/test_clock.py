@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from clocks import BEGAN, JITTERS, SET, simulated
+from clocks import BEGAN, JITTERS, SET, simulate_stamps
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
@@ -31,7 +31,7 @@ def test_stamps_are_within_a_millisecond_and_a_clock_that_is_set_is_reported(
     jitter: str, drift_ppm: float, step: float
 ) -> None:
     for seed in range(3):
-        run = simulated(seed, jitter, drift_ppm=drift_ppm, step=step)
+        run = simulate_stamps(seed, jitter, drift_ppm=drift_ppm, step=step)
         assert np.abs(run.errors[run.is_settled]).max() < 1e-3
         assert (np.diff(run.stamps) > 0).all()
         assert (run.stamps <= run.host).all()
@@ -45,13 +45,13 @@ def test_stamps_are_within_a_millisecond_and_a_clock_that_is_set_is_reported(
 
 @pytest.mark.parametrize("jitter", LATE_ONLY)
 def test_packets_improve_stamps_over_scans(jitter: str) -> None:
-    alone, with_packets = (simulated(1, jitter, each=each) for each in (1, 40))
+    alone, with_packets = (simulate_stamps(1, jitter, each=each) for each in (1, 40))
     errors = [np.abs(run.errors[run.is_settled]).mean() for run in (alone, with_packets)]
     assert errors[1] < errors[0] / 2
     assert with_packets.clock.jumps == 2
 
 
-def made(wall: HostClock | None = None, **wanted: Any) -> NDArray[np.int64]:
+def make_stamps(wall: HostClock | None = None, **wanted: Any) -> NDArray[np.int64]:
     """The stamps of ten seconds of scans that arrived 3 ms after they were measured, less the times
     of these.
     """
@@ -69,26 +69,26 @@ def made(wall: HostClock | None = None, **wanted: Any) -> NDArray[np.int64]:
 
 
 def test_a_constant_delay_is_subtracted_only_if_known() -> None:
-    assert np.abs(made() - 3_000_000).max() < 1000
-    assert np.abs(made(time_offset=-0.003)).max() < 1000
-    assert (made(use_device_time=False) == 3_000_000).all()
+    assert np.abs(make_stamps() - 3_000_000).max() < 1000
+    assert np.abs(make_stamps(time_offset=-0.003)).max() < 1000
+    assert (make_stamps(use_device_time=False) == 3_000_000).all()
 
 
 def test_a_synchronized_sensor_clock_is_used_directly() -> None:
-    assert (made(device_time_is_ros_time=True) == -BEGAN).all()
-    assert (made(device_time_is_ros_time=True, use_device_time=False) == 3_000_000).all()
+    assert (make_stamps(device_time_is_ros_time=True) == -BEGAN).all()
+    assert (make_stamps(device_time_is_ros_time=True, use_device_time=False) == 3_000_000).all()
 
 
 def test_stamps_follow_the_computers_clock_where_it_is_set() -> None:
     now = [0]
     wall = HostClock(lambda: time.time_ns() + now[0])
-    assert np.abs(made(wall) - 3_000_000).max() < 1000
+    assert np.abs(make_stamps(wall) - 3_000_000).max() < 1000
     now[0] = -3600 * SECOND
-    assert np.abs(made(wall) - 3_000_000 + 3600 * SECOND).max() < 1_000_000
+    assert np.abs(make_stamps(wall) - 3_000_000 + 3600 * SECOND).max() < 1_000_000
 
 
 def test_stamps_do_not_jump_while_the_clock_is_not_set() -> None:
-    run = simulated(0, "uniform, 0 to 5 ms", step=0, wraps=False)
+    run = simulate_stamps(0, "uniform, 0 to 5 ms", step=0, wraps=False)
     later = run.times > 10
     pace = np.diff(run.stamps[later]) / np.diff(run.times[later] * 1e9)
     assert np.abs(pace - 1).max() < 5e-3
@@ -128,7 +128,7 @@ def test_a_slower_line_is_not_a_clock_change() -> None:
 def test_until_it_is_sure_that_the_clock_was_set_stamps_are_no_worse_than_arrivals(
     step: float,
 ) -> None:
-    run = simulated(0, "uniform, 0 to 5 ms", step=step, stalls=0)
+    run = simulate_stamps(0, "uniform, 0 to 5 ms", step=step, stalls=0)
     after = (run.times >= SET) & (run.times < SET + 2)
     assert np.abs(run.errors[after]).max() < 20e-3
 
@@ -157,7 +157,7 @@ def test_stamps_continue_after_a_pause(pause: int) -> None:
 def test_any_drift_and_step_is_followed(
     wraps: bool, jitter: str, seed: int, drift: float, step: float, sign: int
 ) -> None:
-    run = simulated(seed, jitter, drift_ppm=drift, step=sign * step, wraps=wraps)
+    run = simulate_stamps(seed, jitter, drift_ppm=drift, step=sign * step, wraps=wraps)
     assert np.abs(run.errors[run.is_settled]).max() < 2e-3
     assert (np.diff(run.stamps) > 0).all()
     assert run.clock.jumps == 1 + wraps
@@ -198,7 +198,7 @@ def test_it_does_not_matter_when_either_clock_began(
 
 
 def test_packets_may_be_observed_in_batches_of_any_size() -> None:
-    run = simulated(3, "uniform, 0 to 5 ms", step=0, wraps=False)
+    run = simulate_stamps(3, "uniform, 0 to 5 ms", step=0, wraps=False)
     lines = []
     for size in (1, 7, len(run.times)):
         clock = DeviceClock()

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from client import PATIENCE, Client, ended, given, message
+from client import PATIENCE, Client, end_node, format_parameters, message
 from rcl_interfaces.msg import ParameterType
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
@@ -69,7 +69,7 @@ def test_without_ros_one_line_says_both_ways_to_have_it(tmp_path: Path) -> None:
 def test_a_manager_can_control_the_lifecycle(run: Any, client: Client) -> None:
     scans = client.listen("scan", LaserScan)
     process = run(
-        ros=given(source=STL[0], sensor=STL[2], autostart=False, qos="reliable"),
+        ros=format_parameters(source=STL[0], sensor=STL[2], autostart=False, qos="reliable"),
         executable="lidarspec_node",
     )
     assert client.state == "unconfigured"
@@ -106,7 +106,7 @@ def test_configuring_fails_until_the_source_can_be_opened(
     run: Any, client: Client, tmp_path: Path
 ) -> None:
     run(
-        ros=given(source=str(tmp_path / "none"), sensor=STL[2], autostart=False),
+        ros=format_parameters(source=str(tmp_path / "none"), sensor=STL[2], autostart=False),
         executable="lidarspec_node",
     )
     assert not client.change("configure")
@@ -145,17 +145,20 @@ def test_invalid_arguments_give_the_errors_of_the_command_line(
         stats, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=PATIENCE
     )
     reason = known.stderr.splitlines()[0]
-    for process in (run(*words), run(ros=given(**parameters), executable="lidarspec_node")):
+    for process in (
+        run(*words),
+        run(ros=format_parameters(**parameters), executable="lidarspec_node"),
+    ):
         _, complaints = process.communicate(timeout=PATIENCE)
         assert (process.returncode, reason in complaints) == (known.returncode, True)
 
 
 def test_parameters_have_descriptions_and_some_can_be_changed(run: Any, client: Client) -> None:
     scans = client.listen("scan", LaserScan)
-    run(*STL, ros=given(qos="reliable", frame_id="front"))
+    run(*STL, ros=format_parameters(qos="reliable", frame_id="front"))
     client.until(lambda: scans)
     for parameter, descriptor in zip(
-        PARAMETERS, client.described(*(one.name for one in PARAMETERS)), strict=True
+        PARAMETERS, client.describe_parameters(*(one.name for one in PARAMETERS)), strict=True
     ):
         kind = getattr(ParameterType, f"PARAMETER_{parameter.kind.upper()}")
         assert (descriptor.description, descriptor.type) == (parameter.text, kind)
@@ -193,10 +196,14 @@ def test_parameters_have_descriptions_and_some_can_be_changed(run: Any, client: 
 def test_an_unknown_parameter_is_reported(run: Any, client: Client) -> None:
     process = run(
         *STL,
-        ros=[*given(beam=720, qos="reliable"), "-p", "qos_overrides./points.publisher.depth:=5"],
+        ros=[
+            *format_parameters(beam=720, qos="reliable"),
+            "-p",
+            "qos_overrides./points.publisher.depth:=5",
+        ],
     )
     client.until(lambda: client.diagnostics)
-    code, complaints = ended(process)
+    code, complaints = end_node(process)
     (said,) = complaints.splitlines()
     assert (
         code,
@@ -208,13 +215,13 @@ def test_qos_is_sensor_data_unless_overridden(run: Any, client: Client) -> None:
     client.listen("/points", PointCloud2, reliable=False)
     for words, is_reliable in (
         ([], False),
-        (given(qos="reliable"), True),
+        (format_parameters(qos="reliable"), True),
         (["-p", "qos_overrides./points.publisher.reliability:=reliable"], True),
     ):
-        process = run(*STL, ros=words or given(qos="best_effort"))
+        process = run(*STL, ros=words or format_parameters(qos="best_effort"))
         client.until(lambda: client.reliable("/points"))
         assert client.reliable("/points") == [is_reliable]
-        assert ended(process)[0] == 0
+        assert end_node(process)[0] == 0
         client.until(lambda: not client.reliable("/points"))
 
 
@@ -226,7 +233,7 @@ def test_a_ring_that_the_sensor_lacks_is_a_warning_and_clouds_go_on(
         "sim:velodyne-vlp16",
         "-s",
         "velodyne-vlp16",
-        ros=given(qos="reliable", scan_ring=7, frame_id="mast"),
+        ros=format_parameters(qos="reliable", scan_ring=7, frame_id="mast"),
     )
     client.until(lambda: len(scans) > 1)
     assert message(scans[-1], SCAN).header.frame_id == "mast"
@@ -299,7 +306,7 @@ def test_a_file_is_played_with_its_times_on_clock_and_then_the_node_ends(
         str(file),
         "-s",
         "ldrobot-stl27l",
-        ros=given(use_sim_time=True, qos="reliable", replay_speed=2.0),
+        ros=format_parameters(use_sim_time=True, qos="reliable", replay_speed=2.0),
     )
     client.until(lambda: len(scans) > 2)
     assert client.state == "active"
@@ -349,7 +356,7 @@ def test_a_transform_turns_as_the_mount_does(
 
 
 def test_a_transform_is_refused_where_ros_has_no_message_for_it(run: Any, client: Client) -> None:
-    process = run(*STL, ros=given(publish_tf=True))
+    process = run(*STL, ros=format_parameters(publish_tf=True))
     _, complaints = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2
     assert "publish_tf takes tf2_msgs" in complaints
@@ -388,7 +395,7 @@ def plugged(tmp_path: Path) -> Iterator[Callable[..., tuple[Path, int]]]:
 def test_a_missing_port_makes_the_node_inactive(run: Any, client: Client, plugged: Any) -> None:
     port, _ = plugged("--unplug", "5s", "--absent", "3s")
     scans = client.listen("scan", LaserScan)
-    run(str(port), "-s", "ldrobot-stl27l", ros=given(qos="reliable"))
+    run(str(port), "-s", "ldrobot-stl27l", ros=format_parameters(qos="reliable"))
     client.until(lambda: len(scans) > 2)
     assert client.state == "active"
     client.until(lambda: client.diagnostics and client.diagnostics[-1].status[0].level == b"\2")
@@ -440,21 +447,26 @@ def test_a_sensor_that_falls_silent_makes_the_node_inactive_until_it_sends(
 @pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
 def test_nothing_is_left_behind(run: Any, client: Client, plugged: Any, by: int) -> None:
     port, simulator = plugged()
-    scans, before = client.listen("scan", LaserScan, reliable=False), shared(os.getpid())
+    scans, before = (
+        client.listen("scan", LaserScan, reliable=False),
+        list_shared_memory(os.getpid()),
+    )
     process = run(str(port), "-s", "ldrobot-stl27l")
     client.until(lambda: scans)
-    threads, own = os.listdir(f"/proc/{process.pid}/task"), shared(process.pid) - before
+    threads, own = os.listdir(f"/proc/{process.pid}/task"), list_shared_memory(process.pid) - before
     assert own
     assert str(process.pid) in holders(port)
-    code, complaints = ended(process, by)
+    code, complaints = end_node(process, by)
     assert (code, complaints) == (0, "")
     assert not any(Path(f"/proc/{thread}").exists() for thread in threads)
-    ports = {name for name in shared(os.getpid()) if "_port" in name}  # where the client listens
+    ports = {
+        name for name in list_shared_memory(os.getpid()) if "_port" in name
+    }  # where the client listens
     assert not [name for name in own - ports if Path(name).exists()]
     assert set(holders(port)) <= {str(simulator)}
 
 
-def shared(pid: int) -> set[str]:
+def list_shared_memory(pid: int) -> set[str]:
     """The files of shared memory that a process has."""
     return set(
         re.findall(r"/dev/shm/fast\w+", Path(f"/proc/{pid}/maps").read_text(encoding="utf-8"))

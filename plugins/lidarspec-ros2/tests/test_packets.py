@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client import GRID, STORE, Client, given, message
+from client import GRID, STORE, Client, format_parameters, message
 from rosbags.rosbag2 import Writer
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import UInt8MultiArray
@@ -22,7 +22,7 @@ from lidarspec.transports.robotics_logs import RAW, raw_chunk
 def test_a_node_decodes_packets_of_another_node(run: Any, client: Client) -> None:
     first, again = client.listen("scan", LaserScan), client.listen("again", LaserScan)
     client.diagnostics.clear()
-    grid = given(qos="reliable", **GRID)
+    grid = format_parameters(qos="reliable", **GRID)
     run(
         "ros2:/packets",
         "-s",
@@ -34,7 +34,7 @@ def test_a_node_decodes_packets_of_another_node(run: Any, client: Client) -> Non
         "sim:ldrobot-stl27l?seed=5",
         "-s",
         "ldrobot-stl27l",
-        ros=[*grid, *given(publish_packets=True)],
+        ros=[*grid, *format_parameters(publish_packets=True)],
     )
 
     def shared() -> set[tuple[float, ...]]:
@@ -52,7 +52,7 @@ def test_a_bag_with_packets_is_a_source(
     run: Any, client: Client, tmp_path: Path, sensor: str
 ) -> None:
     packets = client.listen("packets", UInt8MultiArray)
-    run(f"sim:{sensor}", "-s", sensor, ros=given(publish_packets=True, qos="reliable"))
+    run(f"sim:{sensor}", "-s", sensor, ros=format_parameters(publish_packets=True, qos="reliable"))
     client.until(lambda: len(packets) > 500)
     chunks = [raw_chunk(message(data, RAW)) for data in packets]
     with Writer(tmp_path / "bag", version=8) as bag:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from client import GRID, Client, given, message
+from client import GRID, Client, format_parameters, message
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, LaserScan, PointCloud2
 from std_msgs.msg import Header, UInt8MultiArray
@@ -37,7 +37,7 @@ PADDING = 64
 SOAK = float(os.environ.get("LIDARSPEC_SOAK", "600"))
 
 
-def recorded(packets: list[bytes], path: Path, sensor: str) -> Path:
+def record(packets: list[bytes], path: Path, sensor: str) -> Path:
     """A recording of what the topic of packets had."""
     with Recorder(path, sensor) as recorder:
         for packet in packets:
@@ -45,7 +45,7 @@ def recorded(packets: list[bytes], path: Path, sensor: str) -> Path:
     return path
 
 
-def expected(path: Path, sensor: str, kind: str) -> list[Any]:
+def make_expected_messages(path: Path, sensor: str, kind: str) -> list[Any]:
     """The messages that the library makes of the whole scans of a recording."""
     planes, found = PlanarScans(GRID["beams"], (GRID["angle_min"], GRID["angle_max"])), []
     with ls.open(path, sensor) as device:
@@ -56,10 +56,10 @@ def expected(path: Path, sensor: str, kind: str) -> list[Any]:
                 )
             elif scan.whole and (planar := planes.project(scan)) is not None:
                 found.append(MESSAGES.laserscan(scan, planar, 0).data)
-    return [unstamped(message(bytes(data), kind)) for data in found]
+    return [without_stamp(message(bytes(data), kind)) for data in found]
 
 
-def unstamped(content: Any) -> dict[str, Any]:
+def without_stamp(content: Any) -> dict[str, Any]:
     """The values of a message, but for its stamp."""
     return {**dataclasses.asdict(content), "header": content.header.frame_id}
 
@@ -91,13 +91,13 @@ def test_messages_equal_those_of_the_library(
         f"sim:{sensor}?loss=0.0005&seed=3",
         "-s",
         sensor,
-        ros=given(publish_packets=True, qos="reliable", **GRID),
+        ros=format_parameters(publish_packets=True, qos="reliable", **GRID),
     )
     client.until(lambda: len(received) > WHOLE)
     number = len(received)
     client.until(lambda: len(received) > number)  # whose packets have come
-    wanted = expected(recorded(packets, tmp_path / "packets.lsr", sensor), sensor, kind)
-    found = [unstamped(message(data, kind)) for data in received[:number]]
+    wanted = make_expected_messages(record(packets, tmp_path / "packets.lsr", sensor), sensor, kind)
+    found = [without_stamp(message(data, kind)) for data in received[:number]]
     begin = next(index for index, content in enumerate(found) if same(content, wanted[0]))
     assert number - begin >= WHOLE - 2
     for content, one in zip(found[begin:], wanted, strict=False):
@@ -125,13 +125,13 @@ def test_imu_messages_equal_those_of_the_library(
         source,
         "-s",
         "livox-mid360",
-        ros=given(publish_packets=True, qos="reliable", frame_id="head"),
+        ros=format_parameters(publish_packets=True, qos="reliable", frame_id="head"),
     )
     client.until(lambda: packets)  # the topic may be found later than that of the IMU
     first = len(received)
     client.until(lambda: len(received) > first + 400)
     with ls.open(
-        recorded(packets, tmp_path / "packets.lsr", "livox-mid360"), "livox-mid360"
+        record(packets, tmp_path / "packets.lsr", "livox-mid360"), "livox-mid360"
     ) as device:
         wanted = [
             row
@@ -242,7 +242,7 @@ def test_no_scan_is_lost_in_ten_minutes(
 
     client.listen(topic, message_class, reliable=qos == "reliable", take=note)
     run(
-        ros=given(source=f"sim:{sensor}", sensor=sensor, qos=qos, autostart=False),
+        ros=format_parameters(source=f"sim:{sensor}", sensor=sensor, qos=qos, autostart=False),
         executable="lidarspec_node",
     )
     assert client.change("configure")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from client import PATIENCE, Client, ended, given
+from client import PATIENCE, Client, end_node, format_parameters
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2
 
@@ -203,7 +203,7 @@ def test_clouds_arrive_with_best_effort_at_the_full_rate(
     client.until(lambda: len(client.diagnostics) > 1)  # no cloud is on its way any more
     sent = sent_clouds(client) - first_sent
     arrived = len(received) - first_received
-    code, log = ended(process)
+    code, log = end_node(process)
     assert arrived >= MIN_SHARE * sent
     assert code == 0
     assert log.count("Fast DDS: shared memory of 21 MB for clouds of up to 2.5 MB") == 1
@@ -211,13 +211,15 @@ def test_clouds_arrive_with_best_effort_at_the_full_rate(
 
 def test_larger_clouds_than_foreseen_are_a_warning(run: Callable[..., Any], client: Client) -> None:
     client.listen("points", PointCloud2, reliable=False)
-    parameters = given(source="sim:ldrobot-stl27l", sensor="ldrobot-stl27l", autostart=False)
+    parameters = format_parameters(
+        source="sim:ldrobot-stl27l", sensor="ldrobot-stl27l", autostart=False
+    )
     process = run(ros=parameters, executable="lidarspec_node")
     assert client.set("source", "sim:robosense-m1") == client.set("sensor", "robosense-m1") == ""
     assert client.change("configure")
     assert client.change("activate")
     client.until(lambda: client.diagnostics and sent_clouds(client) > 3)
-    _, log = ended(process)
+    _, log = end_node(process)
     assert log.count("clouds of 2.5 MB may be lost") == 1
     assert "qos:=reliable" in log
 
@@ -239,6 +241,6 @@ def test_nothing_of_the_profile_is_left(
         command, env=environment, cwd=tmp_path, text=True, stderr=subprocess.PIPE
     ) as process:
         client.until(lambda: client.diagnostics, patience=PATIENCE)
-        code, log = ended(process)
+        code, log = end_node(process)
     assert (code, "shared memory of" in log) == (0, True)
     assert list(scratch.iterdir()) == []

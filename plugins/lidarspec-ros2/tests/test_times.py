@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from client import Client, given, message
+from client import Client, format_parameters, message
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, LaserScan, PointCloud2
@@ -34,7 +34,7 @@ SENSORS = {
 }
 
 
-def recorded(path: Path, sensor: str, *, jumps: int = 0) -> tuple[Path, int]:
+def record(path: Path, sensor: str, *, jumps: int = 0) -> tuple[Path, int]:
     """A recording of a simulated sensor, each of whose packets arrived up to 5 ms late, and what
     its clock is behind.
 
@@ -57,7 +57,7 @@ def recorded(path: Path, sensor: str, *, jumps: int = 0) -> tuple[Path, int]:
 def test_the_messages_of_a_recording_are_those_of_its_bag(
     run: Callable[..., Any], client: Client, tmp_path: Path, sensor: str
 ) -> None:
-    path, _ = recorded(tmp_path / "drive.lsr", sensor)
+    path, _ = record(tmp_path / "drive.lsr", sensor)
     _, topic, kind, shape = SENSORS[sensor]
     words = [
         "convert",
@@ -75,7 +75,7 @@ def test_the_messages_of_a_recording_are_those_of_its_bag(
     clock, received = client.listen("/clock", Clock), client.listen(topic, kind)
     run(
         str(path),
-        ros=given(
+        ros=format_parameters(
             use_sim_time=True, use_device_time=False, qos="reliable", frame_id="front", beams=360
         ),
     )
@@ -90,12 +90,12 @@ def test_the_messages_of_a_recording_are_those_of_its_bag(
 def test_stamps_by_the_sensors_clock_are_closer_to_the_truth_than_arrivals(
     run: Callable[..., Any], client: Client, tmp_path: Path, sensor: str
 ) -> None:
-    path, behind = recorded(tmp_path / "drive.lsr", sensor)
+    path, behind = record(tmp_path / "drive.lsr", sensor)
     with ls.open(path) as device:
         truths = np.array([scan.stamp_ns + behind for scan in device.scans()])
     _, topic, kind, _ = SENSORS[sensor]
     received = client.listen(topic, kind)
-    run(str(path), ros=given(qos="reliable"))
+    run(str(path), ros=format_parameters(qos="reliable"))
     client.until(lambda: len(received) >= WANTED)
     stamps = np.array(
         [stamp(message(data, f"sensor_msgs/msg/{kind.__name__}").header.stamp) for data in received]
@@ -108,12 +108,10 @@ def test_stamps_by_the_sensors_clock_are_closer_to_the_truth_than_arrivals(
 def test_a_clock_change_is_reported(
     run: Callable[..., Any], client: Client, tmp_path: Path
 ) -> None:
-    path, _ = recorded(
-        tmp_path / "drive.lsr", "velodyne-vlp16", jumps=7540
-    )  # packets of ten seconds
+    path, _ = record(tmp_path / "drive.lsr", "velodyne-vlp16", jumps=7540)  # packets of ten seconds
     clouds = client.listen("points", PointCloud2)
-    run(str(path), ros=given(qos="reliable"))
-    client.until(lambda: any("clock was set by +10.0" in text for text in told(client)))
+    run(str(path), ros=format_parameters(qos="reliable"))
+    client.until(lambda: any("clock was set by +10.0" in text for text in list_diagnostics(client)))
     stamps = np.array(
         [stamp(message(data, "sensor_msgs/msg/PointCloud2").header.stamp) for data in clouds]
     )
@@ -128,14 +126,14 @@ def test_imu_samples_and_points_have_consistent_stamps(
     run: Callable[..., Any], client: Client, sensor: str
 ) -> None:
     felt, clouds = client.listen("imu", Imu), client.listen("points", PointCloud2)
-    run(f"sim:{sensor}", "-s", sensor, ros=given(qos="reliable"))
+    run(f"sim:{sensor}", "-s", sensor, ros=format_parameters(qos="reliable"))
     client.until(lambda: len(felt) > WANTED and len(clouds) > 2)
     now = time.time_ns()
     for data, kind in ((felt[-1], "Imu"), (clouds[-1], "PointCloud2")):
         assert abs(stamp(message(data, f"sensor_msgs/msg/{kind}").header.stamp) - now) < 5 * SECOND
 
 
-def told(client: Client) -> list[str]:
+def list_diagnostics(client: Client) -> list[str]:
     """What all diagnostics have said."""
     return [
         entry.value

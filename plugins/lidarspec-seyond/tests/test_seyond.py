@@ -13,7 +13,7 @@ import pytest
 import lidarspec as ls
 import lidarspec_seyond
 from lidarspec import simulate
-from tests.evidence import assert_points, decoded
+from tests.evidence import assert_points, decode
 
 FALCON = ls.sensor("seyond-falcon")
 VECTORS = json.loads(
@@ -26,7 +26,7 @@ def test_packets_of_one_return_and_two_by_hand(
     vector: dict[str, dict[str, dict[str, float]]],
 ) -> None:
     data = bytes.fromhex(str(vector["hex"]))
-    packets = decoded(FALCON, [data])
+    packets = decode(FALCON, [data])
     assert packets.frame == vector["frame"]
     assert FALCON.build(packets.frame, FALCON.parse(data)) == data
     cloud = packets.points()

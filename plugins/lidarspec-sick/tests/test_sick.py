@@ -14,7 +14,7 @@ import lidarspec as ls
 from lidarspec.detect.identification import identify_sample
 from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.errors import CommandError, UsageError
-from tests.evidence import capture, decoded, vector_bytes, vectors
+from tests.evidence import capture, decode, vector_bytes, vectors
 
 LMS511 = ls.sensor("sick-lms511")
 TIM871S, TIM551 = ls.sensor("sick-tim871s"), ls.sensor("sick-tim551")
@@ -68,7 +68,7 @@ def test_bad_headers_are_counted_equally_for_all_chunk_sizes() -> None:
 
 def test_a_telegram_in_text_is_read_and_built_again() -> None:
     data = vector_bytes("vectors_serial2d.json", "sick_tim_sra")
-    cloud = decoded(TIM551, data).points()
+    cloud = decode(TIM551, data).points()
     assert TIM551.build("text", TIM551.parse(data)) == data
     np.testing.assert_allclose(cloud.range[:4], [0.278, 0.288, 0.291, 0.285], atol=1e-6)
     np.testing.assert_allclose(cloud.azimuth, np.deg2rad(np.arange(271) - 135.0), atol=1e-5)
@@ -83,7 +83,7 @@ def test_telegrams_with_and_without_strengths() -> None:
     data = vector_bytes("vectors_serial2d.json", "sick_tim_sra")
     values = TIM551.parse(data)
     bare = TIM551.build("text", {**values, "channels8": 0, "rssi1_8bit": None})
-    cloud = decoded(TIM551, data + bare).points()
+    cloud = decode(TIM551, data + bare).points()
     assert cloud.intensity is not None
     assert cloud.intensity[271:].tolist() == [0] * 271
     np.testing.assert_array_equal(cloud.range[271:], cloud.range[:271])
@@ -216,7 +216,7 @@ def test_modules_of_a_multiscan_are_those_published(name: str) -> None:
     )
     parsed = MULTISCAN.parse(data)
     assert MULTISCAN.build("scan", parsed) == data
-    decoded(MULTISCAN, [data])
+    decode(MULTISCAN, [data])
     for module, known in zip(parsed.modules, filter(None, expected["modules"]), strict=False):
         assert (module.segment, module.turn, module.beam_count) == (
             known["segment"],

@@ -180,7 +180,7 @@ def dense_points(f: Fields) -> Polar:
     return Polar(range=f.distances, azimuth=-np.deg2rad(clockwise))
 
 
-def predicted(base: Any, level: Any, prediction: Any) -> Any:
+def predict(base: Any, level: Any, prediction: Any) -> Any:
     """Millimetres of a predicted distance, in steps of its base's scale; 0 for the two values that
     mean no return.
     """
@@ -211,8 +211,8 @@ def ultra_points(f: Fields) -> Polar:
     lacking = (major == 0) & (after > 0)
     base = np.where(lacking, after, major)
     level = np.where(lacking, after_level, take(LEVELS, code))
-    first = predicted(base, level, f.cabins.predict1)
-    second = predicted(after, after_level, f.cabins.predict2)
+    first = predict(base, level, f.cabins.predict1)
+    second = predict(after, after_level, f.cabins.predict2)
     mm = stack(major, first, second)
     return Polar(
         range=mm / 1000, azimuth=-np.deg2rad(headings(f, ULTRA_CABINS, 3) - compensation(mm))

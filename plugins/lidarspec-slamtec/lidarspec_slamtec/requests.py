@@ -25,7 +25,7 @@ from lidarspec.spec import Checksummed, Frame, Scaled, Xor
 START = Const(b"\xa5")
 
 
-def sealed(*fields: Construct) -> Checksummed:
+def make_request(*fields: Construct) -> Checksummed:
     """A request of these fields, between its start byte and the XOR of all bytes before that."""
     return Checksummed(
         Struct("start" / START, *fields, "checksum" / Int8ul), field="checksum", algorithm=Xor()
@@ -35,7 +35,8 @@ def sealed(*fields: Construct) -> Checksummed:
 def asking(cmd: int, size: int, *payload: Construct) -> Frame:
     """The request of one command with a payload of `size` bytes."""
     return Frame(
-        sealed("cmd" / Const(cmd, Int8ul), "size" / Const(size, Int8ul), *payload), direction="out"
+        make_request("cmd" / Const(cmd, Int8ul), "size" / Const(size, Int8ul), *payload),
+        direction="out",
     )
 
 
@@ -46,7 +47,7 @@ PLAIN = Struct(
         "payload" / Const(0, BitsInteger(1)) * "0: none follows", "number" / BitsInteger(7)
     ),
 )
-PAYLOAD = sealed(
+PAYLOAD = make_request(
     "cmd" / Int8ul * "80 and above",
     "size" / Int8ul * "of the payload",
     "payload" / Bytes(this.size),

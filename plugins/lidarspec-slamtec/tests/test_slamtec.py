@@ -15,7 +15,7 @@ import lidarspec as ls
 from lidarspec.errors import OutOfRange
 from lidarspec.frames.row_checksums import compute_checksums
 from lidarspec.framing.frame_engine import codec
-from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
+from tests.evidence import assert_points, clockwise, decode, vector_bytes, vectors
 
 from .rplidar import believing
 
@@ -92,7 +92,7 @@ def test_the_name_of_a_mode_is_text() -> None:
 @pytest.mark.parametrize(("name", "answer"), PAIRS.items())
 def test_a_pair_of_capsules_has_the_expected_points(name: str, answer: str) -> None:
     data, expected = vector_bytes(FILE, name), vectors(FILE)[name]["expected"]
-    cloud = decoded(A1.configure(answer=answer), data).points()
+    cloud = decode(A1.configure(answer=answer), data).points()
     number = expected["n"]
     metres = np.array(expected["dist_mm"]) / 1000
     np.testing.assert_allclose(
@@ -123,7 +123,7 @@ def test_the_scale_of_ultra_capsules() -> None:
 def test_a_node_by_hand() -> None:
     # bd: quality bd >> 2 = 47, !S 0, S 1.   1681: >> 1 = 2880, / 64 = 45 degrees clockwise.   0fa0
     # = 4000 quarters of a millimetre.
-    cloud = decoded(believing(1), bytes.fromhex("bd8116a00f")).points()
+    cloud = decode(believing(1), bytes.fromhex("bd8116a00f")).points()
     assert_points(cloud, [(0, (math.sqrt(0.5), -math.sqrt(0.5), 0))])
     assert cloud.intensity is not None
     assert cloud.intensity.tolist() == [47]
@@ -137,7 +137,7 @@ def test_dense_capsules_by_hand() -> None:
         S2.build("dense", start={"angle": angle * 64, "sync": 0}, distances=distances)
         for angle in (80, 100)
     )
-    cloud = decoded(S2.configure(answer="dense"), data).points()
+    cloud = decode(S2.configure(answer="dense"), data).points()
     assert_points(
         cloud,
         [(20, (0, -2.5, 0)), (0, (math.cos(math.radians(80)), -math.sin(math.radians(80)), 0))],
@@ -167,7 +167,7 @@ def test_ultra_dense_capsules_by_hand() -> None:
         )
         for angle in (350, 118)
     )
-    cloud = decoded(S2.configure(answer="ultra_dense"), data).points()
+    cloud = decode(S2.configure(answer="ultra_dense"), data).points()
     np.testing.assert_allclose(cloud.range[:5], [1.0, 3.999, 9.999, 24.997, np.inf], rtol=1e-6)
     np.testing.assert_allclose(clockwise(cloud)[:6], [350, 352, 354, 356, 358, 0], atol=2e-5)
     assert cloud.intensity is not None
@@ -199,7 +199,7 @@ def test_an_ultra_capsule_by_hand() -> None:
     ]
     cabins += [{"major": 0, "predict1": 511, "predict2": 511}] * 30
     starts = [{"angle": round(degrees * 64), "sync": 0} for degrees in (10, 29.203125)]
-    cloud = decoded(
+    cloud = decode(
         A3.configure(answer="ultra"),
         b"".join(A3.build("ultra", start=start, cabins=cabins) for start in starts),
     ).points()
@@ -218,7 +218,7 @@ def test_an_hq_capsule_by_hand() -> None:
     data = A3.build("hq", time_stamp=5, nodes=points)
     assert len(data) == 781
     assert int.from_bytes(data[-4:], "little") == zlib.crc32(data[:-4] + bytes(3))
-    cloud = decoded(A3.configure(answer="hq"), data).points()
+    cloud = decode(A3.configure(answer="hq"), data).points()
     assert_points(cloud, [(0, (2 * math.cos(math.pi / 8), -2 * math.sin(math.pi / 8), 0))])
     assert cloud.valid.tolist() == [True] + [False] * 95
     wrong = data[:9] + bytes([data[9] ^ 1]) + data[10:]
@@ -248,11 +248,11 @@ def test_the_compensation_of_express_capsules_signed_or_not() -> None:
     )
     sensor = A1.configure(answer="express")
     np.testing.assert_allclose(
-        clockwise(decoded(sensor, data).points())[:2], [100 - 5, 101 - 1], atol=1e-4
+        clockwise(decode(sensor, data).points())[:2], [100 - 5, 101 - 1], atol=1e-4
     )
     signed = sensor.configure(dtheta="signed")
     np.testing.assert_allclose(
-        clockwise(decoded(signed, data).points())[:2], [100 + 3, 101 - 1], atol=1e-4
+        clockwise(decode(signed, data).points())[:2], [100 + 3, 101 - 1], atol=1e-4
     )
     for also in (signed.configure(mode=3), pickle.loads(pickle.dumps(signed))):
         np.testing.assert_allclose(

@@ -13,8 +13,8 @@ from lidarspec import simulate
 from lidarspec.spec import Polar
 from lidarspec_slamtec.capsules import ultra_codes
 from tests.engine.oracle import Oracle
-from tests.engine.streams import damaged
-from tests.evidence import clockwise, decoded
+from tests.engine.streams import damage
+from tests.evidence import clockwise, decode
 
 from .rplidar import A1, ANSWERS, believing, capsule, capsules, nodes_in, turns
 
@@ -49,16 +49,16 @@ def test_a_descriptor_switches_to_its_own_frames_alone(answer: str) -> None:
 )
 def test_a_damaged_stream_equals_the_oracle(answer: str, rate: float) -> None:
     number = {("hq", 0.001): 16, ("hq", 0.01): 6, ("ultra_dense", 0.01): 60}.get((answer, rate), 30)
-    data = damaged(capsules(answer, number), rate, 11)
+    data = damage(capsules(answer, number), rate, 11)
     found = [(item.frame, item.offset, item.data) for item in A1.split(data)]
     assert found == Oracle(A1, data).frames()
     intact = sum(name == answer for name, _, _ in found)
     assert intact == 0 if (answer, rate) == ("hq", 0.01) else 5 < intact < number
-    decoded(A1.configure(answer=answer), data)
+    decode(A1.configure(answer=answer), data)
 
 
 def test_damaged_nodes_equal_the_oracle() -> None:
-    data = damaged(A1.example("scan_descriptor") + turns(600), 0.01, 12)
+    data = damage(A1.example("scan_descriptor") + turns(600), 0.01, 12)
     found = [(item.frame, item.offset, item.data) for item in A1.split(data)]
     assert found == Oracle(A1, data).frames()
     assert 300 < len(found) < 600
@@ -73,7 +73,7 @@ def test_a_conversation_with_several_answers_equals_the_oracle() -> None:
         capsules("dense", 6),
         capsules("hq", 3),
     ]
-    data = damaged(
+    data = damage(
         b"".join(parts) + A1.example("scan_descriptor") + turns(40, seed=2), 0.004, 5, burst=8
     )
     assert [(item.frame, item.offset, item.data) for item in A1.split(data)] == Oracle(

@@ -12,7 +12,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.detect.identification import identify_sample
 from lidarspec.detect.sample_bytes import SampleBytes
-from tests.evidence import decoded
+from tests.evidence import decode
 
 RADAR = ls.sensor("ti-iwr6843")
 AHEAD, ASIDE = (
@@ -37,7 +37,7 @@ def frame(number: int, *parts: tuple[int, bytes], platform: int = 0xA6843) -> by
 
 def test_points_are_turned_to_our_axes_and_have_velocities() -> None:
     side = (7, struct.pack("<4h", 180, 600, 95, 610))
-    packets = decoded(
+    packets = decode(
         RADAR,
         frame(1, points(AHEAD, ASIDE), side)
         + frame(2)
@@ -54,7 +54,7 @@ def test_points_are_turned_to_our_axes_and_have_velocities() -> None:
 
 def test_its_cycles_start_again_and_a_lost_frame_is_counted() -> None:
     data = [frame(number, points(AHEAD)) for number in (213, 214, 215, 217)]
-    packets = decoded(RADAR, b"".join(data))
+    packets = decode(RADAR, b"".join(data))
     assert packets.time_ns[-1] - packets.time_ns[0] == 400_000_000
     assert packets.stats.lost == 1
 

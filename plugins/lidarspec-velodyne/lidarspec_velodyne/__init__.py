@@ -36,10 +36,10 @@ from lidarspec_velodyne.frames import (
     VLP32C_FRAMES,
     VLP32C_PRODUCT,
     VLS128_PRODUCT,
+    nmea_seconds,
     packet,
     plausible_dual,
     plausible_single,
-    told,
 )
 from lidarspec_velodyne.hdl64e import HDL64E_S2, HDL64E_S3
 
@@ -240,7 +240,7 @@ VLP16 = Sensor(
         "timestamp",
         wraps_at=HOUR,
         pace=partial(pace, model=VLP16_FIRINGS),
-        reference=("position", told),
+        reference=("position", nmea_seconds),
     ),
     simulation=Simulation(partial(sweep, model=VLP16_FIRINGS)),
     configure=configure,
@@ -274,7 +274,7 @@ def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
             "timestamp",
             wraps_at=HOUR,
             pace=partial(pace, model=firings),
-            reference=("position", told),
+            reference=("position", nmea_seconds),
         ),
         simulation=Simulation(partial(sweep, model=firings)),
         **facts,

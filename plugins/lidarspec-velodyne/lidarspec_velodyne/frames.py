@@ -154,7 +154,7 @@ _RMC = re.compile(rb"\$G[A-Z]RMC,(\d{6})(?:\.\d*)?,A,(?:[^,]*,){6}(\d{6})[,*]")
 LOCKED = 2  # state of the PPS
 
 
-def told(f: Fields) -> Any:
+def nmea_seconds(f: Fields) -> Any:
     """Seconds since 1970 of each NMEA sentence; nan of one that is not valid, or while no PPS holds
     the clock to it.
     """

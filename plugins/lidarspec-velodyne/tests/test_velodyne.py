@@ -17,7 +17,7 @@ from lidarspec import simulate
 from lidarspec.errors import UnknownOption
 from lidarspec.packets.stream import PacketStream
 from tests.calibration_files import write_velodyne_xml
-from tests.evidence import assert_points, clockwise, decoded, vector_bytes, vectors
+from tests.evidence import assert_points, clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_udp3d.json"
 VLP16, HDL32E, HI_RES = (
@@ -61,7 +61,7 @@ def steps(start: int, step: int = 40, *, each: int = 1) -> list[int]:
     return [(start + step * (block // each)) % 36000 for block in range(12)]
 
 
-def filled(
+def make_packet(
     start: int, step: int = 40, *, each: int = 1, mode: int = STRONGEST, time_us: int = 0
 ) -> bytes:
     """A packet in which every distance is 10 m."""
@@ -76,7 +76,7 @@ def spot(block: int, slot: int) -> int:
 def test_vlp16_points_by_hand() -> None:
     azimuths = [4500, 4540, 4580, 20000, 20040, 20080, 20120, 20160, 20200, 20240, 20280, 35990]
     first = packet(azimuths, {(0, 2): (5000, 17), (3, 31): (1000, 200), (11, 16): (2500, 3)})
-    cloud = decoded(VLP16, [first, packet(steps(30), {}, time_us=1327)]).points()
+    cloud = decode(VLP16, [first, packet(steps(30), {}, time_us=1327)]).points()
     # laser = slot % 16; it fires 2.304 us * laser after its round, the second round 55.296 us after
     # the first, a block takes 110.592 us. x = r cosE cosA, y = -r cosE sinA (clockwise), z = r sinE
     # - 0.04191 tanE.
@@ -110,9 +110,7 @@ def test_vlp16_points_by_hand() -> None:
 
 def test_vlp16_dual_return_by_hand() -> None:
     first = packet(steps(8800, each=2), {(10, 17): (3000, 40), (11, 17): (2000, 90)}, mode=DUAL)
-    cloud = decoded(
-        VLP16, [first, packet(steps(9040, each=2), {}, mode=DUAL, time_us=664)]
-    ).points()
+    cloud = decode(VLP16, [first, packet(steps(9040, each=2), {}, mode=DUAL, time_us=664)]).points()
     # blocks 10 and 11 share A 90.00, the next pair has 90.40; slot 17 is laser 1, E 1, second
     # round: 57.6 / 110.592 = 0.5208333: A 90.2083333, cosA = -.003636, sinA = .999993
     #   block 10, the last return, 6 m: x = -6 * .999848 * .003636 = -0.02181, y = -5.99905, z =
@@ -133,7 +131,7 @@ def test_vlp16_dual_return_by_hand() -> None:
 def test_hdl32e_points_by_hand() -> None:
     cells = {(2, 31): (10000, 11), (5, 0): (500, 12), (8, 15): (1500, 13)}
     azimuths = [29968, 29984, 30000, 30016, 30032, 18000, 18016, 18032, 9000, 9016, 9032, 9048]
-    cloud = decoded(HDL32E, [packet(azimuths, cells, product=0x21)]).points()
+    cloud = decode(HDL32E, [packet(azimuths, cells, product=0x21)]).points()
     # slot j fires 1.152 us * j after its block, which takes 46.08 us; z = r sinE - 0.02883 tanE
     #   block 2, slot 31: 20 m, E 10.67; 35.712 / 46.08 = 0.775 of 0.16: A 300.124, cosA = .501873,
     # sinA = -.864942
@@ -166,7 +164,7 @@ def test_the_real_packets_of_the_vectors(sensor: ls.Sensor, name: str) -> None:
         expected["tohus"],
     )
     assert [block.azimuth for block in parsed.blocks] == expected["azimuths"]
-    packets = decoded(sensor, [data])
+    packets = decode(sensor, [data])
     cloud = packets.points()
     assert packets.time_ns.tolist() == [expected["tohus"] * 1000]
     assert int(cloud.valid.sum()) == expected["n_nonzero"]
@@ -182,7 +180,7 @@ def test_the_real_packets_of_the_vectors(sensor: ls.Sensor, name: str) -> None:
 
 
 def test_vlp32c_points_by_hand() -> None:
-    cloud = decoded(
+    cloud = decode(
         VLP32C, [packet(steps(9000), {(0, 0): (2500, 5), (3, 31): (5000, 9)}, product=0x28)]
     ).points()
     # 4 mm steps; slot j fires 2.304 us * (j // 2) after its block, which takes 55.296 us, and looks
@@ -206,7 +204,7 @@ def test_vlp32c_points_by_hand() -> None:
 
 
 def test_the_high_resolution_of_the_puck() -> None:
-    cloud = decoded(HI_RES, [packet(steps(0), {(0, 16): (5000, 1)}, product=0x24)]).points()
+    cloud = decode(HI_RES, [packet(steps(0), {(0, 16): (5000, 1)}, product=0x24)]).points()
     # as a VLP-16's, E -10: 10 m at A 0.20: x = 9.84802, y = -0.03438, z = -1.736482 + .04191 *
     # .176327 = -1.72909
     assert_points(cloud, [(spot(0, 16), (9.84802, -0.03438, -1.72909))])
@@ -220,7 +218,7 @@ def test_vls128_points_by_hand() -> None:
         product=0xA1,
         flags=FOUR_BANKS * 3,
     )
-    packets = decoded(
+    packets = decode(
         VLS128, [first, packet([27060] * 12, {}, product=0xA1, flags=FOUR_BANKS * 3, time_us=160)]
     )
     cloud = packets.points()
@@ -255,7 +253,7 @@ def test_vls128_with_dual_return() -> None:
         packet([9000 + 20 * i] * 8, cells, product=0xA1, mode=DUAL, flags=flags, time_us=53 * i)
         for i in range(2)
     ]
-    packets = decoded(VLS128, data)
+    packets = decode(VLS128, data)
     assert packets.frame == "data_dual"
     cloud = packets.points()
     #   blocks 2 and 3, slot 4: laser 37, E -25, A 90 + .04 - .911 = 89.129, 5 and 10 m: x = 4.53154
@@ -275,7 +273,7 @@ def test_the_real_packet_of_a_vls128() -> None:
     assert VLS128.build("data", parsed) == data
     assert [block.azimuth for block in parsed.blocks] == expected["azimuths"]
     assert [f"{block.flag:04x}" for block in parsed.blocks] == expected["flags"]
-    packets = decoded(VLS128, [data])
+    packets = decode(VLS128, [data])
     assert int(packets.raw["blocks"]["channels"]["distance"].sum()) == expected["sum_raw"]
     assert packets.time_ns.tolist() == [expected["tohus"] * 1000]
 
@@ -285,13 +283,13 @@ def test_the_real_packet_of_a_vls128() -> None:
 def test_the_last_block_where_nothing_follows_or_packets_are_lost(
     each: int, mode: int, beyond: int | None
 ) -> None:
-    data = [filled(1000, 39, each=each, mode=mode)]
+    data = [make_packet(1000, 39, each=each, mode=mode)]
     if beyond is not None:
-        data.append(filled(beyond, 39, each=each, mode=mode, time_us=9000))
+        data.append(make_packet(beyond, 39, each=each, mode=mode, time_us=9000))
     last = steps(1000, 39, each=each)[-1] / 100
     inner, outer = range(12 - each), range(12 - each, 12)
     for sensor, known in ((VLP16, True), (VLP16.configure(last_block="invalid"), False)):
-        cloud = decoded(sensor, data).points()
+        cloud = decode(sensor, data).points()
         valid = cloud.valid.reshape(-1, 12, 32)[0]
         assert valid[inner].all()
         assert valid[outer].all() == valid[outer].any() == known
@@ -306,10 +304,10 @@ def test_directions_run_on_over_packet_borders_and_over_zero(each: int, mode: in
     per_packet = 12 // each
     starts = [(35000 + 40 * per_packet * number) % 36000 for number in range(6)]
     data = [
-        filled(start, each=each, mode=mode, time_us=1000 * number)
+        make_packet(start, each=each, mode=mode, time_us=1000 * number)
         for number, start in enumerate(starts)
     ]
-    cloud = decoded(VLP16, data).points()
+    cloud = decode(VLP16, data).points()
     turned = (clockwise(cloud).reshape(72, 32)[::each] - 350) % 360
     slot = np.arange(32)
     within = 0.4 * (slot // 16 * 55.296 + slot % 16 * 2.304) / 110.592
@@ -318,9 +316,7 @@ def test_directions_run_on_over_packet_borders_and_over_zero(each: int, mode: in
 
 def test_points_are_not_interpolated_across_a_masked_sector() -> None:
     masked = packet([*steps(8900)[:6], *steps(27000)[:6]], {(5, 16): (500, 1)})
-    assert clockwise(decoded(VLP16, [masked]).points())[spot(5, 16)] == pytest.approx(
-        91.2, abs=1e-4
-    )
+    assert clockwise(decode(VLP16, [masked]).points())[spot(5, 16)] == pytest.approx(91.2, abs=1e-4)
 
 
 @pytest.mark.parametrize("jump_deg", [20, 116, 200, 350])
@@ -339,9 +335,7 @@ def test_a_single_block_after_a_masked_sector_uses_the_rotor_speed(jump_deg: int
 
 def test_an_azimuth_that_falls_back_is_no_turn() -> None:
     stuck = packet([1000, 999, *steps(1000, 0)[2:]], {(0, 16): (500, 1)})
-    assert clockwise(decoded(VLP16, [stuck]).points())[spot(0, 16)] == pytest.approx(
-        9.995, abs=1e-4
-    )
+    assert clockwise(decode(VLP16, [stuck]).points())[spot(0, 16)] == pytest.approx(9.995, abs=1e-4)
 
 
 def test_neither_the_product_byte_nor_an_unset_mode_changes_points() -> None:
@@ -356,16 +350,14 @@ def test_neither_the_product_byte_nor_an_unset_mode_changes_points() -> None:
 
 def test_the_clock_runs_on_over_the_hour() -> None:
     times = [3_599_999_000, 327, 1_654]
-    packets = decoded(VLP16, [filled(0, time_us=time) for time in times])
+    packets = decode(VLP16, [make_packet(0, time_us=time) for time in times])
     assert np.diff(packets.time_ns).tolist() == [1_327_000, 1_327_000]
 
 
 def test_azimuths_up_to_a_whole_turn_are_valid() -> None:
-    wrong_flag = bytearray(filled(0))
+    wrong_flag = bytearray(make_packet(0))
     wrong_flag[300] = 0xFE
-    packets = decoded(
-        VLP16, [packet([36000] * 12, {}), packet([36001] * 12, {}), bytes(wrong_flag)]
-    )
+    packets = decode(VLP16, [packet([36000] * 12, {}), packet([36001] * 12, {}), bytes(wrong_flag)])
     assert (len(packets), packets.stats.implausible) == (1, 1)
     with pytest.raises(ls.WireError) as caught:
         VLP16.parse(bytes(wrong_flag), "data")
@@ -398,7 +390,7 @@ def test_the_position_packet() -> None:
         parsed.shutdown_temperature,
         parsed.power_up_temperature,
     ) == (2, 1, 99, 22)
-    packets = decoded(VLP16, [data, filled(0), position(b"", pps=0, time_us=0)], "position")
+    packets = decode(VLP16, [data, make_packet(0), position(b"", pps=0, time_us=0)], "position")
     assert packets["timestamp"].tolist() == [pytest.approx(123.456789), 0]
     assert packets["adc_age"].tolist() == [600, 600]
 
@@ -413,15 +405,15 @@ def test_the_position_packet() -> None:
     ],
 )
 def test_invalid_position_packets_are_rejected(data: bytes) -> None:
-    assert len(decoded(VLP16, [data], "position")) == 0
+    assert len(decode(VLP16, [data], "position")) == 0
 
 
 def test_the_option_is_checked_and_kept() -> None:
     chosen = VLP16.configure(last_block="invalid")
     assert pickle.loads(pickle.dumps(chosen)).options == {"last_block": "invalid"}
     again = chosen.configure(frame="vendor")
-    assert not again.decode([filled(0)]).points().valid[spot(11, 5)]
-    assert VLP16.decode([filled(0)]).points().valid.all()
+    assert not again.decode([make_packet(0)]).points().valid[spot(11, 5)]
+    assert VLP16.decode([make_packet(0)]).points().valid.all()
     with pytest.raises(ls.UsageError, match="'previous' or 'invalid', not 'mean'"):
         VLP16.configure(last_block="mean")
     with pytest.raises(UnknownOption):
@@ -461,7 +453,7 @@ def test_the_hour_is_that_of_the_position_packets() -> None:
         (3599.5, 3599.9, 7199.9),
         (3599.5, 0.1, 7200.1),
     ):
-        packets = decoded(
+        packets = decode(
             VLP16,
             [
                 packet(steps(0), {}, time_us=round(read * 1e6)),
@@ -484,7 +476,7 @@ def test_the_hour_is_that_of_the_position_packets() -> None:
     ids=["no sentence", "not valid", "without a date", "no day", "no pulse"],
 )
 def test_without_a_date_times_start_at_the_hour_with_a_warning(nmea: bytes, pps: int) -> None:
-    packets = decoded(VLP16, [position(nmea, pps=pps), packet(steps(0), {}, time_us=2_000_000)])
+    packets = decode(VLP16, [position(nmea, pps=pps), packet(steps(0), {}, time_us=2_000_000)])
     assert packets.time_ns.tolist() == [2_000_000_000]
     assert (
         packets.stats.undated
@@ -519,7 +511,7 @@ def test_hdl64e_points_by_hand() -> None:
     """
     sensor = ls.sensor("velodyne-hdl64e-s2")
     flags = [b"\xff\xee", b"\xff\xdd"] * 6
-    cloud = decoded(
+    cloud = decode(
         sensor,
         [packet(steps(9000, 20, each=2), {(0, 0): (4240, 9), (1, 0): (4240, 8)}, flags=flags)],
     ).points()
@@ -554,7 +546,7 @@ def test_an_hdl64e_has_the_corrections_of_its_file(tmp_path: Path) -> None:
         calibration=write_velodyne_xml(tmp_path / "db.xml")
     )
     data = packet(steps(0, 20, each=2), {(1, 1): (2000, 9)}, flags=[b"\xff\xee", b"\xff\xdd"] * 6)
-    cloud = decoded(sensor, [data]).points()
+    cloud = decode(sensor, [data]).points()
     assert not cloud.nominal
     assert ls.sensor("velodyne-hdl64e-s2").decode([data]).points().nominal
     assert cloud.range[33] == pytest.approx(4.66)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
-from tests.evidence import capture, decoded
+from tests.evidence import capture, decode
 
 pytestmark = pytest.mark.slow  # captures of many megabytes
 
@@ -44,9 +44,9 @@ def payloads(name: str) -> tuple[bytes, ...]:
 @pytest.mark.parametrize(("sensor", "name"), [(VLP16, DUAL), (VLP16, OLD), (HDL32E, HDL)])
 def test_compiled_and_interpreted_agree_on_real_packets(sensor: ls.Sensor, name: str) -> None:
     data = payloads(name)[:8]
-    assert decoded(sensor, data).stats.bytes_skipped == 0
+    assert decode(sensor, data).stats.bytes_skipped == 0
     if name == OLD:
-        assert len(decoded(sensor, data, "position")) > 0
+        assert len(decode(sensor, data, "position")) > 0
 
 
 def test_old_firmware_pieces() -> None:
@@ -83,7 +83,7 @@ def test_old_firmware_published_points() -> None:
 
 def test_position_packets_of_a_sensor_without_gps() -> None:
     data = [datagram for datagram in payloads(OLD) if len(datagram) == 512]
-    packets = decoded(VLP16, data[:20], "position")
+    packets = decode(VLP16, data[:20], "position")
     assert VLP16.build("position", VLP16.parse(data[0])) == data[0]
     assert not packets.raw["pps"].any()
     assert not packets.raw["nmea"].any()
@@ -142,7 +142,7 @@ def test_a_lost_packet_moves_no_point_of_the_others() -> None:
     assert not moved.any()
 
 
-def published() -> NDArray[Any]:
+def read_published_points() -> NDArray[Any]:
     """The points that nebula published for one turn of the dual return capture."""
     _, _, body = (
         capture("velodyne/vlp16_dual/1673400472138016708.pcd")
@@ -153,7 +153,7 @@ def published() -> NDArray[Any]:
 
 
 def test_dual_return_against_the_published_cloud() -> None:
-    expected = published()
+    expected = read_published_points()
     assert len(expected) == 14831
     cloud = VLP16.decode(payloads(DUAL)).points()
     assert cloud.ring is not None

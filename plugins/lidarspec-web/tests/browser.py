@@ -16,7 +16,7 @@ FLAGS = (
 )
 
 
-def installed() -> str:
+def find_browser() -> str:
     """Return its path."""
     path = (
         shutil.which("chromium")

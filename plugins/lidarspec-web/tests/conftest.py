@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from .browser import FLAGS, installed
+from .browser import FLAGS, find_browser
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,7 @@ def browser() -> Iterator[Any]:
     with (
         api.sync_playwright() as running,
         contextlib.closing(
-            running.chromium.launch(executable_path=installed(), args=FLAGS)
+            running.chromium.launch(executable_path=find_browser(), args=FLAGS)
         ) as started,
     ):
         yield started

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 
-def parsed(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def parse_message(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the header of a message, and its columns."""
     (length,) = struct.unpack_from("<I", message)
     header, place = json.loads(message[4 : 4 + length]), 4 + length

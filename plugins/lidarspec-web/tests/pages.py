@@ -20,7 +20,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.transports.simulated_files import write_file
 from tests.libraries import Library
 
-from .messages import parsed
+from .messages import parse_message
 
 client = Library("websockets.sync.client")
 
@@ -85,9 +85,9 @@ class Station:
     def token(self) -> str:
         return self.link.partition("?token=")[2]
 
-    def answered(self, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    def request(self, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
         """Return the response to a raw request with the token."""
-        return answered(self.port, f"{path}?token={self.token}", **headers)
+        return request_raw(self.port, f"{path}?token={self.token}", **headers)
 
     def handshake(self) -> bytes:
         """Return the request that opens a WebSocket by hand."""
@@ -133,7 +133,7 @@ class Page:
     def say(self, word: str, **facts: Any) -> None:
         self.socket.send(json.dumps({"do": word, **facts}))
 
-    def heard(self, is_it: Callable[[Any], bool], *, within: float = DEADLINE) -> Any:
+    def receive_matching(self, is_it: Callable[[Any], bool], *, within: float = DEADLINE) -> Any:
         """Return the first unread message that matches; the others stay unread."""
         for message in self._kept:
             if is_it(message):
@@ -143,7 +143,7 @@ class Page:
         while (left := end - time.monotonic()) > 0:
             message = self.socket.recv(left)
             message = (
-                parsed(message)
+                parse_message(message)
                 if isinstance(message, bytes)
                 else json.loads(message, parse_constant=_no_constant)
             )
@@ -154,7 +154,7 @@ class Page:
 
     def until(self, word: str, holds: Callable[[Any], bool] = lambda message: True) -> Any:
         """Return the next message of a kind that matches."""
-        return self.heard(
+        return self.receive_matching(
             lambda message: isinstance(message, dict) and message["is"] == word and holds(message)
         )
 
@@ -170,7 +170,7 @@ class Page:
     def scan(self, most: int = 1 << 20) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Return the newest scan that the page has not received."""
         self.say("next", most=most)
-        return self.heard(lambda message: isinstance(message, tuple))  # type: ignore[no-any-return]
+        return self.receive_matching(lambda message: isinstance(message, tuple))  # type: ignore[no-any-return]
 
     def scan_at(self, position: float) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Return the first scan from now on that is near a position.
@@ -182,10 +182,10 @@ class Page:
             if abs(header["position"] - position) < 0.21:
                 return header, columns
 
-    def asked(self, word: str, **facts: Any) -> Any:
+    def request(self, word: str, **facts: Any) -> Any:
         """Return the reply to a request, neither a scan nor a state."""
         self.say(word, **facts)
-        return self.heard(
+        return self.receive_matching(
             lambda message: (
                 isinstance(message, dict) and message["is"] not in ("state", "hello", "ended")
             )
@@ -203,7 +203,7 @@ def _no_constant(name: str) -> None:
     raise ValueError(f"{name} is not JSON")
 
 
-def recorded(
+def write_recording(
     folder: Path, sensor: str = FLAT, seconds: float = 5.0, suffix: str = ".lsr", **faults: Any
 ) -> Path:
     """Return a file of data from a simulated sensor."""
@@ -212,7 +212,7 @@ def recorded(
     return path
 
 
-def answered(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+def request_raw(port: int, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
     """Return status, headers and body of the response to a raw request.
 
     Args:
@@ -254,7 +254,7 @@ UPGRADE = {
 }
 
 
-def masked(message: dict[str, Any]) -> bytes:
+def mask(message: dict[str, Any]) -> bytes:
     """Return a short message as a WebSocket frame, masked with zeros."""
     text = json.dumps(message).encode()
     return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text

@@ -15,7 +15,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.simulation.faults import Faults
 
-from .pages import FLAT, SOLID, Page, Station, recorded
+from .pages import FLAT, SOLID, Page, Station, write_recording
 
 #: A byte stream, datagrams, points that wait for the next packet, parts of a frame, text on the
 #: wire, messages of several datagrams.
@@ -43,7 +43,7 @@ def agree(
 ) -> None:
     """Check that a point's frame is explained as by `explain`, with this point."""
     index = int(columns["index"][spot])
-    frame = page.asked("frame", point={"scan": header["scan"], "index": index})
+    frame = page.request("frame", point={"scan": header["scan"], "index": index})
     assert (frame["is"], frame["why"]) == ("frame", "point"), frame
     data, sensor = bytes.fromhex(frame["hex"]), ls.sensor(scan.sensor.id)
     explanation = ls.explain(data, sensor, frame["explanation"]["frame"])
@@ -93,14 +93,14 @@ def test_a_point_of_a_file_leads_to_its_frame(
     tmp_path: Path, sensor: str, suffix: str, to: int
 ) -> None:
     """Also after a seek, when the same bytes have other offsets in the input."""
-    path = recorded(tmp_path, sensor, to + 2, suffix)
+    path = write_recording(tmp_path, sensor, to + 2, suffix)
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         page.scan()
         page.say("pause")
         page.state(lambda state: state["paused"])
         page.say("seek", to=to)
         header, columns = page.scan_at(to)
-        assert page.asked("frame", number=0)["is"] == "gone"  # a frame from before the move
+        assert page.request("frame", number=0)["is"] == "gone"  # a frame from before the move
         shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         for spot in range(0, header["points"], header["points"] // ASKED_OF_LONG_FRAMES):
@@ -131,28 +131,30 @@ def test_a_point_leads_to_its_frame_after_bytes_were_dropped(
         shown = station.broadcast.find_scan(header["scan"])
         assert shown is not None
         agree(page, header, columns, 7, shown.scan)
-        assert page.asked("frame", number=0) == {"is": "gone", "what": "frame 0"}
+        assert page.request("frame", number=0) == {"is": "gone", "what": "frame 0"}
 
 
 @pytest.mark.slow
 def test_points_of_old_scans_are_discarded(tmp_path: Path) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
         header, _ = page.scan()
-        assert page.asked("frame", point={"scan": header["scan"] + 9, "index": 1})["is"] == "gone"
-        assert page.asked("frame", point={"scan": header["scan"], "index": 1 << 20})["is"] == "gone"
+        assert page.request("frame", point={"scan": header["scan"] + 9, "index": 1})["is"] == "gone"
+        assert (
+            page.request("frame", point={"scan": header["scan"], "index": 1 << 20})["is"] == "gone"
+        )
 
 
 @pytest.mark.slow
 def test_frames_follow_one_another_by_number(tmp_path: Path) -> None:
     """Each is the frame after the previous one in the file."""
-    path = recorded(tmp_path, suffix=".bin")
+    path = write_recording(tmp_path, suffix=".bin")
     data = path.read_bytes()
     with Station(path, tmp_path, FLAT) as station, station.page() as page:
         page.scan()
-        frames = [page.asked("frame", number=number) for number in range(20)]
+        frames = [page.request("frame", number=number) for number in range(20)]
         assert [frame["number"] for frame in frames] == list(range(20))
         assert b"".join(bytes.fromhex(frame["hex"]) for frame in frames) in data
-        assert page.asked("frame", number=10**6)["is"] == "gone"
+        assert page.request("frame", number=10**6)["is"] == "gone"
 
 
 @pytest.mark.slow
@@ -167,7 +169,7 @@ def test_the_newest_frame_is_sent_while_it_is_watched(tmp_path: Path) -> None:
         page.state()
         page.state()
         with pytest.raises(TimeoutError):
-            page.heard(
+            page.receive_matching(
                 lambda message: isinstance(message, dict) and message["is"] == "frame", within=1.5
             )
 
@@ -181,11 +183,11 @@ def test_paused_bytes_stand_still(tmp_path: Path) -> None:
         page.say("watch", frames=True)
         last = page.until("frame")
         with pytest.raises(TimeoutError):
-            page.heard(
+            page.receive_matching(
                 lambda message: isinstance(message, dict) and message["is"] == "frame", within=1.5
             )
-        assert page.asked("frame", number=last["number"] - 1)["is"] == "frame"
-        assert page.asked("frame", number=last["number"] + 1)["is"] == "gone"
+        assert page.request("frame", number=last["number"] - 1)["is"] == "frame"
+        assert page.request("frame", number=last["number"] + 1)["is"] == "gone"
 
 
 @pytest.mark.slow
@@ -203,7 +205,7 @@ def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, wh
         assert numbers == sorted(set(numbers))
         assert damaged["total"] > numbers[-1]
         assert all(piece["verdict"] and piece["size"] > 0 for piece in listed)
-        frames = [page.asked("frame", damaged=number) for number in numbers[-8:]]
+        frames = [page.request("frame", damaged=number) for number in numbers[-8:]]
         assert {frame["is"] for frame in frames} == {"frame"}
         for frame, piece in zip(frames, listed[-8:], strict=True):
             assert (frame["why"], frame["number"], len(frame["hex"]) // 2) == (
@@ -225,7 +227,7 @@ def test_damaged_frames_are_listed_and_explained(tmp_path: Path, source: str, wh
 
 
 def test_damage_in_a_file_equals_that_of_explain(tmp_path: Path) -> None:
-    path = recorded(tmp_path, suffix=".bin", faults=Faults(errors=0.0005))
+    path = write_recording(tmp_path, suffix=".bin", faults=Faults(errors=0.0005))
     data, sensor = path.read_bytes(), ls.sensor(FLAT)
     decoder, gaps, end = sensor.decoder(), [], 0
     for frame in decoder.feed(data):
@@ -246,4 +248,4 @@ def test_nothing_is_listed_where_nothing_is_damaged(tmp_path: Path) -> None:
     with Station(f"sim:{SOLID}?loss=0.05&{SLOWLY}", tmp_path) as station, station.page() as page:
         state = page.state(lambda state: state["figures"] and state["figures"]["lost"])
         assert state["damaged"] == {"total": 0, "newest": []}
-        assert page.asked("frame", damaged=0) == {"is": "gone", "what": "damaged piece 0"}
+        assert page.request("frame", damaged=0) == {"is": "gone", "what": "damaged piece 0"}

@@ -18,7 +18,7 @@ import pytest
 
 from tests.cli.running import process, ran
 
-from .pages import DEADLINE, FLAT, Page, recorded
+from .pages import DEADLINE, FLAT, Page, write_recording
 
 #: The command line with a page that replaces the built one.
 MAIN = """import pathlib, sys
@@ -29,7 +29,7 @@ sys.exit(main())"""
 
 
 @contextlib.contextmanager
-def served(
+def run_verb(
     folder: Path, *words: object, **variables: str
 ) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Run the verb with environment variables, and yield the process and the link."""
@@ -48,7 +48,7 @@ def served(
         running.communicate()
 
 
-def ended(
+def wait_until_end(
     running: subprocess.Popen[str], by: signal.Signals | None = None
 ) -> tuple[int, str, list[str]]:
     """Return the exit code, further standard output, and the lines on standard error."""
@@ -63,10 +63,10 @@ def ended(
     "by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
 def test_it_prints_its_link_and_ends_on_a_signal(tmp_path: Path, by: signal.Signals) -> None:
-    with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
+    with run_verb(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{32}", link)
         page.scan()
-        code, out, lines = ended(running, by)
+        code, out, lines = wait_until_end(running, by)
     assert (code, out) == (130, "")
     assert lines == ["page 1 opened by 127.0.0.1; 1 open", "page 1 closed; 0 open", "interrupted"]
     assert [path.name for path in tmp_path.iterdir()] == ["page"]
@@ -76,13 +76,16 @@ def test_it_prints_its_link_and_ends_on_a_signal(tmp_path: Path, by: signal.Sign
 
 @pytest.mark.slow
 def test_it_ends_after_its_time(tmp_path: Path) -> None:
-    with served(tmp_path, f"sim:{FLAT}", "-t", "1s") as (running, _):
-        assert ended(running) == (0, "", [])
+    with run_verb(tmp_path, f"sim:{FLAT}", "-t", "1s") as (running, _):
+        assert wait_until_end(running) == (0, "", [])
 
 
 @pytest.mark.slow
 def test_a_file_that_has_ended_is_still_shown(tmp_path: Path) -> None:
-    with served(tmp_path, recorded(tmp_path, seconds=1)) as (running, link), Page(link) as page:
+    with (
+        run_verb(tmp_path, write_recording(tmp_path, seconds=1)) as (running, link),
+        Page(link) as page,
+    ):
         page.until("ended")
         assert page.scan()[1]["x"].size
         assert running.poll() is None
@@ -90,12 +93,12 @@ def test_a_file_that_has_ended_is_still_shown(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_recordings_are_listed_at_the_end(tmp_path: Path) -> None:
-    with served(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
+    with run_verb(tmp_path, f"sim:{FLAT}") as (running, link), Page(link) as page:
         page.say("record")
         name = page.state(lambda state: state["recording"] and state["recording"]["bytes"])[
             "recording"
         ]["name"]
-        _, _, lines = ended(running, signal.SIGINT)
+        _, _, lines = wait_until_end(running, signal.SIGINT)
     assert any(
         line.startswith("recorded ") and line.endswith(f"next: lidarspec view {name}")
         for line in lines
@@ -107,15 +110,15 @@ def test_recordings_are_listed_at_the_end(tmp_path: Path) -> None:
 def test_a_port_that_is_taken_is_one_clear_line(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with served(tmp_path, f"sim:{FLAT}", "--address", f"127.0.0.1:{port}") as (running, link):
-            code, out, lines = ended(running)
+        with run_verb(tmp_path, f"sim:{FLAT}", "--address", f"127.0.0.1:{port}") as (running, link):
+            code, out, lines = wait_until_end(running)
     assert (code, link, out) == (3, "", "")
     assert lines[0] == f"cannot serve the page at 127.0.0.1:{port}: Address already in use"
 
 
 @pytest.mark.slow
 def test_another_address_is_reached_from_here(tmp_path: Path) -> None:
-    with served(tmp_path, f"sim:{FLAT}", "--address", "0.0.0.0") as (_, link):
+    with run_verb(tmp_path, f"sim:{FLAT}", "--address", "0.0.0.0") as (_, link):
         local = f"http://127.0.0.1:{link.rpartition(':')[2]}"
         with Page(local) as page:
             assert page.scan()[1]["x"].size
@@ -129,7 +132,7 @@ def test_the_browser_is_led_to_the_link(tmp_path: Path) -> None:
     browser.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\n')
     browser.chmod(0o700)
     with (
-        served(tmp_path, f"sim:{FLAT}", "--open", BROWSER=f"{browser} %s") as (_, link),
+        run_verb(tmp_path, f"sim:{FLAT}", "--open", BROWSER=f"{browser} %s") as (_, link),
         Page(link) as page,
     ):
         page.scan()
@@ -151,7 +154,7 @@ def test_more_idle_connections_than_files_can_be_open(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 2048), hard))
     try:
-        with served(tmp_path, f"sim:{FLAT}") as (running, link), contextlib.ExitStack() as stack:
+        with run_verb(tmp_path, f"sim:{FLAT}") as (running, link), contextlib.ExitStack() as stack:
             resource.prlimit(running.pid, resource.RLIMIT_NOFILE, (256, hard))
             for _ in range(1100):
                 stack.enter_context(
@@ -159,7 +162,7 @@ def test_more_idle_connections_than_files_can_be_open(tmp_path: Path) -> None:
                 )
             with Page(link) as page:
                 assert page.scan()[1]["x"].size
-            _, _, lines = ended(running, signal.SIGINT)
+            _, _, lines = wait_until_end(running, signal.SIGINT)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert sum("connections: closing" in line for line in lines) == 1
@@ -168,8 +171,8 @@ def test_more_idle_connections_than_files_can_be_open(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_source_that_fails_ends_it_with_its_code(tmp_path: Path) -> None:
-    with served(tmp_path, recorded(tmp_path), "--slice", "100:200") as (running, _):
-        code, _, lines = ended(running)
+    with run_verb(tmp_path, write_recording(tmp_path), "--slice", "100:200") as (running, _):
+        code, _, lines = wait_until_end(running)
     assert code == 2
     assert "nothing of that is asked for" in lines[0]
 
@@ -189,7 +192,7 @@ def test_reading_continues_when_a_port_returns(tmp_path: Path) -> None:
 
     sim = begin()
     try:
-        with served(tmp_path, port, "-s", FLAT) as (running, link), Page(link) as page:
+        with run_verb(tmp_path, port, "-s", FLAT) as (running, link), Page(link) as page:
             page.scan()
             sim.terminate()
             sim.wait(DEADLINE)
@@ -202,7 +205,7 @@ def test_reading_continues_when_a_port_returns(tmp_path: Path) -> None:
             assert back["figures"]["disconnects"] == 1
             page.scan()
             assert page.scan()[1]["x"].size
-            assert ended(running, signal.SIGINT)[0] == 130
+            assert wait_until_end(running, signal.SIGINT)[0] == 130
     finally:
         sim.terminate()
         sim.wait(DEADLINE)

@@ -55,7 +55,7 @@ def test_idle_connections_make_way_for_a_page(station: Station) -> None:
         opened = [stack.enter_context(connect(station)) for _ in range(MANY)]
         wait_until_closed(opened, MANY - FEW + 1)
         assert not all(map(is_closed, opened))
-        assert station.answered("/")[0] == 200
+        assert station.request("/")[0] == 200
         with station.page() as after:
             for page in (before, after):
                 assert page.scan()[1]["x"].size

@@ -23,9 +23,9 @@ from lidarspec.transports.protocol import Chunk
 from lidarspec_web.access import write_opening_page
 from lidarspec_web.server import PAGE
 
-from .browser import FLAGS, installed
+from .browser import FLAGS, find_browser
 from .pages import Station
-from .visits import PATIENCE, Visit, served, streaming
+from .visits import PATIENCE, Visit, serve, streaming
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +39,7 @@ def m1_page(browser: Any) -> Iterator[Visit]:
 
     It is slowed down to one scan a second, because drawing them in software is slow.
     """
-    with served("sim:robosense-m1?rate=0.1") as link:
+    with serve("sim:robosense-m1?rate=0.1") as link:
         visit = Visit(browser, link)
         yield visit
         visit.context.close()
@@ -64,8 +64,8 @@ def check_drawing(visit: Visit) -> None:
 
     Points are drawn where the scan has some, and nowhere else.
     """
-    scan, (coloured, looked) = visit.scan, visit.coloured
-    own = np.array([[float(row[axis]) for axis in "xyz"] for row in visit.saved()])
+    scan, (coloured, looked) = visit.scan, visit.find_coloured
+    own = np.array([[float(row[axis]) for axis in "xyz"] for row in visit.save()])
     assert visit.value("lidarspec.picture.scan.of") == len(own)
     np.testing.assert_allclose(
         np.stack([scan[axis] for axis in "xyz"], axis=1), own[scan["index"]], atol=1e-3
@@ -194,7 +194,7 @@ def stl27l_page(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Itera
         for number, frame in enumerate(ls.simulate(sensor, packets=20 * RATE)):
             data = frame if number % 500 else frame[:20] + bytes([frame[20] ^ 1]) + frame[21:]
             recorder.write(Chunk(data, began + number * 1_000_000_000 // RATE))
-    with served(str(path)) as link:
+    with serve(str(path)) as link:
         visit = Visit(browser, link, theme="light")
         yield visit
         visit.context.close()
@@ -274,7 +274,7 @@ def test_a_damaged_frame_is_explained(stl27l: Visit) -> None:
 
 
 def test_a_command_shows_its_bytes_and_its_reply(browser: Any) -> None:
-    with served("sim:ldrobot-ld14p") as link:
+    with serve("sim:ldrobot-ld14p") as link:
         visit = Visit(browser, link)
         visit.page.click("#tabs [data-value=commands]")
         visit.page.click(".list [data-value=set_speed]")
@@ -316,7 +316,7 @@ def test_text_of_the_sensor_is_never_part_of_the_page(browser: Any, tmp_path: Pa
     parameters["model"]["text"] = name.encode()
     path = tmp_path / "ust.bin"
     path.write_bytes(b"".join([sensor.build("parameters", parameters), *ls.simulate(sensor, 200)]))
-    with served(str(path), "-s", sensor.id) as link:
+    with serve(str(path), "-s", sensor.id) as link:
         visit = Visit(browser, link)
         visit.until(lambda: name in visit.text("#info"), "the model's name is not shown")
         assert visit.value(
@@ -332,11 +332,11 @@ def test_a_page_reports_a_restarted_server(browser: Any) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     source = "sim:ldrobot-stl27l?rate=0.5"
-    with served(source, address=f"127.0.0.1:{port}") as link:
+    with serve(source, address=f"127.0.0.1:{port}") as link:
         visit = Visit(browser, link)
     visit.until(lambda: "Connection lost" in visit.text("#notice"), "nothing is said of it")
     assert visit.text("#status") == "no server"
-    with served(source, address=f"127.0.0.1:{port}") as link:
+    with serve(source, address=f"127.0.0.1:{port}") as link:
         visit.until(
             lambda: "Open the link that it printed" in visit.text("#notice"),
             "it does not say what to do",
@@ -367,7 +367,7 @@ def test_a_page_reconnects(browser: Any, tmp_path: Path, monkeypatch: pytest.Mon
 def test_the_file_that_a_browser_is_started_with_leads_to_the_page(
     browser: Any, tmp_path: Path
 ) -> None:
-    with served("sim:ldrobot-stl27l?rate=0.5") as link:
+    with serve("sim:ldrobot-stl27l?rate=0.5") as link:
         page = browser.new_page()
         page.goto(write_opening_page(tmp_path, link).as_uri())
         page.wait_for_url(link)
@@ -382,7 +382,7 @@ def test_a_hidden_page_requests_no_scans(tmp_path: Path) -> None:
     Tabs of one window are controlled by the browser's own
     protocol.
     """
-    with served("sim:ldrobot-stl27l?rate=0.5") as link, tabs(link, tmp_path) as (evaluated, turned):
+    with serve("sim:ldrobot-stl27l?rate=0.5") as link, tabs(link, tmp_path) as (evaluated, turned):
         newest = "globalThis.lidarspec?.picture?.scan?.scan ?? 0"
 
         def goes_on() -> bool:
@@ -415,7 +415,7 @@ def tabs(link: str, folder: Path) -> Iterator[tuple[Callable[[str], Any], Callab
     from websockets.sync.client import connect
 
     words = [
-        installed(),
+        find_browser(),
         "--headless=new",
         *FLAGS,
         "--window-size=400,300",

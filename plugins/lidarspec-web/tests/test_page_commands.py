@@ -14,7 +14,7 @@ from lidarspec.transports.destinations import simulated_outlet
 from lidarspec.transports.serving import Served
 from tests.installed import sensor_modules, sensors_in
 
-from .pages import FLAT, Page, Station, recorded
+from .pages import FLAT, Page, Station, write_recording
 
 STREAM, TEXT = "slamtec-rplidar-a1", "hokuyo-urg04lx"
 SPINNING, ANSWERING = "ldrobot-ld14p", "benewake-tfmini-plus"
@@ -48,7 +48,7 @@ def test_other_arguments_show_their_accepted_values(tmp_path: Path) -> None:
 def test_the_bytes_are_seen_before_they_are_sent(tmp_path: Path) -> None:
     sensor = ls.sensor(SPINNING)
     with Station(f"sim:{SPINNING}", tmp_path) as station, station.page() as page:
-        composed = page.asked("compose", command="set_speed", arguments={"speed": "6 Hz"})
+        composed = page.request("compose", command="set_speed", arguments={"speed": "6 Hz"})
         given = arguments(sensor, "set_speed", ["speed=6 Hz"])
         assert composed["hex"] == sensor.command("set_speed", **given).hex()
         assert composed["explanation"]["fault"] is None
@@ -67,7 +67,7 @@ def test_invalid_arguments_are_refused(tmp_path: Path) -> None:
     with Station(f"sim:{SPINNING}", tmp_path) as station, station.page() as page:
         for command, words in WRONG_ARGUMENTS:
             for word in ("compose", "send"):
-                refused = page.asked(word, command=command, arguments=words)
+                refused = page.request(word, command=command, arguments=words)
                 assert (refused["is"], refused["of"], refused["command"]) == (
                     "refused",
                     word,
@@ -79,7 +79,7 @@ def test_invalid_arguments_are_refused(tmp_path: Path) -> None:
 def test_a_reply_is_shown_while_scans_continue(tmp_path: Path) -> None:
     with Station(f"sim:{ANSWERING}", tmp_path) as station, station.page() as page:
         first, _ = page.scan()
-        replied = page.asked("send", command="get_version", arguments={})
+        replied = page.request("send", command="get_version", arguments={})
         assert (replied["is"], replied["command"]) == ("replied", "get_version")
         assert bytes.fromhex(replied["hex"])
         assert replied["text"].startswith("replied with ")
@@ -91,9 +91,9 @@ def test_a_command_without_an_answer_is_sent(tmp_path: Path) -> None:
     """The rotor stops, and the data with it."""
     with Station(f"sim:{STREAM}", tmp_path) as station, station.page() as page:
         page.scan()
-        assert "unknown" in page.asked("send", command="stop", arguments={})["text"]
+        assert "unknown" in page.request("send", command="stop", arguments={})["text"]
         page.state(lambda state: state["state"] == "silent")
-        page.asked("send", command="scan", arguments={})
+        page.request("send", command="scan", arguments={})
         page.scan()
 
 
@@ -107,27 +107,27 @@ def test_a_real_device_takes_commands_only_with_control(tmp_path: Path) -> None:
             hello = page.until("hello")
             assert not hello["control"]
             assert "--control" in hello["why_no_control"]
-            assert "--control" in page.asked("send", command="get_version", arguments={})["text"]
-            assert page.asked("compose", command="get_version", arguments={})["is"] == "composed"
+            assert "--control" in page.request("send", command="get_version", arguments={})["text"]
+            assert page.request("compose", command="get_version", arguments={})["is"] == "composed"
         with (
             Station(served.path, tmp_path, ANSWERING, control=True) as station,
             station.page() as page,
         ):
             assert page.until("hello")["control"]
-            assert page.asked("send", command="get_version", arguments={})["is"] == "replied"
+            assert page.request("send", command="get_version", arguments={})["is"] == "replied"
 
 
 @pytest.mark.parametrize("sensor", [FLAT, pytest.param(STREAM, marks=pytest.mark.slow)])
 def test_a_file_takes_no_commands(tmp_path: Path, sensor: str) -> None:
     with (
-        Station(recorded(tmp_path, sensor), tmp_path, control=True) as station,
+        Station(write_recording(tmp_path, sensor), tmp_path, control=True) as station,
         station.page() as page,
     ):
         hello = page.until("hello")
         assert not hello["control"]
         assert hello["why_no_control"]
         for name in ls.sensor(sensor).commands:
-            assert page.asked("send", command=name, arguments={})["is"] == "refused"
+            assert page.request("send", command=name, arguments={})["is"] == "refused"
 
 
 KEYS_OF_AN_ARGUMENT = {"name", "text", "unit", "low", "high", "choices", "default"}

@@ -14,7 +14,7 @@ import lidarspec as ls
 from lidarspec.simulation.scenes import Room
 from lidarspec.testing.fixtures import virtual_port
 
-from .visits import Visit, served
+from .visits import Visit, serve
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
-def saved(visit: Visit, kind: str) -> tuple[str, bytes]:
+def save_file(visit: Visit, kind: str) -> tuple[str, bytes]:
     """Return the name and the content of the file that the browser stores for a scan."""
     visit.page.click("#save summary")
     with visit.page.expect_download() as download:
@@ -31,7 +31,7 @@ def saved(visit: Visit, kind: str) -> tuple[str, bytes]:
 
 
 def test_data_is_recorded_until_the_next_click(browser: Any, tmp_path: Path) -> None:
-    with served("sim:ldrobot-stl27l", folder=tmp_path) as link:
+    with serve("sim:ldrobot-stl27l", folder=tmp_path) as link:
         visit = Visit(browser, link)
         assert visit.text("#recording") == "Record"
         visit.page.click("#record")
@@ -55,7 +55,7 @@ def test_data_is_recorded_until_the_next_click(browser: Any, tmp_path: Path) -> 
 def test_a_double_click_starts_one_recording_that_all_pages_show(
     browser: Any, tmp_path: Path
 ) -> None:
-    with served("sim:ldrobot-stl27l?rate=0.5", folder=tmp_path) as link:
+    with serve("sim:ldrobot-stl27l?rate=0.5", folder=tmp_path) as link:
         visit, other = Visit(browser, link), Visit(browser, link)
         visit.page.dblclick("#record")
         for page in (visit, other):
@@ -79,11 +79,11 @@ def test_a_double_click_starts_one_recording_that_all_pages_show(
 
 
 def test_the_scan_that_is_shown_is_saved(browser: Any) -> None:
-    with served("sim:ldrobot-stl27l") as link:
+    with serve("sim:ldrobot-stl27l") as link:
         visit = Visit(browser, link)
         visit.pause()
         position = visit.value("lidarspec.picture.scan.position")
-        name, table = saved(visit, "csv")
+        name, table = save_file(visit, "csv")
         assert name == f"ldrobot-stl27l-{position:.3f}s.csv"
         rows = list(csv.DictReader(io.StringIO(table.decode())))
         shown = visit.scan
@@ -91,10 +91,10 @@ def test_the_scan_that_is_shown_is_saved(browser: Any) -> None:
         np.testing.assert_allclose(
             np.stack([shown[axis] for axis in "xyz"], axis=1), own[shown["index"]], atol=1e-3
         )
-        name, cloud = saved(visit, "pcd")
+        name, cloud = save_file(visit, "pcd")
         assert name.endswith(".pcd")
         assert f"POINTS {len(rows)}\n".encode() in cloud
-        name, picture = saved(visit, "png")
+        name, picture = save_file(visit, "png")
         assert name.endswith(".png")
         check_picture(visit, picture)
         assert not visit.page.locator("#notice").is_visible()
@@ -107,7 +107,7 @@ def check_picture(visit: Visit, data: bytes) -> None:
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     assert data.startswith(SIGNATURE)
     pixels = np.asarray(image.open(io.BytesIO(data)).convert("RGB"), int)
-    coloured, _ = visit.coloured
+    coloured, _ = visit.find_coloured
     assert pixels.shape[:2] == coloured.shape
     scan, walls = visit.scan, Room().walls
     assert walls is not None
@@ -119,7 +119,7 @@ def check_picture(visit: Visit, data: bytes) -> None:
 
 
 def test_an_unplugged_sensor_is_reported_until_it_returns(browser: Any) -> None:
-    with virtual_port("ldrobot-stl27l") as port, served(port.path, "-s", "ldrobot-stl27l") as link:
+    with virtual_port("ldrobot-stl27l") as port, serve(port.path, "-s", "ldrobot-stl27l") as link:
         visit = Visit(browser, link)
         assert visit.until(lambda: visit.text("#status"), "no state is shown") == "streaming"
         port.unplug()

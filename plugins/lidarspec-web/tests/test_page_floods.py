@@ -105,7 +105,7 @@ def test_a_page_that_asks_without_end_waits_for_itself(
             flooding.say("pause")
         for _ in range(2):
             assert other.scan()[1]["x"].size
-        assert other.asked("frame", number=0)["is"] == "frame"
+        assert other.request("frame", number=0)["is"] == "frame"
         assert 4 < counts["messages"] < FLOOD / 2
         assert counts["freeze"] == 1
 
@@ -141,8 +141,8 @@ def test_writing_scans_does_not_delay_pages(
             with station.page() as other:
                 assert other.until("hello")
                 assert other.scan()[1]["x"].size
-                assert other.asked("frame", number=0)["is"] == "frame"
-            status, _, body = station.answered(f"/save/{number}.csv")
+                assert other.request("frame", number=0)["is"] == "frame"
+            status, _, body = station.request(f"/save/{number}.csv")
             assert (status, body) == (
                 503,
                 b"2 scans are being saved already: try again in a moment",
@@ -150,7 +150,7 @@ def test_writing_scans_does_not_delay_pages(
         finally:
             may_write.set()
         end = time.monotonic() + DEADLINE
-        while station.answered(f"/save/{number}.csv")[0] != 200:
+        while station.request(f"/save/{number}.csv")[0] != 200:
             assert time.monotonic() < end, "no scan is saved any more"
             time.sleep(0.05)
 
@@ -185,7 +185,7 @@ def test_a_scan_that_is_not_read_is_given_up(
             assert received < LARGE
         wait_until_files(folder, 0)
         monkeypatch.setattr(saving, "SEND_TIMEOUT_S", DEADLINE)
-        assert len(station.answered(f"/save/{number}.csv")[2]) == LARGE
+        assert len(station.request(f"/save/{number}.csv")[2]) == LARGE
 
 
 def test_saved_scans_leave_nothing_behind(
@@ -211,5 +211,5 @@ def test_a_folder_that_cannot_be_made_is_reported(
     monkeypatch.setattr("tempfile.tempdir", "/nowhere")
     with station.page() as page:
         number = kept_scan(page)
-        status, _, body = station.answered(f"/save/{number}.csv")
+        status, _, body = station.request(f"/save/{number}.csv")
         assert (status, b"/nowhere" in body) == (500, True)

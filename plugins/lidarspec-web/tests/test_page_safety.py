@@ -21,7 +21,7 @@ from lidarspec.errors import SourceError
 from lidarspec_web.access import add_token
 from lidarspec_web.server import PAGE
 
-from .pages import FLAT, UPGRADE, Station, answered, recorded
+from .pages import FLAT, UPGRADE, Station, request_raw, write_recording
 
 EVIL = "http://evil.example"
 FOREIGN_ORIGINS = (
@@ -60,23 +60,23 @@ def test_a_foreign_host_is_refused(shared: Station, path: str, host: str) -> Non
     """A foreign name that points here (DNS rebinding) has its own Host header."""
     named = host.format(port=shared.port)
     more: dict[str, Any] = {**UPGRADE, "Origin": f"http://{named}"} if path == "/socket" else {}
-    status, _, body = shared.answered(path, Host=named, **more)
+    status, _, body = shared.request(path, Host=named, **more)
     assert status in (400, 403)
     assert b"<title>" not in body
 
 
 def test_all_names_of_this_computer_are_accepted(shared: Station) -> None:
     for name in ("127.0.0.1", "localhost", "[::1]"):
-        status, _, body = shared.answered("/", Host=f"{name}:{shared.port}")
+        status, _, body = shared.request("/", Host=f"{name}:{shared.port}")
         assert (status, b"<title>page</title>" in body) == (200, True), name
 
 
 @pytest.mark.parametrize("origin", FOREIGN_ORIGINS)
 def test_a_foreign_or_missing_origin_gets_no_socket(shared: Station, origin: str | None) -> None:
     headers = {**UPGRADE} | ({} if origin is None else {"Origin": origin.format(port=shared.port)})
-    assert shared.answered("/socket", **headers)[0] == 403
+    assert shared.request("/socket", **headers)[0] == 403
     own = f"http://127.0.0.1:{shared.port}"
-    assert shared.answered("/socket", **UPGRADE, Origin=own)[0] == 101
+    assert shared.request("/socket", **UPGRADE, Origin=own)[0] == 101
 
 
 def test_other_pages_get_no_scan(tmp_path: Path) -> None:
@@ -85,15 +85,15 @@ def test_other_pages_get_no_scan(tmp_path: Path) -> None:
         page.say("pause")
         page.state(lambda state: state["paused"])
         path = f"/save/{header['scan']}.csv"
-        assert station.answered(path, Origin=EVIL)[0] == 403
-        assert station.answered(path, Sec_Fetch_Site="cross-site")[0] == 403
-        assert station.answered(path, Sec_Fetch_Site="same-origin")[0] == 200
-        assert station.answered(path, Origin=f"http://127.0.0.1:{station.port}")[0] == 200
+        assert station.request(path, Origin=EVIL)[0] == 403
+        assert station.request(path, Sec_Fetch_Site="cross-site")[0] == 403
+        assert station.request(path, Sec_Fetch_Site="same-origin")[0] == 200
+        assert station.request(path, Origin=f"http://127.0.0.1:{station.port}")[0] == 200
 
 
 @pytest.mark.parametrize("path", ["/", "/nothing.js", "/save/0.pcd"])
 def test_a_content_security_policy_is_sent(shared: Station, path: str) -> None:
-    _, headers, _ = shared.answered(path)
+    _, headers, _ = shared.request(path)
     policy = dict(
         part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";")
     )
@@ -120,7 +120,7 @@ def test_a_content_security_policy_is_sent(shared: Station, path: str) -> None:
     "path", ["/../server.py", "/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/..%5c..%5cserver.py"]
 )
 def test_only_the_files_of_the_page_are_served(shared: Station, path: str) -> None:
-    status, _, body = shared.answered(path)
+    status, _, body = shared.request(path)
     assert status in (400, 404)
     assert b"secret" not in body
 
@@ -143,31 +143,31 @@ def test_nothing_is_served_without_the_token(shared: Station, path: str) -> None
         f"#{token}",
     )
     for query in wrong:
-        status, headers, body = answered(shared.port, f"{path}{query}", **more)
+        status, headers, body = request_raw(shared.port, f"{path}{query}", **more)
         assert status == 403, query
         assert headers["connection"] == "close"
         assert b"<title>page" not in body
         assert token.encode() not in body
-    assert answered(shared.port, path, Cookie=f"token={token}", **more)[0] == 403
-    assert answered(shared.port, path, Referer=shared.link, **more)[0] == 403
+    assert request_raw(shared.port, path, Cookie=f"token={token}", **more)[0] == 403
+    assert request_raw(shared.port, path, Referer=shared.link, **more)[0] == 403
 
 
 def test_a_refused_page_says_where_the_link_is(shared: Station) -> None:
-    _, headers, body = answered(shared.port, "/")
+    _, headers, body = request_raw(shared.port, "/")
     assert headers["content-type"].startswith("text/html")
     assert b"Open the whole link that <code>lidarspec view --web</code> printed" in body
     assert headers["referrer-policy"] == "no-referrer"
 
 
 def test_the_page_loads_its_files_with_the_token(shared: Station) -> None:
-    status, headers, body = shared.answered("/")
+    status, headers, body = shared.request("/")
     assert (status, headers["cache-control"]) == (200, "no-store")
     assert (
         f'<link rel="icon" href="data:,"><script src="page.js?token={shared.token}">'.encode()
         in body
     )
-    assert shared.answered("/index.html")[2] == body
-    assert shared.answered("/page.js")[2] == b"1"
+    assert shared.request("/index.html")[2] == body
+    assert shared.request("/page.js")[2] == b"1"
     assert "set-cookie" not in headers
 
 
@@ -185,7 +185,7 @@ def test_the_built_page_names_no_file_that_would_lack_the_token() -> None:
 def test_each_server_has_a_token_of_its_own(tmp_path: Path, shared: Station) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station:
         assert station.token != shared.token
-        assert answered(station.port, f"/?token={shared.token}")[0] == 403
+        assert request_raw(station.port, f"/?token={shared.token}")[0] == 403
 
 
 def test_a_browser_is_started_with_a_file_and_not_with_the_token(
@@ -211,8 +211,8 @@ def test_all_addresses_and_its_own_name_reach_a_server_at_all_interfaces(tmp_pat
         name, port = socket.gethostname(), station.port
         assert station.link.startswith(f"http://{name}:{port}/?token=")
         for host in (name, name.upper(), "192.168.7.9"):
-            assert station.answered("/", Host=f"{host}:{port}")[0] == 200
-        assert station.answered("/", Host=f"evil.example:{port}")[0] == 403
+            assert station.request("/", Host=f"{host}:{port}")[0] == 200
+        assert station.request("/", Host=f"evil.example:{port}")[0] == 403
 
 
 def test_a_port_in_use_is_reported(tmp_path: Path) -> None:
@@ -229,7 +229,7 @@ def test_markup_that_a_device_sends_stays_text(tmp_path: Path) -> None:
     markup, sensor = "<script>alert(1)<!--", ls.sensor("hokuyo-ust10lx")
     told = sensor.parse(sensor.example("parameters"), "parameters")
     told["model"]["text"] = markup.encode()
-    path = recorded(tmp_path, sensor.id, seconds=1.0, suffix=".bin").rename(
+    path = write_recording(tmp_path, sensor.id, seconds=1.0, suffix=".bin").rename(
         tmp_path / "<img src=x>.bin"
     )
     path.write_bytes(sensor.build("parameters", told) + path.read_bytes())

@@ -14,7 +14,7 @@ import pytest
 
 import lidarspec as ls
 
-from .visits import Visit, served, streaming
+from .visits import Visit, serve, streaming
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +46,7 @@ VIOLATIONS = """axe.run().then(({ violations }) =>
 
 @pytest.fixture(scope="module")
 def link() -> Iterator[str]:
-    with served("sim:ldrobot-ld14p") as link:
+    with serve("sim:ldrobot-ld14p") as link:
         yield link
 
 
@@ -252,7 +252,7 @@ def test_a_damaged_packet_is_counted_once(browser: Any, tmp_path: Path) -> None:
     ]
     path = tmp_path / "damaged.bin"
     path.write_bytes(b"".join(damaged))
-    with served(str(path), "-s", sensor.id) as link:
+    with serve(str(path), "-s", sensor.id) as link:
         visit = Visit(browser, link)
         visit.until(
             lambda: visit.text(".split").startswith(("damaged 49", "damaged 5")),
@@ -289,7 +289,7 @@ def test_an_unplugged_sensor_is_reported_and_dimmed(browser: Any, tmp_path: Path
     sending = threading.Thread(target=send)
     sending.start()
     try:
-        with served(str(port), "-s", sensor.id) as link:
+        with serve(str(port), "-s", sensor.id) as link:
             visit = Visit(browser, link)
             visit.until(lambda: visit.text("#status") == "streaming", "it does not stream")
             assert not visit.page.locator("#notice").is_visible()
@@ -317,7 +317,7 @@ def test_an_unplugged_sensor_is_reported_and_dimmed(browser: Any, tmp_path: Path
 
 
 def test_a_question_to_a_running_sensor_stops_it_and_starts_it_again(browser: Any) -> None:
-    with served("sim:slamtec-rplidar-a1") as link:
+    with serve("sim:slamtec-rplidar-a1") as link:
         visit = Visit(browser, link)
         visit.page.click("#tab-commands")
         assert visit.page.locator("#commands h2").all_inner_texts() == [
@@ -354,7 +354,7 @@ def test_a_saved_scan_is_named_after_its_time_in_the_file_at_each_replay(
     sensor = ls.sensor("ldrobot-stl27l")
     path = tmp_path / "short.bin"
     path.write_bytes(b"".join(ls.simulate(sensor, packets=1800)))  # one second
-    with served(str(path), "-s", sensor.id) as link:
+    with serve(str(path), "-s", sensor.id) as link:
         visit = Visit(browser, link)
         newest = -1
         for _ in range(2):

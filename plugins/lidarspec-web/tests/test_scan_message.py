@@ -12,7 +12,7 @@ import lidarspec as ls
 from lidarspec import Scan
 from lidarspec_web.scan_message import make_scan_message, thin_out
 
-from .messages import parsed
+from .messages import parse_message
 
 ALL = 1 << 30
 FLAT, SOLID = "ldrobot-stl27l", "robosense-m1"
@@ -31,7 +31,7 @@ def sent(scan: Scan, most: int = ALL) -> bytes:
 @pytest.mark.parametrize("sensor", [FLAT, SOLID])
 def test_a_message_is_the_points_with_a_return(sensor: str) -> None:
     scan = scan_of(sensor)
-    header, columns = parsed(sent(scan))
+    header, columns = parse_message(sent(scan))
     returns = np.flatnonzero(scan.points.valid)
     assert 0 < len(returns) == header["points"] == header["of"]
     assert np.array_equal(columns["index"], returns)
@@ -43,7 +43,7 @@ def test_a_message_is_the_points_with_a_return(sensor: str) -> None:
 
 def test_the_header_describes_the_scan() -> None:
     scan = scan_of(FLAT)
-    header, columns = parsed(sent(scan))
+    header, columns = parse_message(sent(scan))
     assert (header["scan"], header["position"], header["sent"]) == (12, 1.5, 1.7e9)
     assert (header["whole"], header["nominal"]) == (scan.whole, False)
     assert header["rate_hz"] == pytest.approx(scan.rate_hz)
@@ -57,13 +57,13 @@ def test_the_header_describes_the_scan() -> None:
 
 def test_an_unknown_rate_is_null() -> None:
     scan = replace(scan_of(FLAT), rate_hz=float("nan"))
-    assert parsed(sent(scan))[0]["rate_hz"] is None
+    assert parse_message(sent(scan))[0]["rate_hz"] is None
 
 
 def test_a_scan_without_returns_is_empty() -> None:
     scan = scan_of(FLAT)
     none = replace(scan, points=scan.points[np.flatnonzero(~scan.points.valid)][:0])
-    header, columns = parsed(sent(none))
+    header, columns = parse_message(sent(none))
     assert header["points"] == header["of"] == 0
     assert all(len(column) == 0 for column in columns.values())
 
@@ -71,7 +71,7 @@ def test_a_scan_without_returns_is_empty() -> None:
 @pytest.mark.parametrize("most", [1, 100, 5000])
 def test_points_are_thinned_to_the_requested_number(most: int) -> None:
     scan = scan_of(SOLID)
-    header, columns = parsed(sent(scan, most))
+    header, columns = parse_message(sent(scan, most))
     assert header["of"] == scan.points.valid.sum()
     assert most * 0.98 - 1 <= header["points"] <= most
     assert np.array_equal(columns["x"], scan.points.x[columns["index"]])

@@ -15,7 +15,7 @@ import lidarspec as ls
 from lidarspec import UsageError
 from lidarspec.scans.selection import Selection
 
-from .pages import DEADLINE, FLAT, SOLID, Station, masked, recorded
+from .pages import DEADLINE, FLAT, SOLID, Station, mask, write_recording
 
 
 @pytest.mark.parametrize(
@@ -73,14 +73,14 @@ def test_scans_are_sent_only_on_request(tmp_path: Path) -> None:
         page.scan()
         page.scan(most=100)
         with pytest.raises(TimeoutError):
-            page.heard(lambda message: isinstance(message, tuple), within=1.0)
+            page.receive_matching(lambda message: isinstance(message, tuple), within=1.0)
         header, _ = page.scan(most=100)
         assert 90 < header["points"] <= 100 < header["of"]
 
 
 @pytest.mark.slow
 def test_equal_requests_share_one_message(tmp_path: Path) -> None:
-    path = recorded(tmp_path)
+    path = write_recording(tmp_path)
     with Station(path, tmp_path) as station, station.page() as one, station.page() as other:
         one.scan()
         one.say("pause")
@@ -97,7 +97,10 @@ def test_ten_pages_see_one_source(tmp_path: Path) -> None:
         pages = [opened.enter_context(station.page()) for _ in range(10)]
         for page in pages:
             page.say("next", most=5000)
-        seen = {page.heard(lambda message: isinstance(message, tuple))[0]["scan"] for page in pages}
+        seen = {
+            page.receive_matching(lambda message: isinstance(message, tuple))[0]["scan"]
+            for page in pages
+        }
         assert len(seen) < 10  # they share scans
         for page in pages:
             assert page.scan(most=5000)[1]["x"].size
@@ -136,14 +139,15 @@ def test_pausing_a_live_source_affects_one_page_only(tmp_path: Path) -> None:
         while other.scan()[0]["scan"] < first["scan"] + 5:
             pass
         with pytest.raises(TimeoutError):
-            paused.heard(lambda message: isinstance(message, tuple), within=0.5)
-        frame = paused.asked(
+            paused.receive_matching(lambda message: isinstance(message, tuple), within=0.5)
+        frame = paused.request(
             "frame", point={"scan": header["scan"], "index": int(columns["index"][3])}
         )
         assert frame["is"] == "frame"
         paused.say("play")
         assert (
-            paused.heard(lambda message: isinstance(message, tuple))[0]["scan"] >= first["scan"] + 5
+            paused.receive_matching(lambda message: isinstance(message, tuple))[0]["scan"]
+            >= first["scan"] + 5
         )
 
 
@@ -151,7 +155,7 @@ def test_pausing_a_live_source_affects_one_page_only(tmp_path: Path) -> None:
 @pytest.mark.parametrize("word", ["step", "seek", "speed"])
 def test_a_live_source_cannot_be_moved_through(tmp_path: Path, word: str) -> None:
     with Station(f"sim:{FLAT}", tmp_path) as station, station.page() as page:
-        refused = page.asked(word, to=1, times=2)
+        refused = page.request(word, to=1, times=2)
         assert (refused["is"], refused["of"]) == ("refused", word)
         assert f"sim:{FLAT}" in refused["text"]
 
@@ -159,7 +163,7 @@ def test_a_live_source_cannot_be_moved_through(tmp_path: Path, word: str) -> Non
 @pytest.mark.parametrize("suffix", [".lsr", pytest.param(".pcap", marks=pytest.mark.slow)])
 def test_a_file_is_paused_stepped_and_moved_through(tmp_path: Path, suffix: str) -> None:
     sensor = FLAT if suffix == ".lsr" else SOLID
-    path = recorded(tmp_path, sensor, suffix=suffix)
+    path = write_recording(tmp_path, sensor, suffix=suffix)
     first, *scans = ls.open(path, sensor).scans()
     times = [(scan.stamp_ns - first.stamp_ns) * 1e-9 for scan in scans]
     with Station(path, tmp_path, sensor) as station, station.page() as page:
@@ -185,7 +189,10 @@ def test_a_file_is_paused_stepped_and_moved_through(tmp_path: Path, suffix: str)
 @pytest.mark.slow
 def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
     """Two parts, compared with each other and with the clock."""
-    with Station(recorded(tmp_path, seconds=20), tmp_path) as station, station.page() as page:
+    with (
+        Station(write_recording(tmp_path, seconds=20), tmp_path) as station,
+        station.page() as page,
+    ):
         page.say("pause")
 
         def speed(times: float) -> float:
@@ -200,14 +207,14 @@ def test_a_file_is_played_at_its_speed_and_at_another(tmp_path: Path) -> None:
         assert 0.5 < slow < 1.5
         assert 2.5 < quick / slow < 6
         assert page.state()["speed"] == 4
-        assert page.asked("speed", times=0)["is"] == "refused"
+        assert page.request("speed", times=0)["is"] == "refused"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("sensor", "suffix"), [(FLAT, ".bin"), (FLAT, ".lsr"), (SOLID, ".pcap")])
 def test_a_file_is_read_as_it_is_played(tmp_path: Path, sensor: str, suffix: str) -> None:
     """Figures, bytes and damaged frames are those of the shown scans alone."""
-    path = recorded(tmp_path, sensor, 8, suffix)
+    path = write_recording(tmp_path, sensor, 8, suffix)
     with Station(path, tmp_path, sensor) as station, station.page() as page:
         header, _ = page.scan()
         page.say("pause")
@@ -218,7 +225,7 @@ def test_a_file_is_read_as_it_is_played(tmp_path: Path, sensor: str, suffix: str
 
 @pytest.mark.slow
 def test_a_file_ends_and_is_played_again(tmp_path: Path) -> None:
-    path = recorded(tmp_path, seconds=1)
+    path = write_recording(tmp_path, seconds=1)
     with Station(path, tmp_path) as station, station.page() as page:
         assert "sent.lsr has ended" in page.until("ended")["text"]
         assert page.state()["state"] == "ended"
@@ -230,7 +237,7 @@ def test_a_file_ends_and_is_played_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_seeking_past_the_end_shows_the_end(tmp_path: Path) -> None:
-    with Station(recorded(tmp_path, seconds=1), tmp_path) as station, station.page() as page:
+    with Station(write_recording(tmp_path, seconds=1), tmp_path) as station, station.page() as page:
         page.say("seek", to=100)
         page.until("ended")
         page.say("seek", to=0)
@@ -240,19 +247,21 @@ def test_seeking_past_the_end_shows_the_end(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_selection_of_a_file_cannot_be_sought(tmp_path: Path) -> None:
-    path = recorded(tmp_path)
+    path = write_recording(tmp_path)
     with (
         Station(path, tmp_path, select=Selection(times=(1.0, 2.0))) as station,
         station.page() as page,
     ):
         assert page.until("hello")["duration"] is None
-        assert "cannot seek" in page.asked("seek", to=1)["text"]
+        assert "cannot seek" in page.request("seek", to=1)["text"]
         page.until("ended")
 
 
 def test_a_failing_source_is_reported(tmp_path: Path) -> None:
     with (
-        Station(recorded(tmp_path), tmp_path, select=Selection(times=(100.0, 200.0))) as station,
+        Station(
+            write_recording(tmp_path), tmp_path, select=Selection(times=(100.0, 200.0))
+        ) as station,
         station.page() as page,
     ):
         assert "nothing of that is asked for" in page.until("ended")["text"]
@@ -294,7 +303,7 @@ def test_a_too_long_message_closes_its_own_page_only(tmp_path: Path) -> None:
     ):
         page.socket.send(" " * (1 << 17))
         with pytest.raises(Exception, match=r"1009|too big"):
-            page.heard(lambda message: False)
+            page.receive_matching(lambda message: False)
         assert other.scan()[1]["x"].size
 
 
@@ -304,7 +313,7 @@ def test_a_scan_is_saved_as_it_is_shown(tmp_path: Path) -> None:
         page.say("pause")
         page.state(lambda state: state["paused"])
         for suffix in page.until("hello")["saves"]:
-            status, headers, body = station.answered(f"/save/{header['scan']}.{suffix}")
+            status, headers, body = station.request(f"/save/{header['scan']}.{suffix}")
             assert (status, len(body) > 1000) == (200, True), suffix
             assert re.search(
                 rf'filename="{FLAT}-\d+\.\d{{3}}s\.{suffix}"', headers["content-disposition"]
@@ -323,7 +332,7 @@ def test_a_scan_is_saved_as_it_is_shown(tmp_path: Path) -> None:
             "..%2f..%2fetc%2fpasswd",
             "-1.pcd",
         ):
-            assert station.answered(f"/save/{name}")[0] == 404, name
+            assert station.request(f"/save/{name}")[0] == 404, name
 
 
 def test_a_recording_is_switched_on_and_off(tmp_path: Path) -> None:
@@ -342,9 +351,9 @@ def test_a_recording_is_switched_on_and_off(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_file_is_not_recorded(tmp_path: Path) -> None:
-    with Station(recorded(tmp_path), tmp_path) as station, station.page() as page:
+    with Station(write_recording(tmp_path), tmp_path) as station, station.page() as page:
         assert not page.until("hello")["records"]
-        assert "file" in page.asked("record")["text"]
+        assert "file" in page.request("record")["text"]
 
 
 @pytest.mark.slow
@@ -364,7 +373,7 @@ def test_a_page_that_does_not_read_is_disconnected(
         end = time.monotonic() + DEADLINE
         while not any("dropped" in text for text in station.said) and time.monotonic() < end:
             with contextlib.suppress(OSError):
-                raw.sendall(masked({"do": "next", "most": 1 << 20}))
+                raw.sendall(mask({"do": "next", "most": 1 << 20}))
             assert healthy.scan(most=2000)[1]["x"].size
         assert station.said[-1].startswith("page 2 disconnected: it ")
         healthy.say("record")

@@ -42,7 +42,7 @@ PATIENCE = 60.0
 
 
 @contextlib.contextmanager
-def served(*words: str, address: str = "127.0.0.1", folder: Path | None = None) -> Iterator[str]:
+def serve(*words: str, address: str = "127.0.0.1", folder: Path | None = None) -> Iterator[str]:
     """Yield the link to the page of a source.
 
     Args:
@@ -147,7 +147,7 @@ class Visit:
         }
 
     @property
-    def coloured(self) -> tuple[np.ndarray, np.ndarray]:
+    def find_coloured(self) -> tuple[np.ndarray, np.ndarray]:
         """Return which pixels of the picture are coloured, and which show only points.
 
         Both have the shape (height, width).
@@ -160,7 +160,7 @@ class Visit:
         looked[max(down - AXES, 0) : down + AXES, max(across - AXES, 0) : across + AXES] = False
         return coloured.reshape(height, width), looked
 
-    def saved(self) -> list[dict[str, str]]:
+    def save(self) -> list[dict[str, str]]:
         """Return the shown scan as the server saves it, row by row."""
         number = self.value("lidarspec.picture.scan.scan")
         answer = self.page.request.get(self.link.replace("?", f"save/{number}.csv?"))

@@ -39,7 +39,7 @@ class Form:
     intense: bool = False
 
 
-def between(distance: Any) -> Any:
+def camera_angle(distance: Any) -> Any:
     """Return the degrees between the laser's ray and the ray of the camera.
 
     Source: "angle second-level analysis".
@@ -53,20 +53,24 @@ def alone(step: float) -> Construct:
     return Struct("distance" / Scaled(Int16ul, step, "m") * NONE)
 
 
-def packed(*below: Construct) -> Construct:
+def make_distance(*below: Construct) -> Construct:
     """Whole millimetres in the upper 14 bits."""
     return ByteSwapped(BitStruct("distance" / Scaled(BitsInteger(14), 0.001, "m") * NONE, *below))
 
 
 FLAGS = "flags" / BitsInteger(2)
 MARKS = FLAGS * "2: mirror or glass, 3: sunlight"
-EIGHT = packed(MARKS, "intensity" / BitsInteger(8))
+EIGHT = make_distance(MARKS, "intensity" / BitsInteger(8))
 
-TRIANGLE = Form(alone(0.00025), correction=between)
-TRIANGLE_FLAGGED = Form(packed(FLAGS * "not 0: disturbed by another lidar"), correction=between)
-TRIANGLE_8 = Form(EIGHT, 3, (1, 2), between, intense=True)
-TRIANGLE_10 = Form(packed("intensity" / BitsInteger(10)), 3, (1, 2), between, intense=True)
-HALF = Form(alone(0.0005), correction=between)
+TRIANGLE = Form(alone(0.00025), correction=camera_angle)
+TRIANGLE_FLAGGED = Form(
+    make_distance(FLAGS * "not 0: disturbed by another lidar"), correction=camera_angle
+)
+TRIANGLE_8 = Form(EIGHT, 3, (1, 2), camera_angle, intense=True)
+TRIANGLE_10 = Form(
+    make_distance("intensity" / BitsInteger(10)), 3, (1, 2), camera_angle, intense=True
+)
+HALF = Form(alone(0.0005), correction=camera_angle)
 TOF = Form(alone(0.001), slowest=3.0)
 TOF_8 = Form(EIGHT, 3, (1, 2), intense=True)
 TOF_16 = Form(

@@ -13,7 +13,7 @@ import lidarspec as ls
 from lidarspec import simulate
 from lidarspec.detect.identification import find_contradiction, identify_sample
 from lidarspec.detect.sample_bytes import SampleBytes
-from tests.evidence import capture, clockwise, decoded, vector_bytes, vectors
+from tests.evidence import capture, clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
 X4, TG15, G4B = ls.sensor("ydlidar-x4"), ls.sensor("ydlidar-tg15"), ls.sensor("ydlidar-g4b")
@@ -51,7 +51,7 @@ def test_a_published_packet_decodes_to_its_published_values(name: str) -> None:
         vector_bytes(FILE, name),
         vectors(FILE)[name]["expected"],
     )
-    packets = decoded(sensor, data)
+    packets = decode(sensor, data)
     assert sensor.build("data", sensor.parse(data)) == data
     assert (packets.raw["ct"]["start"].tolist(), packets.raw["lsn"].tolist()) == (
         [expected["t"]],
@@ -104,14 +104,14 @@ def test_the_examples_of_single_samples_and_of_the_angles() -> None:
     )
     assert data[3:8] == vector_bytes(FILE, "yd_angle_doc")
     np.testing.assert_allclose(
-        clockwise(decoded(X4, data).points())[[0, 39]], [angle["a1"], angle["an"]], atol=2e-5
+        clockwise(decode(X4, data).points())[[0, 39]], [angle["a1"], angle["an"]], atol=2e-5
     )
 
     def alone(sensor: ls.Sensor, name: str) -> ls.PointCloud:
         sample = sensor.frames["data"].struct.subcon.samples.subcon.subcon.parse(
             vector_bytes(FILE, name)
         )
-        return decoded(
+        return decode(
             sensor,
             sensor.build(
                 "data",
@@ -134,7 +134,7 @@ def test_the_examples_of_single_samples_and_of_the_angles() -> None:
 
 def test_packets_of_a_tmini_pro() -> None:
     expected = json.loads(capture("ydlidar/packets.json").read_text())
-    packets = decoded(TMINI, b"".join(bytes.fromhex(one["hex"]) for one in expected))
+    packets = decode(TMINI, b"".join(bytes.fromhex(one["hex"]) for one in expected))
     right = [one for one in expected if one["checksum_ok"]]
     assert (len(packets), packets.stats.bad_checksum) == (len(right), len(expected) - len(right))
     said = [sample for one in right for sample in one["dist_mm_intensity_flag"]]

@@ -61,7 +61,7 @@ def plain(name: str, **changes: Any) -> Sensor:
     return dataclasses.replace(sensor, **changes)
 
 
-def framed(struct: Any, **options: Any) -> dict[str, Frame]:
+def make_frames(struct: Any, **options: Any) -> dict[str, Frame]:
     return {"data": Frame(struct, data=True, max_length=8, **options)}
 
 
@@ -70,11 +70,11 @@ def lidarspec_sensors() -> list[Sensor]:
     return [
         plain(
             "broken-checksum",
-            frames=framed(Checksummed(Struct(*BODY), field="check", algorithm=Fails())),
+            frames=make_frames(Checksummed(Struct(*BODY), field="check", algorithm=Fails())),
         ),
         plain(
             "broken-parse",
-            frames=framed(
+            frames=make_frames(
                 Struct(
                     *BODY[:2],
                     "distances" / Array(4 + 1 // (this.angle - this.angle), Int8ul),
@@ -82,7 +82,7 @@ def lidarspec_sensors() -> list[Sensor]:
                 )
             ),
         ),
-        plain("broken-plausible", frames=framed(Struct(*BODY), plausible=fails)),
+        plain("broken-plausible", frames=make_frames(Struct(*BODY), plausible=fails)),
         plain("broken-points", points=fails),
         plain("broken-field", points=lambda f: Polar(range=f.distance, azimuth=0)),
         plain("broken-shape", points=lambda f: Polar(range=f.distances, azimuth=np.zeros(3))),
