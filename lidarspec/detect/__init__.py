@@ -5,7 +5,7 @@ in reading order:
 
 * `sample_bytes`: the bytes of one source.
 * `listen`: read some bytes from any source.
-* `identification`: which installed sensor sent them.
-* `uninstalled_sensors`: sensors that are not installed and may have sent them.
-* `doctor`: why no bytes, or no valid frames, arrive.
+* `identification`: identify the installed sensor that sent some bytes.
+* `uninstalled_sensors`: recognize bytes of sensors that are not installed.
+* `doctor`: diagnose a source without bytes or without valid frames.
 """

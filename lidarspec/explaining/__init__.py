@@ -3,12 +3,12 @@
 In: a sensor, and the bytes of a frame, valid or damaged, or of a stream. Out: an `Explanation` of
 each frame, and its lines; or the contents of a file. Modules in reading order:
 
-* `explanation`: `explain`: from bytes to rows, verdict and points.
+* `explanation`: `explain`, and the explanation of a frame: rows, verdict, points.
 * `frame_rows`: one frame as rows of values.
 * `damage_search`: the flipped bit, or the lost or inserted byte, that explains damage.
 * `input_segments`: a stream in pieces: valid frames, damaged frames, and other bytes.
 * `formatting`: the texts for values, bits, rows, points and differences.
 * `file_contents`: the contents of a file.
-* `assignments`: text from users as raw values.
+* `assignments`: raw values from the text of users.
 * `listing`: rows and differences as lines, with roles for colours.
 """

@@ -5,5 +5,5 @@ functions for their columns, or the graph of their steps. Modules in reading ord
 
 * `columns`: `Batch`, `Fields` and `Column`: the plain evaluation, ordinary NumPy on arrays with
   named axes.
-* `graph`: a function traced once; one way to go through what it does, and one to evaluate it.
+* `graph`: the steps of a traced function as a graph, and its evaluation.
 """

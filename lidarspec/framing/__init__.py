@@ -4,20 +4,20 @@ In: a byte stream in any pieces, or datagrams. Out: `Frames`, a struct of arrays
 frames, and counters for all other bytes. Nothing here uses a clock, a port or a thread, and no
 input bytes raise an exception. Modules in reading order:
 
-* `results`: `Frames`, which each module passes on to the next; frames one by one; the counters.
-* `plausibility`: whether candidates of one layout are frames, many at a time.
-* `variable_lengths`: judge candidates together whose layouts differ only in an array's length.
-* `frame_codec`: the interface of the engine of one frame type: its candidates judged,
-  and its frames as columns.
-* `text_frames`: this engine for frames with a wire form.
-* `frame_engine`: this engine for binary frames, by layouts.
-* `plain_frames`: this engine for frames without layouts, by construct.
-* `weak_frames`: types that are accepted only in runs: the runs among their candidates.
-* `candidates`: the candidates in a piece of a stream, of the types that are looked for.
-* `search`: the rule of a stream: the leftmost valid candidate, then on after its last byte.
-* `regular_rows`: frames at one distance, which need no search: in streams, in datagrams, in arrays.
-* `datagram_assembly`: messages that come in several datagrams.
+* `results`: `Frames`, many frames as arrays; `Found`, one frame; `Counters`.
+* `plausibility`: checks of many candidates of one layout at a time.
+* `variable_lengths`: joint checks of candidates whose layouts differ only in an array's length.
+* `frame_codec`: the interface of the engine of one frame type: checks of candidates, and tables
+  of frames.
+* `text_frames`: the engine of frames with a wire form.
+* `frame_engine`: the engine of binary frames, by layouts.
+* `plain_frames`: the engine of frames without layouts, by construct.
+* `weak_frames`: the runs of frame types that are accepted only in runs.
+* `candidates`: the candidates of all searched types in a piece of a stream.
+* `search`: the search of a stream for the leftmost valid candidates.
+* `regular_rows`: frames at equal distances, which need no search.
+* `datagram_assembly`: messages in several datagrams, joined before framing.
 * `datagrams`: datagrams of several types.
-* `decoder`: all of it, incrementally: what is undecided is looked at again with the next bytes.
+* `decoder`: `Decoder`, the incremental interface to all of these.
 * `example_frames`: valid frames with random content.
 """

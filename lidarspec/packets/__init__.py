@@ -9,10 +9,10 @@ other types. Modules in reading order:
 * `pace`: the time that a packet takes by the clock, as declared.
 * `counter_order`: lost, duplicate and late packets by their counter.
 * `clock_order`: the same by the clock, for datagrams without a counter.
-* `arrival_order`: lost packets in streams that cannot disorder them, and that have no counter.
-* `masked_sector`: gaps where a rotating sensor is set to send nothing, which are no loss.
+* `arrival_order`: lost packets of streams without a counter, which arrive in order.
+* `masked_sector`: sectors in which a rotating sensor sends nothing, which are no loss.
 * `reorder`: packets put back in order, duplicates left out.
 * `imu`: the samples of an IMU.
-* `packet_type`: how the packets of one frame type are timed, and how losses are found.
+* `packet_type`: the clock and the loss detection of one frame type.
 * `stream`: from frames to packets, batch by batch.
 """

@@ -4,15 +4,15 @@ In: `Packets`. Out: a `PointCloud`, whose columns are computed when they are fir
 evaluators give the same columns: the reference evaluator, a NumPy plan, and compiled kernels.
 Modules in reading order:
 
-* `conventions`: what the columns mean: axes, ranges, coordinates, types.
-* `column_sources`: where the columns of consecutive points come from.
+* `conventions`: the definitions of columns: axes, ranges, coordinates, types.
+* `column_sources`: sources of the columns of consecutive points.
 * `table_types`: PCL's structured layout and the schema of Arrow.
 * `cloud`: point clouds.
-* `mount`: how a sensor is mounted on its carrier.
+* `mount`: the position of a sensor on its carrier.
 * `colours`: the scale of colours for values, on a dark and on a light ground.
 * `appearance`: the extent and the colours of a drawn cloud.
 * `reference_evaluator`: `points` evaluated with ordinary NumPy; other evaluators must agree.
-* `lookup_tables`: fields by their one or two bytes, and tables of what they can hold.
+* `lookup_tables`: fields of one or two bytes, and tables of all their values.
 * `plan`: `points` traced once for a layout, as expressions of the columns.
 * `layout_groups`: the packets of one layout in a batch, with their plan and plain results.
 * `batch_columns`: the columns of planned points, computed when they are first read.

@@ -15,5 +15,5 @@ In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules i
 * `limits`: the longest and the largest scan.
 * `completeness`: the packets of a scan, and those missing in it.
 * `masking`: the masked sector of a rotating sensor, in which scans are cut.
-* `selection`: which scans to read, and what of each; which bytes, by their arrival.
+* `selection`: selects scans of a source, parts of scans, and bytes by arrival time.
 """

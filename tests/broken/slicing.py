@@ -5,9 +5,9 @@ from __future__ import annotations
 from construct import Array, Int8ul, Slicing
 
 from lidarspec.spec import hookimpl
-from tests.broken.sound import SIZE, frame, sealed, sensor
+from tests.broken.sound import SIZE, frame, make_frame, sensor
 
 
 @hookimpl
 def lidarspec_sensors():
-    return [sensor(frame(sealed(spare=Slicing(Array(2, Int8ul), 2, 0, 1)), max_length=SIZE + 8))]
+    return [sensor(frame(make_frame(spare=Slicing(Array(2, Int8ul), 2, 0, 1)), max_length=SIZE + 8))]

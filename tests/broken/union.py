@@ -5,10 +5,10 @@ from __future__ import annotations
 from construct import Bytes, Int16ul, Union
 
 from lidarspec.spec import hookimpl
-from tests.broken.sound import SIZE, frame, sealed, sensor
+from tests.broken.sound import SIZE, frame, make_frame, sensor
 
 
 @hookimpl
 def lidarspec_sensors():
     spare = Union(0, "number" / Int16ul, "data" / Bytes(2))
-    return [sensor(frame(sealed(spare=spare), max_length=SIZE + 8))]
+    return [sensor(frame(make_frame(spare=spare), max_length=SIZE + 8))]

@@ -1,16 +1,15 @@
 """Points and checksums by compiled code: an optional back end, which needs Numba.
 
-In: a `points.plan.Plan`. Out: what fills its columns, by `compile`; and what computes the checksums
-of a decoder, by `compiled_sums`. Nobody needs to know more of this package, and nothing breaks
-without it but ``backend="jit"``. Numba is imported with the first kernel
-that runs, not with this package. Modules in reading order:
+In: a `points.plan.Plan`. Out: an object that fills its columns, by `compile`; and the function that
+computes the checksums of a decoder, by `compile_sums`. Only ``backend="jit"`` requires this
+package. Numba is imported with the first kernel that runs. Modules in reading order:
 
-* `arithmetic`: what kernels are written with; the only module that imports Numba as it is imported.
-* `writer`: fields, tables and places as text, each in the loop in which it varies.
-* `source`: expressions as text, and the whole of a kernel.
-* `cache`: compiled code on disk, between runs.
-* `kernels`: the text compiled, and called by one thread or several.
-* `checksums`: kernels of their own for checksums that are XORed byte by byte.
+* `arithmetic`: the functions that kernels call; the only module that imports Numba on import.
+* `writer`: the source text of fields, tables and indices.
+* `source`: the source text of expressions and of a whole kernel.
+* `cache`: compiled code on disk.
+* `kernels`: compiles kernels, and calls them in one or more threads.
+* `checksums`: kernels for checksums that are an XOR of the contributions of bytes.
 """
 
 from __future__ import annotations

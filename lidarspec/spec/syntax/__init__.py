@@ -1,14 +1,15 @@
-"""The layer over construct, and the only package that knows its classes: an author's struct made
-fit for the engine, and read off.
+"""Prepare construct structs for the engine, and translate them to the frame tree.
 
-In: an author's struct. Out: `prepare`, a copy of it for the engine; `check_struct`, what speaks
-against it; `frame_tree`, the nodes that it means. Modules in reading order:
+Only this package knows construct's classes.
 
-* `replacements`: the classes that replace construct's, each with its reason, and parts of our own.
-* `raw_checksums`: construct's Checksum of a RawCopy as a seal.
-* `structs`: a struct prepared, the properties of a construct, random values for it.
-* `refusals`: what no frame can be described by, with the reason.
-* `meaning`: a struct read off as nodes.
+In: an author's struct. Out: a copy of it for the engine (`prepare`), an error if it is unsupported
+(`check_struct`), its nodes (`frame_tree`). Modules in reading order:
+
+* `replacements`: classes that replace construct's, each with its reason, and additional ones.
+* `raw_checksums`: translates construct's Checksum of a RawCopy to a seal.
+* `structs`: prepares a struct; properties of a construct, and random values for it.
+* `refusals`: checks for unsupported structs.
+* `meaning`: translates a struct to nodes.
 """
 
 from __future__ import annotations
