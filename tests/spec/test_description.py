@@ -87,4 +87,4 @@ def test_column_compared_with_bytes_says_that_it_is_numbers() -> None:
 
 
 def test_advice_on_examples_names_an_argument_that_exists() -> None:
-    assert "simulation=Simulation(sweep=...)" in RULES["LS301"].fix
+    assert "Simulation(sweep=...)" in RULES["LS301"].fix

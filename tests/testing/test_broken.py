@@ -132,7 +132,7 @@ LINES = {
     "degrees": "def points",
     "sweep_of_nothing": "def sweep",
     "not_importable": "import a_library",
-    "no_longest_length": "Frame(sealed()",
+    "no_longest_length": "Frame(make_frame()",
     "bare_const": '"order": Frame(',
 }
 
