@@ -1,20 +1,19 @@
-"""Columns: what `points`, `plausible` and clock functions compute with.
+"""Columns: the operands of `points`, `plausible` and clock functions.
 
-A `Batch` is a table of packets with what surrounds them: where something was lost, the frames of
-other types that were last before each packet, and what the batch before left over. `Fields` is what
-a function is given as ``f``: the fields of a batch by attribute, each of which is a `Column`.
+A `Batch` is a table of packets with their context: where packets were lost, the last frame of each
+other type before each packet, and values left over from the previous batch. A function receives
+the fields of a batch as ``f``, a `Fields`; each attribute is a `Column`.
 
-A `Column` is an array with one axis for the packets and one for each array level of the struct, of
-length 1 where its field is further out. Each axis is named by its array, so that arithmetic lines
-up by itself, and sibling arrays cannot be mixed by accident. A column also knows its batch, and so
-where packets were lost and how long variable arrays are; and how many packets are already certain
-(``ready``) where a value depends on what follows. `RowOfValues` is a column as one run of values in
-stream order, without padding, which is what `previous`, `following` and `last` mean by "before" and
-"after".
+A `Column` is an array with one axis for the packets and one for each array level of the struct; an
+axis has length 1 if the field is further out. Each axis is named after its array, so arithmetic
+aligns columns by name, and sibling arrays cannot be mixed by accident. A column also knows its
+batch, and therefore where packets were lost and how long variable arrays are, and how many packets
+are final (``ready``) if values depend on later packets. `RowOfValues` is a column as one run of
+values in stream order, without padding; `previous`, `following` and `last` work on it.
 
-Arrays that are no columns line up with them, too (`align`): what `along` made by the name of its
-array, a plain array where its length is that of one array alone; only one that has as many axes as
-the arrays that are nested lines up by place, as in NumPy.
+`align` also aligns other arrays: an array made by `along` by the name of its array; a plain array
+by its length, if exactly one array of the frame has this length; and a plain array with as many
+axes as there are nested arrays by position, as in NumPy.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis, row_numbers
 
 BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 
-#: what is said where Python, or a bitwise operator, asks one answer of a column.
+#: messages for operations that would need a single truth value of a column.
 NO_TRUTH = (
     "a column has an answer for each packet: & | ~ in place of `and`, `or`, `not` and a < f.x < b,"
     " np.where in place of `if`"
@@ -54,7 +53,7 @@ NO_TEXT = (
 
 Carry = dict[int, NDArray[np.float64]]
 
-#: where `Batch.state` has the frames that parts are in.
+#: the key of `Batch.state` for the frames that contain the parts of this batch.
 AROUND = "^"
 
 
@@ -64,11 +63,11 @@ class Batch:
 
     Attributes:
         table: their raw columns.
-        breaks: (n,) True where something was lost before the packet.
-        state: per frame type, its table and for each packet the index of the frame that was last
-            (-1: none yet).
+        breaks: (n,) True if packets or bytes were lost before the packet.
+        state: per frame type, its table and for each packet the index of the last frame before it
+            (-1: no frame yet).
         defaults: declared defaults of state columns, per frame type and path.
-        carry: what the previous batch left for `previous` and `last`, by order of call.
+        carry: values left by the previous batch for `previous` and `last`, by order of call.
     """
 
     table: Table
@@ -87,7 +86,7 @@ class Batch:
         return {slot: rest(ready) for slot, rest in enumerate(self.left)}
 
     def of(self, group: LayoutRows) -> Batch:
-        """The packets of a group, in its order, as a batch of their own, which no other follows."""
+        """Return the packets of a group as a separate batch that no other batch follows."""
         table = CompiledTable(
             self.table.schema, [LayoutRows(group.layout, np.arange(len(group.where)), group.rows)]
         )
@@ -96,20 +95,20 @@ class Batch:
 
 
 class Column(NDArrayOperatorsMixin):
-    """Numbers of a batch of packets: NumPy's ufuncs and functions apply, see the module's text.
+    """Numbers of a batch of packets, to which NumPy's functions apply.
 
     Attributes:
-        array: shape (n or 1, ...), one axis per array level of the struct, length 1 where the value
-            is further out.
-        axes: names of the axes after the first; None where the length is 1; with a "?" where no
-            field is along it by now: behind the name that `along` gave it, before the one that a
-            plain array is guessed to be along.
-        ready: packets from the start whose values depend on nothing that is still to come.
-        source: the field's path, while the column is an unchanged field.
-        frame: the other frame type that this is a field of; "" for the packets themselves.
+        array: shape (n or 1, ...), one axis per array level of the struct, length 1 if the value is
+            further out.
+        axes: names of the axes after the first; None for an axis of length 1. A "?" marks an axis
+            that no field has confirmed: after a name given by `along`, before a name that was
+            guessed for a plain array.
+        ready: number of packets, from the start, whose values do not depend on later packets.
+        source: path of the field, as long as the column is an unchanged field.
+        frame: the other frame type that the field belongs to; "" for the packets themselves.
     """
 
-    #: a column is no sequence of its elements
+    #: a column cannot be iterated
     __iter__ = None
 
     def __init__(
@@ -136,7 +135,7 @@ class Column(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """Its values, as far as they are known: of all packets."""
+        """The values that are known while a function runs: all values."""
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -148,7 +147,7 @@ class Column(NDArrayOperatorsMixin):
         raise SpecError(NO_TRUTH, rule="LS213")
 
     def __getitem__(self, index: int) -> Column:
-        """An element of a field that is an array, of each packet; nan where a packet has fewer."""
+        """Return one element of an array field for each packet; nan if a packet has fewer."""
         if not self.source or not isinstance(index, int):
             raise SpecError(
                 "only fields have elements, each by one index: f.columns[0].timestamp,"
@@ -174,8 +173,9 @@ class Column(NDArrayOperatorsMixin):
         return function(*plain, **kwargs)
 
     def apply_function(self, function: Callable[..., Any], *values: Any) -> Column:
-        """`function` of arrays, lined up by axes; columns on the left, arrays by their last axes as
-        in NumPy.
+        """Return `function` of the values, after aligning them by axes.
+
+        Plain arrays align by their last axes, as in NumPy.
         """
         arrays, axes, ready = align(values, self.batch)
         try:
@@ -194,14 +194,13 @@ class Column(NDArrayOperatorsMixin):
         return Column(array, names, self.batch, ready=ready)
 
     def on(self, *axes: str) -> Column:
-        """The column's values on other axes, by the names of any arrays of the frame; its own axes
-        go to the last of those named.
+        """Return the same values on other axes, named after arrays of the frame.
 
-        Where they are fewer than that array has elements, as in frames that lack theirs, the others
-        are nan.
+        The column's own axes become the last of the named axes. Elements beyond the length of the
+        column are nan, for example in frames that lack the field.
 
         Raises:
-            SpecError: for fewer axes than the column has, or an array that the frame does not have.
+            SpecError: for fewer axes than the column has, or an unknown array.
         """
         schema = self.batch.table.schema
         own = [index for index, name in enumerate(self.axes) if name is not None]
@@ -224,10 +223,10 @@ class Column(NDArrayOperatorsMixin):
 
     @property
     def index(self) -> AlongAxis:
-        """0, 1, 2 ... along the innermost array that the values are in.
+        """0, 1, 2 ... along the innermost array of the column.
 
         Raises:
-            SpecError: where they are in none.
+            SpecError: if the column is not in an array.
         """
         schema = self.batch.table.schema
         names = [str(name).strip("?") for name in self.axes if name is not None]
@@ -240,8 +239,9 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """0, 1, 2 ... up to the largest value, (m,): the indices of the array of which this column
-        is the count.
+        """Return 0, 1, 2 ... below the largest value, (m,).
+
+        These are the indices of the array whose length this column counts.
         """
         schema = self.batch.table.schema
         most = int(np.nanmax(self.array, initial=0))
@@ -261,8 +261,12 @@ class Column(NDArrayOperatorsMixin):
         return AlongAxis((axis,), np.arange(_find_extent(self.batch.table, axis, most)))
 
     def gather(self, table: NDArray[np.float64]) -> Column:
-        """The rows of a table, (m + 1, k), the last one nan, at these indices, along the array of k
-        elements that stands in theirs.
+        """Return rows of a table, selected by these indices, on one more axis.
+
+        The new axis is the one array of the frame with k elements.
+
+        Args:
+            table: (m + 1, k); the last row is nan, for missing indices.
         """
         own = [place for place, name in enumerate(self.axes) if name is not None]
         depth = max(len(self.axes), self.batch.table.schema.depth())
@@ -277,7 +281,7 @@ class Column(NDArrayOperatorsMixin):
         return Column(np.moveaxis(rows, -1, 1 + place), tuple(axes), self.batch, ready=self.ready)
 
     def running(self) -> Column:
-        """The sum of the values so far along the innermost array that they are in."""
+        """Return the cumulative sum along the innermost array of the column."""
         place = max([place for place, name in enumerate(self.axes) if name is not None], default=0)
         return Column(
             np.cumsum(self.array, axis=1 + place, dtype=np.float64),
@@ -287,8 +291,9 @@ class Column(NDArrayOperatorsMixin):
         )
 
     def shift(self, step: int) -> Column:
-        """The values `step` places later (earlier if negative) in stream order, on the same axes;
-        nan across a loss and at the end.
+        """Return the values `step` places later in stream order, on the same axes.
+
+        A negative step returns earlier values. Values across a loss and beyond the end are nan.
         """
         row = RowOfValues(self)
         size = abs(step)
@@ -320,14 +325,16 @@ class Column(NDArrayOperatorsMixin):
             )
         )
         return Column(
-            row.spread(shifted[len(carried) :]), self.axes, self.batch, ready=max(ready, 0)
+            row.unflatten(shifted[len(carried) :]), self.axes, self.batch, ready=max(ready, 0)
         )
 
     def latest(self, where: Any = None) -> Column:
-        """The most recent value at which `where` was true, this one included; nan before the first.
+        """Return the last value at or before each element for which `where` is true.
+
+        Elements before the first such value are nan.
 
         Args:
-            where: a condition that lines up with the column; by default where its value is finite.
+            where: a condition that aligns with the column; by default, whether the value is finite.
         """
         (values, flags), axes, ready = align(
             (self, np.isfinite(self) if where is None else where), self.batch
@@ -344,7 +351,7 @@ class Column(NDArrayOperatorsMixin):
         starts = np.concatenate([[0], 1 + np.flatnonzero(known.values > 0)])
         latest = np.repeat(numbers[starts], np.diff(starts, append=len(numbers)))
         self.batch.left.append(lambda upto: latest[: 1 + row.starts[upto]][-1:])
-        return Column(row.spread(latest[1:]), axes, self.batch, ready=ready)
+        return Column(row.unflatten(latest[1:]), axes, self.batch, ready=ready)
 
 
 class RowOfValues:
@@ -353,7 +360,7 @@ class RowOfValues:
     Attributes:
         values: (k,) as float64.
         starts: (n + 1,) index of the first value of each packet.
-        edges: indices of the values before which something was lost, ascending.
+        edges: ascending indices of the values that follow a loss.
     """
 
     def __init__(self, column: Column) -> None:
@@ -373,8 +380,8 @@ class RowOfValues:
             self.starts = np.concatenate([[0], np.cumsum(self._mask.sum(axis=1))]).astype(np.intp)
         self.edges = self.starts[np.flatnonzero(column.batch.breaks)]
 
-    def spread(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values in stream order back into the column's shape, nan in the padding."""
+    def unflatten(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values in stream order in the column's shape, with nan as padding."""
         if self._mask is None:
             return values.reshape(self._shape)
         full = np.full(self._mask.shape, np.nan)
@@ -385,9 +392,9 @@ class RowOfValues:
 def padding_mask(
     axes: tuple[str | None, ...], shape: tuple[int, ...], batch: Batch
 ) -> NDArray[np.bool_] | None:
-    """Return the mask of elements that are not padding, (n, product of the other lengths).
+    """Return the mask of elements that are not padding, None if there is no padding.
 
-    Return None if there is no padding.
+    The mask has shape (n, product of the other lengths).
     """
     mask: NDArray[np.bool_] | None = None
     for index, axis in enumerate(axes):
@@ -410,11 +417,10 @@ def padding_mask(
 def align(
     values: tuple[Any, ...], batch: Batch
 ) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int]:
-    """Columns and arrays as arrays that broadcast, the names of the axes they have together, and
-    the smallest `ready`.
+    """Return arrays that broadcast, the names of their common axes, the smallest `ready`.
 
     Raises:
-        SpecError: where axes of different arrays meet.
+        SpecError: if axes of different arrays meet.
     """
     columns = [value for value in values if isinstance(value, Column)]
     if (
@@ -470,9 +476,10 @@ def align(
 
 
 def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Return arrays that broadcast: along each axis all have length 1 or that of the shortest.
+    """Return arrays cut so that they broadcast: each axis to its shortest length.
 
     Without packets an array of variable length is empty, but a plugin's own table for it is not.
+    Axes of length 1 stay.
     """
     reversed_shapes = [array.shape[::-1] for array in arrays]
     shortest = [
@@ -486,10 +493,10 @@ def _cut_to_shortest(arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
 
 
 def _merge_axis_names(first: str | None, name: str | None) -> str | None:
-    """The name of an axis that has two, of which one may be None.
+    """Return the name of an axis with two names, each of which may be None.
 
     Raises:
-        SpecError: for those of different arrays, unless one is a guess.
+        SpecError: if they name different arrays and neither is a guess.
     """
     if first is None or name is None:
         return first or name
@@ -517,11 +524,10 @@ def _length(value: AlongAxis, axis: str) -> int:
 def _place(
     array: NDArray[Any], axes: list[str | None], lengths: Sequence[int], table: Table
 ) -> NDArray[Any]:
-    """A plain array, lined up with axes of these lengths, which are given a name where they have
-    none.
+    """Return a plain array reshaped to axes of these lengths; name axes without a name.
 
     Raises:
-        SpecError: where its length is that of several of them, or of no array of the frame.
+        SpecError: if its length fits several axes, or no array of the frame.
     """
     depth = len(lengths)
     if array.size == 1:
@@ -549,11 +555,12 @@ def _find_axis(
     table: Table,
     without: Sequence[int] = (),
 ) -> int:
-    """The axis that the first one of a plain array goes with, as its lengths say: among those that
-    are there, else among the frame's.
+    """Return the axis for the first axis of a plain array, found by its lengths.
+
+    Axes of the other operands are tried first, then the arrays of the frame.
 
     Args:
-        without: axes that it does not go with.
+        without: axes that are excluded.
     """
     wanted = [(place, length) for place, length in enumerate(shape) if length != 1]
     there = {
@@ -582,10 +589,10 @@ def _find_axis(
         }
         found = (
             fixed or found
-        )  # which other arrays are as long by chance is not to change what a spec means
+        )  # an array of variable length that happens to fit must not change the spec's meaning
         if len(found) == 1 or (
             len(shape) > 1 and len(lengths) - len(shape) in found
-        ):  # which says itself how far out it is
+        ):  # several axes determine the position
             return max(found)
         if found:
             names = [" x ".join(names) for names in found.values()]
@@ -603,10 +610,10 @@ def _find_axis(
 def align_points(
     parts: Mapping[str, Any], batch: Batch
 ) -> tuple[list[NDArray[Any]], tuple[str | None, ...], int, tuple[int, ...]]:
-    """The parts of points as `align` gives them, and the shape that they have together, (n, ...).
+    """Return the parts of points aligned, their axes, `ready`, and common shape (n, ...).
 
     Raises:
-        SpecError: where axes of different arrays meet, lengths do not fit, or a plain array is
+        SpecError: if axes of different arrays meet, lengths do not fit, or a plain array is
             along an axis that no field has.
     """
     anchor = Column(
@@ -634,8 +641,9 @@ def align_points(
 
 
 def _find_extent(table: Table, axis: str, length: int) -> int:
-    """How far along an axis values are; no further than the array where frames say its length and
-    have no array around it.
+    """Return the extent of values along an axis, at most the array's length in the frames.
+
+    The limit applies only if some frame lacks an array around this one.
     """
     if any((table.counts(other) == 0).any() for other in table.schema.outer(axis)):
         return min(length, table.length(axis))
@@ -643,8 +651,11 @@ def _find_extent(table: Table, axis: str, length: int) -> int:
 
 
 def _pad_to_extent(array: NDArray[Any], place: int, table: Table, axis: str) -> NDArray[Any]:
-    """An array at a place of its shape as far along an axis as frames go; nan where they have
-    nothing to put there.
+    """Return an array extended with nan, or cut, to the length of an array of the frame.
+
+    Args:
+        place: the axis of `array`.
+        axis: the name of the array.
     """
     length = array.shape[place]
     missing = table.length(axis) - length
@@ -659,14 +670,14 @@ def _pad_to_extent(array: NDArray[Any], place: int, table: Table, axis: str) -> 
 def broadcast_shape(
     arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]
 ) -> tuple[int, ...]:
-    """The shape that arrays broadcast to.
+    """Return the shape that arrays broadcast to.
 
     Args:
-        arrays: by what they are called; what has no name is not told.
+        arrays: by name; arrays named "" are left out of the message.
         axes: names of their axes after the first.
 
     Raises:
-        SpecError: where lengths do not fit.
+        SpecError: if lengths do not fit.
     """
     try:
         return np.broadcast_shapes(*(array.shape for array in arrays.values()))
@@ -677,9 +688,7 @@ def broadcast_shape(
 
 
 def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None, ...]) -> str:
-    """How long arrays are along which axes: "range: samples 3, azimuth: samples 4"; those of one
-    number are left out.
-    """
+    """Return the lengths of arrays by axis: "range: samples 3, azimuth: samples 4"."""
     names = ("packets", *((name or "").strip("?") for name in axes))
     texts = []
     for what, array in arrays.items():
@@ -694,18 +703,19 @@ def _describe_lengths(arrays: Mapping[str, NDArray[Any]], axes: tuple[str | None
 
 
 def _only_numbers_beside(values: tuple[Any, ...]) -> bool:
-    """Whether what is no column is a plain number, so that nothing has to be lined up."""
+    """Return whether all operands are columns or numbers, so that no array needs aligning."""
     return all(isinstance(value, Column | int | float) for value in values)
 
 
 def call_aligned(function: Callable[..., Any], arrays: Sequence[Any]) -> NDArray[Any]:
-    """Return the result of a function of aligned arrays, in the shape that they broadcast to."""
+    """Return the result of a function of aligned arrays, in their broadcast shape."""
     return np.asarray(remainder(*arrays) if function is np.remainder else function(*arrays))
 
 
 def remainder(values: Any, full: Any) -> NDArray[Any]:
-    """``np.remainder``, bit by bit; a quarter of the time for what is a turn away at most, as
-    nearly all angles are.
+    """Return ``np.remainder``, bit by bit the same.
+
+    It takes a quarter of the time for values at most one turn outside, as nearly all angles are.
     """
     if np.ndim(full) or not full > 0 or np.ndim(values) == 0 or values.dtype != np.float64:
         return np.asarray(np.remainder(values, full))
@@ -720,7 +730,7 @@ def remainder(values: Any, full: Any) -> NDArray[Any]:
 def _take_connected_tail(
     values: NDArray[np.float64], edges: NDArray[np.intp], end: int, size: int
 ) -> NDArray[np.float64]:
-    """The last values before `end` that nothing lost separates from it."""
+    """Return the last values before `end` that follow its latest loss, at most `size`."""
     if end == 0 or size == 0:
         return np.empty(0)
     lost = edges[edges < end]
@@ -735,8 +745,11 @@ def field_column(
     which: NDArray[np.intp] | None = None,
     frame: str = "",
 ) -> Column:
-    """A field in its unit as a column of `depth` array axes; `which`: the frame of the table, of
-    type `frame`, for each packet.
+    """Return a field in its unit as a column with `depth` array axes.
+
+    Args:
+        which: for each packet the row of `table`; None: the packets are the rows.
+        frame: the frame type of `table`, if it is not that of the packets.
     """
     array = field_array(info, table, depth)
     if which is not None:
@@ -749,18 +762,19 @@ def field_column(
 
 
 def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False) -> NDArray[Any]:
-    """A field in its unit, (n, ...), each array's axis in its place, with `depth` axes at least
-    behind the first, some of length 1.
+    """Return a field in its unit, (n, ...), each array at its axis.
+
+    The result has at least `depth` axes after the first; further axes have length 1.
 
     Args:
-        raw: as it was sent, of its own type.
+        raw: return the integers of the wire, in their own type.
     """
     if raw:
         array = table.raw(info.path)
     else:
         array = physical(info, table)
     places = [table.schema.places[axis] for axis in info.axes]
-    if places and places[-1] >= len(places):  # an element of an array in which others stand
+    if places and places[-1] >= len(places):  # an element of an array with nested arrays
         lengths = dict(zip(places, array.shape[1:], strict=True))
         array = array.reshape(
             len(array), *(lengths.get(place, 1) for place in range(places[-1] + 1))
@@ -769,9 +783,7 @@ def field_array(info: FieldInfo, table: Table, depth: int, *, raw: bool = False)
 
 
 def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
-    """The name of an axis; of length 1 it needs none, unless packets of the batch have no element
-    at all.
-    """
+    """Return the name of an axis, None if it has length 1 and no packet lacks the element."""
     if length != 1 or (
         known
         and not isinstance(table.schema.arrays.get(name), int)
@@ -782,7 +794,7 @@ def _axis(name: str, length: int, table: Table, *, known: bool) -> str | None:
 
 
 def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
-    """A field in its unit: float64, shape (n, *lengths); nan where a frame lacks the field."""
+    """Return a field in its unit, float64, (n, *lengths); nan if a frame lacks the field."""
     array = table.raw(info.path)
     if array.dtype == object:
         raise SpecError(
@@ -801,13 +813,14 @@ def physical(info: FieldInfo, table: Table) -> NDArray[np.float64]:
 
 
 class Fields:
-    """The fields of a batch of packets by attribute, as columns: ``f.points.distance``,
-    ``f.state.difop.vertical``; of parts also those of the frame that each is in,
-    ``f.frame.counter``.
+    """The fields of a batch of packets by attribute, as columns.
+
+    ``f.points.distance`` is a field, ``f.state.difop.vertical`` a field of another frame type. For
+    parts, ``f.frame.counter`` is a field of the frame that contains the part.
 
     Args:
-        prefix: the names so far, each with a dot behind it.
-        frame: the other frame type that they are of; "" for the packets themselves.
+        prefix: the names so far, each followed by a dot.
+        frame: the other frame type; "" for the packets themselves.
     """
 
     def __init__(self, batch: Batch, prefix: str = "", frame: str = "") -> None:
@@ -841,9 +854,7 @@ class Fields:
         )
 
     def __getitem__(self, index: int) -> Fields:
-        """An element of an array of structs, counted from the last one of each packet where the
-        index is negative.
-        """
+        """Return one element of an array of structs; a negative index counts from the end."""
         if not self._prefix or not isinstance(index, int):
             raise SpecError(
                 "only arrays have elements, each by one index: f.columns[0].timestamp,"
@@ -853,14 +864,12 @@ class Fields:
 
     @property
     def _is_around(self) -> bool:
-        """Whether they are of other frames than the packets."""
+        """Whether the fields belong to another frame type."""
         return bool(self._frame)
 
 
 def _paths(batch: Batch, frame: str) -> Iterable[str]:
-    """The fields of a batch, or those of the frames of another type that were last before its
-    packets.
-    """
+    """Return the field paths of a batch, or of another frame type in its state."""
     if not frame:
         return batch.table.schema.columns
     table, _ = batch.state[frame]
@@ -882,8 +891,10 @@ class _States:
 
 
 def _column(batch: Batch, frame: str, path: str) -> Column:
-    """A field of a batch; of another frame type that of the frame that was last before each packet,
-    or its declared default.
+    """Return a field of a batch as a column.
+
+    For another frame type it is, for each packet, the field of the last such frame before it, or
+    the declared default.
     """
     depth = batch.table.schema.depth()
     table, which = batch.state[frame] if frame else (batch.table, np.zeros(0, np.intp))

@@ -1,24 +1,20 @@
-"""What a function of fields computes, as a graph: it is called once with columns that note down
-what is done to them.
+"""Trace a function of fields: record its steps as a graph by calling it once.
 
-`trace` calls a `points`, `plausible` or clock function with `TracedFields`, and gives back what it
-returned, with the `Tape` of its steps. A step is a `Node`: a field, a state column, an elementwise
-call, or one of the steps that know packets by name (`on`, `shift`, `latest`). Every node carries
-the plain result for two sample packets, so shapes and axes need no rules of their own. What cannot
-be noted down (a branch on data, reductions, attributes of arrays) is `UntraceableError`, with the
-reason.
+`trace` calls a `points`, `plausible` or clock function with `TracedFields`, and returns its result
+and the `Tape` of its steps. A step is a `Node`: a field, a state column, an elementwise call, or a
+step that depends on the order of packets (`on`, `shift`, `latest`). Every node carries the result
+for two sample packets, so shapes and axes need no rules of their own. A step that cannot be
+recorded (a branch on data, a reduction, an attribute of an array) raises `UntraceableError` with
+the reason.
 
-Whoever works with a graph goes through it with `traverse`, and computes it with `compute`: the
-plain evaluation of a batch, tables of all values that a field can have, tests of plausibility and
-clocks differ only in what they say the fields are. The compilers of points (`points.numpy_plan`,
-`points.numba_kernels`) write a graph down in another form; what they ask of it stands here, too:
-the fields that a value is made of, conditions and sums taken apart. For them a value is *full*
-where each point has its own, else *low*: then it is computed once for its packet or block, plainly.
+`traverse` iterates over the nodes of a graph, and `compute` evaluates it; the callers differ only
+in the values that they give for the fields. The compilers of points (`points.numpy_plan`,
+`points.numba_kernels`) translate a graph; the functions that they need to take conditions and sums
+apart are here, too. In them a value is *full* if each point has its own value. Otherwise it is
+*low*, and is computed once for its packet or block by the reference evaluator.
 
-A node's axes are those of its sample. What is no column (`vocabulary.AlongAxis`, plain arrays) is
-lined up with these as it is noted down, so that whoever computes with the graph broadcasts arrays.
-
-Room is left for what is to come. More columns of a point (M5): further values that are traced.
+The axes of a node are those of its sample. Other operands (`vocabulary.AlongAxis`, plain arrays)
+are aligned when they are recorded, so evaluating the graph only broadcasts arrays.
 """
 
 from __future__ import annotations
@@ -41,7 +37,7 @@ from lidarspec.spec.vocabulary import ELEMENTWISE, AlongAxis
 
 
 class UntraceableError(Exception):
-    """Something that only plain evaluation can do; the text says what."""
+    """An operation that only the reference evaluator can execute; the message has the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +47,13 @@ class Node:
     Attributes:
         kind: "field", "state", "shift", "latest", "on", "running", "rows" (of a table, at indices)
             or "call".
-        function: for "call" what is applied to arrays that broadcast; for "field" and "state" what
-            makes its column of `Fields`; for the others what makes a column of columns.
+        function: for "call", a function of arrays that broadcast; for "field" and "state", a
+            function of `Fields` that returns the column; otherwise a function of columns that
+            returns a column.
         args: nodes, numbers and arrays.
         sample: the result for the sample.
         number: position in the order of evaluation.
-        path: of a field or state column, as it is written after ``f.``.
+        path: of a field or state column, as written after ``f.``.
     """
 
     kind: str
@@ -73,7 +70,7 @@ class Node:
 
     @cached_property
     def width(self) -> int:
-        """Values for each packet; 0 where all packets share them."""
+        """Number of values per packet; 0 if all packets share them."""
         size = int(np.prod(self.shape, dtype=np.intp))
         if self.sample.shape[0] > 1:
             return size
@@ -81,8 +78,9 @@ class Node:
 
     @cached_property
     def fields(self) -> tuple[Node, ...] | None:
-        """The fields of the frame that it is made of, each once, with numbers and element by
-        element; None where it is made of more.
+        """The fields that the node is computed from element by element, each once.
+
+        None if other kinds of steps are needed.
         """
         if self.kind == "field":
             return (self,)
@@ -104,14 +102,12 @@ class Node:
 
     @cached_property
     def _first(self) -> int:
-        """The place of the first node among the arguments."""
+        """The index of the first node among the arguments."""
         return next(place for place, arg in enumerate(self.args) if isinstance(arg, Node))
 
     @cached_property
     def _operands(self) -> list[tuple[bool, Any]]:
-        """Of what is called with: whether it is a node, and the axes that it lacks of the deepest
-        one; or else what it is, as an array.
-        """
+        """Per argument: (True, missing axes) of a node, or (False, the constant as an array)."""
         depth = max(len(arg.sample.axes) for arg in self.args if isinstance(arg, Node))
         return [
             (
@@ -123,8 +119,9 @@ class Node:
         ]
 
     def value(self, args: list[Any]) -> Any:
-        """Return the value, computed from the arguments: a column if these are columns, else an
-        array.
+        """Return the value, computed from the arguments.
+
+        It is a column if the arguments are columns, otherwise an array.
         """
         if self.kind != "call":
             return self.function(*args)
@@ -140,12 +137,12 @@ class Node:
 
 @dataclass
 class Tape:
-    """The nodes of a trace in the order in which they were made, and what was assumed.
+    """The nodes of a trace in the order in which they were made, and its assumptions.
 
     Attributes:
         nodes: in order.
-        steps: (node, largest value) of counts whose indices were asked for: the trace holds for
-            these only.
+        steps: (node, largest value) of counts that were used for indices; the trace is valid only
+            for these counts.
     """
 
     nodes: list[Node] = field(default_factory=list)
@@ -160,7 +157,7 @@ class Tape:
         sample: Column,
         path: str = "",
     ) -> TracedColumn:
-        """A new node, as a traced column; a field that was read before has one already."""
+        """Return a new node as a traced column; reuse the node of a field that was read before."""
         if path in self._read:
             return TracedColumn(self._read[path], self)
         node = Node(kind, function, tuple(map(node_of, args)), sample, len(self.nodes), path)
@@ -171,7 +168,7 @@ class Tape:
 
 
 class TracedColumn(NDArrayOperatorsMixin):
-    """A column that notes down what is done to it; offers what `Column` offers to expressions."""
+    """A column that records the operations on it; it has the same methods as `Column`."""
 
     def __init__(self, node: Node, tape: Tape) -> None:
         self.node = node
@@ -179,7 +176,7 @@ class TracedColumn(NDArrayOperatorsMixin):
 
     @property
     def seen(self) -> NDArray[Any]:
-        """Its values, as far as they are known: of the sample."""
+        """The values that are known while a function runs: those of the sample."""
         return self.node.sample.array
 
     def __array_ufunc__(
@@ -209,7 +206,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         ]
         arrays, _, _ = align(
             tuple(samples), self.node.sample.batch
-        )  # what is no column is noted down in its place
+        )  # other operands are recorded as aligned arrays
         table = _fold(function, values, arrays)
         if table is not None:
             return TracedColumn(table[0], self._tape).gather(table[1])
@@ -223,13 +220,11 @@ class TracedColumn(NDArrayOperatorsMixin):
 
     @property
     def index(self) -> AlongAxis:
-        """0, 1, 2 ... along the innermost array that the values are in."""
+        """0, 1, 2 ... along the innermost array of the column."""
         return self.node.sample.index
 
     def on(self, *axes: str) -> Any:
-        """The value on other axes, by the names of arrays, noted down; nan where frames of this
-        layout lack the array that it is in.
-        """
+        """Record `Column.on`; return nan if frames of this layout lack the column's array."""
         sample = self.node.sample.on(*axes)
         if sample.array.size > self.node.sample.array.size:
             if not self.node.sample.array.size:
@@ -239,11 +234,11 @@ class TracedColumn(NDArrayOperatorsMixin):
             sample.axes == self.node.sample.axes
             and sample.array.shape == self.node.sample.array.shape
         ):
-            return self  # which stands on them already
+            return self
         return self._tape.add("on", lambda column: column.on(*axes), (self,), sample)
 
     def gather(self, table: NDArray[np.float64]) -> TracedColumn:
-        """The rows of a table at these indices, noted down."""
+        """Record `Column.gather`."""
         return self._tape.add(
             "rows",
             lambda column, rows: column.gather(rows),
@@ -252,27 +247,25 @@ class TracedColumn(NDArrayOperatorsMixin):
         )
 
     def running(self) -> TracedColumn:
-        """The sum so far along the innermost array, noted down."""
+        """Record `Column.running`."""
         return self._tape.add(
             "running", lambda column: column.running(), (self,), self.node.sample.running()
         )
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
-        """0, 1, 2 ... up to the largest value in the sample; the tape remembers how many these
-        were.
-        """
+        """Return `Column.steps` of the sample, and record their number on the tape."""
         indices = self.node.sample.steps()
         self._tape.steps.append((self.node, len(indices)))
         return indices
 
     def shift(self, step: int) -> TracedColumn:
-        """The value `step` places later (earlier if negative) in stream order, noted down."""
+        """Record `Column.shift`."""
         return self._tape.add(
             "shift", lambda column: column.shift(step), (self,), self.node.sample.shift(step)
         )
 
     def latest(self, where: Any = None) -> TracedColumn:
-        """The most recent value at which `where` was true, noted down."""
+        """Record `Column.latest`."""
         if isinstance(where, TracedColumn):
             condition = where.node.sample
         else:
@@ -299,7 +292,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         raise UntraceableError("the length of a column")
 
     def __getitem__(self, index: Any) -> TracedColumn:
-        """An element of a field that is an array: a field by itself."""
+        """Record one element of an array field as a field."""
         node = self.node
         return self._tape.add(
             node.kind,
@@ -311,7 +304,7 @@ class TracedColumn(NDArrayOperatorsMixin):
 
 
 class TracedFields:
-    """The fields of the sample while `points` is traced; operations on them are recorded."""
+    """The fields of the sample during a trace; operations on them are recorded."""
 
     def __init__(
         self,
@@ -352,17 +345,17 @@ class TracedFields:
 def _fold(
     function: Callable[..., Any], values: Sequence[Any], arrays: Sequence[Any]
 ) -> tuple[Node, NDArray[np.float64]] | None:
-    """A function of rows of tables at the same indices, of numbers and of a row that all packets
-    share, as rows of one table.
+    """Return a function of table rows as rows of a new table, if all operands allow it.
 
-    So the sines and cosines of directions that are looked up, and their products, are computed
-    once, for the table.
+    The operands must be rows of tables at the same indices, numbers, or one row that all packets
+    share. Sines and cosines of looked-up directions, and their products, are then computed once,
+    for the table.
 
     Args:
-        arrays: the values, those that are no columns lined up with the others.
+        arrays: the values; values that are not columns are aligned with the others.
 
     Returns:
-        The indices and the table; None where it is none.
+        The indices and the table, or None.
     """
     nodes = [value.node for value in values if isinstance(value, TracedColumn)]
     if any(node.kind != "rows" or node.args[0] is not nodes[0].args[0] for node in nodes):
@@ -389,7 +382,7 @@ def _fold(
 
 
 def node_of(value: Any) -> Any:
-    """The node of a traced column; what is none as it is."""
+    """Return the node of a traced column; return other values unchanged."""
     if isinstance(value, TracedColumn):
         return value.node
     return value
@@ -399,7 +392,7 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
     """Return the result of a function of traced columns, and the tape of its steps.
 
     Raises:
-        Untraceable: where that cannot be noted down.
+        UntraceableError: if a step cannot be recorded.
     """
     tape = Tape()
     with np.errstate(all="ignore"):
@@ -407,8 +400,9 @@ def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
 
 
 def make_sample(batch: Batch, group: LayoutRows) -> Batch:
-    """The first frame of a group of a batch, twice, as a batch to trace functions on: enough to
-    tell what all packets share.
+    """Return a batch for tracing: the first frame of a group, twice.
+
+    Two packets show which values all packets share.
     """
     return batch.of(
         LayoutRows(group.layout, group.where[[0, 0]], np.ascontiguousarray(group.rows[[0, 0]]))
@@ -416,10 +410,10 @@ def make_sample(batch: Batch, group: LayoutRows) -> Batch:
 
 
 def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> Iterator[Node]:
-    """The nodes that values, traced columns or nodes, are made of, themselves included, each once.
+    """Yield the nodes of some values, including themselves, each once.
 
     Args:
-        into: whether to go on to what a node is made of.
+        into: whether to continue to the arguments of a node.
     """
     seen = set[Node]()
     waiting = [node_of(value) for value in values]
@@ -437,13 +431,13 @@ def compute(
     """Return the value of a node, given the fields.
 
     Args:
-        results: the values of nodes: columns, or arrays whose first axis is for the packets; added
-            to, so that each is computed once.
+        results: the values of nodes, columns or arrays with one row for each packet. New values
+            are added, so each node is computed once.
         source: the value of a node that is not computed from others, such as a field; None for
-            those that are.
+            other nodes.
 
     Returns:
-        A column or an array, as those that it is made of are.
+        A column or an array, like the values of the fields.
     """
     value = results.get(node)
     if value is None:
@@ -460,7 +454,7 @@ def compute(
 
 
 def only_field(node: Node) -> Node | None:
-    """Return the field of an expression of one field and numbers, else None."""
+    """Return the field of an expression of one field and numbers, None for others."""
     if node.fields is not None and len(node.fields) == 1:
         return node.fields[0]
     return None
@@ -471,8 +465,8 @@ class Expression:
     """An expression of fields of the frame that are all in the same arrays.
 
     Attributes:
-        node: what is computed.
-        fields: those that it is made of, each once.
+        node: the expression.
+        fields: its fields, each once.
     """
 
     node: Node
@@ -480,10 +474,10 @@ class Expression:
 
     @classmethod
     def of(cls, node: Node, schema: Schema) -> Expression:
-        """A node as such an expression.
+        """Return a node as an expression.
 
         Raises:
-            Untraceable: if it is made of more than fields of the frame that stand side by side.
+            UntraceableError: if it depends on more than fields of the frame in the same arrays.
         """
         if node.fields is None:
             raise UntraceableError("made of more than fields of the frame")
@@ -504,7 +498,7 @@ class Expression:
 def values_of(
     expressions: Sequence[Expression], raw: Mapping[str, NDArray[Any]]
 ) -> list[NDArray[Any]]:
-    """Return the values of expressions, as `Expression.values`; common nodes are computed once."""
+    """Return `Expression.values` of each expression; compute common nodes once."""
     infos = {info.path: info for expression in expressions for info in expression.fields}
     results = dict[Node, Any]()
     with np.errstate(all="ignore"):
@@ -518,23 +512,22 @@ def values_of(
         ]
 
 
-#: values of a term that are remembered.
+#: maximum number of cached values of a term.
 REMEMBERED = 64
 
-#: the integers that are wanted of the plain values of a term, for so many packets: (n,) or (1,).
+#: (values of a term, number of packets n) -> the term as integers, (n,) or (1,).
 Made = Callable[[Any, int], NDArray[np.int64]]
 
 
 class HeaderFunction:
-    """A function of header fields, taken apart: each term of it is computed again only where its
-    fields change.
+    """A function of header fields that recomputes only terms whose fields change.
 
-    Most of a clock is a date, and most counters depend on a setting: the same in thousands of
-    packets, and dozens of operations to read.
+    Most of a clock is a date, and most counters depend on a setting: both are the same in thousands
+    of packets, and take dozens of operations to read.
 
     Args:
-        function: of `Fields`; gives a column, or several, the terms.
-        made: the integers that are wanted of a term.
+        function: a function of `Fields` that returns a column, or several: the terms.
+        made: converts the values of a term to integers.
     """
 
     def __init__(self, function: Callable[[Any], Any], made: Made) -> None:
@@ -544,11 +537,11 @@ class HeaderFunction:
         self._is_tried = False
 
     def __call__(self, batch: Batch) -> list[NDArray[np.int64]]:
-        """The integers of each term, (n,) or (1,)."""
+        """Return the integers of each term, (n,) or (1,)."""
         table = batch.table
         if not self._is_tried and isinstance(table, CompiledTable):
             self._is_tried, self._terms = True, self._split_terms(batch, table)
-        if self._terms is None:  # only the function itself can tell
+        if self._terms is None:
             return [
                 self._made(term, len(batch)) for term in _several(self._function(Fields(batch)))
             ]
@@ -561,7 +554,7 @@ class HeaderFunction:
                 _ResultPart(Expression.of(term.node, table.schema), self._made)
                 for term in _several(traced)
             ]
-        except Exception:  # the function itself says so, if anything is wrong
+        except Exception:  # calling the function itself reports the error
             return None
 
 
@@ -572,10 +565,10 @@ def _several(terms: Any) -> Sequence[Any]:
 
 
 class _ResultPart:
-    """A part of what a function gives.
+    """One term of a `HeaderFunction`, with cached values.
 
     Raises:
-        Untraceable: if its fields are no plain ones of the header.
+        UntraceableError: if a field is optional or in an array.
     """
 
     def __init__(self, expression: Expression, made: Made) -> None:
@@ -602,7 +595,7 @@ class _ResultPart:
         return np.repeat(values, np.diff(starts, append=len(table)))
 
     def _once(self, columns: list[NDArray[Any]]) -> NDArray[np.int64]:
-        """The integer of one packet, (1,), which a later one with equal readings shares."""
+        """Return the integer of one packet, (1,), cached by the raw values of its fields."""
         key = tuple(column.item(0) for column in columns)
         cached = self._known.get(key)
         if cached is None:
@@ -621,12 +614,12 @@ class _ResultPart:
 
 @lru_cache(maxsize=256)
 def header_function(function: Callable[[Any], Any], schema: Schema, made: Made) -> HeaderFunction:
-    """The function for frames of a type, by their schema, with what it remembers."""
+    """Return the `HeaderFunction` of a function and a schema, with its cached values."""
     return HeaderFunction(function, made)
 
 
 def split_condition(node: Node) -> Iterator[Node]:
-    """The conditions that have to hold together for a condition to hold."""
+    """Yield the conditions that a condition combines with "and"."""
     both = node.kind == "call" and node.function in (np.bitwise_and, np.logical_and)
     if both and all(
         isinstance(arg, Node) and arg.sample.array.dtype == np.bool_ for arg in node.args
@@ -644,8 +637,9 @@ FACTORS |= {np.rad2deg: 180 / np.pi, np.degrees: 180 / np.pi}
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A part of a sum: `full` times a number, or `low` (None: 1) times a row of numbers that every
-    packet shares.
+    """A part of a sum: `full` times a number, or `low` times a row that all packets share.
+
+    `low` None stands for 1.
     """
 
     row: NDArray[np.float64]
@@ -653,18 +647,19 @@ class Term:
     full: Node | None = None
 
     def times(self, factor: Any) -> Term:
-        """The term multiplied by a number, or by a row of numbers."""
+        """Return the term multiplied by a number, or by a row of numbers."""
         return Term(self.row * factor, self.low, self.full)
 
 
 def is_full(value: Any, width: int) -> bool:
-    """Whether each of the `width` points of a packet has its own value."""
+    """Return whether each of the `width` points of a packet has its own value."""
     return isinstance(value, Node) and value.width == width
 
 
 def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
-    """The condition of a ``np.where`` that packets or blocks decide, and what it chooses from, each
-    a number or full of one field.
+    """Return condition and both options of a ``np.where``, None if it has another form.
+
+    The condition must be low, and each option a number or a full expression of one field.
     """
     if node.kind != "call" or node.function is not np.where or len(node.args) != 3:
         return None
@@ -681,7 +676,7 @@ def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
 
 
 def is_nan_where(node: Node) -> bool:
-    """Whether a node is nan where a condition holds, and else another value."""
+    """Return whether a node is ``np.where(condition, nan, value)``."""
     if (
         node.function is not np.where
         or len(node.args) != 3
@@ -703,7 +698,7 @@ def make_key(node: Node) -> tuple[Any, ...]:
 
 
 def split_sum(value: Any, width: int) -> list[Term]:
-    """An expression as a sum."""
+    """Return an expression as the terms of a sum."""
     if not isinstance(value, Node):
         return [Term(np.asarray(value, np.float64))]
     if not is_full(value, width) and value.width:
@@ -730,12 +725,15 @@ def split_sum(value: Any, width: int) -> list[Term]:
 
 
 def _scale(value: Node, parts: list[Term], factor: Any) -> list[Term]:
-    """A sum times a factor; in one piece where a full part would be multiplied by a row."""
+    """Return the terms of a sum times a factor.
+
+    The sum stays one term if a full part would be multiplied by a row.
+    """
     if np.ndim(factor) and any(part.full is not None for part in parts):
         return [Term(np.ones(()), full=value)]
     return [part.times(factor) for part in parts]
 
 
 def last_axis(shape: tuple[int, ...]) -> int:
-    """One more than the last axis that is longer than 1."""
+    """Return the number of axes up to the last axis longer than 1."""
     return max((index + 1 for index, length in enumerate(shape) if length > 1), default=0)
