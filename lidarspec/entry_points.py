@@ -1,10 +1,8 @@
-"""Entry points: what installed distributions declare, by group, found without importing any of
-them.
+"""Find entry points by group without importing the distributions that declare them.
 
-They are read straight from the folders that Python imports from: importlib.metadata finds the same
-ones, but importing it takes longer than all else that finding a sensor takes. It is asked where
-something could be installed in another way than as a folder: in a zip file or an egg, or by an
-import hook.
+The folders on `sys.path` are read directly, because importing importlib.metadata takes longer than
+everything else needed to find a sensor. importlib.metadata is used only if something may be
+installed in another form than a folder: in a zip file or an egg, or through an import hook.
 """
 
 from __future__ import annotations
@@ -30,12 +28,16 @@ _FOLDERS = (".dist-info", ".egg-info")
 
 
 class _NonFolderPathError(Exception):
-    """Something that only importlib.metadata knows how to search."""
+    """A path that only importlib.metadata can search."""
 
 
 class EntryPoint(NamedTuple):
-    """One entry point: its name, the module or object that it stands for, and the distribution that
-    declares it.
+    """One entry point and the distribution that declares it.
+
+    Attributes:
+        name: its name.
+        value: "module" or "module:object".
+        distribution, version: of the distribution, "?" if unknown.
     """
 
     name: str
@@ -45,15 +47,15 @@ class EntryPoint(NamedTuple):
 
     @property
     def module(self) -> str:
-        """The module that it stands for, or that holds its object."""
+        """The module, or the module that contains the object."""
         return self.value.partition("[")[0].partition(":")[0].strip()
 
     def load(self) -> Any:
-        """The module, or the object in it, imported.
+        """Import and return the module, or the object in it.
 
         Raises:
-            SpecError: where a file of entry points cannot be read.
-            Exception: whatever the import fails with.
+            SpecError: if a file of entry points cannot be read.
+            Exception: any exception of the import.
         """
         if not self.module:
             raise SpecError("its entry_points.txt is not UTF-8, or has an entry without a module")
@@ -63,8 +65,9 @@ class EntryPoint(NamedTuple):
 
 
 def entry_points(group: str) -> list[EntryPoint]:
-    """Every entry point of a group, sorted by name and value; of several distributions of one name
-    those of the first.
+    """Return every entry point of a group, sorted by name and value.
+
+    If several distributions have one name, the first on `sys.path` counts.
     """
     try:
         entries = [entry for folder in _distributions() for entry in _iter_declared(folder, group)]
@@ -74,33 +77,33 @@ def entry_points(group: str) -> list[EntryPoint]:
 
 
 def _distributions() -> Iterator[str]:
-    """The folders that describe the installed distributions, the first one of each name."""
+    """Yield the folders that describe installed distributions, the first of each name."""
     if any(
         hasattr(finder, "find_distributions") and finder is not PathFinder
         for finder in sys.meta_path
     ):
         raise _NonFolderPathError
     seen = set()
-    for place in sys.path:
-        for name in _list_names(place or os.curdir):
+    for path in sys.path:
+        for name in _list_names(path or os.curdir):
             stem, kind = os.path.splitext(name)
             if kind.lower() in _FOLDERS:
                 distribution = normalise_name(stem.partition("-")[0])
                 if distribution not in seen:
                     seen.add(distribution)
-                    yield os.path.join(place, name)
+                    yield os.path.join(path, name)
 
 
 def normalise_name(distribution: str) -> str:
-    """The name of a distribution, in the one way of the several that people write it in."""
+    """Return the normalised name of a distribution: lower case, with hyphens."""
     return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
-def _list_names(place: str) -> list[str]:
-    if place.lower().rstrip("/\\").endswith(".egg"):
+def _list_names(path: str) -> list[str]:
+    if path.lower().rstrip("/\\").endswith(".egg"):
         raise _NonFolderPathError
     try:
-        return os.listdir(place)
+        return os.listdir(path)
     except NotADirectoryError:
         raise _NonFolderPathError from None
     except OSError:
@@ -108,8 +111,10 @@ def _list_names(place: str) -> list[str]:
 
 
 def _iter_declared(folder: str, group: str) -> Iterator[EntryPoint]:
-    """The entry points of a group that one distribution declares; where not all can be read, one
-    that says so among the modules.
+    """Yield the entry points of a group that one distribution declares.
+
+    If the file is not UTF-8, an entry without a module is yielded first for the group of modules;
+    its `load` raises the error.
     """
     text = _text(folder, "entry_points.txt")
     is_damaged = "\ufffd" in text and group == GROUP
@@ -160,9 +165,8 @@ def _read_by_metadata(group: str) -> list[EntryPoint]:
                 entries = [EntryPoint("entry_points.txt", "", name, version)]
             else:
                 entries = []
-        except (
-            FileNotFoundError
-        ):  # so the finder of the library importlib_metadata says that there is no metadata
+        # importlib_metadata's finder raises it if there is no metadata
+        except FileNotFoundError:
             continue
         entries_by_group.setdefault(normalise_name(name), entries)
     return [entry for entries in entries_by_group.values() for entry in entries]

@@ -1,10 +1,10 @@
 """The sensors of this project's distributions, installed or not, read from a table.
 
 `known_sensors.json` is generated from the plugins by `make known-sensors` and is the only place in
-the core that names sensors. It serves two purposes: a sensor that is not installed can be named
-with its distribution, and the installed ones can be listed without loading their plugins. A row
+the core that names sensors. It serves two purposes: messages can name the distribution of a sensor
+that is not installed, and installed sensors can be listed without loading their plugins. A row
 describes one version of a distribution; `plugins` uses it only if that version is installed and its
-entry points name the sensor as the row does.
+entry points have the same names as the row.
 """
 
 from __future__ import annotations
@@ -18,15 +18,18 @@ from typing import Any, NamedTuple
 from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import UnknownSensor, suggest
 
-#: stands for the vendor in an install command that is valid for every vendor.
+#: placeholder for the vendor's distribution in an install command.
 ANY_DISTRIBUTION = "lidarspec-VENDOR"
 _REPOSITORY = "https://github.com/lidarspec/lidarspec"
 _PREFIX = "lidarspec-"
 
 
 class KnownLink(NamedTuple):
-    """A link of a sensor: its kind, "serial", "udp", "tcp" or another, and its bauds or ports, the
-    most likely first.
+    """A link of a sensor.
+
+    Attributes:
+        kind: "serial", "udp", "tcp" or another kind.
+        numbers: baud rates or ports, the most likely first.
     """
 
     kind: str
@@ -50,7 +53,7 @@ class KnownSensor(NamedTuple):
     """A row of the table.
 
     Attributes:
-        signatures: those of its data frames.
+        signatures: constant bytes and sizes of its data frames.
     """
 
     id: str
@@ -100,8 +103,9 @@ def known_sensors() -> tuple[KnownSensor, ...]:
 
 
 def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
-    """Return the rows whose distribution is installed in the version of the row, with entry points
-    of exactly its names.
+    """Return the rows that describe installed entry points exactly.
+
+    The distribution must be installed in the version of the row, with the names of the row.
     """
     offered: dict[tuple[str, str], dict[str, set[str]]] = {}
     for entry in entries:
@@ -115,11 +119,10 @@ def describe_entry_points(entries: Iterable[EntryPoint]) -> list[KnownSensor]:
 
 
 def list_described_sensors() -> list[KnownSensor] | None:
-    """Return a row for each installed sensor, sorted by id; None if the table does not describe all
-    of them.
+    """Return a row for each installed sensor, sorted by id; None if rows are missing.
 
-    Then plugins have to be loaded: one that has hooks, is not of this project, or has a name that
-    another one has too.
+    Then plugins must be loaded: a plugin has hooks, belongs to another project, or has a name that
+    another plugin has, too.
     """
     if entry_points(GROUP):
         return None
@@ -132,7 +135,7 @@ def list_described_sensors() -> list[KnownSensor] | None:
 
 
 def find_known_sensor(name: str) -> KnownSensor | None:
-    """Return the row with an id or alias, whatever its case and hyphens, else None."""
+    """Return the row with an id or alias in any case, with or without hyphens, or None."""
     letters = _letters(name)
     return next(
         (row for row in known_sensors() if any(_letters(known) == letters for known in row.names)),
@@ -147,8 +150,8 @@ def _letters(name: str) -> str:
 def install_command(*distributions: str, extra: str = "") -> str:
     """Return the command that installs distributions of this project.
 
-    No package index has them yet. If lidarspec runs from a checkout, the command names folders of
-    it, else the repository.
+    No package index has them yet. If lidarspec runs from a checkout, the command names its folders,
+    otherwise the repository.
     """
     extras = f"[{extra}]" if extra else ""
     plugins = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "plugins")
@@ -169,9 +172,7 @@ def _quote(word: str) -> str:
 
 
 def no_sensors() -> str:
-    """Return the text for an environment without any sensor: how to install those of a vendor, and
-    the vendors.
-    """
+    """Return the message for an environment without sensors, with the install command."""
     vendors = sorted({row.distribution.removeprefix(_PREFIX) for row in known_sensors()})
     return (
         f"no sensor is installed: {install_command(ANY_DISTRIBUTION)}\n  vendors:"
@@ -185,8 +186,7 @@ def unknown_sensor(
     aliases: Mapping[str, str],
     failures: Mapping[str, str],
 ) -> UnknownSensor:
-    """Return the error for a sensor that is not installed, with the command that installs it if the
-    table has it.
+    """Return the error for an unknown sensor, with its install command if it is known.
 
     Args:
         name: an id or alias.

@@ -1,5 +1,6 @@
-"""Files that are written beside the ones whose place they take, and what killed processes left of
-them.
+"""Names of files while they are written, and removal of files that killed processes left.
+
+A file is written under a temporary name in the folder of its destination, and renamed at the end.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from pathlib import Path
 from lidarspec.errors import SourceError
 from lidarspec.remote_files import remove
 
-#: seconds without a write after which the file of a process that has ended is removed; another
-#: computer may be writing to it.
+#: seconds without a write before the file of an ended process is removed; a process with the same
+#: number on another computer may still be writing it.
 ABANDONED_AFTER_S = 60.0
 
 
 def path_while_written(path: Path) -> Path:
-    """Return where this process writes a file or folder until it takes its place."""
+    """Return the temporary path of a file or folder while this process writes it."""
     return path.with_name(f".{os.getpid()}.{path.name}")
 
 
@@ -39,9 +40,7 @@ def remove_abandoned(path: Path) -> None:
 
 @functools.cache  # listed once: a folder can get many thousands of files
 def _list_unfinished(folder: Path) -> list[tuple[int, str]]:
-    """Return process and name of what is unfinished in a folder when this process writes there
-    first.
-    """
+    """Return (process, name) of the unfinished files in a folder."""
     try:
         names = os.listdir(folder)
     except OSError:
@@ -51,7 +50,7 @@ def _list_unfinished(folder: Path) -> list[tuple[int, str]]:
 
 
 def is_running(process: int) -> bool:
-    """Return whether a process exists; True if the system has no way to tell."""
+    """Return whether a process exists; True if the system cannot report it."""
     if os.name != "posix":
         return True
     try:
