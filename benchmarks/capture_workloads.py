@@ -40,7 +40,7 @@ HOSTILE = 100_000  # bytes of a hostile stream
 
 
 def from_capture(inputs: Inputs, key: str, title: str, more: Others | None = None) -> Work:
-    """A capture file to scans, against the same packets in memory."""
+    """Return a capture file to scans, against the same packets in memory."""
     sensor, rows, path = inputs.sensor(key), inputs.array(key), inputs.capture(key)
     points = len(sensor.decode(rows).points())
 
@@ -116,7 +116,7 @@ def payloads(inputs: Inputs) -> Work:
 
 
 def one_by_one_of(path: Path) -> int:
-    """The same payloads as an object each."""
+    """Return the same payloads as an object each."""
     with CaptureReader(path) as reader:
         return sum(len(datagram.data) for datagram in reader)
 

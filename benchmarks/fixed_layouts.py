@@ -49,7 +49,7 @@ from lidarspec_sick import compact, telegrams
 def make_sensor(
     struct: Construct, points: Any, size: int, *, scan: str, clock: str, stream: bool = False
 ) -> Sensor:
-    """A sensor with frames of this size alone."""
+    """Return a sensor with frames of this size alone."""
     return Sensor(
         "fixed-places",
         vendor="Fixed",
@@ -66,7 +66,7 @@ def make_sensor(
 
 
 def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
-    """A telegram of one module, as `lidarspec_sick.compact` has it."""
+    """Return a telegram of one module, as `lidarspec_sick.compact` has it."""
     (module,) = sensor.parse(frame).modules
     layers, beams, echoes = module.layer_count, module.beam_count, module.echo_count
     echo = Struct("distance" / Scaled(Int16ul, 0.001, "m"), "strength" / Int16ul)
@@ -166,7 +166,7 @@ def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
 
 
 def livox_packet(sensor: ls.Sensor, frame: bytes) -> Sensor:
-    """A packet of points in millimetres, as `lidarspec_livox.sdk2` has it."""
+    """Return a packet of points in millimetres, as `lidarspec_livox.sdk2` has it."""
     shots = sensor.parse(frame).dot_num
     points = "points" / Array(shots, Struct(*livox.MILLIMETRES, livox.REFLECTIVITY, livox.TAG))
     struct = Struct(

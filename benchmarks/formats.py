@@ -148,7 +148,7 @@ def process(*command: object) -> Spent:
 
 
 def capture(inputs: Inputs, key: str, size: int) -> Path:
-    """A simulated capture of about so many bytes."""
+    """Return a simulated capture of about so many bytes."""
     path, made = inputs.folder / f"{key}-{size}.pcap", CAPTURES[key]
     if path.exists():
         return path
@@ -164,7 +164,7 @@ def capture(inputs: Inputs, key: str, size: int) -> Path:
 
 
 def write_simulated_capture(path: Path, sensor: str, seconds: float) -> Path:
-    """A capture of a simulated sensor."""
+    """Return a capture of a simulated sensor."""
     line = [
         sys.executable,
         "-m",
@@ -197,13 +197,13 @@ def write_repeated_capture(once: Path, path: Path, size: int, period: int) -> Pa
 
 @functools.cache
 def points_of(path: Path, sensor: str) -> int:
-    """The points of a capture that are written."""
+    """Return the points of a capture that are written."""
     with ls.open(path, sensor) as device:
         return sum(int(scan.points.valid.sum()) for scan in device.scans())
 
 
 def files(out: Path) -> Iterator[Path]:
-    """A file itself, or all of a folder."""
+    """Return a file itself, or all of a folder."""
     return (file for file in (out.rglob("*") if out.is_dir() else [out]) if file.is_file())
 
 
@@ -302,7 +302,7 @@ def written(
 
 
 def converting(inputs: Inputs, key: str, suffix: str) -> Work:
-    """A capture to a file, beside what a user would write."""
+    """Return a capture to a file, beside what a user would write."""
     made, out = CAPTURES[key], inputs.folder / "out" / f"points{suffix}"
     path, part = (
         capture(inputs, key, inputs.size // made.share),

@@ -192,7 +192,7 @@ class Scratch:
         self.single = np.empty((5, points), np.float32)
 
     def directions(self, clockwise: NDArray[np.float64], count: int) -> tuple[Floats, Floats]:
-        """The cosine and the sine of angles in degrees, turned counter-clockwise."""
+        """Return the cosine and the sine of angles in degrees, turned counter-clockwise."""
         angle, east, north = (row[:count] for row in self.single[2:])
         np.multiply(clockwise.reshape(-1), -np.pi / 180, out=angle, casting="same_kind")
         return np.cos(angle, out=east), np.sin(angle, out=north)
@@ -211,5 +211,5 @@ def _metres(step: float) -> Floats:
 
 
 def column(buffer: NDArray[Any], offset: int, kind: str, stride: int, count: int) -> NDArray[Any]:
-    """A field of each of so many elements that stand at one distance."""
+    """Return a field of each of so many elements that stand at one distance."""
     return np.ndarray((count,), kind, buffer.view(np.uint8).data, offset, (stride,))

@@ -254,7 +254,7 @@ def rplidar_points(nodes: Bytes) -> Floats:
 
 
 def rplidar_stream(data: bytes, opening: int) -> Floats:
-    """The same of a stream of nodes behind so many other bytes, if nothing disturbs it."""
+    """Return the same of a stream of nodes behind so many other bytes, if nothing disturbs it."""
     stream = np.frombuffer(data, np.uint8)[opening:]
     return rplidar_points(stream[: len(stream) // 5 * 5].reshape(-1, 5))
 

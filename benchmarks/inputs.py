@@ -75,12 +75,12 @@ class Inputs:
         self.capture: Callable[[str], Path] = functools.cache(self._capture)
 
     def sensor(self, key: str) -> ls.Sensor:
-        """The sensor of this name, configured."""
+        """Return the sensor of this name, configured."""
         name, _, options = SENSORS[key]
         return ls.sensor(name).configure(**options) if options else ls.sensor(name)
 
     def array(self, key: str) -> Bytes:
-        """The frames that have the full length, (n, size)."""
+        """Return the frames that have the full length, (n, size)."""
         frames = self.frames(key)
         size = max(map(len, frames))
         return np.frombuffer(
@@ -88,11 +88,11 @@ class Inputs:
         ).reshape(-1, size)
 
     def stream(self, key: str) -> bytes:
-        """All frames in a row, after what the sensor sends before them."""
+        """Return all frames in a row, after what the sensor sends before them."""
         return make_opening_frame(self.sensor(key)) + b"".join(self.frames(key))
 
     def noisy(self, key: str) -> Noisy:
-        """The frames with one byte of every fiftieth damaged, and as many runs of noise of a
+        """Return the frames with one byte of every fiftieth damaged, and as many runs of noise of a
         frame's mean length between them.
         """
         random = np.random.default_rng(SEED)
@@ -118,7 +118,7 @@ class Inputs:
         return simulate(self.sensor(key), count // QUICKER if self.is_quick else count)
 
     def _capture(self, key: str) -> Path:
-        """A pcap file of the frames, one datagram each."""
+        """Return a pcap file of the frames, one datagram each."""
         path = self.folder / f"{key}.pcap"
         sender, receiver = ("192.168.1.200", 6699), ("192.168.1.102", 6699)
         with path.open("wb") as file:

@@ -77,7 +77,7 @@ def dpkt_payloads(path: Path, packets: int) -> Contender:
 
 
 def ouster_payloads(path: Path, packets: int) -> Contender:
-    """The C++ reader under ouster-sdk: the payloads of a capture into one buffer."""
+    """Return the C++ reader under ouster-sdk: the payloads of a capture into one buffer."""
     pcap = library("ouster.sdk._bindings.pcap")
     buffer = np.empty(1 << 16, np.uint8)
 
@@ -125,7 +125,7 @@ def ouster_scans(
 
 
 def rplidar_nodes(frames: Sequence[bytes]) -> Contender:
-    """The package rplidar, what it makes of each node."""
+    """Return the package rplidar, what it makes of each node."""
     parse = library("rplidar")._process_scan
     return Contender(lambda: [parse(frame) for frame in frames], len(frames))
 

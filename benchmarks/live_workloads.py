@@ -85,7 +85,7 @@ class Line:
         self.share.setdefault(backend, []).append(100 * spent)
 
     def facts(self, backend: str, rates: Rates) -> Facts:
-        """The medians over the runs."""
+        """Return the medians over the runs."""
         return {
             "ms from a frame's last byte to its points": median(self.late[backend]),
             f"% of one core at {self._rate:.0f} frames/s": median(self.share[backend]),
@@ -129,7 +129,7 @@ def live(
     rate: float,
     opened: Callable[[], contextlib.AbstractContextManager[Any]],
 ) -> Work:
-    """A line at its sensor's rate for some seconds."""
+    """Return a line at its sensor's rate for some seconds."""
     seconds = QUICK_SECONDS if inputs.is_quick else SECONDS
     frames = [row.tobytes() for row in inputs.array(key)]
     line, number = Line(inputs.sensor(key), frames, rate, seconds, opened), int(rate * seconds)

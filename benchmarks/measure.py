@@ -102,7 +102,7 @@ def times(rates: Rates, fast: str, slow: str) -> float:
 
 
 def memcpy(*, quick: bool = False) -> Contender:
-    """A copy of a large buffer; the amount is bytes."""
+    """Return a copy of a large buffer; the amount is bytes."""
     source = np.ones(COPIED >> 4 if quick else COPIED, np.uint8)
     target = np.zeros_like(source)
     return Contender(lambda: np.copyto(target, source), source.size)

@@ -98,7 +98,7 @@ def points_of(sensor: ls.Sensor, data: Any, backend: str) -> Callable[[], Any]:
 
 
 def plainly(sensor: ls.Sensor, data: Any) -> Callable[[], Any]:
-    """The same with the plain evaluation of `points`."""
+    """Return the same with the plain evaluation of `points`."""
     return lambda: columns(evaluate_plainly(sensor.decode(data, backend="numpy")).cloud)
 
 
@@ -156,7 +156,7 @@ def in_stream(
     more: Others,
     facts: Any = no_facts,
 ) -> Work:
-    """A byte stream to points: framing and checksums included."""
+    """Return a byte stream to points: framing and checksums included."""
     sensor = inputs.sensor(key)
     points = len(sensor.decode(data).points())
     others: Others = {
@@ -250,7 +250,7 @@ FIXED: Mapping[str, tuple[str, Callable[[ls.Sensor, bytes], ls.Sensor], bool]] =
 
 
 def beside_fixed(inputs: Inputs, key: str) -> Work:
-    """The sensor's frames, and the same bytes read with every field at a fixed place."""
+    """Return the sensor's frames, and the same bytes read with every field at a fixed place."""
     title, made, is_stream = FIXED[key]
     sensor, simple = inputs.sensor(key), made(inputs.sensor(key), inputs.frames(key)[0])
     data: Any = b"".join(inputs.frames(key)) if is_stream else inputs.array(key)
@@ -269,7 +269,7 @@ def beside_fixed(inputs: Inputs, key: str) -> Work:
 
 
 def in_text(inputs: Inputs, key: str, title: str) -> Work:
-    """A stream of frames in text."""
+    """Return a stream of frames in text."""
     sensor, data = inputs.sensor(key), b"".join(inputs.frames(key))
     points = len(sensor.decode(data).points())
     others: Others = {"plain": lambda: Contender(plainly(sensor, data), points)}

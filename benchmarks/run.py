@@ -76,7 +76,7 @@ def rows(
     least: float,
     clock: Clock,
 ) -> Iterator[dict[str, Any]]:
-    """The lines of a work, one for each back end, all measured in turn."""
+    """Yield the lines of a work, one for each back end, all measured in turn."""
     chosen = backends if work.has_backends else [""]
     others, missing = work.prepare_others()
     runs, least = (1, 0.0) if work.after else (runs, least)
@@ -156,7 +156,7 @@ def record(found: list[dict[str, Any]], *, quick: bool, cpu: bool) -> dict[str, 
 
 
 def arguments() -> argparse.Namespace:
-    """The command line."""
+    """Return the command line."""
     parser = argparse.ArgumentParser(prog="make bench", description=__doc__)
     names = ", ".join(WORKS)
     parser.add_argument(

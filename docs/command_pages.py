@@ -39,7 +39,7 @@ OBVIOUS_LIMIT = re.compile(r"; x>=?[01](?=\])| \[x>=?[01]\]")
 
 
 def context(verb: str) -> click.Context:
-    """The verb as it is invoked; of "" the command itself."""
+    """Return the verb as it is invoked; of "" the command itself."""
     top = click.Context(root, info_name="lidarspec", **root.context_settings)
     command = root.get_command(top, verb)
     return click.Context(command, info_name=verb, parent=top) if command else top
@@ -60,7 +60,7 @@ def usage(verb: str) -> str:
 
 
 def options(verb: str) -> list[tuple[str, str]]:
-    """Each option of its own as it is typed, and what it does."""
+    """Return each option of its own as it is typed, and what it does."""
     own = (
         param
         for param in context(verb).command.params
@@ -165,7 +165,7 @@ def node(text: str) -> str:
 
 
 def manual(verb: str) -> str:
-    """The manual page of a verb; of "" that of the command."""
+    """Return the manual page of a verb; of "" that of the command."""
     name = f"lidarspec-{verb}" if verb else "lidarspec"
     said = paragraphs(verb)
     lines = [

@@ -41,7 +41,7 @@ FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 
 
 def write_simulated_file(sensor: str, file: Path, duration: str) -> Path:
-    """A file with what a simulated sensor sends in a while."""
+    """Return a file with what a simulated sensor sends in a while."""
     words = ["sim", sensor, "--to", str(file), "-t", duration, "--seed", "7", "-q"]
     subprocess.run(
         [sys.executable, "-m", "lidarspec", *words], check=True, stdout=subprocess.DEVNULL
@@ -50,7 +50,7 @@ def write_simulated_file(sensor: str, file: Path, duration: str) -> Path:
 
 
 def terminal(folder: Path) -> str:
-    """The window of `view`, some seconds into a file."""
+    """Return the window of `view`, some seconds into a file."""
     with ls.open(
         write_simulated_file("ldrobot-stl27l", folder / "room.pcap", "5s"), "ldrobot-stl27l"
     ) as device:
@@ -64,7 +64,7 @@ def terminal(folder: Path) -> str:
 
 
 def cloud() -> str:
-    """A scan of a spinning lidar."""
+    """Return a scan of a spinning lidar."""
     sensor = ls.sensor("ouster-os1")
     scan = next(scan for scan in sensor.scans(simulate(sensor, 600)) if scan.complete)
     return svg(
@@ -77,7 +77,7 @@ def cloud() -> str:
 
 
 def packet() -> str:
-    """The packet diagram of a sensor."""
+    """Return the packet diagram of a sensor."""
     return diagram(select_frame(ls.sensor("ldrobot-stl27l"), "data"))
 
 

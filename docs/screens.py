@@ -44,7 +44,7 @@ def draw_window(
     ramp: str = "range",
     called: str = "",
 ) -> CellGrid:
-    """The window of `view` after some seconds."""
+    """Return the window of `view` after some seconds."""
     with ls.open(source, sensor) as device:
         feed = LiveScans(device, played=True)
         window = Window(feed, called or source, ramp=ramp)
@@ -161,7 +161,7 @@ def renew_page(page: str) -> str:
 
 
 def run_command(command: str, link: Path) -> str:
-    """A command as the page has it, and what it prints."""
+    """Return a command as the page has it, and what it prints."""
     words = [str(link) if word == PORT else word for word in command.split()]
     program = [sys.executable, "-m", "lidarspec", *words]
     done = subprocess.run(
@@ -178,7 +178,7 @@ def run_command(command: str, link: Path) -> str:
 
 
 def make_unknown_frame(index: int) -> bytes:
-    """A frame of nobody's: two bytes of sync, a counter, noise, and a CRC."""
+    """Return a frame of nobody's: two bytes of sync, a counter, noise, and a CRC."""
     body = b"\x9a\x51" + index.to_bytes(2, "little") + random.Random(index).randbytes(20)
     return body + Crc(16, 0x1021, 0xFFFF)(body).to_bytes(2, "little")
 

@@ -31,7 +31,7 @@ def repeat(value: int, *shape: int) -> NDArray[np.int64]:
 def select_values(
     values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice
 ) -> NDArray[np.int64]:
-    """The values, (k,), that a mask, indices or a slice pick; equal ones stay `repeat`."""
+    """Return the values, (k,), that a mask, indices or a slice pick; equal ones stay `repeat`."""
     value = broadcast_value(values)
     if value is None or isinstance(which, slice):
         return values[which]
@@ -49,7 +49,7 @@ def count_up(count: int) -> NDArray[np.int64]:
 
 
 def is_counted(numbers: NDArray[np.int64]) -> bool:
-    """Whether numbers are known to ascend, because they are from `count_up`."""
+    """Return whether numbers are known to ascend, because they are from `count_up`."""
     return numbers.base is _numbers() and numbers.strides[0] > 0
 
 
@@ -91,7 +91,7 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
 def take_rows(
     rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """The rows of bytes that indices or a mask pick, (k, size), each copied as one piece."""
+    """Return the rows of bytes that indices or a mask pick, (k, size), each copied as one piece."""
     whole = rows.view(f"V{rows.shape[1]}")[:, 0]
     if which.dtype != np.bool_ and rows.flags.c_contiguous:
         some = whole.take(which)

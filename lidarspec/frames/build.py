@@ -35,7 +35,7 @@ def build(
     *,
     units: bool = False,
 ) -> bytes:
-    """The bytes of one frame; constants, counts and the checksum are filled in.
+    """Return the bytes of one frame; constants, counts and the checksum are filled in.
 
     Args:
         value: a mapping of all fields, such as what `parse` returned, or None; `values` override

@@ -26,7 +26,7 @@ from lidarspec.spec.tree import FieldInfo
 
 
 def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, Any]) -> bytes:
-    """The bytes of a command, none for one that only moves lines.
+    """Return the bytes of a command, none for one that only moves lines.
 
     Args:
         arguments: by name, in the units of their fields; a value that is found out when it is sent
@@ -153,7 +153,7 @@ def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> Argume
 
 
 def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, place: str) -> Any:
-    """The raw value of a field that an argument stands for.
+    """Return the raw value of a field that an argument stands for.
 
     Raises:
         UsageError: for what it does not take.

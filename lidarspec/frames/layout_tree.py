@@ -72,7 +72,7 @@ class CutOffError(Exception):
 def layout_of(
     root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None
 ) -> Layout:
-    """The layout of the frames whose header fields have these values.
+    """Return the layout of the frames whose header fields have these values.
 
     Args:
         values: raw, by path, of the fields that the layout depends on.
@@ -102,7 +102,7 @@ def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
 
 
 def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
-    """The constants whose place depends on no header field: offset -> (mask, value)."""
+    """Return the constants whose place depends on no header field: offset -> (mask, value)."""
     walk = HeaderWalk({}, limit)
     with contextlib.suppress(
         Exception
@@ -151,7 +151,7 @@ class HeaderWalk:
     parts: dict[str, Leaf | PartsSize | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
-        """The layout that the walk found."""
+        """Return the layout that the walk found."""
         held = self._held_bits()
         self.asked = _unknown  # what follows from the header asks for no more of it
         seals = tuple(_in_order(self.seals))
@@ -563,7 +563,7 @@ class HeaderNode:
         return self.value_classes.representative(value)
 
     def child(self, value: int) -> HeaderNode:
-        """The branch of a value."""
+        """Return the branch of a value."""
         if value not in self.children:
             assert self.leaf is not None
             self.children[value] = HeaderNode({**self.values, self.leaf.info.path: value}, self)
@@ -657,13 +657,13 @@ class _ValueClasses:
         return cls(info.limits, low, high)
 
     def mark_too_long(self, value: int) -> _ValueClasses:
-        """The same, where the frame of a value is known to be too long."""
+        """Return the same, where the frame of a value is known to be too long."""
         if self.rises is not None and self.rises <= value < self.high:
             return replace(self, high=value)
         return self
 
     def representative(self, value: int) -> int:
-        """The value that stands for one that means the same."""
+        """Return the value that stands for one that means the same."""
         if self.keys:
             if value in self.keys:
                 return value
@@ -671,7 +671,7 @@ class _ValueClasses:
         return min(max(value, self.low), self.high)
 
     def representatives(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Those that stand for many, of their shape and type."""
+        """Return those that stand for many, of their shape and type."""
         if (self.low, self.high) == self.limits and not self.keys:
             return values
         if self.keys:
@@ -703,7 +703,7 @@ def _counts(node: tree.Node, formula: tree.Formula) -> bool:
 
 
 def _is_increasing(formula: tree.Formula) -> bool:
-    """Whether a formula is of one field, and never falls as that grows."""
+    """Return whether a formula is of one field, and never falls as that grows."""
     match formula:
         case tree.Ref() | tree.Op("+", (int(), tree.Ref())):
             return True
@@ -713,7 +713,7 @@ def _is_increasing(formula: tree.Formula) -> bool:
 
 
 def _with_value(formula: tree.Formula, value: int) -> int:
-    """A formula of one field, where that has this value."""
+    """Return a formula of one field, where that has this value."""
     return int(tree.evaluate(formula, lambda _: value))
 
 
@@ -884,7 +884,7 @@ class HeaderTree:
         return groups
 
     def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
-        """The fields and the constants whose place depends on no header field."""
+        """Return the fields and the constants whose place depends on no header field."""
         self._explore(self._root)
         if isinstance(self._root.result, Layout):
             leaves = self._root.result.leaves
@@ -940,7 +940,7 @@ class HeaderTree:
             self._size = 0
 
     def layout(self, frame: bytes) -> Layout | LayoutRefusal | None:
-        """The layout of one frame, or None where its header is not all there."""
+        """Return the layout of one frame, or None where its header is not all there."""
         return self._end(frame, self._root).result
 
     def layout_for(self, read: Callable[[Leaf | PartsSize], int]) -> Layout:
@@ -1071,7 +1071,7 @@ def kinds_of(
 
 @functools.lru_cache(maxsize=2048)
 def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
-    """The layouts of a frame type, or why they cannot be computed."""
+    """Return the layouts of a frame type, or why they cannot be computed."""
     try:
         check_compilable(frame.tree)
         return HeaderTree(frame.tree, frame.room)

@@ -283,7 +283,7 @@ def _pieces(
 
 
 def xor_words(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.uint64]:
-    """The XOR of some words of each row, (n,)."""
+    """Return the XOR of some words of each row, (n,)."""
     total = np.zeros(columns.shape[1], np.uint64)
     if len(which):
         total[:] = columns[which[0]]
@@ -293,7 +293,7 @@ def xor_words(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.u
 
 
 def fold_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The XOR of the eight bytes of each word, (n,); `total` is used up."""
+    """Return the XOR of the eight bytes of each word, (n,); `total` is used up."""
     part = np.empty_like(total)
     for bits in (32, 16, 8):
         np.bitwise_xor(total, np.right_shift(total, np.uint64(bits), out=part), out=total)
@@ -301,7 +301,7 @@ def fold_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def sum_bytes(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """The sum of all bytes of each row; (n,)."""
+    """Return the sum of all bytes of each row; (n,)."""
     total = np.zeros(columns.shape[1], np.uint64)
     even = np.uint64(0x00FF00FF00FF00FF)
     for first in range(0, len(columns), 128):  # 128 * 2 * 255 is less than 2**16
@@ -330,7 +330,7 @@ def compute_registers(
 
 
 def gather_spans(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
-    """The bytes of each row that some spans cover, one span after another, (n, bytes)."""
+    """Return the bytes of each row that some spans cover, one span after another, (n, bytes)."""
     parts = [rows[:, start:stop] for start, stop in spans]
     if len(parts) == 1:
         return parts[0]

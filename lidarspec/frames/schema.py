@@ -193,7 +193,7 @@ class Schema:
         }
 
     def axis(self, name: str) -> str:
-        """The path of an array, by it or by its last part.
+        """Return the path of an array, by it or by its last part.
 
         Raises:
             SpecError: where there is none of that name, or several.
@@ -212,11 +212,11 @@ class Schema:
         return found[0]
 
     def outer(self, axis: str) -> list[str]:
-        """The arrays that an array is in."""
+        """Return the arrays that an array is in."""
         return [other for other in self.arrays if axis.startswith((f"{other}.", f"{other}["))]
 
     def depth(self) -> int:
-        """The largest number of nested arrays."""
+        """Return the largest number of nested arrays."""
         return len(self.chain)
 
 
@@ -228,7 +228,7 @@ def counting_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str | N
 
 @lru_cache(maxsize=4096)
 def schema(root: Node) -> Schema:
-    """The table of fields of a frame's tree."""
+    """Return the table of fields of a frame's tree."""
     fields: dict[str, FieldInfo] = {}
     arrays: dict[str, Formula | None] = {}
     derived: dict[str, FieldInfo] = {}

@@ -54,7 +54,7 @@ class SizeFormula:
         return SizeFormula(self.number + other.number, self.terms + other.terms)
 
     def times(self, factor: int | str) -> SizeFormula:
-        """The extent of so many elements."""
+        """Return the extent of so many elements."""
         if isinstance(factor, int):
             return SizeFormula(
                 self.number * factor, tuple(f"{factor}*({term})" for term in self.terms)
@@ -85,7 +85,7 @@ class SizeFormula:
 
 
 def wire_table(frame: Frame) -> tuple[WireRow, ...]:
-    """The rows of a frame type in the order of the wire."""
+    """Return the rows of a frame type in the order of the wire."""
     seals = {
         path: _describe_seal(node)
         for node in tree.nodes(frame.tree)
@@ -96,7 +96,7 @@ def wire_table(frame: Frame) -> tuple[WireRow, ...]:
 
 
 def frame_size(frame: Frame) -> str:
-    """The length of a frame in bytes: a number, or a formula of its header fields."""
+    """Return the length of a frame in bytes: a number, or a formula of its header fields."""
     return str(extent(frame.tree))
 
 
@@ -134,7 +134,7 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
 
 
 def _length(size: tree.Formula | None, shown: str) -> SizeFormula:
-    """A declared length; None for one that only the bytes tell."""
+    """Return a declared length; None for one that only the bytes tell."""
     if isinstance(size, int):
         return SizeFormula(size)
     return SizeFormula(0, (f"size({shown})" if size is None else format_formula(size),))
@@ -160,7 +160,7 @@ def _element(shown: str) -> tuple[str, str]:
 def _rows(
     node: tree.Node, shown: str, start: SizeFormula, condition: str, seals: Mapping[str, str]
 ) -> Iterator[WireRow]:
-    """The rows of a part that begins at `start`, and is there under a condition."""
+    """Yield the rows of a part that begins at `start`, and is there under a condition."""
     match node:
         case tree.Struct():
             for member in node.members:
@@ -264,7 +264,7 @@ def _type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
 
 
 def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
-    """The alternatives of a part, each with its condition in words."""
+    """Return the alternatives of a part, each with its condition in words."""
     if isinstance(node, tree.When):
         condition_text = format_formula(node.condition)
         return [(f"if {condition_text}", node.then), (f"unless {condition_text}", node.otherwise)]
@@ -315,7 +315,7 @@ def format_formula(formula: tree.Formula) -> str:
 
 
 def _is_enclosed(text: str) -> bool:
-    """Whether the first bracket of a text closes at its end."""
+    """Return whether the first bracket of a text closes at its end."""
     depths = list(itertools.accumulate((part == "(") - (part == ")") for part in text))
     return text.startswith("(") and depths.index(0) == len(text) - 1
 

@@ -37,7 +37,7 @@ from lidarspec.framing.results import (
 def sort_datagrams(
     framing: Framing, buffer: Bytes1D, starts: Numbers, sizes: Indices, mode: SearchState
 ) -> PieceResult:
-    """The type of each datagram.
+    """Return the type of each datagram.
 
     Args:
         buffer: what the datagrams stand in.
@@ -77,7 +77,7 @@ class _DatagramBatch:
         self._piece = PieceResult(Frames.make_empty(buffer), len(buffer))
 
     def sort(self, mode: SearchState) -> PieceResult:
-        """All of them."""
+        """Return all of them."""
         position = 0
         parts = list[Frames]()
         while position < len(self._starts):
@@ -89,7 +89,7 @@ class _DatagramBatch:
         return self._piece
 
     def _sort_from(self, position: int, mode: SearchState) -> Frames:
-        """The types from here up to the datagram that changes what is looked for."""
+        """Return the types from here up to the datagram that changes what is looked for."""
         if mode.after not in self._known:
             frames, reasons = self._judge(self._starts[position:], self._sizes[position:], mode)
             if self._framing.named:
@@ -118,7 +118,7 @@ class _DatagramBatch:
         return frames
 
     def _judge(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
-        """The type and layout of each datagram while nothing changes what is looked for.
+        """Return the type and layout of each datagram while nothing changes what is looked for.
 
         Returns:
             They, and why those that are no frames are none, 0 where they resemble none; `PLUGIN`

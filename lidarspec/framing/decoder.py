@@ -496,7 +496,7 @@ def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
 
 
 def is_stream(data: Any) -> bool:
-    """Whether an input is one run of bytes, not datagrams.
+    """Return whether an input is one run of bytes, not datagrams.
 
     Raises:
         UsageError: for a text or a path.

@@ -59,7 +59,7 @@ NOTHING: Drawn = {}
 
 
 def example(sensor: SensorDescription, frame: str, *, seed: int = 0) -> bytes:
-    """The bytes of a valid frame with seeded random content.
+    """Return the bytes of a valid frame with seeded random content.
 
     Raises:
         UnknownFrame: with the closest known name.
@@ -131,7 +131,7 @@ def _header(
 
 
 def _switch_keys(root: Node) -> Iterator[int]:
-    """The values of keys that have no name: fields are known to have those with one."""
+    """Yield the values of keys that have no name: fields are known to have those with one."""
     for node in nodes(root):
         if isinstance(node, Select):
             labels = node.key.info.labels if isinstance(node.key, Ref) else ()

@@ -54,7 +54,7 @@ class Codec:
         gathered: bool = True,
         sums: Sums | None = None,
     ) -> Frames:
-        """The candidates at these offsets, each with its layout and whether it is a frame.
+        """Return the candidates at these offsets, each with its layout and whether it is a frame.
 
         Args:
             offsets: those whose prefix does not match must be left out.

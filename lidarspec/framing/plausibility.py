@@ -103,7 +103,7 @@ class CandidateChecker:
     def __call__(
         self, rows: Bytes2D, errors: list[PluginError], sums: Sums | None = None
     ) -> NDArray[np.uint8]:
-        """The status of each candidate, (n,).
+        """Return the status of each candidate, (n,).
 
         Args:
             rows: the candidates, whole, one a row.
@@ -178,7 +178,7 @@ def _check_valid_parts(
 def _check_parts(
     region: Region, errors: list[PluginError], sums: Sums | None, rows: Bytes2D
 ) -> NDArray[np.uint8]:
-    """The status of each frame, (n,), by its parts."""
+    """Return the status of each frame, (n,), by its parts."""
     buffer, walked = region.in_rows(rows)
     status = OF_PARTS[walked.status]
     errors += walked.errors
@@ -347,7 +347,7 @@ class _LookupTable:
     bits: tuple[int, tuple[int, ...]] | None = None
 
     def holds(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """Whether the condition holds for each of the values, of their shape."""
+        """Return whether the condition holds for each of the values, of their shape."""
         if self.limits is not None:
             low, high = map(values.dtype.type, self.limits)
             return np.asarray(
@@ -384,7 +384,7 @@ class LookupCondition:
     strides: tuple[int, ...]
 
     def __call__(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Whether the condition holds in each frame, (n,)."""
+        """Return whether the condition holds in each frame, (n,)."""
         if not len(rows):
             return np.empty(0, np.bool_)
         held = self._each(rows)
@@ -408,7 +408,7 @@ class LookupCondition:
         return np.asarray(held.all(axis=1))
 
     def _each(self, rows: Bytes2D) -> NDArray[np.bool_]:
-        """Whether it holds for each element, (n, *shape)."""
+        """Return whether it holds for each element, (n, *shape)."""
         view = elements(rows, self.table.dtype, self.offset, self.shape, self.strides)
         if view.itemsize == 1:
             values = view
@@ -418,7 +418,7 @@ class LookupCondition:
 
 
 def _table(part: FrameTest, leaves: Mapping[str, Leaf], size: int) -> _LookupTable:
-    """A condition on so many bytes, at most two."""
+    """Return a condition on so many bytes, at most two."""
     for dtype in map(np.dtype, ("<u2", ">u2") if size == 2 else ("u1",)):
         blocks = np.split(
             np.arange(1 << 8 * dtype.itemsize, dtype=dtype), 16

@@ -108,7 +108,7 @@ class Counters:
     masked: str = field(default="", repr=False, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """The counters by name."""
+        """Return the counters by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.compare}
 
     def error(self, failure: PluginError, number: int) -> None:
@@ -235,7 +235,7 @@ class Frames:
 
     @classmethod
     def make_empty(cls, buffer: NDArray[np.uint8]) -> Frames:
-        """No frames."""
+        """Return no frames."""
         return cls(buffer, repeat(-1, 0), range(0), repeat(0, 0))
 
     @classmethod
@@ -307,7 +307,7 @@ class Frames:
         return not np.count_nonzero(self.status)
 
     def select(self, which: NDArray[np.bool_] | Indices | slice) -> Frames:
-        """The frames that a mask, ascending indices or a slice choose."""
+        """Return the frames that a mask, ascending indices or a slice choose."""
         if not (isinstance(which, slice) or which.dtype != np.bool_):
             which = np.flatnonzero(which)
         rows = self.rows
@@ -329,7 +329,7 @@ class Frames:
         return self._with(**chosen, rows=rows, _starts=starts, places=places)
 
     def by_layout(self) -> list[tuple[Layout, Indices]]:
-        """Each layout that is known, with the indices of its frames, (k,)."""
+        """Return each layout that is known, with the indices of its frames, (k,)."""
         form = broadcast_value(self.forms)
         if form is not None:
             if form >= 0:
@@ -383,11 +383,11 @@ class Frames:
         return changed
 
     def data(self, index: int) -> bytes:
-        """The bytes of one frame."""
+        """Return the bytes of one frame."""
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
 
     def found(self) -> list[Found]:
-        """The frames one by one."""
+        """Return the frames one by one."""
         rows = zip(
             self.kinds.tolist(),
             self.offsets.tolist(),
@@ -418,7 +418,7 @@ def pack_found(frames: Sequence[Found]) -> Frames:
 
 
 def array_of(numbers: Numbers) -> NDArray[np.int64]:
-    """The numbers as an array, (n,)."""
+    """Return the numbers as an array, (n,)."""
     if isinstance(numbers, range):
         return np.arange(numbers.start, numbers.stop, numbers.step)
     return numbers

@@ -123,7 +123,7 @@ class LayoutFamilies:
 
 
 def _is_extended(seal: Seal) -> bool:
-    """Whether zeros behind the bytes that a checksum covers do not change it."""
+    """Return whether zeros behind the bytes that a checksum covers do not change it."""
     return type(seal.algorithm) in ZERO_EXTENDED and bool(seal.spans)
 
 

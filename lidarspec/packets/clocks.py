@@ -41,7 +41,7 @@ class Unwrapper:
         self._last: tuple[int, int, int] | None = None
 
     def push(self, ns: Times, host: Times) -> Times:
-        """The readings of the next packets, (n,), as times that run on from those before."""
+        """Return the readings of the next packets, (n,), as times that run on from those before."""
         if not self._turn or not len(ns):
             return ns
         raw, time, at = self._last or (int(ns[0]), int(ns[0]), int(host[0]))
@@ -223,7 +223,7 @@ def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
 
 
 def _sum_fields(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
-    """The nanoseconds that some fields add up to, (n,)."""
+    """Return the nanoseconds that some fields add up to, (n,)."""
     total: Times | None = None
     for path, step, zero, furthest in clock_terms(fields, table.schema, sensor):
         raw = table.raw(path)
@@ -271,7 +271,7 @@ def part_times(
     which: NDArray[np.intp],
     times: Times,
 ) -> Times:
-    """The times of parts, (k,), where they have a clock of their own.
+    """Return the times of parts, (k,), where they have a clock of their own.
 
     Args:
         place: where they stand.
@@ -300,7 +300,7 @@ def _prefix(place: tuple[str, str]) -> str:
 
 
 def _in_parts(sensor: SensorDescription, place: tuple[str, str], table: Table) -> Times:
-    """The clock that stands in parts, in each of them."""
+    """Return the clock that stands in parts, in each of them."""
     assert sensor.clock is not None
     own = tuple(path.removeprefix(f"{_prefix(place)}.") for path in paths(sensor.clock))
     return _sum_fields(own, table, sensor.id)
@@ -313,7 +313,7 @@ def _turn(seconds: float) -> int:
 
 
 def paths(clock: Clock) -> tuple[str, ...]:
-    """The fields that add up to a clock; none where a function computes it."""
+    """Return the fields that add up to a clock; none where a function computes it."""
     if isinstance(clock.source, str):
         return (clock.source,)
     if callable(clock.source):

@@ -50,7 +50,7 @@ class ImuSamples:
         )
 
     def __getitem__(self, which: Any) -> ImuSamples:
-        """The samples that a mask, indices or a slice pick."""
+        """Return the samples that a mask, indices or a slice pick."""
         return ImuSamples(
             self.time_ns[which], self.angular_velocity[which], self.linear_acceleration[which]
         )
@@ -62,7 +62,7 @@ class ImuSamples:
         return {"time_ns": self.time_ns, **dict(zip(UNITS, values, strict=True))}
 
     def turn(self, rotation: NDArray[np.float64]) -> ImuSamples:
-        """The same in other axes; `rotation`: (3, 3), from these axes to those."""
+        """Return the same in other axes; `rotation`: (3, 3), from these axes to those."""
         return ImuSamples(
             self.time_ns, self.angular_velocity @ rotation.T, self.linear_acceleration @ rotation.T
         )
@@ -81,7 +81,7 @@ def join_samples(parts: Sequence[ImuSamples]) -> ImuSamples:
 def read_samples(
     sensor: SensorDescription, frame: str, batch: Batch, time_ns: NDArray[np.int64]
 ) -> ImuSamples:
-    """The samples of packets.
+    """Return the samples of packets.
 
     Args:
         frame: their type, or the parts that they are.

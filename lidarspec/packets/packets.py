@@ -149,7 +149,7 @@ class Packets:
         return array
 
     def count(self, array: str) -> NDArray[np.intp]:
-        """The length of an array in each packet, (n,).
+        """Return the length of an array in each packet, (n,).
 
         Raises:
             UnknownField: for an array that the frame does not have.

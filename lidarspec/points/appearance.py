@@ -107,7 +107,7 @@ def choose_appearance(
 
 
 def is_flat(cloud: PointCloud) -> bool:
-    """Whether all points are in the sensor's plane."""
+    """Return whether all points are in the sensor's plane."""
     return not len(cloud) or float(np.nanmax(np.abs(cloud.elevation))) < FLAT
 
 
@@ -189,5 +189,5 @@ def ramp_indices(cloud: PointCloud, look: CloudAppearance) -> NDArray[np.intp]:
 
 
 def _shown(cloud: PointCloud, ramp: str) -> NDArray[np.float64]:
-    """The column that colours show, (n,)."""
+    """Return the column that colours show, (n,)."""
     return np.asarray(cloud.intensity if ramp == "intensity" else cloud.extra[ramp], np.float64)

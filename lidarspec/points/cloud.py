@@ -110,7 +110,7 @@ class PointCloud:
         return {name: column for name, column in columns.items() if column is not None}
 
     def shows(self, name: str) -> bool:
-        """Whether a column was chosen, or is a place, which every file of points has."""
+        """Return whether a column was chosen, or is a place, which every file of points has."""
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
     def only(self, *names: str) -> PointCloud:
@@ -337,7 +337,7 @@ class PointCloud:
         return frame
 
     def to_polars(self) -> Any:
-        """A `polars.DataFrame` with the columns of `columns`, which are not copied.
+        """Return a `polars.DataFrame` with the columns of `columns`, which are not copied.
 
         Raises:
             UsageError: where Polars is not installed.
@@ -366,7 +366,7 @@ def grid_of(cloud: PointCloud) -> Grid:
 
 
 def find_organised_shape(number: int, grid: Grid) -> tuple[int, int] | None:
-    """The shape of a cloud of so many points."""
+    """Return the shape of a cloud of so many points."""
     if grid.rows:
         return (number // grid.column, grid.rows)
     return None

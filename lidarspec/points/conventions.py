@@ -136,12 +136,12 @@ def _is_row(value: Any) -> bool:
 
 
 def is_zero(value: Any) -> bool:
-    """Whether a number or an array, which no data decides, is 0."""
+    """Return whether a number or an array, which no data decides, is 0."""
     return not isinstance(value, TracedColumn) and bool(np.all(np.asarray(value) == 0))
 
 
 def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:
-    """The times of packets, (n,) nanoseconds, as seconds since one of them."""
+    """Return the times of packets, (n,) nanoseconds, as seconds since one of them."""
     return np.multiply(time_ns - base, 1e-9, dtype=np.float64)
 
 
@@ -252,7 +252,7 @@ class ExtraType(NamedTuple):
 
 
 def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
-    """A column of numbers in its type, of the same shape; nan is 0."""
+    """Return a column of numbers in its type, of the same shape; nan is 0."""
     return np.asarray(np.nan_to_num(values) if values.dtype.kind == "f" else values, dtype)
 
 

@@ -36,14 +36,14 @@ class PlainValues:
         self._arrays: dict[Node, Any] = {}
 
     def column(self, node: Node) -> Column:
-        """The result of a node."""
+        """Return the result of a node."""
         if node not in self._columns:
             with np.errstate(all="ignore"):
                 compute(node, self._columns, self._read)
         return self._columns[node]  # type: ignore[no-any-return]
 
     def array(self, node: Node) -> NDArray[Any]:
-        """The array of a node's result, (n or 1, ...)."""
+        """Return the array of a node's result, (n or 1, ...)."""
         if node not in self._arrays:
             with np.errstate(all="ignore"):
                 compute(node, self._arrays, self._load)
@@ -177,7 +177,7 @@ class GroupPoints:
         return share
 
     def some(self, which: NDArray[np.intp]) -> GroupPoints:
-        """The share of some of the packets, by index, with what is known of them plainly."""
+        """Return the share of some of the packets, by index, with what is known of them plainly."""
         remembered = {
             node.number: self.plain_values.column(node)
             for node in self.plan.eager

@@ -75,7 +75,7 @@ def window(leaf: Leaf) -> FieldWindow | None:
 
 
 def raw_values(leaf: Leaf, field_window: FieldWindow) -> NDArray[Any]:
-    """The raw values of a field for every value of its window: (256,) or (65536,)."""
+    """Return the raw values of a field for every value of its window: (256,) or (65536,)."""
     codes = np.arange(1 << (8 * field_window.size)).astype(field_window.dtype)
     frames = np.zeros((len(codes), leaf.size), np.uint8)
     start = field_window.offset - leaf.offset

@@ -60,7 +60,7 @@ class ColumnMaker(Protocol):
     """Makes some columns of the points of frames of one layout."""
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """The columns of so many frames, by name, to be filled: (number * width,) each."""
+        """Return the columns of so many frames, by name, to be filled: (number * width,) each."""
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill the columns of all frames.
@@ -180,7 +180,7 @@ class Plan:
         )
 
     def is_exact(self, name: str) -> bool:
-        """Whether a column is computed in float64 as it is written, and rounded then."""
+        """Return whether a column is computed in float64 as it is written, and rounded then."""
         return self.exact or name == "intensity" or name in self.extra
 
     def _sent(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
@@ -208,7 +208,7 @@ class Plan:
         return None
 
     def _floats_of(self, *values: Any) -> list[Node]:
-        """The floating-point fields that values are made of."""
+        """Return the floating-point fields that values are made of."""
         return [
             node
             for node in graph.traverse(*values)
@@ -250,7 +250,7 @@ class Plan:
         return dict(zip("xyz", places, strict=True)) | columns
 
     def _by_coordinates(self, parts: Mapping[str, Any]) -> dict[str, Any]:
-        """The columns that back ends make, of the parts of `Cartesian`."""
+        """Return the columns that back ends make, of the parts of `Cartesian`."""
         places = parts["x"], parts["y"], parts["z"]
         measured, azimuth, elevation = direction_of(*places)
         columns = {
@@ -326,7 +326,7 @@ class Plan:
         return (self.parts["azimuth"], self.parts["elevation"])
 
     def _finite(self, node: Node) -> bool:
-        """Whether an expression is a number for every value that its field can have."""
+        """Return whether an expression is a number for every value that its field can have."""
         if node.kind == "rows":  # of a table of numbers, if the indices are in it
             return bool(np.isfinite(node.args[1][:-1]).all())
         options = graph.find_choice(node, self.width)

@@ -102,7 +102,7 @@ def evaluate_plainly(
     final: bool = True,
     epoch: int | None = None,
 ) -> EvaluatedPoints:
-    """The points of a batch.
+    """Return the points of a batch.
 
     Args:
         carry: what the batch before left.
@@ -227,7 +227,7 @@ def make_cloud(
     kinds: Mapping[str, ExtraType],
     **facts: Any,
 ) -> PointCloud:
-    """A cloud from flat columns.
+    """Return a cloud from flat columns.
 
     Args:
         flat: the parts of `Polar` (with ox, oy, oz) or `Cartesian`, (N,) each.

@@ -60,7 +60,7 @@ def compiled(kept, signature, **options):
 
 @intrinsic
 def byte_at(context, array, index):
-    """A byte as an integer."""
+    """Return a byte as an integer."""
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
@@ -123,7 +123,7 @@ def apart(context):
 
 @intrinsic
 def fused(context, factor, other, added):
-    """A product and a sum of float32, rounded once."""
+    """Return a product and a sum of float32, rounded once."""
 
     def make(target, builder, signature, args):
         return builder.fma(*args)
@@ -166,7 +166,7 @@ float8_little, float8_big = _float_at(64, ir.DoubleType())
 
 @intrinsic
 def at(context, array, index):
-    """An element of an array; whether there is one is not checked."""
+    """Return an element of an array; whether there is one is not checked."""
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
@@ -189,7 +189,7 @@ def put(context, array, index, value):
 
 @intrinsic
 def flipped(context, value, whole):
-    """A float32 with its sign changed where the lowest bit of a float64 is set."""
+    """Return a float32 with its sign changed where the lowest bit of a float64 is set."""
 
     def make(target, builder, signature, args):
         word = ir.IntType(32)
@@ -260,7 +260,7 @@ def returned(a):
 
 @njit(forceinline=True)
 def looked_up(table, index):
-    """The entry of a table; nan where there is none."""
+    """Return the entry of a table; nan where there is none."""
     if 0 <= index < len(table):
         return at(table, np.int64(index))
     return np.nan

@@ -83,7 +83,7 @@ class StoredKernel:
 
 
 def is_stored(name: str) -> bool:
-    """Whether there is a file of this kernel, for one processor or another."""
+    """Return whether there is a file of this kernel, for one processor or another."""
     try:
         folder = _own(cache_folder())
         key = _key(folder)
@@ -107,7 +107,7 @@ def cache_folder() -> Path:
 
 
 def _make_folder(folder: Path) -> Path:
-    """The folder, made where it is missing.
+    """Return the folder, made where it is missing.
 
     Raises:
         OSError: where it cannot be made, or is not its user's alone.
@@ -117,7 +117,7 @@ def _make_folder(folder: Path) -> Path:
 
 
 def _own(folder: Path) -> Path:
-    """The folder that is given.
+    """Return the folder that is given.
 
     Raises:
         OSError: where it is missing, or not its user's alone.
@@ -147,7 +147,7 @@ def _digest(key: bytes, name: str, data: bytes = b"") -> bytes:
 
 
 def _path(folder: Path, key: bytes, name: str, target: Any) -> Path:
-    """The file of a kernel, for the processor that Numba compiles for here."""
+    """Return the file of a kernel, for the processor that Numba compiles for here."""
     processor = _digest(key, repr(target.codegen().magic_tuple())).hex()[:16]
     return folder / f"{_digest(key, name).hex()}-{processor}"
 

@@ -72,14 +72,14 @@ _SIDE = "abcd"
 
 
 def _slice(name: str) -> str:
-    """A register after eight more bytes, by what it and they are together."""
+    """Return a register after eight more bytes, by what it and they are together."""
     return " ^ ".join(
         f"at(table, {256 * byte} + ({name} >> {8 * byte} & 255))" for byte in range(8)
     )
 
 
 def _single(name: str) -> str:
-    """A register after one more byte."""
+    """Return a register after one more byte."""
     return (
         f"at(table, 1792 + (({name} ^ byte_at(rows, at_{name} + place)) & 255)) ^ ({name} >> 8 &"
         f" {(1 << 56) - 1})"
@@ -109,7 +109,7 @@ def kernel(rows, size, spans, table, start, found):
 
 
 def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) -> NDArray[np.uint64]:
-    """The CRCs of some bytes of each row, (n,)."""
+    """Return the CRCs of some bytes of each row, (n,)."""
     table, _, _ = make_place_tables(8, 0, algorithm.width, algorithm.poly, algorithm.refin)
     found = np.empty(len(rows), np.int64)
     edges = np.array(spans, np.int64).reshape(-1)
@@ -174,7 +174,7 @@ class _ByteShares:
         )
 
     def values(self, rows: Bytes2D) -> NDArray[np.uint64]:
-        """The checksums of frames, (n,)."""
+        """Return the checksums of frames, (n,)."""
         checksums = np.empty(len(rows), np.int64)
         flat = rows.reshape(-1)
         if self.is_plain:
@@ -192,7 +192,7 @@ _KNOWN: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()
 
 
 def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
-    """The checksums of frames, (n,); None where NumPy is to compute them."""
+    """Return the checksums of frames, (n,); None where NumPy is to compute them."""
     known = _KNOWN.get(seal)
     if known is None and not seal.spans:
         return None  # over no bytes there is nothing to compute
@@ -221,7 +221,7 @@ def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
 
 
 def compile_sums() -> Sums:
-    """The function that a decoder computes checksums by; the values are the same.
+    """Return the function that a decoder computes checksums by; the values are the same.
 
     Raises:
         UsageError: where Numba is not installed, or does not work here.

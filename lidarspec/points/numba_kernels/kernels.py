@@ -186,7 +186,7 @@ def _module_name(source: str) -> str:
 
 
 def compiled_before(source: str) -> bool:
-    """Whether compiled code of a kernel is at hand, or in the cache folder."""
+    """Return whether compiled code of a kernel is at hand, or in the cache folder."""
     name = _module_name(source)
     return name in sys.modules or is_stored(name)
 

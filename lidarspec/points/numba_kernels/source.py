@@ -122,7 +122,7 @@ class Expressions(KernelWriter):
     """Writes traced expressions into the loops, each value where it varies."""
 
     def double(self, value: Any, depth: int = 0) -> KernelValue:
-        """An expression in float64, or a condition."""
+        """Return an expression in float64, or a condition."""
         if not isinstance(value, Node):
             return self.constant(value, depth)
         return self.once(("double", value), lambda: self._double(value))  # type: ignore[no-any-return]
@@ -144,7 +144,7 @@ class Expressions(KernelWriter):
         return self.add_argument(node)
 
     def _row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> KernelValue:
-        """An element of the row of a table, by default the node's own, at an index."""
+        """Return an element of the row of a table, by default the node's own, at an index."""
         index = node.args[0]
         table = node.args[1] if table is None else table
         row = self.double(index)
@@ -358,13 +358,13 @@ class Expressions(KernelWriter):
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
     def combine(self, sign: str, first: Any, second: Any) -> Any:
-        """A product or sum; in the loops where both parts are there."""
+        """Return a product or sum; in the loops where both parts are there."""
         if isinstance(first, KernelValue) and isinstance(second, KernelValue):
             return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
         return DeferredFloat(sign, (first, second))
 
     def _of_field(self, node: Node, *, exact: bool) -> KernelValue | None:
-        """An expression of one field that each point has: by a straight line or a table."""
+        """Return an expression of one field that each point has: by a straight line or a table."""
         source = only_field(node)
         if source is not None and is_full(source, self.width):
             leaf = self.layout.leaves.get(source.path)
@@ -383,7 +383,7 @@ class Expressions(KernelWriter):
         return self.looked_up(node, source, np.float32, 1.0)
 
     def angle_of(self, node: Node) -> int:
-        """The number of an angle whose cosine or sine the flat loop takes."""
+        """Return the number of an angle whose cosine or sine the flat loop takes."""
 
         def make() -> int:
             self.angles.append(self.angle(node, 1 / np.pi, len(node.shape)))
@@ -392,7 +392,7 @@ class Expressions(KernelWriter):
         return int(self.once(("angle", node), make))
 
     def angle(self, value: Any, factor: float, depth: int) -> KernelValue:
-        """An angle times a factor that makes half turns of it, in float64."""
+        """Return an angle times a factor that makes half turns of it, in float64."""
         if not isinstance(value, Node):
             return self.constant(np.asarray(value) * factor, depth)
         if not is_full(value, self.width) or value.kind != "call" or self.is_shared(value):
@@ -435,7 +435,7 @@ class Expressions(KernelWriter):
         return self.let(made.level, f"{made.text} * {factor!r}")
 
     def _small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
-        """An angle by one field: a table in float32 where that is exact enough."""
+        """Return an angle by one field: a table in float32 where that is exact enough."""
         values = possible(node, self.layout.leaves)
         if values is None:
             return None
@@ -515,7 +515,7 @@ class KernelAssembly:
         lines += [f"put(out_{name}, o, {name} + bad)" for name in values]
 
     def text(self, value: Any) -> str:
-        """An expression in the flat loop."""
+        """Return an expression in the flat loop."""
         if isinstance(value, DeferredFloat):
             return f"({f' {value.sign} '.join(map(self.text, value.parts))})"
         if isinstance(value, Trig):
@@ -525,7 +525,7 @@ class KernelAssembly:
         return self._store(value, "float32")
 
     def _store(self, value: KernelValue, kind: str) -> str:
-        """A value of the loops, kept for the flat one."""
+        """Return a value of the loops, kept for the flat one."""
         if value.text not in self._kept:
             name = self._kept[value.text] = f"h{len(self.scratch)}"
             self.scratch.append(f"{name} = np.empty(held, np.{kind})")
@@ -533,7 +533,7 @@ class KernelAssembly:
         return f"at({self._kept[value.text]}, k)"
 
     def turns(self) -> list[str]:
-        """The cosines and sines that the flat loop begins with."""
+        """Return the cosines and sines that the flat loop begins with."""
         return [
             f"cos{index}, sin{index} = cos_sin({self._store(made, 'float64')})"
             for index, made in enumerate(self.writer.angles)
@@ -541,7 +541,7 @@ class KernelAssembly:
 
 
 def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> KernelText:
-    """The kernel of some columns of a plan.
+    """Return the kernel of some columns of a plan.
 
     Args:
         varying: the arrays whose lengths differ from frame to frame, if it is to serve them all.
@@ -573,7 +573,7 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
 
 
 def _both(expressions: Iterable[Any]) -> set[Node]:
-    """The angles of which the cosine and the sine are wanted."""
+    """Return the angles of which the cosine and the sine are wanted."""
     nodes = list(traverse(*expressions))
     cosines, sines = (
         {node.args[0] for node in nodes if node.function is function}
@@ -605,7 +605,7 @@ def _function(
     turns: list[str],
     columns: Mapping[str, np.dtype[Any]],
 ) -> str:
-    """The signature and the loops."""
+    """Return the signature and the loops."""
     width = writer.number(writer.width)
     if turns:
         held = writer.number(max(CHUNK // writer.width, 1))

@@ -71,7 +71,7 @@ FEW = 8
 
 
 def is_cheap(node: Node) -> bool:
-    """Whether an expression of one field is a few simple operations."""
+    """Return whether an expression of one field is a few simple operations."""
     nodes = list(islice(traverse(node), FEW + 1))
     return len(nodes) <= FEW and all(
         this.kind != "call" or this.function in CHEAP for this in nodes
@@ -130,7 +130,7 @@ class LinearTable:
     exact: bool
 
     def text(self, raw: str) -> str:
-        """The value as an expression of the raw one."""
+        """Return the value as an expression of the raw one."""
         if self.exact:
             expression = f"np.float32({raw} * {self.slope!r} + {self.start!r})"
         elif self.slope == 1 and self.start == 0:
@@ -297,7 +297,7 @@ class KernelWriter:
         self._made = 0
 
     def number(self, value: int) -> str:
-        """A length or place in the text."""
+        """Return a length or place in the text."""
         if not self.varying or value in (0, 1):
             return str(value)
         self.wanted.numbers.append(value)
@@ -310,13 +310,13 @@ class KernelWriter:
         return self._known[name]
 
     def let(self, level: int, text: str) -> KernelValue:
-        """A variable in a loop."""
+        """Return a variable in a loop."""
         self._made += 1
         self.lines[level].append(f"v{self._made} = {text}")
         return KernelValue(f"v{self._made}", level)
 
     def place(self, shape: tuple[int, ...]) -> str:
-        """The index of an element of an array of this shape in the loops."""
+        """Return the index of an element of an array of this shape in the loops."""
         return self.format_index(
             shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape)))
         )
@@ -331,7 +331,7 @@ class KernelWriter:
         return " + ".join(parts) or "0"
 
     def array(self, values: NDArray[Any]) -> str:
-        """An array that is known, as an argument; flat."""
+        """Return an array that is known, as an argument; flat."""
         flat = np.ascontiguousarray(values).reshape(-1)
         return str(self.once(("array", id(values)), lambda: (self._keep(flat), values))[0])
 
@@ -340,7 +340,7 @@ class KernelWriter:
         return f"c{len(self.wanted.arrays) - 1}"
 
     def constant(self, value: Any, depth: int, kind: str = "float64") -> KernelValue:
-        """A number, or an element of an array that all packets share."""
+        """Return a number, or an element of an array that all packets share."""
         array = np.asarray(value)
         if array.size == 1:
             number = (
@@ -373,7 +373,7 @@ class KernelWriter:
         return self.once(("given flag", node), lambda: self.let(found.level, f"{found.text} != 0"))  # type: ignore[no-any-return]
 
     def raw(self, leaf: Leaf) -> KernelValue | None:
-        """The raw number of a field; None where only NumPy reads it."""
+        """Return the raw number of a field; None where only NumPy reads it."""
         if leaf.info.path not in self._known:
             self._known[leaf.info.path] = self._float(leaf) or self._integer(leaf)
         return self._known[leaf.info.path]  # type: ignore[no-any-return]
@@ -401,7 +401,7 @@ class KernelWriter:
         return self._read(leaf, leaf.offset, f"float{leaf.wire.itemsize}_{order}")
 
     def byte(self, leaf: Leaf, offset: int) -> KernelValue:
-        """A byte of the element of an array, or of the frame."""
+        """Return a byte of the element of an array, or of the frame."""
         return self._read(leaf, offset, "byte_at")
 
     def _read(self, leaf: Leaf, offset: int, reader: str) -> KernelValue:

@@ -53,7 +53,7 @@ HEAD = "header" / Const(b"\x5a") * "then the length of the frame"
 
 @cache
 def data(unit: str) -> Frame:
-    """The frame with a distance in this unit."""
+    """Return the frame with a distance in this unit."""
     step = UNITS[unit]
     struct = Struct(
         "header" / Const(b"\x59\x59"),
@@ -77,7 +77,7 @@ def points(f: Fields) -> Polar:
 
 
 def make_message(size: int, *fields: Any, out: bool = False) -> Frame:
-    """A message of so many bytes, its length and sum among them."""
+    """Return a message of so many bytes, its length and sum among them."""
     struct = Struct(HEAD, "length" / Const(size, Int8ul), *fields, "checksum" / Int8ul)
     return Frame(
         Checksummed(struct, field="checksum", algorithm=Sum(8)),
@@ -96,7 +96,7 @@ def is_known_reply(f: Fields) -> Any:
 
 
 def of(number: int) -> Any:
-    """The field that says what a message is about."""
+    """Return the field that says what a message is about."""
     return "id" / Const(number, Int8ul)
 
 

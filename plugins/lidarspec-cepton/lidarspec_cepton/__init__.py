@@ -87,7 +87,7 @@ DATA = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """A known signature, and no more points than a packet takes."""
+    """Return a known signature, and no more points than a packet takes."""
     return (
         ((f.signature == SIGNATURES[0]) | (f.signature == SIGNATURES[1]))
         & (f.count >= 1)
@@ -96,7 +96,7 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields) -> Cartesian:
-    """The sensor's right, ahead and up, turned to ahead, left and up."""
+    """Return the sensor's right, ahead and up, turned to ahead, left and up."""
     each = f.points
     return Cartesian(
         each.y,

@@ -79,7 +79,7 @@ COMMAND = Checksummed(
 
 
 def ack(header: bytes) -> Checksummed:
-    """The acknowledgement of a command, behind this header."""
+    """Return the acknowledgement of a command, behind this header."""
     return Checksummed(
         Struct(
             "header" / Const(header),
@@ -148,7 +148,7 @@ def angle() -> Construct:
 
 
 def data(first: Construct, sample: Construct, groups: tuple[int, ...]) -> Checksummed:
-    """The point packet.
+    """Return the point packet.
 
     Args:
         first: what stands above the bit that says that a turn begins, 7 bits.
@@ -209,7 +209,7 @@ def plausible(f: Fields) -> Any:
 
 
 def correction(distance: Any) -> Any:
-    """The angle correction in degrees for a distance in metres, 0 where there is no return.
+    """Return the angle correction in degrees for a distance in metres, 0 where there is no return.
 
     Source: manual 2.2.3, AngCorrect; the distance there is in millimetres.
     """
@@ -241,7 +241,7 @@ def points(f: Fields, zero: str = "data") -> Polar:
 
 
 def older_points(f: Fields, zero: str = "data") -> Polar:
-    """The points of a packet of the older kind, which all have the time of their packet."""
+    """Return the points of a packet of the older kind, which all have the time of their packet."""
     return Polar(range=f.samples.distance, azimuth=-np.deg2rad(directions(f, zero)[1]))
 
 
@@ -441,7 +441,7 @@ def coin(model: str, **facts: Any) -> Sensor:
 
 
 def coin_simulation(model: str, **turns: Any) -> Simulation:
-    """A simulated one, which says what it is when it is started."""
+    """Return a simulated one, which says what it is when it is started."""
     answers = {
         "start": make_start_packets(1, model.encode(), 1, b"\xfa\xfa"),
         "get_version": VERSION,

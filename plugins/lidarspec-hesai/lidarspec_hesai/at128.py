@@ -141,7 +141,7 @@ class Mirror(Calibration):
         )
 
     def to_file(self) -> bytes:
-        """The angles as a unit says them: its file."""
+        """Return the angles as a unit says them: its file."""
         start = np.rint(self.faces * STEPS).astype(int).tolist()
         none = bytes(LASERS * 180)
         values = {

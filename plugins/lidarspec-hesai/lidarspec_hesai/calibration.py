@@ -87,7 +87,7 @@ class Calibration:
         return dataclasses.replace(self, elevation=elevation, azimuth=azimuth, nominal=False)
 
     def to_file(self) -> bytes:
-        """The angles as a unit says them: a file of corrections."""
+        """Return the angles as a unit says them: a file of corrections."""
         rows = zip(self.elevation, self.azimuth, strict=True)
         return "".join(
             [
@@ -100,7 +100,7 @@ class Calibration:
 def nominal(
     elevation: Iterable[float], azimuth: Iterable[float], firing_us: Iterable[float]
 ) -> Calibration:
-    """The table of a model; firing times in microseconds."""
+    """Return the table of a model; firing times in microseconds."""
     return Calibration(
         np.array(list(elevation)), np.array(list(azimuth)), np.array(list(firing_us)) * 1e-6
     )
@@ -192,7 +192,7 @@ def columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[
 
 
 def _rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
-    """The headings and the table, each row with its line."""
+    """Return the headings and the table, each row with its line."""
     try:
         reader = csv.reader(io.StringIO(content(path).decode("utf-8-sig", "replace"), newline=""))
         rows = [

@@ -21,7 +21,7 @@ def spinning(
     azimuth: str = "blocks.azimuth",
     **facts: Any,
 ) -> Sensor:
-    """A sensor that turns, and is asked for its angles when it is opened.
+    """Return a sensor that turns, and is asked for its angles when it is opened.
 
     Args:
         data: its data frames.

@@ -33,7 +33,7 @@ USUAL_UNIT = 4
 
 
 def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> Struct:
-    """The packet of a protocol version with so many lasers in each block."""
+    """Return the packet of a protocol version with so many lasers in each block."""
     header: list[Construct] = [
         "sync" / Const(b"\xee\xff"),
         "major" / Const(major, Int8ul),
@@ -57,12 +57,12 @@ def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> St
 
 
 def longest(lasers: int, blocks: int) -> int:
-    """The length of a packet with so many blocks: header, blocks, tail and sequence."""
+    """Return the length of a packet with so many blocks: header, blocks, tail and sequence."""
     return 12 + blocks * (2 + 4 * lasers) + 24 + 4
 
 
 def plausible(f: Fields) -> Any:
-    """A block, one to three returns, a unit, and azimuths below 360 degrees."""
+    """Return a block, one to three returns, a unit, and azimuths below 360 degrees."""
     return (
         (f.block_count >= 1)
         & (f.dis_unit >= 1)
@@ -78,12 +78,12 @@ def distance(f: Fields) -> Any:
 
 
 def block_numbers(f: Fields) -> Any:
-    """The number of each block in its packet, from 0, (n, blocks, 1)."""
+    """Return the number of each block in its packet, from 0, (n, blocks, 1)."""
     return f.block_count.steps()[:, None]
 
 
 def header(blocks: int) -> dict[str, Any]:
-    """The header of a simulated packet with single return."""
+    """Return the header of a simulated packet with single return."""
     return {
         "block_count": blocks,
         "first_return": 1,

@@ -58,7 +58,7 @@ AZIMUTH = (
 
 
 def packet(data_type: int, *body: Any) -> Struct:
-    """A packet of this type: its head, and the body with the CRC."""
+    """Return a packet of this type: its head, and the body with the CRC."""
     return Struct(
         "sync" / Const(b"\xee\xff\x01\x08"),
         "time_version" / Int8ul,
@@ -109,7 +109,7 @@ IMU = Checksummed(
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """The shots of one azimuth, all at the packet's time."""
+    """Return the shots of one azimuth, all at the packet's time."""
     return Polar(
         range=f.channels.distance,
         azimuth=-np.deg2rad(f.azimuth + channels.azimuth),

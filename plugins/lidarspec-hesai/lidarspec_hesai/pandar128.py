@@ -149,7 +149,7 @@ VERSION = ("major" / Const(1, Int8ul), "minor" / Const(4, Int8ul))
 
 
 def tail(speed: float) -> Any:
-    """The tail, with the motor's speed in steps of so many rpm."""
+    """Return the tail, with the motor's speed in steps of so many rpm."""
     return (
         "tail_reserved" / Bytes(9),
         "azimuth_state" / Int16ul * "two bits a block, that of the first in the highest",
@@ -207,7 +207,7 @@ def by_channel(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
 
 
 def relatives(own: str) -> dict[str, Relative]:
-    """The others that send these packets, and how their status tells them."""
+    """Return the others that send these packets, and how their status tells them."""
     others = {
         "hesai-pandar128": Relative("a status below 128", lambda f: f.status_version < FIRST_OT128),
         "hesai-ot128": Relative("a status from 128 to 136", is_ot128),
@@ -217,7 +217,7 @@ def relatives(own: str) -> dict[str, Relative]:
 
 
 def is_ot128(f: Fields) -> Any:
-    """Whether a status is that of an OT128."""
+    """Return whether a status is that of an OT128."""
     return (f.status_version >= FIRST_OT128) & (f.status_version < FIRST_JT128)
 
 

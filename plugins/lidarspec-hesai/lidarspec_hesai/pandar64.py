@@ -72,7 +72,7 @@ COUNTED = Struct(*PLAIN.subcons, "sequence" / Int32ul)
 
 
 def plausible(f: Fields) -> Any:
-    """A unit, azimuths below 360 degrees and a known factory byte."""
+    """Return a unit, azimuths below 360 degrees and a known factory byte."""
     return (
         (f.dis_unit >= 1) & (f.blocks.azimuth < 360) & ((f.factory == 0x42) | (f.factory == 0x43))
     )

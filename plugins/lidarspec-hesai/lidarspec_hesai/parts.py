@@ -73,7 +73,7 @@ def clock(f: Fields) -> tuple[Any, Any]:
 def beams(
     blocks: Fields, channels: Calibration, *, distance: Any, block: Any, returns: Any, fired: Any
 ) -> Polar:
-    """The points of a packet.
+    """Return the points of a packet.
 
     Args:
         blocks: the blocks of the frame.

@@ -38,7 +38,7 @@ SETTINGS = {
 
 
 def message(payload: Construct) -> Struct:
-    """A request or an answer with this payload."""
+    """Return a request or an answer with this payload."""
     return Struct(
         "sync" / Const(b"\x47\x74"),
         "code" / Int8ub,
@@ -49,7 +49,7 @@ def message(payload: Construct) -> Struct:
 
 
 def plausible(f: Fields) -> Any:
-    """A result that there is, and a payload as long as one can be."""
+    """Return a result that there is, and a payload as long as one can be."""
     return (f.result <= 7) & (f.length <= LARGEST)
 
 

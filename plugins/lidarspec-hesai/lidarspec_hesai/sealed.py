@@ -85,7 +85,7 @@ def packet(
     safety: bool = True,
     held: bool = False,
 ) -> Construct:
-    """The packet of a protocol version.
+    """Return the packet of a protocol version.
 
     Args:
         version: the fields major and minor.

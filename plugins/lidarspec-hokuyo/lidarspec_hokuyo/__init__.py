@@ -62,7 +62,7 @@ def relative(own: Geometry, other: Geometry) -> str | Relative:
 
 @cache
 def frames(kind: str, geometry: Geometry) -> dict[str, Frame]:
-    """All frames of a scanner, first the scans of a kind."""
+    """Return all frames of a scanner, first the scans of a kind."""
     kinds = sorted(geometry.kinds, key=lambda other: other != kind)
     scans = {
         f"{prefix}{one}": scan(command, geometry)

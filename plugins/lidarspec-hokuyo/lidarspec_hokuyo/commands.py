@@ -88,7 +88,7 @@ def line(name: str, begin: str) -> Construct:
 
 
 def make_reply(command: bytes, lines: Mapping[str, str]) -> Frame:
-    """An answer in such lines."""
+    """Return an answer in such lines."""
     struct = Struct(
         "head" / Const(command + b"\n00P\n"),
         *(line(*one) for one in lines.items()),
@@ -121,7 +121,7 @@ def answer(command: bytes, *more: Construct, size: int = 0, told: tuple[int, ...
 
 
 def order(command: bytes, size: int) -> Frame:
-    """A command with an argument of so many characters."""
+    """Return a command with an argument of so many characters."""
     value = ("value" / Bytes(size),) if size else ()
     return Frame(Struct("command" / Const(command), *value, "end" / Const(b"\n")), direction="out")
 
@@ -145,7 +145,7 @@ OF_URG: dict[str, tuple[bytes, int, dict[str, Any]]] = {
 
 
 def orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
-    """All that a scanner takes whose scans are of this kind."""
+    """Return all that a scanner takes whose scans are of this kind."""
     scans = {
         "start": (KINDS[kind][0].encode(), 13, {"starts": True}),
         "get_scan": (KINDS[kind][1].encode(), 10, {}),
@@ -155,7 +155,7 @@ def orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, 
 
 @cache
 def messages(kind: str, *, is_urg: bool) -> dict[str, Frame]:
-    """All commands and answers, but for scans."""
+    """Return all commands and answers, but for scans."""
     rows = orders(kind, is_urg=is_urg)
     found = dict[str, Frame]()
     for name, (command, size, _) in rows.items():

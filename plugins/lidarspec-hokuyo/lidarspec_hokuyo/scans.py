@@ -103,7 +103,7 @@ def two(digits: Any) -> Any:
 
 
 def digits(name: str, value: int, places: int) -> dict[str, int]:
-    """The digits of a number, by their paths."""
+    """Return the digits of a number, by their paths."""
     return {
         f"{name}.{place}": int(digit)
         for place, digit in zip(DIGITS[places], f"{value:0{places}}", strict=True)
@@ -111,7 +111,7 @@ def digits(name: str, value: int, places: int) -> dict[str, int]:
 
 
 def width(f: Any) -> Any:
-    """The steps of a cluster, of which 00 means one too."""
+    """Return the steps of a cluster, of which 00 means one too."""
     return two(f.cluster) + (two(f.cluster) == 0)
 
 
@@ -121,7 +121,7 @@ def count(f: Any) -> Any:
 
 
 def plausible(f: Fields, end: int) -> Any:
-    """The steps are those of the scanner."""
+    """Return the steps are those of the scanner."""
     return (number(f.last) <= end) & (number(f.first) <= number(f.last))
 
 
@@ -143,7 +143,7 @@ def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
 
 @cache
 def scan(command: str, geometry: Geometry) -> Frame:
-    """The answer to a command for scans."""
+    """Return the answer to a command for scans."""
     goes_on = command[0] in "MN"
     echoes = ECHOES if command[0] in "NH" else 1
     fields = FIELDS[command[1]]

@@ -59,7 +59,7 @@ CRC8 = Crc(width=8, poly=0x4D)
 
 
 def with_crc(*members: Any) -> Checksummed:
-    """A frame that ends with its CRC."""
+    """Return a frame that ends with its CRC."""
     return Checksummed(Struct(*members, "crc" / Int8ul), field="crc", algorithm=CRC8)
 
 
@@ -141,7 +141,7 @@ def sweep(i: int, rate: int, turns: int) -> dict[str, float]:
 
 
 def slug(name: str) -> str:
-    """The id of a model."""
+    """Return the id of a model."""
     return "ldrobot-" + name.lower().replace("-", "")
 
 

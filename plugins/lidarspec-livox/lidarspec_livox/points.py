@@ -38,7 +38,7 @@ INERTIAL = (
 
 
 def echoes(number: int, *members: Any) -> Any:
-    """The returns of one shot."""
+    """Return the returns of one shot."""
     return "returns" / Array(number, Struct(*members, REFLECTIVITY, TAG))
 
 

@@ -80,7 +80,7 @@ TIMESTAMP = Struct(
 
 
 def packet(kind: int, *members: Any) -> Struct:
-    """A packet with data of one type behind the header."""
+    """Return a packet with data of one type behind the header."""
     return Struct(
         "version" / Const(5, Int8ul),
         "slot" / Int8ul,
@@ -191,7 +191,7 @@ def simulation(name: str, rate: float, view: View, **more: Any) -> Simulation:
 
 
 def make_header(ns: int) -> dict[str, Any]:
-    """The header of a packet of this time since power-up."""
+    """Return the header of a packet of this time since power-up."""
     pieces = {"low": ns % 2**32, "middle": (ns >> 32) % 2**16, "high": ns >> 48}
     header = {"slot": 1, "lidar_id": 1, "reserved": 0, "status_code": 0, "timestamp_type": 0}
     return header | {f"timestamp.{name}": piece for name, piece in pieces.items()}
@@ -259,7 +259,7 @@ DATE = (
 
 
 def out(number: tuple[int, int] | None, *members: Any) -> Frame:
-    """A command."""
+    """Return a command."""
     return Frame(message(ASK, number, *members), direction="out")
 
 
@@ -328,12 +328,12 @@ def command(
 
 
 def setter(number: tuple[int, int], low: int, high: int) -> Command:
-    """A command that sets something to a number."""
+    """Return a command that sets something to a number."""
     return command("set", number=number, args={"number": ("number", low, high)})
 
 
 def getter(number: tuple[int, int]) -> Command:
-    """A command that asks for a number."""
+    """Return a command that asks for a number."""
     return command("ask", "number", number)
 
 

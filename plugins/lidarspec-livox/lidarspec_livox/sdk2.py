@@ -87,7 +87,7 @@ TYPES = "9 MID-360, 10 HAP, 15 HAP, 35 MID-360S"
 
 
 def packet(kind: int, *members: Any) -> Checksummed:
-    """A packet with data of one type behind the header."""
+    """Return a packet with data of one type behind the header."""
     header = Struct(
         "version" / Const(0, Int8ul),
         "length" / SizeOf(Int16ul),
@@ -113,7 +113,7 @@ def after(f: Fields) -> Any:
 
 
 def has_points(f: Fields) -> Any:
-    """A packet has points."""
+    """Return a packet has points."""
     return f.dot_num >= 1
 
 
@@ -240,7 +240,7 @@ RESULT = (
 
 
 def setting(*values: Any) -> Frame:
-    """A request to set one parameter."""
+    """Return a request to set one parameter."""
     value = Struct("key" / Int16ul, "size" / SizeOf(Int16ul, "value"), "value" / Struct(*values))
     return Frame(
         message(
@@ -395,7 +395,7 @@ FRAMES: dict[str, Frame] = {
 
 
 def asking(frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any) -> Command:
-    """A request with a running number, which the answer repeats."""
+    """Return a request with a running number, which the answer repeats."""
     own = {
         "values": {"head.seq": Count(16), **(values or {})},
         "reply": reply,
@@ -413,7 +413,7 @@ def setter(
     args: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> Command:
-    """A command that sets one parameter; values and arguments by their names in it."""
+    """Return a command that sets one parameter; values and arguments by their names in it."""
     given = {
         "parameter.key": PARAMETERS[name][0],
         **{f"parameter.value.{path}": value for path, value in (values or {}).items()},
@@ -423,17 +423,17 @@ def setter(
 
 
 def one_of(name: str, low: int, high: int) -> Command:
-    """A command that sets a parameter to a number."""
+    """Return a command that sets a parameter to a number."""
     return setter("set_number", name, args={"number": (low, high)})
 
 
 def host(name: str, port: int, lidar_port: int) -> Command:
-    """A command that has something sent to this computer."""
+    """Return a command that has something sent to this computer."""
     return setter("set_host", name, {"ip": Address(), "host_port": port, "lidar_port": lidar_port})
 
 
 def work(mode: int, **more: Any) -> Command:
-    """A command that puts the Lidar to work, or to rest."""
+    """Return a command that puts the Lidar to work, or to rest."""
     return setter("set_number", "work_mode", {"number": mode}, **more)
 
 

@@ -85,7 +85,7 @@ CLOCK = Clock(
 
 
 def make_packet(size: Construct, samples: Construct, *rest: Construct) -> Frame:
-    """A packet of the N family: 16 samples between two angles."""
+    """Return a packet of the N family: 16 samples between two angles."""
     struct = Struct(
         "header" / START,
         "size" / size,
@@ -107,17 +107,17 @@ def n_plausible(f: Fields) -> Any:
 
 
 def m_plausible(f: Fields) -> Any:
-    """An angle of the circle."""
+    """Return an angle of the circle."""
     return f.start_angle <= 360
 
 
 def sized_plausible(f: Fields) -> Any:
-    """An angle of the circle, and two bytes to the sample."""
+    """Return an angle of the circle, and two bytes to the sample."""
     return (f.start_angle <= 360) & (f.length > 20) & (f.length % 2 == 0)
 
 
 def mask_no_return(distance: Any) -> Any:
-    """A distance, 0 where all its bits say that there is none."""
+    """Return a distance, 0 where all its bits say that there is none."""
     return np.where(distance >= 65.535, 0, distance)
 
 
@@ -139,7 +139,7 @@ def n10_points(f: Fields) -> Polar:
 
 
 def n10p_points(f: Fields) -> Polar:
-    """The same with two returns of each sample."""
+    """Return the same with two returns of each sample."""
     azimuth, time = from_to(f)
     return Polar(
         range=stack(mask_no_return(f.samples.first), mask_no_return(f.samples.second)),
@@ -268,7 +268,7 @@ COMMAND = Frame(
 
 
 def asking(code: int, argument: int, filtered: int = 0, **more: Any) -> Command:
-    """The command of this code, argument and filter."""
+    """Return the command of this code, argument and filter."""
     return Command("command", {"code": code, "argument": argument, "filter": filtered}, **more)
 
 

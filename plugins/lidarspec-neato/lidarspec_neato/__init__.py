@@ -96,12 +96,12 @@ LFCD = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """An angle of the circle."""
+    """Return an angle of the circle."""
     return (f.start_angle >= 0) & (f.start_angle < 360)
 
 
 def lfcd_plausible(f: Fields) -> Any:
-    """An angle of the circle, and no more than twice the speed that it has."""
+    """Return an angle of the circle, and no more than twice the speed that it has."""
     return (f.start_angle >= 0) & (f.start_angle < 360) & (f.speed <= 600)
 
 

@@ -126,7 +126,7 @@ def sweep(unit: Unit, i: int) -> dict[str, Any]:
 
 
 def with_unit(sensor: Sensor, unit: Unit) -> Sensor:
-    """The sensor with the layout and the beams of a unit."""
+    """Return the sensor with the layout and the beams of a unit."""
     turned = tuple(map(tuple, unit.imu[:3, :3].tolist()))
     frames = {
         "data": lidar(unit.profile, unit.rows, unit.columns, unit.turn),
@@ -156,7 +156,7 @@ def with_unit(sensor: Sensor, unit: Unit) -> Sensor:
 
 
 def nominal(model: str, rows: int, turn: int, profile: str) -> Unit:
-    """A unit as the data sheet has it."""
+    """Return a unit as the data sheet has it."""
     line, low, high, out, height, _ = MODELS[model]
     beam = np.eye(4)
     lifted = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -247,7 +247,7 @@ HTTP = {
 
 
 def make_request(method: str, path: str, body: str = "", **more: Any) -> Command:
-    """A request to the web server."""
+    """Return a request to the web server."""
     values = {"method": method, "path": f"/api/v1/{path}".encode(), "body": body.encode()}
     return Command("ask", values, reply="reply", link="http", timeout=6.0, **more)
 
@@ -271,7 +271,7 @@ COMMANDS = {
 
 
 def model(name: str, status: str) -> Sensor:
-    """A model of the family."""
+    """Return a model of the family."""
     limits = MODELS[name][-1]
     unit = nominal(name, **LAYOUT)
     bare = Sensor(

@@ -113,7 +113,7 @@ class Unit:
         return directions @ turned, (starts @ turned + self.lidar[:3, 3]) / 1000
 
     def to_metadata(self) -> bytes:
-        """The metadata, as the web server of such a sensor would give them."""
+        """Return the metadata, as the web server of such a sensor would give them."""
         first, last = self.window
         return json.dumps(
             {
@@ -141,7 +141,7 @@ class Unit:
 
 
 def read(metadata: str | Path | Learned) -> Unit:
-    """The unit that a file, or the sensor itself, describes.
+    """Return the unit that a file, or the sensor itself, describes.
 
     Raises:
         UsageError: for what cannot be read, or lacks what the points need; with the key.
@@ -193,7 +193,7 @@ class Facts:
     data: Mapping[str, Any]
 
     def unit(self) -> Unit:
-        """The unit.
+        """Return the unit.
 
         Raises:
             UsageError: for a key that is missing, or has a value that cannot be.

@@ -147,7 +147,7 @@ FOOTER = ("reserved_footer" / Bytes(24), "crc" / Int64ul)
 
 
 def size(profile: str, rows: int, columns: int = COLUMNS) -> int:
-    """The bytes of a lidar packet."""
+    """Return the bytes of a lidar packet."""
     head, column = (0, 20) if profile == "LEGACY" else (64, 12)
     return head + columns * (column + rows * sum(PROFILES[profile].values()) // 8)
 
@@ -162,7 +162,7 @@ def pixel(profile: str) -> Construct:
 
 
 def _field(name: str, bits: int) -> Construct:
-    """A field of a pixel: ranges have steps of 8 mm where they have 15 bits, else of 1 mm;
+    """Return a field of a pixel: ranges have steps of 8 mm where they have 15 bits, else of 1 mm;
     near-infrared of 8 bits lacks its low 4.
     """
     if name.startswith("range"):
@@ -173,7 +173,7 @@ def _field(name: str, bits: int) -> Construct:
 
 
 def packet(profile: str, rows: int, columns: int) -> Construct:
-    """A lidar packet."""
+    """Return a lidar packet."""
     pixels = "pixels" / Array(rows, pixel(profile))
     began = (
         "timestamp" / TIME,
@@ -198,7 +198,7 @@ def packet(profile: str, rows: int, columns: int) -> Construct:
 
 @functools.cache
 def lidar(profile: str, rows: int, columns: int, turn: int) -> Frame:
-    """The data frame, with so many columns in a turn."""
+    """Return the data frame, with so many columns in a turn."""
     plausible = partial(legacy_plausible if profile == "LEGACY" else plausible_columns, turn=turn)
     return Frame(packet(profile, rows, columns), data=True, plausible=plausible)
 
@@ -276,7 +276,7 @@ def imu(samples: int, turned: Rotation) -> Frame:
 
 
 def sample_times(samples: int, i: int) -> dict[str, Any]:
-    """The times of packet i, 100 a second."""
+    """Return the times of packet i, 100 a second."""
     return {"samples.timestamp": (i + np.arange(samples) / samples) * 10_000_000}
 
 
@@ -301,7 +301,7 @@ def feel(f: Fields, path: str, turned: Rotation) -> Imu:
 
 
 def rotate(turned: Rotation, vector: Any) -> tuple[Any, ...]:
-    """A vector of columns, turned."""
+    """Return a vector of columns, turned."""
     parts = list(vector)
     return tuple(
         sum(weight * part for weight, part in zip(row, parts, strict=True) if weight)

@@ -118,7 +118,7 @@ def _likeness(columns: Bytes2D, profile: str, rows: int) -> float:
 
 
 def _bits(rows: NDArray[Any], spot: int, width: int) -> NDArray[np.int64]:
-    """The bits of the little-endian numbers in the last axis from `spot` on."""
+    """Return the bits of the little-endian numbers in the last axis from `spot` on."""
     return _word(rows, spot // 8, -(-(spot % 8 + width) // 8)) >> spot % 8 & ((1 << width) - 1)
 
 

@@ -59,7 +59,7 @@ INTENSITIES: Construct = Array(LASERS, Int8ub * "255: saturated")
 
 
 def header(kind: int, size: int) -> tuple[Construct, ...]:
-    """The header of a packet of this kind and so many bytes in all."""
+    """Return the header of a packet of this kind and so many bytes in all."""
     return (
         "signature" / Const(b"\x75\xbd\x7e\x97"),
         "size" / Const(size, Int32ub) * "of the whole packet",

@@ -102,7 +102,7 @@ HELIOS_32_ROTOR = dataclasses.replace(HELIOS_5515_ROTOR, vertical=15.0 - np.aran
 
 
 def packet(rows: Construct) -> Struct:
-    """A data packet with these blocks."""
+    """Return a data packet with these blocks."""
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x5a"),
         "protocol_version" / Int16ub * "0 old, 1 latest",
@@ -180,7 +180,7 @@ def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
 
 
 def in_pairs(f: Fields) -> Any:
-    """Whether blocks have one azimuth: the two returns of 32 lasers."""
+    """Return whether blocks have one azimuth: the two returns of 32 lasers."""
     return f.blocks[0].azimuth == f.blocks[1].azimuth
 
 

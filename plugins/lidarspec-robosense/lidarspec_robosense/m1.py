@@ -144,12 +144,12 @@ DIFOP_OTHER = Struct(*DIFOP_HEAD, "rest" / Bytes(228))
 
 
 def plausible(f: Fields) -> Any:
-    """The counter starts at 1 (M1P user guide, header)."""
+    """Return the counter starts at 1 (M1P user guide, header)."""
     return f.pkt_psn >= 1
 
 
 def packets_per_frame(f: Fields) -> Any:
-    """The last number of the counter; only wave mode 0 is dual return."""
+    """Return the last number of the counter; only wave mode 0 is dual return."""
     return np.where(f.wave_mode == 0, DUAL, SINGLE)
 
 
@@ -212,7 +212,7 @@ def sweep(i: int) -> dict[str, Any]:
 
 
 def sweep_difop(i: int) -> dict[str, Any]:
-    """The device information of a sensor with the factory's settings."""
+    """Return the device information of a sensor with the factory's settings."""
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
     modes = {
         "return_mode": 4,

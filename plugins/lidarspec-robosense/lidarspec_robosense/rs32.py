@@ -104,7 +104,7 @@ DATE: tuple[Construct, ...] = (
 
 
 def packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
-    """A data packet with this time and these blocks."""
+    """Return a data packet with this time and these blocks."""
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x0a\x5a\xa5\x50\xa0"),
         "reserved_8" / Bytes(12),

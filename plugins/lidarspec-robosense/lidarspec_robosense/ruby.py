@@ -58,7 +58,7 @@ AFTER = {128: 4, 80: 192, 48: 4}  # bytes after the blocks
 
 
 def packet(lasers: int) -> Struct:
-    """A data packet of a model with so many lasers."""
+    """Return a data packet of a model with so many lasers."""
     flag = Struct("mark" / Const(b"\xfe"), "return_id" / Int8ub)
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x5a"),
@@ -99,7 +99,7 @@ def plausible(f: Fields) -> Any:
 
 
 def is_plus(f: Fields) -> Any:
-    """Whether a packet names the Ruby Plus as its series."""
+    """Return whether a packet names the Ruby Plus as its series."""
     return (f.series == PLUS) | (f.type_30 == PLUS)
 
 
@@ -132,7 +132,7 @@ def steps(*counts: int) -> NDArray[np.float64]:
 
 
 def rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
-    """A model by its firing times, with nominal angles."""
+    """Return a model by its firing times, with nominal angles."""
     return Rotor(
         delay=delay,
         period=period,
@@ -164,7 +164,7 @@ FRAMES = {
 
 
 def model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = None) -> Sensor:
-    """A Ruby, or where its id says so a Ruby Plus; what the two series have in common."""
+    """Return a Ruby, or where its id says so a Ruby Plus; what the two series have in common."""
     lasers = len(rotor.delay)
     plus = "plus" in id
     own = {"series": PLUS, "model": MODELS[lasers]} if plus else {}

@@ -158,7 +158,7 @@ def plausible(f: Fields, model: Scanner) -> Any:
 
 
 def packets(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
-    """The last number of a frame, by the return mode."""
+    """Return the last number of a frame, by the return mode."""
     twice = np.logical_or.reduce([f.wave_mode == mode for mode in dual]) if dual else False
     return np.where(twice, 2 * model.packets, model.packets) + model.first - 1
 
@@ -260,7 +260,7 @@ def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
 
 
 def sweep_e1(i: int) -> dict[str, Any]:
-    """The device information of a sensor at rest with the factory's settings."""
+    """Return the device information of a sensor at rest with the factory's settings."""
     ports = {"msop_port": 6699, "difop_port": 7788, "lidar_ip": bytes([192, 168, 1, 200])}
     return {
         "frame_rate": FRAME_RATE,

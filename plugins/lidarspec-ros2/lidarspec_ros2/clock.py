@@ -69,7 +69,7 @@ class ClockLine(NamedTuple):
     slope: float
 
     def at(self, device: int) -> int:
-        """The difference at a time of the sensor, ns."""
+        """Return the difference at a time of the sensor, ns."""
         return self.delay + round(self.slope * (device - self.device))
 
 
@@ -109,7 +109,7 @@ class MessageStamps:
         )
 
     def at(self, time_ns: int, settings: Settings, *, by_clock: bool) -> int:
-        """The stamp of something that is not a scan, ns.
+        """Return the stamp of something that is not a scan, ns.
 
         Args:
             time_ns: between those of packets.
@@ -194,7 +194,7 @@ class DeviceClock:
         return self._stamp
 
     def _slew(self, device: int) -> int:
-        """The offset that follows the line."""
+        """Return the offset that follows the line."""
         if self._shown is None:
             return self._line.at(device)
         step = device - self._shown.device
@@ -301,7 +301,7 @@ def fit_line(least: Sequence[ClockSample], slope_before: float) -> ClockLine:
 
 
 def lower_hull(samples: Sequence[ClockSample]) -> list[int]:
-    """The places of those samples that lie on the lower convex hull, from left to right."""
+    """Return the places of those samples that lie on the lower convex hull, from left to right."""
     hull: list[int] = []
     for place, (device, delay) in enumerate(samples):
         while len(hull) > 1:
@@ -314,7 +314,7 @@ def lower_hull(samples: Sequence[ClockSample]) -> list[int]:
 
 
 def slope_over(place: float, samples: Sequence[ClockSample], hull: Sequence[int]) -> float:
-    """The slope of the edge of a hull over a place among the samples."""
+    """Return the slope of the edge of a hull over a place among the samples."""
     end = min(max(bisect_left(hull, place), 1), len(hull) - 1)
     (left, low), (right, high) = samples[hull[end - 1]], samples[hull[end]]
     return (high - low) / (right - left)

@@ -151,7 +151,7 @@ class LidarNode(LifecycleNode):
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """The same, and come to the end."""
+        """Return the same, and come to the end."""
         self.close()
         self.ended.set()
         return super().on_shutdown(state)

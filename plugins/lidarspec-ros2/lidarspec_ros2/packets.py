@@ -74,7 +74,7 @@ class PacketTransport(LiveTransport):
         )
 
     def read(self, timeout: float) -> list[Chunk]:
-        """The packets that have come."""
+        """Return the packets that have come."""
         number = -1
         while number < len(self._chunks) < WAITING:
             number = len(self._chunks)

@@ -256,7 +256,7 @@ class Settings:
         return replace(planar, range_min=max(planar.range_min, self["range_min"]), range_max=far)
 
     def sensor(self) -> Sensor:
-        """The sensor, configured; detected where none is named.
+        """Return the sensor, configured; detected where none is named.
 
         Raises:
             UsageError, WireError, SourceError: as the command line.
@@ -287,7 +287,7 @@ class Settings:
         return given if given != Mount() else None if device is None else device.mount
 
     def device(self, record: Callable[[Transport], TrafficLog]) -> Device:
-        """The open device.
+        """Return the open device.
 
         Args:
             record: makes what takes the packets, where they are published.

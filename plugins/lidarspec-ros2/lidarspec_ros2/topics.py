@@ -176,7 +176,7 @@ class Topics:
             self._node.destroy_publisher(publisher)
 
     def _stamp(self, scan: Scan) -> int:
-        """The time of the first point, ns, in ROS's time."""
+        """Return the time of the first point, ns, in ROS's time."""
         if not scan.host_ns:  # of a file that does not say when its bytes arrived
             return int(self._node.get_clock().now().nanoseconds)
         return self.stamps.of(scan.stamp_ns, scan.host_ns, self._settings)
@@ -199,7 +199,7 @@ class Topics:
         return self._publishers[kind]
 
     def _make_plain_publisher(self, message: Any, topic: str, qos: Any) -> Any:
-        """A publisher that is not the lifecycle's."""
+        """Return a publisher that is not the lifecycle's."""
         self._others.append(self._node.create_publisher(message, topic, qos))
         return self._others[-1]
 
@@ -246,7 +246,7 @@ class Topics:
 
 
 def make_transform(settings: Settings, stamp: Any) -> TransformStamped:
-    """The mount, from the frame of the carrier to that of the points."""
+    """Return the mount, from the frame of the carrier to that of the points."""
     mount = settings.mount() or Mount()
     roll, pitch, yaw = (
         math.radians(angle) / 2

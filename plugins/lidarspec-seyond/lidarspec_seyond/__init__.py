@@ -107,7 +107,7 @@ PIXEL = ByteSwapped(
 
 
 def packet(returns: int) -> Struct:
-    """The packet with so many returns."""
+    """Return the packet with so many returns."""
     return Struct(
         "magic" / Const(b"\x6a\x17"),
         "major" / Int8ul,
@@ -209,7 +209,7 @@ def sweep(i: int, returns: int = 1) -> dict[str, Any]:
 
 
 def frame(returns: int) -> Frame:
-    """The data frame with so many returns."""
+    """Return the data frame with so many returns."""
     return Frame(
         packet(returns),
         data=True,

@@ -133,7 +133,7 @@ def message(cola: str, kind: str, method: str, content: tuple[Construct, ...]) -
 
 @cache
 def messages(cola: str) -> Mapping[str, Frame]:
-    """All messages in CoLa "A" or "B"."""
+    """Return all messages in CoLa "A" or "B"."""
     return {name: message(cola, *row) for name, row in MESSAGES.items()}
 
 
@@ -143,7 +143,7 @@ def asking(frame: str, reply: str, values: Mapping[str, Any] | None = None, **mo
 
 
 def commands(scan: str) -> dict[str, Command]:
-    """All commands of a scanner whose scans are such frames."""
+    """Return all commands of a scanner whose scans are such frames."""
     content = {
         "reserved": 0,
         "wide": 1,

@@ -58,7 +58,7 @@ TURNS = 20.0  # turns a second of a simulated one
 
 
 def module(version: int) -> Struct:
-    """A module of a telegram of version 3 or 4: beams of all its layers."""
+    """Return a module of a telegram of version 3 or 4: beams of all its layers."""
     azimuth = "azimuth" / If(
         this._.beam_content.has_azimuth == 1, Scaled(Int16ul, STEP, "rad", -ZERO * STEP)
     )
@@ -106,7 +106,7 @@ def module(version: int) -> Struct:
 
 
 def telegram(version: int) -> Construct:
-    """A telegram of scans, of version 3 or 4."""
+    """Return a telegram of scans, of version 3 or 4."""
     struct = Struct(
         MAGIC,
         "command" / Const(1, Int32ul),
@@ -191,7 +191,7 @@ def sweep(
 
 
 def scans(version: int, sweep: Callable[..., Mapping[str, Any]]) -> Frame:
-    """The telegram of scans of this version, and what is simulated in it."""
+    """Return the telegram of scans of this version, and what is simulated in it."""
     read = {"modules": partial(points, version=version)}
     return Frame(
         telegram(version),

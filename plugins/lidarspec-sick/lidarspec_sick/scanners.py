@@ -57,7 +57,7 @@ class Kind:
     layers: tuple[float, ...] = (0.0,)
 
     def fits(self, f: Fields) -> Any:
-        """Whether a scan can be one of these."""
+        """Return whether a scan can be one of these."""
         steps = [np.abs(f.dist1.step - step) < NEAR for step in self.steps]
         rates = [f.scan_rate == rate for rate in self.rates]
         return (
@@ -69,7 +69,7 @@ class Kind:
 
 
 def any_of(conditions: list[Any]) -> Any:
-    """Whether one of them holds."""
+    """Return whether one of them holds."""
     found = conditions[0]
     for condition in conditions[1:]:
         found = found | condition

@@ -43,7 +43,7 @@ MOST_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
 
 
 def binary(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
-    """A telegram of CoLa B: four times 02, a length, the content, and the XOR of it."""
+    """Return a telegram of CoLa B: four times 02, a length, the content, and the XOR of it."""
     struct = Struct(
         "magic" / Const(b"\x02\x02\x02\x02"),
         "length" / SizeOf(Int32ub, plus=-9) * "of the content",
@@ -57,7 +57,7 @@ def binary(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
 
 
 def text(*parts: Construct, max_length: int = 200, **more: Any) -> Frame:
-    """A telegram of CoLa A: 02, tokens, 03."""
+    """Return a telegram of CoLa A: 02, tokens, 03."""
     return Frame(
         Struct(*parts),
         wire=Tokens(start=b"\x02", sep=b" ", end=b"\x03", base=16),
@@ -193,7 +193,7 @@ def scaled_intensity(channel: Fields) -> Any:
 
 @cache
 def scans(cola: str, echoes: int) -> Frame:
-    """The telegram of a scan with so many echoes, in CoLa "A" or "B"."""
+    """Return the telegram of a scan with so many echoes, in CoLa "A" or "B"."""
     longest = 200 + echoes * 2 * (40 + 2 * MOST_BEAMS)
     kind = "kind" / Bytes(3) * "sSN sent by itself, sRA asked for"
     more = {

@@ -68,7 +68,7 @@ _SIZES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
 
 
 def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]:
-    """The fields of a descriptor of this type and mode."""
+    """Return the fields of a descriptor of this type and mode."""
     block = BitStruct(
         "mode" / Const(mode, BitsInteger(2)) * "0: one answer, 1: an endless stream",
         "length" / length,
@@ -81,17 +81,17 @@ def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]
 
 
 def single(kind: int, size: int, *fields: Construct) -> Frame:
-    """A single answer of `size` bytes behind its descriptor."""
+    """Return a single answer of `size` bytes behind its descriptor."""
     return Frame(Struct(*descriptor(kind, SINGLE, Const(size, BitsInteger(30))), *fields))
 
 
 def announcing(kind: int, size: int) -> Frame:
-    """The descriptor of an endless stream of data frames of `size` bytes."""
+    """Return the descriptor of an endless stream of data frames of `size` bytes."""
     return Frame(Struct(*descriptor(kind, STREAM, Const(size, BitsInteger(30)))))
 
 
 def config_plausible(f: Fields) -> Any:
-    """The length fits the value, where the width of the value is known."""
+    """Return the length fits the value, where the width of the value is known."""
     size = take(_SIZES, f.key)
     return np.isnan(size) | (f.descriptor.length == 4 + size)
 

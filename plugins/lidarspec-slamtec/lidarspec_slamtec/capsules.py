@@ -68,13 +68,13 @@ def nibble(sync: int) -> Construct:
 
 
 def capsule(*fields: Construct) -> Checksummed:
-    """A capsule of these fields behind its sync and checksum."""
+    """Return a capsule of these fields behind its sync and checksum."""
     struct = Struct("low" / nibble(0xA), "high" / nibble(0x5), *fields)
     return Checksummed(struct, field=("low.checksum", "high.checksum"), algorithm=Xor())
 
 
 def start() -> Construct:
-    """The angle of the first point, and whether this is the first capsule after a start."""
+    """Return the angle of the first point, and whether this is the first capsule after a start."""
     flag = "sync" / BitsInteger(1) * "S, 1: first after a start"
     return "start" / ByteSwapped(BitStruct(flag, "angle" / Scaled(BitsInteger(15), 1 / 64, "deg")))
 
@@ -140,7 +140,7 @@ ULTRA_DENSE = capsule(
 
 
 def plausible(f: Fields) -> Any:
-    """The first angle is below 360 degrees."""
+    """Return the first angle is below 360 degrees."""
     return f.start.angle < 360
 
 
@@ -253,7 +253,7 @@ def ultra_codes(polar: Polar) -> Mapping[str, Any]:
 
 
 def nearest(mm: Any) -> Any:
-    """The codes of the scale's values next to these distances."""
+    """Return the codes of the scale's values next to these distances."""
     above = np.clip(np.searchsorted(MILLIMETRES, mm), 1, len(MILLIMETRES) - 1)
     return np.where(mm - MILLIMETRES[above - 1] < MILLIMETRES[above] - mm, above - 1, above) * (
         mm > 0

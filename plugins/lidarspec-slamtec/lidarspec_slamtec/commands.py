@@ -34,7 +34,7 @@ ANY_KEY = ("key", 0, 0xFFFF_FFFF)
 
 
 def plain(cmd: int, **more: Any) -> Command:
-    """A request without payload."""
+    """Return a request without payload."""
     return Command("request", {"cmd.number": cmd}, **more)
 
 
@@ -50,12 +50,12 @@ def asking(
 
 
 def about_sensor(key: int) -> Command:
-    """The request for a configuration value of the sensor."""
+    """Return the request for a configuration value of the sensor."""
     return asking("config_request", "config", {"key": key}, echoes=("key",))
 
 
 def about_mode(key: int) -> Command:
-    """The request for a configuration value of one of its scan modes."""
+    """Return the request for a configuration value of one of its scan modes."""
     return asking(
         "mode_config_request",
         "config",
@@ -66,7 +66,7 @@ def about_mode(key: int) -> Command:
 
 
 def express(mode: int | None = None) -> Command:
-    """The request for capsules: of one scan mode, or of the one that is given as argument.
+    """Return the request for capsules: of one scan mode, or of the one that is given as argument.
 
     Which descriptor answers depends on the mode; get_answer_type tells.
     """

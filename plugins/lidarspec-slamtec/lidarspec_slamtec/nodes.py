@@ -104,7 +104,7 @@ def node_points(f: Fields) -> Polar:
 
 
 def hq_points(f: Fields) -> Polar:
-    """A point for each of the 96 nodes."""
+    """Return a point for each of the 96 nodes."""
     return Polar(
         range=f.nodes.distance, azimuth=-np.deg2rad(f.nodes.angle), intensity=f.nodes.quality
     )

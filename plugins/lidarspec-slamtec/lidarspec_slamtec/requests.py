@@ -33,7 +33,7 @@ def make_request(*fields: Construct) -> Checksummed:
 
 
 def asking(cmd: int, size: int, *payload: Construct) -> Frame:
-    """The request of one command with a payload of `size` bytes."""
+    """Return the request of one command with a payload of `size` bytes."""
     return Frame(
         make_request("cmd" / Const(cmd, Int8ul), "size" / Const(size, Int8ul), *payload),
         direction="out",

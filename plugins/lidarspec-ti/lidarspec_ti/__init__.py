@@ -155,13 +155,13 @@ DATA = Struct(
 
 
 def points(f: Fields) -> Cartesian:
-    """The points of a frame; the radar's x is to the right, and its y ahead."""
+    """Return the points of a frame; the radar's x is to the right, and its y ahead."""
     place = f.points
     return Cartesian(x=place.y, y=-place.x, z=place.z, extra={"velocity": place.velocity})
 
 
 def directions(i: int) -> tuple[Any, Any]:
-    """A fan of 120 degrees, that nods by 15."""
+    """Return a fan of 120 degrees, that nods by 15."""
     return np.deg2rad(np.linspace(-60, 60, POINTS)), np.deg2rad(
         15 * np.sin(i / 7 + np.arange(POINTS))
     )

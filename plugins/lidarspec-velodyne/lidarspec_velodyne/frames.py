@@ -137,7 +137,7 @@ def plausible_single(f: Fields) -> Any:
 
 
 def plausible_dual(f: Fields) -> Any:
-    """Each of the four banks twice."""
+    """Return each of the four banks twice."""
     return (f.blocks.azimuth <= 360) & (f.blocks.flag == np.repeat(BANKS, 2, axis=0))
 
 

@@ -179,7 +179,7 @@ def plausible(f: Fields) -> Any:
 
 
 def dual(f: Fields) -> Any:
-    """Whether four blocks share an azimuth."""
+    """Return whether four blocks share an azimuth."""
     return f.blocks[0].azimuth == f.blocks[2].azimuth
 
 
@@ -212,7 +212,7 @@ def points(f: Fields, unit: Unit) -> Polar:
 
 
 def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sensor:
-    """The sensor with the corrections of one unit.
+    """Return the sensor with the corrections of one unit.
 
     Args:
         calibration: its db.xml; degrees and centimetres.
@@ -280,7 +280,7 @@ FRAMES = {"data": Frame(DATA, data=True, plausible=plausible)}
 
 
 def model(series: str, unit: Unit, other: str) -> Sensor:
-    """A series by its unit."""
+    """Return a series by its unit."""
     return Sensor(
         f"velodyne-hdl64e-{series}",
         vendor="Velodyne",

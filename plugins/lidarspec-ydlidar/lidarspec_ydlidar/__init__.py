@@ -85,7 +85,7 @@ def plausible(f: Fields) -> Any:
 
 @cache
 def data(form: Form) -> Frame:
-    """The packet with samples of this form."""
+    """Return the packet with samples of this form."""
     frequency = Scaled(BitsInteger(7), 0.1, "Hz", form.slowest)
     struct = Struct(
         "header" / Const(b"\xaa\x55"),
@@ -109,7 +109,7 @@ def data(form: Form) -> Frame:
 
 @cache
 def reader(form: Form) -> Callable[[Fields], Points]:
-    """The `points` function of packets with samples of this form."""
+    """Return the `points` function of packets with samples of this form."""
     return partial(points, form=form)
 
 
@@ -146,7 +146,7 @@ def sweep(i: int, model: Model) -> dict[str, float]:
 
 
 def slug(name: str) -> str:
-    """The id of a model: "T-mini Pro" is "ydlidar-tmini-pro"."""
+    """Return the id of a model: "T-mini Pro" is "ydlidar-tmini-pro"."""
     return "ydlidar-" + name.lower().replace("t-mini", "tmini").replace(" ", "-")
 
 

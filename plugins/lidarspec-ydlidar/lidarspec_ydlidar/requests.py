@@ -21,7 +21,7 @@ AFTER_MOTOR = 0.5  # seconds (SDK, startMotor)
 
 
 def answer(kind: int, *fields: Construct, size: int) -> Frame:
-    """The answer to a request, with its descriptor in front."""
+    """Return the answer to a request, with its descriptor in front."""
     header = b"\xa5\x5a" + size.to_bytes(4, "little") + bytes([kind])
     return Frame(Struct("descriptor" / Const(header), *fields))
 
@@ -67,7 +67,7 @@ REQUEST = Frame(Struct("start" / Const(b"\xa5"), "cmd" / Int8ul), direction="out
 
 
 def asking(cmd: int, reply: str | None = None, **more: Any) -> Command:
-    """A request without payload."""
+    """Return a request without payload."""
     return Command("request", {"cmd": cmd}, reply=reply, **more)
 
 

@@ -49,7 +49,7 @@ def camera_angle(distance: Any) -> Any:
 
 
 def alone(step: float) -> Construct:
-    """A distance and nothing else, in steps of so many metres."""
+    """Return a distance and nothing else, in steps of so many metres."""
     return Struct("distance" / Scaled(Int16ul, step, "m") * NONE)
 
 
