@@ -279,7 +279,7 @@ def replay(
             destination = replay_outlet(place, datagrams=source.datagrams, port=port)
         undo.pop_all()  # the replay closes it
     if isinstance(destination, Outlet):
-        place = destination.place
+        place = destination.local_source
         _announce(file, place, sensor, as_json=as_json)
     factor = speed or None  # 0 is as fast as possible
     if speed is None and not is_file:

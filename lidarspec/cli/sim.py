@@ -175,8 +175,8 @@ def sim(
             f"lidarspec sim {sensor.id} --to {'udp://' + LOCALHOST if sensor.datagrams else 'pty'}",
         ) from None
     try:
-        controls = {name: control.place for name, control in opened.controls.items()}
-        _announce(sensor, opened.place, opened.source, controls, as_json=as_json)
+        controls = {name: control.local_source for name, control in opened.controls.items()}
+        _announce(sensor, opened.local_source, opened.source, controls, as_json=as_json)
         with handle_sigterm(), Progress() as progress:
             serve(device, opened, seconds=duration, on_pass=_watching(device, opened, progress))
     finally:
@@ -222,7 +222,9 @@ def _watching(device: SimulatedDevice, opened: Outlet, progress: Progress) -> Ca
         nonlocal printed, present
         events = device.commands_received[printed:]
         if device.present != present:
-            events += [f"plugged in again at {opened.place}" if device.present else "unplugged"]
+            events += [
+                f"plugged in again at {opened.local_source}" if device.present else "unplugged"
+            ]
         for event in events:
             progress.note(f"{time.monotonic() - began:.1f} s: {event}")
         printed = len(device.commands_received)

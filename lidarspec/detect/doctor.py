@@ -34,7 +34,7 @@ from lidarspec.transports.addresses import SourceAddress, with_option
 from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, resolve
 from lidarspec.transports.protocol import no_bytes
-from lidarspec.transports.udp import BUFFER, warn_of_small_buffer
+from lidarspec.transports.udp import REQUESTED_BUFFER_BYTES, warn_of_small_buffer
 
 LOOPBACK = "lo"
 
@@ -116,7 +116,7 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
 def _serial(
     source: str, address: SourceAddress, sensor: Sensor | None, seconds: float
 ) -> Iterator[Diagnosis]:
-    port = address.place
+    port = address.location
     if os.name == "posix" and not os.path.exists(port):
         yield Diagnosis(
             False,
@@ -164,14 +164,14 @@ def _udp(
     yield from _buffer()
     if busy:
         return
-    before = ports.count_received()
+    before = ports.received_per_interface()
     began = time.monotonic()
     findings = list(_examine_bytes(source, sensor, seconds))
     yield from findings
     if any("no data received" in finding.text for finding in findings):
         rates = {
             name: (count - before.get(name, count)) / (time.monotonic() - began)
-            for name, count in ports.count_received().items()
+            for name, count in ports.received_per_interface().items()
         }
         yield from _interfaces(numbers, host, rates)
 
@@ -209,7 +209,7 @@ def _buffer() -> Iterator[Diagnosis]:
         granted = int(limit.read_text(encoding="ascii"))
     except (OSError, ValueError):
         return
-    for text in warn_of_small_buffer(BUFFER, min(granted, BUFFER)):
+    for text in warn_of_small_buffer(REQUESTED_BUFFER_BYTES, min(granted, REQUESTED_BUFFER_BYTES)):
         said, _, command = text.partition("; next: ")
         yield Diagnosis(False, said.replace("the system gave", "the system gives at most"), command)
 

@@ -688,9 +688,9 @@ def find_declared_sensor(source: str | Path) -> Sensor | None:
 def find_simulated_sensor(source: str | Path) -> Sensor | None:
     """Return the sensor of a source "sim:ID", None for any other source."""
     address = live_address(source)
-    if address is None or address.scheme != "sim" or not address.place:
+    if address is None or address.scheme != "sim" or not address.location:
         return None
-    return named_sensor(address.place)
+    return named_sensor(address.location)
 
 
 def _no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception:

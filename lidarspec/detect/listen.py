@@ -90,7 +90,7 @@ def read_samples(
     text = str(source)
     address = live_address(source)
     if address is not None and address.scheme == "serial" and "baud" not in address.options:
-        if has_no_baud(address.place):
+        if has_no_baud(address.location):
             tell(text)
             yield from _read_sample(with_option(text, "baud", ANY_BAUD), seconds, None, text)
             return
@@ -185,7 +185,7 @@ def read_sensor_sample(source: str | Path, sensor: Sensor, seconds: float) -> li
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += opened.read(min(left, LOOK))
-    if address is not None and has_no_baud(address.place):
+    if address is not None and has_no_baud(address.location):
         baud = None
     else:
         baud = opened.baud
@@ -228,7 +228,7 @@ def probe(source: str | Path) -> Iterator[SampleBytes]:
     tried = set[object]()
     if address is None or address.scheme != "serial":
         return
-    plain = has_no_baud(address.place)
+    plain = has_no_baud(address.location)
     for sensor in list_start_required():
         link = data_link(sensor, Serial)
         for baud in link.bauds if link else ():

@@ -22,7 +22,7 @@ from enum import Enum
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.transports.protocol import POLL, Chunk, Disconnected, LiveTransport
+from lidarspec.transports.protocol import POLL_S, Chunk, Disconnected, LiveTransport
 
 #: limits of a queue: several seconds of data of the fastest sensors.
 MAX_QUEUED_CHUNKS = 1 << 16
@@ -156,7 +156,7 @@ class BoundedQueue:
         ):
             if self._blocks:
                 self._changed.notify_all()
-                self._changed.wait(POLL)
+                self._changed.wait(POLL_S)
                 continue
             link, item = self._events.popleft()
             if isinstance(item, Chunk):
@@ -223,7 +223,7 @@ class CaptureThread:
 
         All events that are taken from the queue afterwards are in the recording.
         """
-        while not self._handing.acquire(timeout=POLL):
+        while not self._handing.acquire(timeout=POLL_S):
             self._queue.take(0.0)  # the thread may wait for room in the queue
         self._log = log
         while self._queue.take(0.0):
@@ -238,7 +238,7 @@ class CaptureThread:
             while not self._stop.is_set():
                 began = time.monotonic()
                 try:
-                    chunks = self.transport.read(POLL)
+                    chunks = self.transport.read(POLL_S)
                 except Disconnected:
                     if not self._reconnect():
                         return

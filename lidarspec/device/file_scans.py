@@ -142,7 +142,7 @@ class FileScans(ClosingContext):
     def _make_bookmark(self) -> bytes | None:
         """Return the pickled state; None if it cannot be pickled or the file cannot seek."""
         opened = self._transport
-        if not isinstance(opened, FileTransport) or not opened.can_go_on:
+        if not isinstance(opened, FileTransport) or not opened.can_resume:
             return None
         if isinstance(opened, CaptureTransport):
             reader = opened.reader

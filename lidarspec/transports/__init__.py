@@ -5,11 +5,12 @@ Modules in reading order:
 
 * `protocol`: the base classes of transports; plugins derive from them.
 * `open_url`: opens the transport of a SOURCE.
-* `addresses`, `host_clock`: a live SOURCE as a value; the times of arrivals.
+* `addresses`: a live SOURCE as a value.
+* `host_clock`: the arrival times.
 * `base`: functions of all live transports: reading a stream, waiting, system errors.
 * `serial`, `udp`, `tcp`: live sources.
 * `http`: requests to the web server of a sensor.
-* `simulated`: `sim:`, a simulated sensor in this process.
+* `simulated`: a simulated sensor in this process (`sim:`).
 * `robotics_logs`: robotics logs with packets in ROS messages.
 * `hex_text`: bytes as hexadecimal text.
 * `files`: recordings, captures, raw bytes, standard input.
@@ -22,5 +23,5 @@ In the opposite direction, to send like a sensor:
 * `destinations`: makes the outlet of a destination.
 * `serving`: a simulated sensor at an outlet, in real time.
 * `simulated_files`: a simulated sensor written to a file.
-* `replays`: a recording that is sent again at its recorded times.
+* `replays`: sends a recording at its recorded times.
 """

@@ -1,6 +1,6 @@
 """Parse live SOURCEs and resolve hosts.
 
-A live SOURCE is a scheme, a place and options: ``udp://:2368?src=10.0.0.5``.
+A live SOURCE is a scheme, a location and options: ``udp://:2368?src=10.0.0.5``.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from urllib.parse import parse_qs
 from lidarspec.errors import UnknownOption, UsageError, suggest
 from lidarspec.transports.protocol import Origin
 
-#: Options of every live SOURCE: the address for commands, if it is not that of the data, and the
-#: broadcast address.
+#: Options of every live SOURCE: the address for commands (by default the address of the data), and
+#: the broadcast address.
 _COMMON_OPTIONS = frozenset({"control", "broadcast"})
 _SWITCH_VALUES = {"0": False, "1": True, "false": False, "true": True, "off": False, "on": True}
 #: Host and port; an IPv6 host is in brackets.
 _HOST_AND_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:/]*))(?::(\d*))?/?")
-#: A port for finding the route to a host; nothing is sent.
+#: Port used to find the route to a host; nothing is sent.
 _DISCARD_PORT = 9
 
 
@@ -33,21 +33,23 @@ class SourceAddress:
     Attributes:
         text: the whole text.
         scheme: "serial", "udp", "tcp" and so on.
-        place: a path, or host and port.
-        options: the options behind the question mark; of a repeated one, the last value.
+        location: a path, or host and port.
+        options: the options after the question mark; the last value of a repeated option.
     """
 
     text: str
     scheme: str
-    place: str
+    location: str
     options: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, text: str, *, scheme: str = "") -> SourceAddress:
-        """Return the address that a text stands for.
+        """Return the parts of a live SOURCE.
 
         Args:
-            text: "udp://:2368?src=10.0.0.5"; or, if `scheme` is given, a place with options.
+            text: the SOURCE, "udp://:2368?src=10.0.0.5". If `scheme` is given, the text may be a
+                location with options.
+            scheme: replaces the scheme of the text.
         """
         if "://" in text:
             written_scheme, _, rest = text.partition("://")
@@ -57,27 +59,29 @@ class SourceAddress:
             rest = text
         else:
             scheme, _, rest = text.partition(":")
-        place, _, query = rest.partition("?")
+        location, _, query = rest.partition("?")
         values = parse_qs(query, keep_blank_values=True)
-        return cls(text, scheme, place, {name: given[-1] for name, given in values.items()})
+        return cls(
+            text, scheme, location, {name: repeated[-1] for name, repeated in values.items()}
+        )
 
     def check(self, known: Collection[str]) -> None:
         """Check the names of the options.
 
         Args:
-            known: the options that the source takes, besides those of every source.
+            known: the options that the source accepts in addition to the options of every source.
 
         Raises:
-            UnknownOption: for the first unknown one.
+            UnknownOption: for the first unknown option.
         """
         for name in sorted(set(self.options) - set(known) - _COMMON_OPTIONS):
             raise UnknownOption(name, [*known, *_COMMON_OPTIONS], place=self.text)
 
     def number(self, name: str, low: int, high: int) -> int | None:
-        """Return the whole number that an option has, None if it is not given.
+        """Return the value of an option as an integer; None if the option is not given.
 
         Raises:
-            UsageError: unless it is a number from `low` to `high`.
+            UsageError: if the value is not an integer from `low` to `high`.
         """
         text = self.options.get(name)
         if text is None:
@@ -87,10 +91,10 @@ class SourceAddress:
         return int(text)
 
     def switch(self, name: str) -> bool | None:
-        """Return whether an option is on, None if it is not given.
+        """Return whether an option is on; None if the option is not given.
 
         Raises:
-            UsageError: for any other word.
+            UsageError: if the value is not 0, 1, true, false, on or off.
         """
         text = self.options.get(name)
         if text is None:
@@ -100,14 +104,14 @@ class SourceAddress:
         return _SWITCH_VALUES[text.lower()]
 
     def host_and_port(self) -> tuple[str, int | None]:
-        """Return host and port of the place; "" and None if they are omitted.
+        """Return host and port of the location; "" and None if they are omitted.
 
         Raises:
             UsageError: for an invalid host or port.
         """
-        match = _HOST_AND_PORT.fullmatch(self.place)
+        match = _HOST_AND_PORT.fullmatch(self.location)
         if match is None:
-            raise UsageError(f"{self.text}: {self.place!r} is no host:port")
+            raise UsageError(f"{self.text}: {self.location!r} is no host:port")
         port = int(match[3]) if match[3] else None
         if port is not None and not 0 < port < 65536:
             raise UsageError(f"{self.text}: a port is a number from 1 to 65535, not {port}")
@@ -115,16 +119,16 @@ class SourceAddress:
 
 
 def with_option(source: str | Path, name: str, value: object) -> str:
-    """Return a SOURCE with an option, which replaces one of the same name."""
-    place, _, query = str(source).partition("?")
+    """Return a SOURCE with an option added, or replaced if it has the option already."""
+    location, _, query = str(source).partition("?")
     options = [
         option for option in query.split("&") if option and not option.startswith(f"{name}=")
     ]
-    return f"{place}?{'&'.join([*options, f'{name}={value}'])}"
+    return f"{location}?{'&'.join([*options, f'{name}={value}'])}"
 
 
 def parse_origin(text: str) -> Origin:
-    """Return the sender that `src=` names, by its address.
+    """Return the sender that the option `src=` names, with its numeric address.
 
     Raises:
         UsageError: for an invalid port or an unknown host.
@@ -134,7 +138,7 @@ def parse_origin(text: str) -> Origin:
 
 
 def resolve_host(host: str, place: str) -> str:
-    """Return the numeric address of a host; the IPv4 one if it has both.
+    """Return the numeric address of a host; IPv4 if the host has IPv4 and IPv6.
 
     Args:
         host: an address or a name.
@@ -146,7 +150,7 @@ def resolve_host(host: str, place: str) -> str:
     for family in (socket.AF_INET, socket.AF_INET6):
         with contextlib.suppress(OSError, ValueError):
             return socket.inet_ntop(family, socket.inet_pton(family, host.partition("%")[0]))
-    # The system resolves an incomplete address, such as 192.168.1, to another one.
+    # The system resolves an incomplete address, for example 192.168.1, to another address.
     is_incomplete_address = re.fullmatch(r"[\d.]*", host) is not None
     if not is_incomplete_address:
         for family in (socket.AF_INET, socket.AF_INET6):
@@ -159,7 +163,7 @@ def resolve_host(host: str, place: str) -> str:
 
 
 def find_own_address(host: str) -> str | None:
-    """Return the address of this computer on the route to a host, None without a route."""
+    """Return this computer's address on the route to a host; None without a route."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)

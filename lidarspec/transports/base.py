@@ -16,12 +16,12 @@ from lidarspec.spec.links import Link
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
-#: The pause after a read, in which a fast line gathers bytes: otherwise each byte is a read.
+#: Pause after a read, in which bytes accumulate: without it, a fast line causes one read per byte.
 READ_PAUSE_S = 0.002
 L = TypeVar("L", bound=Link)
 _Descriptor = int | socket.socket
-#: `select` supports no descriptor above 1,023. Windows has nothing else, and does not number its
-#: descriptors in this way.
+#: `select` supports only descriptors up to 1,023, so `poll` is preferred. Windows has only
+#: `select`, without this limit.
 _Selector = getattr(selectors, "PollSelector", selectors.SelectSelector)
 
 
@@ -56,7 +56,7 @@ class StreamTransport(LiveTransport):
 
     @abstractmethod
     def _receive(self, timeout: float) -> bytes:
-        """Return what has arrived; nothing if nothing arrives for `timeout` seconds."""
+        """Return the bytes that have arrived; b"" if none arrive for `timeout` seconds."""
 
 
 def sleep_until(end_s: float) -> None:
@@ -67,7 +67,7 @@ def sleep_until(end_s: float) -> None:
 
 
 def wait_readable(descriptor: int, timeout: float) -> bool:
-    """Wait until a descriptor has input, or its other side has hung up; False after `timeout` s."""
+    """Wait until a descriptor has input or was hung up; return False on timeout."""
     return bool(wait_ready([descriptor], [], timeout)[0])
 
 
@@ -77,8 +77,8 @@ def wait_ready(
     """Wait until a descriptor is ready, at most `timeout` seconds.
 
     Returns:
-        Those of `reading` that have input or have been hung up, and those of `writing` that have
-        room.
+        The descriptors of `reading` that have input or were hung up, and the descriptors of
+        `writing` that have room.
     """
     with _Selector() as selector:
         for descriptor in {*reading, *writing}:
@@ -94,18 +94,18 @@ def wait_ready(
     return readable, writable
 
 
-def source_error(text: str, following: str) -> SourceError:
+def source_error(text: str, command: str) -> SourceError:
     """Return a SourceError with the next command to type."""
-    return suggest(SourceError(text), following)
+    return suggest(SourceError(text), command)
 
 
 def disconnected_error(label: str, error: BaseException | str) -> Disconnected:
-    """Return the error for a device that went away."""
+    """Return the error for a device that has disappeared."""
     return Disconnected(f"{label}: the connection was lost: {system_reason(error)}")
 
 
 def system_reason(error: BaseException | str) -> str:
-    """Return the text of the system for an error, without the words that pyserial adds to it."""
+    """Return the system's text for an error, without the words that pyserial adds."""
     if isinstance(error, BaseException):
         numbers = error_numbers(error)
     else:
@@ -116,12 +116,12 @@ def system_reason(error: BaseException | str) -> str:
 
 
 def error_numbers(error: BaseException) -> list[int]:
-    """Return the error numbers of the system among the arguments of an exception."""
+    """Return the system's error numbers among the arguments of an exception."""
     return [number for number in error.args if isinstance(number, int)]
 
 
 def data_link(sensor: Sensor | None, kind: type[L]) -> L | None:
-    """Return the data link of a sensor if it is of this kind."""
+    """Return the data link of a sensor if it is of this kind, else None."""
     if sensor is not None:
         link = sensor.links.get("data")
     else:
@@ -132,7 +132,7 @@ def data_link(sensor: Sensor | None, kind: type[L]) -> L | None:
 
 
 def sensor_option(sensor: Sensor | None) -> str:
-    """Return the option that names a sensor in a command to type, after a space."""
+    """Return the option " -s ID" for a suggested command; "" without a sensor."""
     if sensor is not None:
         return f" -s {sensor.id}"
     return ""

@@ -13,88 +13,89 @@ from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.outlets import LOCALHOST, Outlet, OutletLine, PtyLine, TcpLine, UdpLine
 
 
-def simulated_outlet(sensor: Sensor, place: str, link: str | Path | None = None) -> Outlet:
-    """Return the outlet of a simulated sensor, with lines for all links that take commands.
+def simulated_outlet(sensor: Sensor, destination: str, link: str | Path | None = None) -> Outlet:
+    """Return the outlet of a simulated sensor, with lines for all links with commands.
 
     Args:
-        place: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT"; TCP port 0 takes any free one. Without
-            a UDP port, data frames go to the first port that the sensor declares, and all others to
-            the second.
+        sensor: the sensor.
+        destination: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT". TCP port 0 selects any free
+            port. Without a UDP port, data frames go to the first port that the sensor declares, and
+            all other frames to the second port.
         link: a symbolic link to the pseudo-terminal.
 
     Raises:
-        UsageError: for an invalid destination, or one that cannot carry the sensor's frames.
+        UsageError: if the destination is invalid, or cannot carry the sensor's frames.
         SourceError: if the destination is not available.
     """
-    data = _make_data_line(sensor, place, link)
+    data = _make_data_line(sensor, destination, link)
     return Outlet(data, _make_control_lines(sensor))
 
 
-def replay_outlet(place: str, *, datagrams: bool, port: int = 0) -> Outlet:
+def replay_outlet(destination: str, *, datagrams: bool, port: int = 0) -> Outlet:
     """Return the outlet of a replay.
 
     Args:
-        place: "pty", "udp://HOST" or "tcp://HOST:PORT"; TCP port 0 takes any free one.
-        datagrams: whether datagrams were recorded. Without a UDP port, each goes to the port that
-            it was recorded at.
-        port: for datagrams whose port was not recorded.
+        destination: "pty", "udp://HOST:PORT" or "tcp://HOST:PORT". TCP port 0 selects any free
+            port. Without a UDP port, each datagram goes to the port at which it was recorded.
+        datagrams: whether datagrams were recorded.
+        port: the port for datagrams that were recorded without a port.
 
     Raises:
-        UsageError: for an invalid destination, or one that cannot carry the recorded data.
+        UsageError: if the destination is invalid, or cannot carry the recorded data.
         SourceError: if the destination is not available.
     """
-    if place.startswith("udp:"):
-        return Outlet(_make_udp_replay_line(place, datagrams=datagrams, port=port))
-    if place != "pty" and not place.startswith("tcp:"):
+    if destination.startswith("udp:"):
+        return Outlet(_make_udp_replay_line(destination, datagrams=datagrams, port=port))
+    if destination != "pty" and not destination.startswith("tcp:"):
         raise UsageError(
             "a replay goes to pty, udp://host:port, tcp://host:port or a new file, not to"
-            f" {place!r}"
+            f" {destination!r}"
         )
     if datagrams:
         raise UsageError(
-            f"datagrams were recorded, and {place} is a byte stream: play them to udp://{LOCALHOST}"
+            f"datagrams were recorded, and {destination} is a byte stream: play them to udp://{LOCALHOST}"
         )
-    if place == "pty":
+    if destination == "pty":
         return Outlet(PtyLine())
-    host, named_port = _parse_host_and_port(place)
+    host, named_port = _parse_host_and_port(destination)
     if named_port is None:
-        raise UsageError(f"{place}: name the port to listen on, as in tcp://{LOCALHOST}:2111")
+        raise UsageError(f"{destination}: name the port to listen on, as in tcp://{LOCALHOST}:2111")
     return Outlet(TcpLine(host, named_port, sole=True))
 
 
-def _make_udp_replay_line(place: str, *, datagrams: bool, port: int) -> UdpLine:
+def _make_udp_replay_line(destination: str, *, datagrams: bool, port: int) -> UdpLine:
     if not datagrams:
         raise UsageError(
-            f"a byte stream was recorded, and {place} takes datagrams: play it to pty or"
+            f"a byte stream was recorded, and {destination} takes datagrams: play it to pty or"
             f" tcp://{LOCALHOST}:PORT"
         )
-    host, named_port = _parse_host_and_port(place)
+    host, named_port = _parse_host_and_port(destination)
     ports = (named_port,) if named_port else ()
     return UdpLine.to(host, ports, default_port=port)
 
 
-def _make_data_line(sensor: Sensor, place: str, link: str | Path | None) -> OutletLine:
-    if place == "pty":
+def _make_data_line(sensor: Sensor, destination: str, link: str | Path | None) -> OutletLine:
+    if destination == "pty":
         if sensor.datagrams:
             raise UsageError(
                 f"{sensor.id} sends datagrams, which a serial port cannot carry: simulate it to"
                 f" udp://{LOCALHOST}"
             )
         return PtyLine(link)
-    if not place.startswith(("udp://", "tcp://")):
+    if not destination.startswith(("udp://", "tcp://")):
         raise UsageError(
-            f"{place!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file (.lsr,"
-            " .pcap, .pcapng, .bin)"
+            f"{destination!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
+            " (.lsr, .pcap, .pcapng, .bin)"
         )
     if link is not None:
         raise UsageError("a link leads to a pseudo-terminal: it goes with pty alone")
-    if place.startswith("tcp://"):
-        return _make_tcp_data_line(sensor, place)
-    return _make_udp_data_line(sensor, place)
+    if destination.startswith("tcp://"):
+        return _make_tcp_data_line(sensor, destination)
+    return _make_udp_data_line(sensor, destination)
 
 
-def _make_tcp_data_line(sensor: Sensor, place: str) -> TcpLine:
-    host, port = _parse_host_and_port(place)
+def _make_tcp_data_line(sensor: Sensor, destination: str) -> TcpLine:
+    host, port = _parse_host_and_port(destination)
     declared = sensor.links.get("data")
     if port is None and isinstance(declared, Tcp):
         port = declared.port
@@ -103,8 +104,8 @@ def _make_tcp_data_line(sensor: Sensor, place: str) -> TcpLine:
     return TcpLine(host, port)
 
 
-def _make_udp_data_line(sensor: Sensor, place: str) -> UdpLine:
-    host, port = _parse_host_and_port(place)
+def _make_udp_data_line(sensor: Sensor, destination: str) -> UdpLine:
+    host, port = _parse_host_and_port(destination)
     declared = sensor.links.get("data")
     if not isinstance(declared, Udp) or not sensor.datagrams:
         raise UsageError(
@@ -117,7 +118,7 @@ def _make_udp_data_line(sensor: Sensor, place: str) -> UdpLine:
 
 
 def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:
-    """Return a line on this computer for each link that takes commands, except the data link."""
+    """Return a line on this computer for each link with commands except the data link."""
     lines = {}
     for name in {command.link for command in sensor.commands.values()} - {"data"}:
         line = _make_control_line(sensor.links[name])
@@ -127,9 +128,9 @@ def _make_control_lines(sensor: Sensor) -> dict[str, OutletLine]:
 
 
 def _make_control_line(link: Link) -> OutletLine | None:
-    """Return a line at the declared port, or at a free one if that is taken.
+    """Return a line at the declared port, or at any free port if that one is in use.
 
-    None for a link of a kind that only a plugin knows.
+    None for a link type that only a plugin supports.
     """
     for port in (_declared_port(link), 0):
         with contextlib.suppress(OSError, SourceError):
@@ -145,7 +146,7 @@ def _make_control_line(link: Link) -> OutletLine | None:
 
 
 def _declared_port(link: Link) -> int:
-    """Return the port at which a sensor takes commands over a link, 0 if it declares none."""
+    """Return the port at which a sensor receives commands; 0 if it declares none."""
     if isinstance(link, Tcp | Http):
         return link.port
     if isinstance(link, Udp):
@@ -155,12 +156,15 @@ def _declared_port(link: Link) -> int:
     return 0
 
 
-def _parse_host_and_port(place: str) -> tuple[str, int | None]:
-    """Return the host, by default this computer, and the port; 0 for any free TCP port."""
-    address = SourceAddress.parse(place)
+def _parse_host_and_port(destination: str) -> tuple[str, int | None]:
+    """Return host and port of a destination.
+
+    The default host is this computer. The port is None if omitted, and 0 for any free TCP port.
+    """
+    address = SourceAddress.parse(destination)
     address.check(())
-    if address.scheme == "tcp" and address.place.endswith(":0"):
-        host, _ = replace(address, place=address.place.removesuffix(":0")).host_and_port()
+    if address.scheme == "tcp" and address.location.endswith(":0"):
+        host, _ = replace(address, location=address.location.removesuffix(":0")).host_and_port()
         return host or LOCALHOST, 0
     host, port = address.host_and_port()
     return host or LOCALHOST, port

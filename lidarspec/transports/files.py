@@ -1,9 +1,9 @@
 """Transports for files and standard input.
 
-`open_file` detects the format of a file by its content: a recording, a capture, a log (see `bags`),
-hexadecimal text or raw bytes. A file is read as fast as the caller requests chunks. Recordings and
-captures yield the original arrival times, and count the data that they skip. Raw bytes have no
-times.
+`open_file` detects the format of a file by its content: a recording, a capture, a robotics log (see
+`robotics_logs`), hexadecimal text or raw bytes. A file is read as fast as the caller requests
+chunks. Recordings and captures yield the original arrival times, and count the data that they skip.
+Raw bytes have no times.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from lidarspec.transports.robotics_logs import BagTransport, find_log_kind
 #: Events that interrupt the stream: an incomplete frame does not continue after them.
 INTERRUPTIONS = frozenset({"disconnect", "reconnect", "dropped"})
 #: Number of bytes that are read at once.
-BLOCK = 1 << 18
+BLOCK_BYTES = 1 << 18
 #: Suffixes of hexadecimal text.
 HEX_SUFFIXES = {".hex", ".txt"}
-#: Suffixes of text that is hexadecimal only if its content is.
+#: Suffixes of files that are read as hexadecimal text only if their content is hexadecimal.
 TEXT_SUFFIXES = {".log", ".csv", ".asc"}
 
 
@@ -56,8 +56,8 @@ class RecordingTransport(Transport):
     Args:
         path: the file.
         file: the open file; by default `path` is opened.
-        sender: yield only datagrams from this "ADDRESS" or "ADDRESS:PORT".
-        salvage: continue after damaged parts.
+        sender: yield only datagrams from this "ADDRESS" or "ADDRESS:PORT"; None for all senders.
+        salvage: whether to continue after damaged parts.
 
     Attributes:
         header: the header of the recording.
@@ -85,10 +85,11 @@ class RecordingTransport(Transport):
         self._has_skipped = False
 
     def known_sensor(self) -> Sensor:
-        """Return the sensor that the recording names, configured with the recorded options.
+        """Return the recorded sensor, configured with the recorded options.
 
         Raises:
-            UsageError: if the recording names no sensor, or an option has to be given again.
+            UsageError: if the recording names no sensor, or if the user has to give an option
+                again.
             UnknownSensor: if the sensor is not installed.
         """
         try:
@@ -141,7 +142,7 @@ class RecordingTransport(Transport):
         self._recording.close()
 
     def _accepts(self, record: Record) -> bool:
-        """Return whether the sender is the requested one; count other senders."""
+        """Return whether a record is from the requested sender; count other datagrams."""
         if self._origin is None or record.sender in self._origin:
             return True
         self.foreign += 1
@@ -182,7 +183,7 @@ def _describe_damage(recording: Recording) -> str:
 
 
 def _describe_skipped(path: str, places: int, size: int) -> str:
-    """Return a warning with the number of damaged parts and of unread bytes."""
+    """Return a warning with the numbers of damaged places and of unread bytes."""
     return (
         f"{path} is damaged in {places} place{'s' * (places > 1)}: {size} bytes were not read,"
         " everything else was"
@@ -214,8 +215,8 @@ class FileTransport(Transport):
         self.warnings: list[str] = []
 
     @property
-    def can_go_on(self) -> bool:
-        """Whether another transport can continue at the current position of the file.
+    def can_resume(self) -> bool:
+        """Whether another transport can continue at the current offset of the file.
 
         This requires a seekable file with raw bytes or a capture.
         """
@@ -226,7 +227,7 @@ class FileTransport(Transport):
 
     def chunks(self) -> Iterator[Chunk]:
         with system_errors(self._path):
-            while block := self.file.read(BLOCK):
+            while block := self.file.read(BLOCK_BYTES):
                 yield Chunk(block)
         _check_end(self, self.file)
 
@@ -314,7 +315,7 @@ class CaptureTransport(FileTransport):
                 self.foreign += 1
                 continue
             yield Chunk(
-                datagram.data, datagram.at, datagram.source, datagram.destination, self._gap()
+                datagram.data, datagram.at, datagram.source, datagram.destination, self._take_gap()
             )
         self._warn(reader.stats)
 
@@ -332,7 +333,7 @@ class CaptureTransport(FileTransport):
                 mine = batch.of(self._origin)
             self.foreign += len(batch) - len(mine)
             if len(mine):
-                yield replace(mine, gap=True) if self._gap() else mine
+                yield replace(mine, gap=True) if self._take_gap() else mine
         self._warn(reader.stats)
 
     def skip_until(self, time_ns: int) -> bool:
@@ -340,7 +341,7 @@ class CaptureTransport(FileTransport):
             self._has_skipped = self.reader is not None and self.reader.skip_until(time_ns)
         return self._has_skipped
 
-    def _gap(self) -> bool:
+    def _take_gap(self) -> bool:
         """Return whether data was skipped since the last call."""
         gap = self._has_skipped
         self._has_skipped = False
@@ -355,7 +356,9 @@ class StreamCaptureTransport(CaptureTransport):
 
     def chunks(self) -> Iterator[Chunk]:
         reader = self.reader = self.in_batches(self.file)
-        yield from (Chunk(packet.data, packet.at or None, gap=self._gap()) for packet in reader)
+        yield from (
+            Chunk(packet.data, packet.at or None, gap=self._take_gap()) for packet in reader
+        )
         self._warn(reader.stats)
 
 
@@ -365,9 +368,10 @@ def open_file(
     """Open a file with the transport for its content.
 
     Args:
-        path: a file, "-" for standard input, or the folder of a bag.
-        sender: yield only data from this address or topic.
-        member: name of a file in a zip archive; "" for the only capture or recording in it.
+        path: a file, "-" for standard input, or the folder of a ROS 2 bag.
+        sender: yield only data from this address or topic; None for all.
+        member: name of a file in a zip archive; "" if the archive has only one capture or
+            recording.
 
     Raises:
         SourceError: if the file cannot be opened, or its format is not supported.
@@ -386,13 +390,13 @@ def open_file(
         log = find_log_kind(path, start)
         if log is not None and (file is not plain or path == "-"):
             raise SourceError(
-                f"{name} is {log.what}{' in a compressed file' * (file is not plain)}, and is not"
-                " read: give the file itself"
+                f"{name} is {log.description}{' in a compressed file' * (file is not plain)}, and"
+                " is not read: give the file itself"
             )
         refuse_container(name, start)
         if log is not None and is_remote(path):
             raise SourceError(
-                f"{path} is {log.what}, which is read from this computer alone: copy it here"
+                f"{path} is {log.description}, which is read from this computer alone: copy it here"
             )
         if log is not None:
             return BagTransport(path, log, sender=sender)

@@ -13,22 +13,19 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from datetime import date
-from functools import partial
 
 from lidarspec.errors import WireError
 from lidarspec.transports.protocol import Chunk
 
-#: bytes of a line that are read at once.
-BLOCK = 1 << 18
-#: characters of an invalid word in a message.
-QUOTED = 64
-#: maximum length of a dump's line with characters after its bytes.
-LONGEST_ROW = 1 << 10
-_BETWEEN, _NO_DIGIT, _COMMENT = (
-    re.compile(r"[\s,;:{}]+"),
-    re.compile(r"[^0-9a-fA-F]"),
-    re.compile(r"/\*|#|//"),
-)
+#: number of bytes of a line that are read at once.
+BLOCK_BYTES = 1 << 18
+#: maximum number of characters of an invalid word in a message.
+MAX_QUOTED_CHARS = 64
+#: maximum number of characters of a dump's line that has characters after its bytes.
+MAX_ROW_CHARS = 1 << 10
+_SEPARATORS = re.compile(r"[\s,;:{}]+")
+_NO_DIGIT = re.compile(r"[^0-9a-fA-F]")
+_COMMENT = re.compile(r"/\*|#|//")
 _HEX = "[0-9a-fA-F]"
 _PLAIN = re.compile(r"\s*(?:(?:[0-9a-fA-F]{2})+(?:\s+|$))*")
 #: lines with bytes as digits, a bus and a time: candump, the log of candump, sigrok's annotations
@@ -43,7 +40,8 @@ FORMS = (
     ),
     re.compile(rf"\s*(?:\d+-\d+\s+)?(?:uart-\d+|UART: RX(?: data)?):\s+(?P<digits>{_HEX}{{2}})\s*"),
 )
-#: a line of a dump: its offset, the mark after it, and the rest. The last line has only an offset.
+#: a line of a dump: its offset, the mark after the offset, and the rest. The last line has only an
+#: offset.
 _ROW = re.compile(
     rf"\s*(?:0[xX])?(?P<offset>{_HEX}{{3,16}})(?P<mark>:(?=\s)|(?=\s\s|\s*$)|(?<=^{_HEX}{{7}})(?="
     rf" {_HEX}{{2}}\b))(?P<rest>.*)"
@@ -56,12 +54,13 @@ _CLOCK = re.compile(
     r"(?(bracket)\]|(?=[\s:>]))\s*(?:->|[:>])?\s*"
 )
 _SECONDS = re.compile(r"\s*(?:[\[(]\s*)?(?P<at>\d+\.\d+)[\])]?:?\s+")
-#: the start of an array; a variable that is not an array; a string of escaped bytes.
+#: the start of an array; a variable that is not an array; a string of escaped bytes; an element of
+#: an array.
 _ARRAY = re.compile(r".*[\w\]]\s*=\s*(?:[{\[]|$)|\s*\[(?=\s*0[xX])")
 _NUMBER = re.compile(r"[\w\s]+=\s*\w+\s*;\s*")
 _STRING = re.compile(r"""\bb?(["'])((?:\\x[0-9a-fA-F]{2})*)\1|(["'])((?:\\x[0-9a-fA-F]{2})*)\3""")
 _IN_ARRAY = re.compile(rf"0[xX]{_HEX}{{1,2}}")
-#: ambiguous lines, and the reason.
+#: ambiguous lines -> the reason.
 AMBIGUOUS = {
     re.compile(
         rf"\s*:{_HEX}{{10,}}\s*"
@@ -80,37 +79,34 @@ AMBIGUOUS = {
 
 
 class HexText:
-    """Reader of one text, line by line.
-
-    It keeps the state of comments, arrays and dumps that span lines.
-    """
+    """Reads one text line by line; comments, arrays and dumps may span several lines."""
 
     def __init__(self) -> None:
         self._in_comment = self._in_array = False
-        self._columns: tuple[int, int] | None = None  # of a table: the columns of values and times
+        self._columns: tuple[int, int] | None = None  # a table's columns of values and times
         self._bus = ""
-        self._position: int | None = None  # bytes since the start of a dump with unmarked offsets
+        self._dump_offset: int | None = None  # bytes so far of a dump with unmarked offsets
 
-    def line(self, text: str) -> Chunk:
-        """Return the bytes of a line, with its time if it has one.
+    def read_line(self, text: str) -> Chunk:
+        """Return the bytes of the next line, with its time if it has a time.
 
         Raises:
-            ValueError: for other content, or an ambiguous line.
+            ValueError: if the line is not hexadecimal, or ambiguous.
         """
         at = None
         if not self._in_comment:
-            for reader in (self._frame, self._cell):
-                if (chunk := reader(text)) is not None:
+            for read in (self._read_form, self._read_table_line):
+                if (chunk := read(text)) is not None:
                     return chunk
             at, text = _split_time(text)
-            if (data := self._row(text)) is not None:
+            if (data := self._read_dump_line(text)) is not None:
                 return Chunk(data, at)
             if reason := next(
                 (reason for form, reason in AMBIGUOUS.items() if form.fullmatch(text)), ""
             ):
                 raise ValueError(reason)
-        data = self._plain(self._strip_comments(text))
-        if data and self._position is not None:
+        data = self._read_plain_line(self._strip_comments(text))
+        if data and self._dump_offset is not None:
             raise ValueError("the lines before have offsets, and this one has none")
         return Chunk(data, at)
 
@@ -123,28 +119,36 @@ class HexText:
         if self._in_comment:
             raise ValueError("a comment begins with /* and does not end")
 
-    def _frame(self, text: str) -> Chunk | None:
-        """Return the bytes of a line of `FORMS`; all lines need the same sender."""
+    def _read_form(self, text: str) -> Chunk | None:
+        """Return the bytes of a line of `FORMS`; None for other lines.
+
+        Raises:
+            ValueError: if the line is of another sender on the bus than earlier lines, or if its
+                bytes do not have the stated number.
+        """
         matched = next((match for form in FORMS if (match := form.fullmatch(text))), None)
         if matched is None:
             return None
-        facts = matched.groupdict()
-        data = bytes.fromhex(facts["digits"].replace(".", ""))
-        bus = " ".join((facts.get("bus") or "").split())
+        groups = matched.groupdict()
+        data = bytes.fromhex(groups["digits"].replace(".", ""))
+        bus = " ".join((groups.get("bus") or "").split())
         if self._bus and bus != self._bus:
             raise ValueError(f"CAN frames of {self._bus} and of {bus}; grep takes those of one")
         self._bus = bus
-        if len(data) != int(facts.get("size") or len(data)) and "remote" not in text:
-            raise ValueError(f"a CAN frame of {facts['size']} bytes with {len(data)}")
-        return Chunk(data, _nanoseconds(facts.get("at")))
+        if len(data) != int(groups.get("size") or len(data)) and "remote" not in text:
+            raise ValueError(f"a CAN frame of {groups['size']} bytes with {len(data)}")
+        return Chunk(data, _to_ns(groups.get("at")))
 
-    def _cell(self, text: str) -> Chunk | None:
-        """Return the bytes of a table's line; the first line names the columns."""
+    def _read_table_line(self, text: str) -> Chunk | None:
+        """Return the bytes of a line of a table; None for other lines.
+
+        The first line of a table names the columns.
+        """
         if self._columns is None:
             names = [name.strip(' "').lower() for name in text.split(",")]
-            values = [number for number, name in enumerate(names) if name in ("value", "data")]
+            values = [index for index, name in enumerate(names) if name in ("value", "data")]
             times = [
-                number for number, name in enumerate(names) if name.startswith(("time", "start"))
+                index for index, name in enumerate(names) if name.startswith(("time", "start"))
             ]
             if not values or not times:
                 return None
@@ -156,15 +160,16 @@ class HexText:
         )
         if value and not _IN_ARRAY.fullmatch(value):
             raise ValueError(
-                f"{value[:QUOTED]!r} is no byte such as 0x54; tables are read whose values are"
-                " hexadecimal"
+                f"{value[:MAX_QUOTED_CHARS]!r} is no byte such as 0x54; tables are read whose"
+                " values are hexadecimal"
             )
-        return Chunk(_whole_bytes(value) if value else b"", _nanoseconds(at))
+        return Chunk(_parse_word(value) if value else b"", _to_ns(at))
 
-    def _row(self, text: str) -> bytes | None:
-        """Return the bytes of a line of a dump, None for other lines.
+    def _read_dump_line(self, text: str) -> bytes | None:
+        """Return the bytes of a line of a dump; None for other lines.
 
-        Its offset is marked, or equals the number of bytes before it.
+        The line begins with an offset that is marked by a colon, or that equals the number of bytes
+        in the lines before.
         """
         match = _ROW.fullmatch(text)
         if match is None:
@@ -172,60 +177,66 @@ class HexText:
         offset = match["offset"]
         rest = match["rest"].strip()
         if match["mark"] == ":":
-            return _shown(rest)
+            return _parse_dump_bytes(rest)
         if not int(offset, 16) and rest and len(offset) > 3:
-            self._position = 0
-        if self._position is None:
+            self._dump_offset = 0
+        if self._dump_offset is None:
             return None
-        if self._position not in (
+        if self._dump_offset not in (
             int(offset, 16),
             int(offset, 8) if re.fullmatch("[0-7]+", offset) else -1,
         ):
-            raise ValueError(f"offset {offset} behind {self._position:#x} bytes: lines are missing")
-        data = _shown(rest)
-        self._position += len(data)
+            raise ValueError(
+                f"offset {offset} behind {self._dump_offset:#x} bytes: lines are missing"
+            )
+        data = _parse_dump_bytes(rest)
+        self._dump_offset += len(data)
         return data
 
     def _strip_comments(self, text: str) -> str:
         """Return a line without comments."""
-        kept = ""
+        content = ""
         while True:
             if self._in_comment:
                 _, end, text = text.partition("*/")
                 if not end:
-                    return kept
+                    return content
                 self._in_comment = False
-            begun = _COMMENT.search(text)
-            if begun is None or begun[0] != "/*":
-                return f"{kept} {text[: begun.start() if begun else None]}"
-            kept = f"{kept} {text[: begun.start()]}"
-            text = text[begun.end() :]
+            comment = _COMMENT.search(text)
+            if comment is None or comment[0] != "/*":
+                return f"{content} {text[: comment.start() if comment else None]}"
+            content = f"{content} {text[: comment.start()]}"
+            text = text[comment.end() :]
             self._in_comment = True
 
-    def _plain(self, text: str) -> bytes:
-        """Return the bytes of a line without offset and time."""
+    def _read_plain_line(self, text: str) -> bytes:
+        """Return the bytes of a line without offset, time and comments."""
         if _NUMBER.fullmatch(text):  # the length in the output of xxd -i
             return b""
-        if begun := _ARRAY.match(text):
+        if start := _ARRAY.match(text):
             self._in_array = True
-            text = text[begun.end() :]
+            text = text[start.end() :]
         words = text
         rest = ""
         if self._in_array:
             words, end, rest = text.replace("]", "}").partition("}")
             if bad := next(
-                (word for word in _BETWEEN.split(words) if word and not _IN_ARRAY.fullmatch(word)),
+                (
+                    word
+                    for word in _SEPARATORS.split(words)
+                    if word and not _IN_ARRAY.fullmatch(word)
+                ),
                 "",
             ):
-                raise ValueError(f"{bad[:QUOTED]!r} in an array is no byte such as 0x54")
+                raise ValueError(f"{bad[:MAX_QUOTED_CHARS]!r} in an array is no byte such as 0x54")
             self._in_array = not end
-        return _digits(f"{words} {rest}")
+        return _parse_words(f"{words} {rest}")
 
 
 def _split_time(text: str) -> tuple[int | None, str]:
     """Return the time at the beginning of a line in ns, and the rest of the line."""
     if match := _SECONDS.match(text):
-        return _nanoseconds(match["at"]), text[match.end() :]
+        return _to_ns(match["at"]), text[match.end() :]
     match = _CLOCK.match(text)
     if match is None or not text[match.end() :].strip():
         return None, text
@@ -239,11 +250,11 @@ def _split_time(text: str) -> tuple[int | None, str]:
         days = 0
     hours, minutes, seconds = map(int, match["clock"].split(":"))
     whole = ((days * 24 + hours) * 60 + minutes) * 60 + seconds
-    return _nanoseconds(f"{whole}.{match['fraction'] or 0}"), text[match.end() :]
+    return _to_ns(f"{whole}.{match['fraction'] or 0}"), text[match.end() :]
 
 
-def _nanoseconds(seconds: str | None) -> int | None:
-    """Return decimal seconds in ns, None if they are invalid or out of range."""
+def _to_ns(seconds: str | None) -> int | None:
+    """Convert decimal seconds to ns; None if they are invalid or out of range."""
     whole, _, fraction = (seconds or "").partition(".")
     if not whole.isdecimal() or not (fraction or "0").isdecimal():
         return None
@@ -253,109 +264,116 @@ def _nanoseconds(seconds: str | None) -> int | None:
     return None
 
 
-def _shown(text: str) -> bytes:
-    """Return the bytes of a dump's line after its offset.
+def _parse_dump_bytes(text: str) -> bytes:
+    """Return the bytes of a dump's line, which is given without its offset.
 
-    Characters after the bytes, between "|" or behind a gap, have to match the bytes.
+    The line may end with the bytes as characters, between "|" or after a gap.
+
+    Raises:
+        ValueError: if the characters do not match the bytes.
     """
     text, bar, _ = text.partition("  |")
     data = b""
     while text:
-        if bar or len(text) > LONGEST_ROW:
+        if bar or len(text) > MAX_ROW_CHARS:
             gap = None
         else:
             gap = _GAP.search(text)
-        area, beside = (text[: gap.start()], text[gap.end() :]) if gap else (text, "")
-        comment = _COMMENT.search(area)
+        digits, rest = (text[: gap.start()], text[gap.end() :]) if gap else (text, "")
+        comment = _COMMENT.search(digits)
         try:
-            data += _digits(area[: comment.start() if comment else None])
+            data += _parse_words(digits[: comment.start() if comment else None])
         except ValueError:
             if not data:
                 raise
             raise ValueError(
-                f"the characters beside the bytes, {text[:QUOTED]!r}, are not theirs; xxd -e prints"
-                " words"
+                f"the characters beside the bytes, {text[:MAX_QUOTED_CHARS]!r}, are not theirs; xxd"
+                " -e prints words"
             ) from None
         if comment or (
-            gap and any(_is_of(" " * number + beside, data) for number in range(len(gap[0]) + 1))
+            # The first characters may be blanks, which the gap then contains.
+            gap and any(_represent(" " * count + rest, data) for count in range(len(gap[0]) + 1))
         ):
             break
-        text = beside
+        text = rest
     return data
 
 
-def _is_of(characters: str, data: bytes) -> bool:
-    """Return whether these characters stand for the bytes.
+def _represent(characters: str, data: bytes) -> bool:
+    """Return whether characters represent the first bytes of `data`.
 
-    Bytes that cannot be printed may have any replacement.
+    "." and characters outside ASCII may replace any byte.
     """
     pairs = zip(characters, data, strict=False)
     return len(characters) <= len(data) and all(
-        ord(one) == byte or one == "." or not one.isascii() for one, byte in pairs
+        ord(character) == byte or character == "." or not character.isascii()
+        for character, byte in pairs
     )
 
 
-def _digits(text: str) -> bytes:
+def _parse_words(text: str) -> bytes:
     """Return the bytes of words of hexadecimal digits."""
     if _PLAIN.fullmatch(text):
         return bytes.fromhex(text)
-    words = _BETWEEN.split(_STRING.sub(r"\2\4 ", text).replace("\\x", " "))
-    return b"".join(_whole_bytes(word) for word in words if word)
+    words = _SEPARATORS.split(_STRING.sub(r"\2\4 ", text).replace("\\x", " "))
+    return b"".join(_parse_word(word) for word in words if word)
 
 
-def _whole_bytes(word: str) -> bytes:
+def _parse_word(word: str) -> bytes:
     digits = word.removeprefix("0x").removeprefix("0X")
     if bad := _NO_DIGIT.search(digits):
         raise ValueError(f"{bad[0]!r} is no digit of it")
     if len(digits) == 1 and digits != word:
         digits = f"0{digits}"
     if not digits or len(digits) % 2:
-        raise ValueError(f"{word[:QUOTED]!r}{' ...' * (len(word) > QUOTED)} makes no whole bytes")
+        raise ValueError(
+            f"{word[:MAX_QUOTED_CHARS]!r}{' ...' * (len(word) > MAX_QUOTED_CHARS)} makes no whole"
+            " bytes"
+        )
     return bytes.fromhex(digits)
 
 
 def hex_chunks(name: str, readline: Callable[[int], bytes]) -> Iterator[Chunk]:
-    """Yield the bytes of hexadecimal text, a chunk for each line.
+    """Yield the bytes of hexadecimal text, one chunk for each line.
 
     A line that is longer than a block yields several chunks.
 
     Args:
-        name: of the file, for messages.
-        readline: returns the next line, or the given number of bytes of it.
+        name: the name of the file, for messages.
+        readline: returns the next line, up to the given number of bytes.
 
     Raises:
-        WireError: for other content.
+        WireError: if the text is not hexadecimal.
     """
     reader = HexText()
     text = ""
-    goes_on = ""
-    number = 1
+    prefix = ""  # put before the rest of a cut line
+    line_number = 1
     try:
-        while (block := readline(BLOCK)) or text:
+        while (block := readline(BLOCK_BYTES)) or text:
             text += block.decode("ascii", "replace")
-            if len(block) < BLOCK or block.endswith(b"\n"):
+            if len(block) < BLOCK_BYTES or block.endswith(b"\n"):
                 end = len(text)
             else:
                 end = find_cut(text)
-            yield reader.line((goes_on + text[:end]).removesuffix("\n"))
+            yield reader.read_line((prefix + text[:end]).removesuffix("\n"))
             if block.endswith(b"\n"):
-                goes_on = ""
-                number = number + 1
-            else:  # a comment also continues; only the beginning of a line can be an offset
-                if re.search("#|//", goes_on + text[:end]):
-                    goes_on = "#"
-                else:
-                    goes_on = ","
+                prefix = ""
+                line_number += 1
+            elif re.search("#|//", prefix + text[:end]):
+                prefix = "#"  # the comment continues
+            else:
+                prefix = ","  # so that the rest is not read as an offset
             text = text[end:]
         reader.finish()
     except ValueError as error:
-        raise WireError(f"{name}, line {number}: not hexadecimal: {error}") from None
+        raise WireError(f"{name}, line {line_number}: not hexadecimal: {error}") from None
 
 
 def find_cut(text: str) -> int:
     """Return an index at which hexadecimal text can be cut.
 
-    It is next to the last separator, else between two bytes.
+    It is next to the last separator, or between two bytes if there is no separator.
     """
     return (
         max(
@@ -366,13 +384,13 @@ def find_cut(text: str) -> int:
 
 
 def parse_hex(text: str) -> bytes:
-    """Return the bytes that hexadecimal text stands for.
+    """Return the bytes that hexadecimal text represents.
 
     Raises:
-        ValueError: for other content, or ambiguous text.
+        ValueError: if the text is not hexadecimal, or ambiguous.
     """
     reader = HexText()
-    data = b"".join(reader.line(line).data for line in text.splitlines())
+    data = b"".join(reader.read_line(line).data for line in text.splitlines())
     reader.finish()
     return data
 
@@ -381,17 +399,14 @@ def is_hexadecimal(head: bytes, *, whole: bool) -> bool:
     """Return whether input begins with hexadecimal text.
 
     Args:
-        head: its first bytes.
+        head: the first bytes of the input.
         whole: whether `head` is the whole input.
     """
     try:
         text = head.decode("ascii")
-        reader = partial(map, HexText().line)
-        return any(
-            chunk.data
-            for chunk in reader(
-                (text if whole else text[: text.rfind("\n") + 1 or find_cut(text)]).splitlines()
-            )
-        )
+        if not whole:
+            text = text[: text.rfind("\n") + 1 or find_cut(text)]
+        reader = HexText()
+        return any(reader.read_line(line).data for line in text.splitlines())
     except ValueError:
         return False

@@ -1,7 +1,7 @@
-"""Stamp arrivals with the time of this computer.
+"""The clock of this computer for arrival times.
 
 `HostClock` reads the wall clock once and continues with a steady clock. The interval between two
-stamps is therefore right even if the wall clock is set in between.
+times is therefore right even if the wall clock is set in between.
 """
 
 from __future__ import annotations
@@ -9,14 +9,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-#: A wall clock that differs by more was set; by less, it is only adjusted.
+#: A wall clock that differs by more than this was set; smaller differences are adjustments.
 _SET_CLOCK_NS = 50_000_000
-#: Attempts to read two clocks at one moment.
+#: Number of attempts to read two clocks at one moment.
 _READ_ATTEMPTS = 10
-#: A reading of both clocks in a longer time is repeated.
+#: If reading both clocks takes longer than this, they are read again.
 _MAX_READ_TIME_NS = _SET_CLOCK_NS // _READ_ATTEMPTS
-#: A thread was suspended between two readings that are further apart; one takes less than a
-#: thousandth of it.
+#: If two readings are further apart than this, the thread was suspended in between. A reading takes
+#: less than a thousandth of this time.
 _SUSPENDED_NS = 200_000
 _CLOCK_BOOTTIME: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 
@@ -24,7 +24,8 @@ _CLOCK_BOOTTIME: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 class HostClock:
     """The wall clock at the start, continued by a steady clock.
 
-    The intervals between its times are right if the wall clock is set or the computer is suspended.
+    Intervals between its times are right even if the wall clock is set or the computer is
+    suspended.
 
     Args:
         wall: the wall clock, ns since 1970.
@@ -33,8 +34,7 @@ class HostClock:
     def __init__(self, wall: Callable[[], int] = time.time_ns) -> None:
         self._wall = wall
         self._offset_ns = 0
-        #: The lead of the wall clock at the last call of `find_step`.
-        self._lead_ns = 0
+        self._lead_ns = 0  # lead of the wall clock when `find_step` last reported a step
         for _ in range(_READ_ATTEMPTS):
             self._offset_ns, read_time_ns = self._read_offset()
             if read_time_ns < _MAX_READ_TIME_NS:
@@ -45,10 +45,9 @@ class HostClock:
         return steady_ns() + self._offset_ns
 
     def now_and_wall(self) -> tuple[int, int]:
-        """Return the times of this clock and of the wall clock at one moment, ns since 1970.
+        """Return this clock and the wall clock at one moment, ns since 1970.
 
-        If the thread is suspended between two readings, both are repeated. The closest pair is
-        returned.
+        If the thread is suspended between the two readings, both are repeated.
         """
         closest: tuple[int, int, int] | None = None
         for _ in range(_READ_ATTEMPTS):
@@ -63,9 +62,9 @@ class HostClock:
         return closest[1:]
 
     def find_step(self) -> int | None:
-        """Return the lead of the wall clock in ns if it was set by more than 50 ms, else None.
+        """Return the lead of the wall clock in ns if it was set; None if it was not.
 
-        A step is returned once.
+        Each step of more than 50 ms is reported once.
         """
         offset_ns, read_time_ns = self._read_offset()
         lead_ns = offset_ns - self._offset_ns
@@ -75,7 +74,7 @@ class HostClock:
         return lead_ns
 
     def _read_offset(self) -> tuple[int, int]:
-        """Return the offset of the wall clock from the steady one, and the time of the reading."""
+        """Return the wall clock minus the steady clock, and the duration of the reading."""
         before = steady_ns()
         wall = self._wall()
         return wall - before, steady_ns() - before
@@ -84,7 +83,7 @@ class HostClock:
 def steady_ns() -> int:
     """Return the time of a clock that is never set, in ns.
 
-    If the system has such a clock, it includes the time in which the computer was suspended.
+    If the system supports it, the clock also runs while the computer is suspended.
     """
     if _CLOCK_BOOTTIME is None:
         return time.monotonic_ns()

@@ -21,13 +21,13 @@ from lidarspec.transports.protocol import Chunk, LiveTransport
 
 
 class HttpTransport(LiveTransport):
-    """Requests to a host, sent by the thread that reads.
+    """Sends requests to a host, in the thread that calls `read`.
 
-    A failed request has no reply; `warnings` has the reason.
+    If a request fails, there is no reply, and `warnings` has the reason.
 
     Args:
         host: name or address of the sensor.
-        link: its port, and the limits.
+        link: the port, and the limits of time and size.
     """
 
     datagrams = True
@@ -92,8 +92,8 @@ class HttpTransport(LiveTransport):
         )
         with contextlib.closing(connection):
             connection.connect()
-            # The timeout of the connection starts anew with every byte, so that it does not limit
-            # the whole request.
+            # The timeout of the connection restarts with every byte, so it does not limit the
+            # duration of the whole request.
             limit = threading.Timer(self._link.timeout, _hang_up, [connection.sock])
             limit.daemon = True
             limit.start()

@@ -1,8 +1,8 @@
 """Serve HTTP in the place of a sensor.
 
-The standard library's server parses requests in threads of its own. Each thread passes its request
-on as a frame of `HttpRequest`, and waits for the frame of `HttpReply` that the simulated sensor
-sends. A request without a reply in time is answered with status 504.
+The standard library's server parses each request in a separate thread. The thread passes the
+request on as a frame of `HttpRequest`, and waits until the simulated sensor sends a frame of
+`HttpReply`. If no reply arrives in time, the status is 504.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lidarspec.transports.protocol import Chunk
 
 _MAX_BODY_BYTES = 1 << 20
 _REPLY_TIMEOUT_S = 2.0
-#: The interval at which requests are fetched from the threads.
+#: Interval at which requests are fetched from the threads.
 _REQUEST_POLL_S = 0.01
 _SHUTDOWN_POLL_S = 0.05
 
@@ -33,7 +33,8 @@ class HttpLine(OutletLine):
     """The web server of a simulated sensor.
 
     Args:
-        host, port: where to listen; port 0 takes any free one.
+        host: the address to listen on.
+        port: the port to listen on; 0 selects any free port.
 
     Raises:
         OSError: if the address is not available.
@@ -42,16 +43,16 @@ class HttpLine(OutletLine):
     def __init__(self, host: str, port: int) -> None:
         self._lock = threading.Lock()
         self._requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        # In the order of the requests. A request that timed out is no longer among them.
-        self._waiting: deque[_ReplyQueue] = deque()
+        # One for each unanswered request, in order. Requests that timed out are removed.
+        self._reply_queues: deque[_ReplyQueue] = deque()
         self._server = ThreadingHTTPServer((host, port), partial(_Handler, self))
         self._server.daemon_threads = True
         self.port = int(self._server.server_address[1])
-        self.place = f"http://{host}:{self.port}"
+        self.local_source = f"http://{host}:{self.port}"
         threading.Thread(
             target=self._server.serve_forever,
             kwargs={"poll_interval": _SHUTDOWN_POLL_S},
-            name=self.place,
+            name=self.local_source,
             daemon=True,
         ).start()
 
@@ -69,23 +70,23 @@ class HttpLine(OutletLine):
     def send(self, chunks: Sequence[Chunk], *, patient: bool) -> None:
         for chunk in chunks:
             with contextlib.suppress(IndexError):  # the request has timed out
-                self._waiting.popleft().put(chunk.data)
+                self._reply_queues.popleft().put(chunk.data)
 
     def close(self) -> None:
         self._server.shutdown()
         self._server.server_close()
 
     def ask(self, request: bytes) -> bytes | None:
-        """Return the reply of the simulated sensor to a request; None if there is none in time."""
+        """Return the simulated sensor's reply to a request; None if it is not in time."""
         reply = _ReplyQueue()
         with self._lock:
-            self._waiting.append(reply)
+            self._reply_queues.append(reply)
             self._requests.put(request)
         try:
             return reply.get(timeout=_REPLY_TIMEOUT_S)
         except queue.Empty:
             with contextlib.suppress(ValueError):
-                self._waiting.remove(reply)
+                self._reply_queues.remove(reply)
             return None
 
 
@@ -96,7 +97,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._line = line
         super().__init__(*arguments)  # handles the request
 
-    def _pass_on(self) -> None:
+    def _handle_request(self) -> None:
         path = self.path.encode("latin-1")
         body = self._read_body()
         request = HttpRequest.build(
@@ -108,17 +109,17 @@ class _Handler(BaseHTTPRequestHandler):
                 "body": body,
             }
         )
-        answer = self._line.ask(request)
-        if answer is None:
+        reply_data = self._line.ask(request)
+        if reply_data is None:
             self.send_error(504, "the simulated sensor has no answer to that")
             return
-        reply = HttpReply.parse(answer)
+        reply = HttpReply.parse(reply_data)
         self.send_response(reply.status)
         self.send_header("Content-Length", str(reply.size))
         self.end_headers()
         self.wfile.write(reply.body)
 
-    do_GET = do_PUT = do_POST = do_DELETE = _pass_on
+    do_GET = do_PUT = do_POST = do_DELETE = _handle_request
 
     def _read_body(self) -> bytes:
         size = self.headers.get("Content-Length", "0")

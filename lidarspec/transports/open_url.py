@@ -1,6 +1,6 @@
 """Open the transport of a SOURCE.
 
-A SOURCE is the text that names an input: a file, a port, a URL, a device of `lidarspec.toml`.
+A SOURCE is a text that names an input: a file, a port, a URL, or a device of `lidarspec.toml`.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ from lidarspec.transports.protocol import LiveTransport, Transport
 
 #: scheme -> the module of lidarspec.transports whose `connect(address, sensor)` opens it.
 SCHEMES = {"serial": "serial", "udp": "udp", "tcp": "tcp", "sim": "simulated"}
-#: options of a file, after "?": the sender, and the member of an archive.
+#: options of a file, after "?": the sender, and the file in an archive.
 FILE_OPTIONS = {"src", "file"}
 _SCHEME = re.compile(r"^([a-z][a-z0-9+.-]+):")
 #: names of serial ports: COM4 on Windows, and all names on POSIX systems.
-_PORT = re.compile(r"(COM\d+|\\\\\.\\\w+|/dev/(tty|cu\.|pts/|serial/|rfcomm).*)", re.IGNORECASE)
-#: devices in /dev that are read like files.
-_NO_PORTS = {"null", "zero", "full", "random", "urandom", "stdin", "fd"}
+_PORT_NAME = re.compile(
+    r"(COM\d+|\\\\\.\\\w+|/dev/(tty|cu\.|pts/|serial/|rfcomm).*)", re.IGNORECASE
+)
+#: names of devices in /dev that are read as files.
+_FILE_DEVICES = {"null", "zero", "full", "random", "urandom", "stdin", "fd"}
 
 
 def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
@@ -39,11 +41,11 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
 
     Args:
         source: a file, "-", a port, a URL, or the name of a device in `lidarspec.toml`.
-        sensor: the source of defaults: baud rate, control lines, ports.
+        sensor: supplies defaults: baud rate, control lines, ports.
 
     Raises:
-        UsageError: for an unknown scheme, or options that the kind of source does not accept.
-        SourceError: if it cannot be opened.
+        UsageError: for an unknown scheme, or an option that this kind of source does not accept.
+        SourceError: if the source cannot be opened.
         SpecError: if a plugin returns an object that is not a `Transport`.
     """
     text = resolve(source)
@@ -68,12 +70,12 @@ def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
 
     Args:
         source: a port, a URL, or the name of a device in `lidarspec.toml`.
-        sensor: the source of defaults: baud rate, control lines, ports.
+        sensor: supplies defaults: baud rate, control lines, ports.
 
     Raises:
-        UsageError: for a file, an unknown scheme, or options that the kind of source does not
+        UsageError: for a file, an unknown scheme, or an option that this kind of source does not
             accept.
-        SourceError: if it cannot be opened.
+        SourceError: if the source cannot be opened.
     """
     opened = transport(source, sensor)
     if isinstance(opened, LiveTransport):
@@ -83,7 +85,7 @@ def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
 
 
 def resolve(source: str | Path) -> str:
-    """Return the SOURCE of a device in `lidarspec.toml`; other text is unchanged."""
+    """Return the SOURCE of a device in `lidarspec.toml`; return other text unchanged."""
     device = find_device(source)
     if device is None:
         return str(source)
@@ -91,12 +93,12 @@ def resolve(source: str | Path) -> str:
 
 
 def is_live(source: str | Path) -> bool:
-    """Return whether a SOURCE, or the device with this name, is live."""
+    """Return whether a SOURCE, or the device with this name, is not a file."""
     return live_address(resolve(source)) is not None
 
 
 def live_address(source: str | Path) -> SourceAddress | None:
-    """Return scheme, place and options of a SOURCE, None for files and standard input."""
+    """Return the parts of a live SOURCE; None for files and standard input."""
     text = str(source)
     if is_port(text):
         return SourceAddress.parse(text, scheme="serial")
@@ -112,8 +114,8 @@ def is_port(text: str) -> bool:
     name = text.partition("?")[0]
     path = Path(name)
     if os.path.exists(name) and path.is_char_device():
-        return path.name not in _NO_PORTS and path.resolve().name not in _NO_PORTS
-    return _PORT.fullmatch(name) is not None and not os.path.isfile(name)
+        return path.name not in _FILE_DEVICES and path.resolve().name not in _FILE_DEVICES
+    return _PORT_NAME.fullmatch(name) is not None and not os.path.isfile(name)
 
 
 def has_control(source: str | Path) -> bool:
@@ -127,12 +129,13 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
 
     Args:
         source: the SOURCE of the data; its ``control=HOST[:PORT]`` has priority over `host`.
-        name, link: the link as the sensor declares it.
-        host: the sensor's address, None if it is unknown.
+        name: the name of the link.
+        link: the link, as declared by the sensor.
+        host: the sensor's address; None if it is unknown.
 
     Raises:
-        UsageError: if the address is unknown, or no plugin opens such a link.
-        SourceError: if it cannot be opened.
+        UsageError: if no plugin opens a link of this type.
+        SourceError: if the address is unknown, or the link cannot be opened.
     """
     address = live_address(source)
     if address is not None:
@@ -190,7 +193,7 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
 
 
 def _open(address: SourceAddress, sensor: Sensor | None) -> Transport:
-    """Open a SOURCE with a scheme, with the package or a plugin."""
+    """Open a SOURCE that has a scheme; a plugin opens unknown schemes."""
     if address.scheme in SCHEMES:
         module = importlib.import_module(f"lidarspec.transports.{SCHEMES[address.scheme]}")
         opened: Transport = module.connect(address, sensor)

@@ -1,12 +1,12 @@
-"""Send bytes as a sensor does, over pseudo-terminals, UDP, TCP and HTTP.
+"""Send bytes like a sensor, over pseudo-terminals, UDP, TCP and HTTP.
 
 Simulated sensors and replays use the same mechanism. An `OutletLine` is the sensor's end of one
 link: it sends without waiting and returns the commands that have arrived. An `Outlet` holds the
 line of the data and the lines of the sensor's other links, and waits for all of them in one loop.
 
-Like a real sensor, an outlet sends without a listener too, and counts the bytes that were not read.
-With `patient=True` it waits for a slow reader instead. A replay requires that, because it has to
-arrive complete; so does a simulated sensor that runs as fast as it is read.
+Like a real sensor, an outlet also sends without a listener, and counts the bytes that were not
+read. With `patient=True` it waits for a slow reader instead. Replays need this because all bytes
+have to arrive, and simulated sensors need it if they run as fast as they are read.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pathlib import Path
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.base import source_error, system_reason, wait_ready
-from lidarspec.transports.protocol import POLL, Chunk, Disconnected, Sender
+from lidarspec.transports.protocol import POLL_S, Chunk, Disconnected, Sender
 
 try:
     import fcntl
@@ -37,21 +37,21 @@ except ImportError:  # not a POSIX system; `has_terminals` checks this
 LOCALHOST = "127.0.0.1"
 _LOOPBACK_BROADCAST = "127.255.255.255"
 _READ_BYTES = 1 << 16
-#: Bytes that may wait for a slow reader before further ones are dropped.
+#: Maximum number of bytes that wait for a slow reader; further bytes are dropped.
 _MAX_CONNECTION_BACKLOG_BYTES = 1 << 20
 _MAX_PTY_BACKLOG_BYTES = 1 << 18
 _SEND_BUFFER_BYTES = 1 << 20
-#: Attempts to send a datagram while the buffer is full or its receiver refuses.
+#: Number of attempts to send a datagram if the buffer is full or the receiver refuses it.
 _SEND_ATTEMPTS = 2
-#: A reader has to stay for this long before a replay begins: many drop the bytes that arrive while
-#: they open a port.
+#: A replay begins when a reader has had the port open for this time: many readers drop bytes that
+#: arrive while they open a port.
 _READER_SETTLE_S = 0.25
 _LISTENER_POLL_S = 0.02
-#: The interval at which a pseudo-terminal without a reader is checked.
+#: Interval at which a pseudo-terminal without a reader is checked.
 _ABSENT_READER_POLL_S = 0.005
-#: The time that readers have to fetch the last bytes.
+#: Time limit for readers to fetch the last bytes.
 FETCH_TIMEOUT_S = 5.0
-#: A pseudo-terminal counts as read after so many checks without waiting bytes.
+#: After this number of checks without waiting bytes, a pseudo-terminal has been read completely.
 _EMPTY_CHECKS = 3
 #: Port for the lookup of a host's address; nothing is sent to it.
 _DISCARD_PORT = 9
@@ -61,25 +61,25 @@ class OutletLine:
     """The sensor's end of one link.
 
     Attributes:
-        place: the SOURCE string with which a program on this computer opens the link.
-        port: the port that it listens on, 0 for none.
-        has_listener: whether there is a listener, as far as this is known.
-        unsent_bytes: the number of bytes that were not read in time.
+        local_source: the SOURCE string with which a program on this computer opens the link.
+        port: the port that the line listens on; 0 if it does not listen.
+        has_listener: whether a program listens; True if this is unknown.
+        unsent_bytes: number of bytes that were not read in time.
     """
 
-    place: str = ""
+    local_source: str = ""
     port: int = 0
     has_listener: bool = True
     unsent_bytes: int = 0
 
     @property
     def source(self) -> str:
-        """The SOURCE string with which a program on the destination computer opens the link."""
-        return self.place
+        """The SOURCE with which a program on the destination computer opens the link."""
+        return self.local_source
 
     @property
     def max_wait_s(self) -> float:
-        """The time after which `receive` has to be called again without an event."""
+        """The longest time between two calls of `receive`, in seconds."""
         return math.inf
 
     def readable(self) -> Collection[int | socket.socket]:
@@ -87,13 +87,13 @@ class OutletLine:
         return ()
 
     def writable(self) -> Collection[int | socket.socket]:
-        """Return the descriptors for which bytes are waiting."""
+        """Return the descriptors to which bytes wait to be written."""
         return ()
 
     def receive(self) -> list[bytes]:
         """Return the commands that have arrived, without blocking.
 
-        Also writes bytes from the backlog, and accepts and drops connections.
+        This also writes waiting bytes, and accepts and closes connections.
         """
         return []
 
@@ -101,18 +101,18 @@ class OutletLine:
         """Send chunks in order.
 
         Args:
-            patient: wait until there is room, instead of dropping bytes.
+            patient: whether to wait until there is room, instead of dropping bytes.
 
         Raises:
-            SourceError: if nothing can be sent at all.
-            UsageError: for a datagram without a known port.
+            SourceError: if nothing can be sent.
+            UsageError: if the destination port of a datagram is unknown.
         """
         raise NotImplementedError
 
     def await_listener(self) -> None:
-        """Wait for a listener that can receive everything from the beginning.
+        """Wait for a new listener, so that it receives everything from the beginning.
 
-        Returns at once if the link cannot tell whether there is a listener, as over UDP.
+        Returns at once if listeners are unknown, as over UDP.
         """
 
     def unplug(self) -> None:
@@ -122,7 +122,7 @@ class OutletLine:
         """Let listeners connect again."""
 
     def finish(self) -> None:
-        """Wait until the listeners have read the last bytes, for at most `FETCH_TIMEOUT_S`."""
+        """Wait up to `FETCH_TIMEOUT_S` until the listeners have read the last bytes."""
 
     def close(self) -> None:
         """Close the line."""
@@ -134,7 +134,7 @@ class _SendBuffer:
 
     Args:
         write: writes without blocking, and returns the number of bytes written.
-        max_bytes: more are not accepted.
+        max_bytes: limit for `has_room`.
     """
 
     def __init__(self, write: Callable[[bytearray], int], max_bytes: int) -> None:
@@ -155,10 +155,10 @@ class _SendBuffer:
         self._waiting.clear()
 
     def flush(self) -> None:
-        """Write as much as the reader has room for.
+        """Write as many bytes as the reader has room for.
 
         Raises:
-            OSError: if the reader has gone.
+            OSError: if the reader has disconnected.
         """
         with contextlib.suppress(BlockingIOError):
             while self._waiting:
@@ -168,19 +168,19 @@ class _SendBuffer:
 class UdpLine(OutletLine):
     """UDP datagrams to one host, or to the sender of the last command.
 
-    `UdpLine.to` and `UdpLine.replying` make one.
+    It is made by `UdpLine.to` or `UdpLine.replying`.
     """
 
     def __init__(
         self,
-        place: str,
+        local_source: str,
         sockets: Sequence[socket.socket],
         *,
         host: str = "",
         ports: Sequence[int] = (),
         default_port: int = 0,
     ) -> None:
-        self.place = place
+        self.local_source = local_source
         self._sockets = sockets
         self._host = host
         self._ports = ports
@@ -193,13 +193,13 @@ class UdpLine(OutletLine):
     def to(
         cls, host: str = LOCALHOST, ports: Sequence[int] = (), *, default_port: int = 0
     ) -> UdpLine:
-        """Return a line that sends to a host, and takes commands from that host only.
+        """Return a line that sends to a host, and accepts commands only from that host.
 
         Args:
             host: name or address.
-            ports: a single port receives all datagrams; otherwise each datagram goes to the port of
-                its `receiver`.
-            default_port: for datagrams without a receiver.
+            ports: if this is a single port, all datagrams go to it; otherwise each datagram goes to
+                the port of its `receiver`.
+            default_port: the port for datagrams without a receiver; 0 for none.
 
         Raises:
             SourceError: for an unknown host.
@@ -222,8 +222,10 @@ class UdpLine(OutletLine):
         sender = socket.socket(family, kind)
         with contextlib.suppress(OSError):
             sender.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
-        place = f"udp://{bracketed}{port_list}"
-        return cls(place, [sender], host=numeric_host, ports=ports, default_port=default_port)
+        local_source = f"udp://{bracketed}{port_list}"
+        return cls(
+            local_source, [sender], host=numeric_host, ports=ports, default_port=default_port
+        )
 
     @classmethod
     def replying(cls, host: str, port: int) -> UdpLine:
@@ -232,7 +234,8 @@ class UdpLine(OutletLine):
         It also receives broadcasts within this computer.
 
         Args:
-            port: where to listen; 0 takes any free one.
+            host: the address to listen on.
+            port: the port to listen on; 0 selects any free port.
 
         Raises:
             OSError: if the address is not available.
@@ -250,10 +253,10 @@ class UdpLine(OutletLine):
     def source(self) -> str:
         """The SOURCE for the destination computer.
 
-        Datagrams from another computer arrive at any of its interfaces, so that no host is named.
+        It names no host, because the datagrams may arrive at any interface of that computer.
         """
         if not self._host or self._host == LOCALHOST:
-            return self.place
+            return self.local_source
         return "udp://" + _format_ports(self._ports)
 
     def readable(self) -> Collection[int | socket.socket]:
@@ -291,11 +294,11 @@ class UdpLine(OutletLine):
         port = port or self._default_port
         if not port:
             text = "the datagrams do not say which port they went to: name one, as in"
-            raise UsageError(f"{self.place}: {text} udp://{self._host}:2368")
+            raise UsageError(f"{self.local_source}: {text} udp://{self._host}:2368")
         return self._host, port
 
     def _send(self, data: bytes, receiver: Sender, *, patient: bool) -> bool:
-        """Return whether a datagram could be sent."""
+        """Send a datagram, and return whether that succeeded."""
         attempts = itertools.count() if patient else range(_SEND_ATTEMPTS)
         for _ in attempts:
             try:
@@ -314,25 +317,26 @@ class UdpLine(OutletLine):
             SourceError: for other errors, if there is only one receiver.
         """
         if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK):
-            wait_ready([], [self._sockets[0]], POLL)
+            wait_ready([], [self._sockets[0]], POLL_S)
             return True
         if error.errno == errno.ENOBUFS:
             time.sleep(_LISTENER_POLL_S)
             return True
         if error.errno == errno.ECONNREFUSED:
-            return True  # the answer to an earlier datagram
+            return True  # an ICMP reply to an earlier datagram
         if self._host:
             reason = system_reason(error)
-            raise SourceError(f"{self.place}: nothing can be sent: {reason}") from None
+            raise SourceError(f"{self.local_source}: nothing can be sent: {reason}") from None
         return False
 
 
 class TcpLine(OutletLine):
-    """TCP connections to one address; each receives the bytes that are sent from then on.
+    """TCP connections to one address; new ones receive only bytes sent from then on.
 
     Args:
-        host, port: where to listen; port 0 takes any free one.
-        sole: accept one connection at a time, and the next one only in `await_listener`.
+        host: the address to listen on.
+        port: the port to listen on; 0 selects any free port.
+        sole: whether only one connection is accepted at a time.
 
     Raises:
         SourceError: if the address is not available.
@@ -345,7 +349,7 @@ class TcpLine(OutletLine):
         self.has_listener = False
         self.port = int(self._listener.getsockname()[1])
         self._host = host
-        self.place = f"tcp://{host}:{self.port}"
+        self.local_source = f"tcp://{host}:{self.port}"
 
     def readable(self) -> Collection[int | socket.socket]:
         if self._listener is None or not self._accepts():
@@ -376,7 +380,7 @@ class TcpLine(OutletLine):
             backlog.add(data)
             self._flush(client)
             while patient and self._clients.get(client):
-                wait_ready([], [client], POLL)
+                wait_ready([], [client], POLL_S)
                 self._flush(client)
 
     def await_listener(self) -> None:
@@ -396,10 +400,10 @@ class TcpLine(OutletLine):
         self._listener = listen(self._host, self.port)
 
     def finish(self) -> None:
-        """Disconnect after the last bytes have been sent.
+        """Disconnect all clients after the last bytes have been delivered.
 
         Closing a socket with unread input would discard bytes that have not been delivered yet, so
-        input is read and ignored until the client closes the connection or the time is up.
+        input is read and ignored until the client closes the connection or the time is over.
         """
         limit = time.monotonic() + FETCH_TIMEOUT_S
         for client in list(self._clients):
@@ -450,10 +454,10 @@ class TcpLine(OutletLine):
 class PtyLine(OutletLine):
     """A pseudo-terminal that programs open by its path, POSIX only.
 
-    Bytes that are sent while no program has it open are lost, as on a serial cable.
+    If no program has it open, sent bytes are lost, as on a serial cable.
 
     Args:
-        link: a symbolic link to the terminal, which is created and removed with it.
+        link: a symbolic link to the terminal, created and removed with the terminal.
 
     Attributes:
         path: the path of the terminal; it changes with each `plug`.
@@ -471,7 +475,7 @@ class PtyLine(OutletLine):
 
     @property
     def max_wait_s(self) -> float:
-        """The interval of checks for a reader: no event tells that the terminal was opened."""
+        """The interval of checks for a reader: opening the terminal causes no event."""
         if self._master >= 0 and not self.has_listener:
             return _ABSENT_READER_POLL_S
         return math.inf
@@ -497,7 +501,7 @@ class PtyLine(OutletLine):
                 f"no pseudo-terminal is available: {system_reason(error)}"
             ) from None
         self.path = os.ttyname(slave)
-        self.place = str(self._link or self.path)
+        self.local_source = str(self._link or self.path)
         tty.setraw(slave)
         os.close(slave)
         os.set_blocking(self._master, False)
@@ -506,7 +510,7 @@ class PtyLine(OutletLine):
             self._make_link(self._link)
 
     def unplug(self) -> None:
-        """Hang up, and remove the link."""
+        """Close the terminal, and remove the link."""
         link = self._link
         if link is not None and link.is_symlink() and os.readlink(link) == self.path:
             link.unlink()
@@ -542,7 +546,7 @@ class PtyLine(OutletLine):
         self._backlog.add(data)
         self._flush()
         while patient and self._backlog:
-            wait_ready([], [self._master], POLL)
+            wait_ready([], [self._master], POLL_S)
             if self._is_alone():
                 self._handle_hangup()
             self._flush()
@@ -557,7 +561,7 @@ class PtyLine(OutletLine):
                 since = time.monotonic()
 
     def finish(self) -> None:
-        """Wait until nothing is left to read; unread bytes are lost with the terminal."""
+        """Wait until all bytes are read, because closing the terminal discards the rest."""
         limit = time.monotonic() + FETCH_TIMEOUT_S
         empty_checks = 0
         while empty_checks < _EMPTY_CHECKS and time.monotonic() < limit and not self._is_alone():
@@ -582,23 +586,20 @@ class PtyLine(OutletLine):
             self._handle_hangup()
 
     def _handle_hangup(self) -> None:
-        """Discard the bytes for a reader that closed the terminal.
-
-        The next reader must not receive them.
-        """
+        """Discard the waiting bytes, which the next reader must not receive."""
         self.unsent_bytes += len(self._backlog)
         self._backlog.clear()
         if not self.has_listener:
             return
         self.has_listener = False
-        # The bytes that were written last may still be on their way to the terminal's buffer.
+        # The last written bytes may not be in the terminal's buffer yet.
         time.sleep(_LISTENER_POLL_S)
         with contextlib.suppress(OSError, termios.error), self._open_slave() as slave:
             termios.tcflush(slave, termios.TCIFLUSH)
 
     @contextlib.contextmanager
     def _open_slave(self) -> Iterator[int]:
-        """Open the end that readers open."""
+        """Open the end of the terminal that readers open."""
         slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
             yield slave
@@ -622,9 +623,9 @@ class Outlet:
     """The lines of one sensor.
 
     Args:
-        data: the line of the data.
+        data: the line of the data link.
         controls: the lines of the other links by name, over which the sensor receives commands and
-            replies.
+            sends replies.
     """
 
     def __init__(self, data: OutletLine, controls: Mapping[str, OutletLine] | None = None) -> None:
@@ -633,13 +634,13 @@ class Outlet:
         self._lines = {"data": data, **self.controls}
 
     @property
-    def place(self) -> str:
-        """The SOURCE that a listener on this computer opens for the data."""
-        return self.data.place
+    def local_source(self) -> str:
+        """The SOURCE string with which a program on this computer opens the data link."""
+        return self.data.local_source
 
     @property
     def source(self) -> str:
-        """The SOURCE string for the destination computer, with a `control=` option if required."""
+        """The SOURCE for the destination computer, with a `control=` option if required."""
         ports = {line.port for line in self.controls.values()}
         if not ports:
             return self.data.source
@@ -649,7 +650,7 @@ class Outlet:
 
     @property
     def has_listener(self) -> bool:
-        """Whether there is a listener, as far as this is known."""
+        """Whether a program listens to the data; True if this is unknown."""
         return self.data.has_listener
 
     @property
@@ -661,7 +662,7 @@ class Outlet:
         """Wait for commands on all links; return the link and the bytes of each.
 
         Args:
-            wait: seconds, at most.
+            wait: maximum time, in seconds.
         """
         wait_for(self._lines.values(), wait)
         return [(name, data) for name, line in self._lines.items() for data in line.receive()]
@@ -671,22 +672,22 @@ class Outlet:
         self._lines[link].send(chunks, patient=patient)
 
     def deliver(self, chunk: Chunk) -> None:
-        """Send a chunk of the data and wait until the listener has room for it.
+        """Send a chunk over the data link, and wait until the listener has room for it.
 
-        Commands that the listener sends are ignored.
+        Commands from the listener are ignored.
 
         Raises:
-            Disconnected: if there is no listener any more.
-            SourceError, UsageError: as `OutletLine.send`.
+            Disconnected: if the listener has disconnected.
+            SourceError, UsageError: the same as `OutletLine.send`.
         """
         self.data.receive()
         if self.data.has_listener:
             self.data.send([chunk], patient=True)
         if not self.data.has_listener:
-            raise Disconnected(f"{self.place}: nobody reads any more")
+            raise Disconnected(f"{self.local_source}: nobody reads any more")
 
     def await_listener(self) -> None:
-        """Wait for a listener that can receive all data from the beginning, if it is known."""
+        """Wait for a new listener to the data; see `OutletLine.await_listener`."""
         self.data.await_listener()
 
     def unplug(self) -> None:
@@ -700,7 +701,7 @@ class Outlet:
             line.plug()
 
     def finish(self) -> None:
-        """Wait until the last bytes of the data have been read, or there is no reader."""
+        """Wait until the last bytes of the data were read; see `OutletLine.finish`."""
         self.data.finish()
 
     def close(self) -> None:
@@ -710,10 +711,11 @@ class Outlet:
 
 
 def wait_for(lines: Collection[OutletLine], timeout: float) -> None:
-    """Wait until one of the lines has something to receive or can write bytes that wait.
+    """Wait until a line has input, or has room for waiting bytes.
 
     Args:
-        timeout: seconds, at most.
+        lines: the lines.
+        timeout: maximum time, in seconds.
     """
     timeout = min([timeout, *(line.max_wait_s for line in lines)])
     reading = [descriptor for line in lines for descriptor in line.readable()]
@@ -725,7 +727,7 @@ def wait_for(lines: Collection[OutletLine], timeout: float) -> None:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a non-blocking TCP socket that listens at an address; port 0 takes any free one.
+    """Return a non-blocking TCP socket that listens; port 0 selects any free port.
 
     Raises:
         SourceError: if the address is not available.
@@ -764,7 +766,7 @@ def _bind_udp(host: str, port: int) -> socket.socket:
 
 
 def _format_ports(ports: Sequence[int]) -> str:
-    """Return the ports as they follow the host of a SOURCE."""
+    """Return the ports in the form that follows the host in a SOURCE."""
     if not ports:
         return ""
     if len(ports) == 1:

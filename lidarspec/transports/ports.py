@@ -1,4 +1,4 @@
-"""The serial and UDP ports of this computer, their permissions and their users."""
+"""List the serial and UDP ports of this computer, their permissions and their users."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ except ImportError:  # no POSIX
     grp = None  # type: ignore[assignment]
 
 _PROCESSES = Path("/proc")
-#: tables of the UDP sockets of this computer.
+#: files with the tables of UDP sockets (Linux).
 _UDP_TABLES = ("/proc/net/udp", "/proc/net/udp6")
 
 
@@ -28,8 +28,8 @@ class SerialPort:
         path: "/dev/ttyUSB0" or "COM4".
         description: the system's description of the device.
         lasting: a name that does not depend on the USB socket; "" if there is none.
-        allowed: whether this user may open it.
-        users: the programs that have it open, as far as the system shows them.
+        allowed: whether this user may open the port.
+        users: the programs that have the port open, if the system shows them.
     """
 
     path: str
@@ -76,7 +76,7 @@ def list_serial_ports() -> list[SerialPort]:
 
 
 def find_lasting_path(port: str) -> str:
-    """Return the name under /dev/serial/by-id of a port, "" if there is none."""
+    """Return the name of a port under /dev/serial/by-id; "" if it has none there."""
     links = sorted(Path("/dev/serial/by-id").glob("*"))
     return next(
         (str(link) for link in links if os.path.realpath(link) == os.path.realpath(port)), ""
@@ -84,13 +84,13 @@ def find_lasting_path(port: str) -> str:
 
 
 def is_allowed(port: str) -> bool:
-    """Return whether this user may open a port; True if there is no such file."""
+    """Return whether this user may open a port; True if it is not a file."""
     effective = os.access in os.supports_effective_ids
     return not os.path.exists(port) or os.access(port, os.R_OK | os.W_OK, effective_ids=effective)
 
 
 def find_group(port: str) -> str:
-    """Return the group that may open a port; "" if only root may, or it is unknown."""
+    """Return the group that may open a port; "" if unknown, or only root may open it."""
     with contextlib.suppress(OSError, KeyError):
         status = os.stat(port)
         if grp is not None and status.st_mode & 0o060 == 0o060 and status.st_gid:
@@ -99,9 +99,9 @@ def find_group(port: str) -> str:
 
 
 def find_users(port: str) -> tuple[PortUser, ...]:
-    """Return the other programs that have a port open.
+    """Return the other programs that have a serial port open.
 
-    Without root's rights, only this user's programs are visible.
+    Without root permissions, only programs of this user are visible.
     """
     path = os.path.realpath(port)
     if os.path.exists(path):
@@ -112,10 +112,10 @@ def find_users(port: str) -> tuple[PortUser, ...]:
 
 
 def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
-    """Return the other programs that have a UDP port open, None if it is free.
+    """Return the other programs that have a UDP port open; None if the port is free.
 
     Returns:
-        An empty tuple if the program belongs to another user and is not visible.
+        An empty tuple if the port is in use by a program of another user, which is not visible.
     """
     inodes = set()
     for table in _UDP_TABLES:
@@ -130,7 +130,7 @@ def find_udp_users(port: int) -> tuple[PortUser, ...] | None:
 
 
 def _find_holders(wanted: Callable[[str], bool]) -> Iterator[PortUser]:
-    """Yield the programs with an open file that `wanted` accepts."""
+    """Yield the other programs that have a file open for which `wanted` returns True."""
     for process in _PROCESSES.glob("[0-9]*") if _PROCESSES.is_dir() else ():
         if int(process.name) == os.getpid():
             continue
@@ -148,11 +148,11 @@ def _read_links(folder: Path) -> Iterator[str]:
             yield os.readlink(folder / name)
 
 
-def count_received() -> dict[str, int]:
-    """Return the number of packets that each network interface has received so far.
+def received_per_interface() -> dict[str, int]:
+    """Return the number of packets received so far by each network interface.
 
     Returns:
-        An empty dict if the system does not report it.
+        Interface -> number; empty if the system does not report it.
     """
     received = {}
     with contextlib.suppress(OSError, ValueError, IndexError):
@@ -163,9 +163,9 @@ def count_received() -> dict[str, int]:
 
 
 def filters_senders(interface: str) -> bool:
-    """Return whether the system drops packets from senders without a route back.
+    """Return whether an interface drops packets from senders without a route back.
 
-    That is strict rp_filter on this interface.
+    This is the setting rp_filter = 1 (strict) of Linux.
     """
     with contextlib.suppress(OSError):
         values = [

@@ -1,8 +1,7 @@
 """Base classes for transports and file formats, which plugins can add.
 
-A `Transport` does all input and output: it yields `Chunk`s and sends bytes. Its class and its
-attributes describe its abilities: a `LiveTransport` does not end by itself, and all attributes have
-defaults here.
+A `Transport` does all input and output: it yields `Chunk`s and sends bytes. A `LiveTransport` does
+not end by itself. Derived classes override the attributes that differ from the defaults here.
 """
 
 from __future__ import annotations
@@ -19,17 +18,17 @@ from typing import Any, BinaryIO, Self
 
 from lidarspec.errors import SourceError, UsageError
 
-#: seconds between two checks for a request to stop.
-POLL = 0.05
+#: time between two checks for a request to stop.
+POLL_S = 0.05
 #: address and port of a sender of datagrams.
 Sender = tuple[str, int]
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The requested sender: an address, or one of its ports.
+    """The sender that the user requests: an address with or without a port.
 
-    ``sender in origin`` is true for datagrams of this sender.
+    ``sender in origin`` is True for every matching `Sender`.
     """
 
     host: str
@@ -61,7 +60,7 @@ class Origin:
 
 
 def endpoint(sender: Sender) -> str:
-    """Return a sender as `src=` accepts it: "192.168.1.201:2368", "[fe80::1]:2368"."""
+    """Return a sender in the form of `src=`: "192.168.1.201:2368", "[fe80::1]:2368"."""
     if ":" in sender[0]:
         return f"[{sender[0]}]:{sender[1]}"
     return f"{sender[0]}:{sender[1]}"
@@ -70,11 +69,11 @@ def endpoint(sender: Sender) -> str:
 def sender_names(ends: Iterable[tuple[Sender | None, Sender | None]]) -> dict[Sender | None, str]:
     """Return a name for each sender: its address, with the port if that is ambiguous.
 
-    The port is added if several senders of one address send to the same port. The name of an
-    unknown sender is "".
+    An address is ambiguous if several of its ports send to the same port. The name of an unknown
+    sender is "".
 
     Args:
-        ends: sender and receiver of datagrams.
+        ends: the sender and the receiver of each datagram.
     """
     known = dict.fromkeys(ends)
     ports = defaultdict[tuple[str, int | None], set[int]](set)
@@ -93,13 +92,13 @@ class Format:
     """A file format, identified by suffix.
 
     Args:
-        suffix: including the dot, ".csv".
+        suffix: the suffix including the dot, ".csv".
         description: a few words for lists.
         write: writes scans to a path; with `every_point`, also points without a return.
         holds: the optional features of the format. "organized": points in rows and columns; `write`
             is called with `organized=True` and a single scan. "scans": scans are stored separately,
-            and always organized. "beams" and "frame-id": those of ROS messages. "packets": raw
-            packets, which `write` gets as `packets=`.
+            and always organized. "beams": planar scans as ROS messages. "frame-id": the frame_id of
+            ROS messages. "packets": raw packets, which `write` gets as `packets=`.
     """
 
     suffix: str
@@ -119,10 +118,12 @@ class Chunk:
     Attributes:
         data: the bytes.
         at: arrival time, ns since 1970; None if unknown.
-        sender: (address, port) of a datagram, else None.
-        receiver: (address, port) that a datagram was sent to, None if unknown.
-        gap: whether the line was interrupted before it: an incomplete frame does not continue here.
-        quiet: whether the line was silent before it: an incomplete frame was discarded then.
+        sender: (address, port) of the sender of a datagram; None for a stream, or if unknown.
+        receiver: (address, port) to which a datagram was sent; None for a stream, or if unknown.
+        gap: whether data is missing before this chunk, so that an incomplete frame does not
+            continue in it.
+        quiet: whether the line was silent before this chunk, so that an incomplete frame was
+            discarded.
     """
 
     data: bytes
@@ -153,18 +154,18 @@ class ClosingContext:
 
 
 class Transport(ABC):
-    """An input and output of bytes; other sources derive from it.
+    """The base class of inputs and outputs of bytes.
 
     Attributes:
         datagrams: whether each chunk is one datagram.
-        baud: the baud rate of a serial line; None for all others.
-        warnings: the warnings so far, such as a damaged file or a small receive buffer.
-        foreign: number of datagrams so far from other senders than the requested one.
+        baud: the baud rate of a serial line; None for all other sources.
+        warnings: the warnings so far, for example about a damaged file or a small receive buffer.
+        foreign: number of datagrams so far from senders other than the requested sender.
         kernel_drops: number of datagrams so far that the system dropped because they were not read
             in time.
         disconnects: number of interruptions so far that a recording reports.
-        unread: number of bytes of a damaged file so far that could not be read.
-        stored: the file as it is stored, below a decompressing one.
+        unread: number of bytes so far that could not be read from a damaged file.
+        stored: the open file before decompression; None if the source is not a file.
     """
 
     datagrams: bool = False
@@ -181,12 +182,15 @@ class Transport(ABC):
         """Yield chunks as they arrive, until the input ends.
 
         Raises:
-            SourceError: if it cannot be read.
+            SourceError: if the source cannot be read.
         """
 
     @property
     def progress(self) -> tuple[int, int] | None:
-        """The read bytes and the size of the stored file; None if unknown."""
+        """The number of bytes read from a file, and its size; None if unknown.
+
+        For a compressed file, both count compressed bytes.
+        """
         stored: Any = self.stored
         if stored is None or not stored.seekable():
             return None
@@ -196,7 +200,7 @@ class Transport(ABC):
         return stored.tell(), size
 
     def skip_until(self, time_ns: int) -> bool:
-        """Skip everything that arrived before a time, if that needs no reading.
+        """Skip everything that arrived before a time, if the source can seek.
 
         Args:
             time_ns: ns since 1970.
@@ -220,14 +224,18 @@ class Transport(ABC):
 
 
 def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
-    """Return the reason why a file has no bytes: the warnings of its transport."""
+    """Return the text of the error for a file without bytes.
+
+    Args:
+        warnings: the warnings of the file's transport, which may give the reason.
+    """
     return "; ".join(warnings) or f"{source} holds no bytes"
 
 
 class Disconnected(SourceError):
     """Raised if the device of a live source disappears.
 
-    `LiveTransport.reopen` opens it again when it is back.
+    `LiveTransport.reopen` opens the device again when it is back.
     """
 
 
@@ -235,13 +243,12 @@ class LiveTransport(Transport):
     """A transport that does not end by itself: a port, a socket, a simulated device.
 
     Attributes:
-        label: the user's name for it, for messages.
-        closed: whether it was closed, which ends `chunks`.
-        overflow: the policy of a reader's full queue: "drop_oldest", or "block" for a source that
+        label: the SOURCE as given by the user, for messages.
+        closed: whether the transport was closed, which ends `chunks`.
+        overflow: the default policy of a full queue: "drop_oldest", or "block" for a source that
             waits for its reader.
         silence: seconds without a byte after which an incomplete frame is discarded.
-        addressed: whether `write` has a destination.
-        other_sender: the sender of the last `foreign` datagram.
+        other_sender: the sender of the last `foreign` datagram; None if there was none.
     """
 
     label: str = ""
@@ -254,14 +261,14 @@ class LiveTransport(Transport):
     def addressed(self) -> bool:
         """Whether `write` has a destination.
 
-        It is False only for datagrams while the address of the sensor is unknown.
+        It is False only for a datagram source while the address of the sensor is unknown.
         """
         return True
 
     def accept(self, sender: Sender) -> None:
-        """Use a sender as the sensor's address, which `write` sends to.
+        """Use a sender as the destination of `write`, because it is the sensor.
 
-        Lines with a fixed other end do nothing.
+        Sources with a fixed destination do nothing.
         """
 
     @abstractmethod
@@ -269,19 +276,19 @@ class LiveTransport(Transport):
         """Return the chunks that have arrived.
 
         Args:
-            timeout: seconds to wait for the first one.
+            timeout: seconds to wait for the first chunk.
 
         Returns:
-            An empty list if nothing arrived in time, or the transport was closed.
+            An empty list if nothing arrived in time, or if the transport was closed.
 
         Raises:
             Disconnected: if the device disappeared.
-            SourceError: if nothing can be read any more.
+            SourceError: if the source cannot be read any more.
         """
 
     @abstractmethod
     def reopen(self) -> None:
-        """Open it again after `Disconnected`.
+        """Open the device again after `Disconnected`.
 
         Raises:
             SourceError: if the device is not back yet.
@@ -290,7 +297,7 @@ class LiveTransport(Transport):
     def chunks(self) -> Iterator[Chunk]:
         """Yield chunks until the transport is closed or its device disappears."""
         while not self.closed:
-            yield from self.read(POLL)
+            yield from self.read(POLL_S)
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         """Set the control lines of a serial port; None leaves a line unchanged.
@@ -301,12 +308,13 @@ class LiveTransport(Transport):
         raise UsageError(f"{self.label}: only a serial port has control lines")
 
     def link(self, name: str) -> LiveTransport | None:
-        """Return the open transport of another link of the same device.
+        """Open the transport of another link of the same device.
 
-        None if that link has an address of its own.
+        Returns:
+            The transport, or None if the caller has to open the link at its own address.
         """
         return None
 
     def peer(self) -> str | None:
-        """Return the host of the device, None if unknown."""
+        """Return the host name or address of the device; None if unknown."""
         return None

@@ -19,17 +19,18 @@ from lidarspec.transports.outlets import Outlet
 from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, sender_names
 
 _SECOND_NS = 1_000_000_000
-#: A chunk that is sent later than this counts as late.
+#: If a chunk is sent later than this after its deadline, it counts as late.
 LATE_NS = 20_000_000
-#: Recorded times that go back further than this come from a clock that was set.
+#: If recorded times go back further than this, the clock of the recording computer was set.
 _MAX_REORDERING_NS = _SECOND_NS
 
 
 class Deadlines:
     """The deadline of each chunk of a replay, in ns of the monotonic clock.
 
-    Times that go back by at most a second, as those of reordered datagrams, are due at once. After
-    a larger step, as when a clock was set, the time continues from there.
+    If the recorded time goes back by at most a second, because datagrams were reordered, the
+    deadline has already passed. If it goes back further, because a clock was set, the following
+    deadlines count from the new time.
 
     Args:
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
@@ -43,10 +44,11 @@ class Deadlines:
         self._latest = 0
 
     def find(self, at: int | None) -> int:
-        """Return the deadline of a chunk; the start for an unknown arrival time.
+        """Return the deadline of the next chunk.
 
         Args:
-            at: its arrival time in ns.
+            at: the recorded arrival time of the chunk, ns; None if unknown, for a chunk that is due
+                at the start.
         """
         if self._speed is None or at is None:
             return self._start
@@ -67,10 +69,13 @@ def iter_paced(
     now: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Chunk, int]]:
-    """Yield each chunk when it is due, with its lateness in ns.
+    """Yield each chunk at its deadline, with its delay after the deadline in ns.
 
     Args:
+        chunks: the recorded chunks.
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
+        now: returns the time, ns.
+        sleep: waits for a number of seconds.
     """
     deadlines: Deadlines | None = None
     for chunk in chunks:
@@ -83,22 +88,24 @@ def iter_paced(
 
 
 class Replay:
-    """A recording that is sent again.
+    """Sends a recording to an outlet or a file.
 
     Args:
         file: the SOURCE of a recording, capture or raw file.
         destination: an outlet, or a new file; it stays open.
         speed: 2.0 is twice as fast as recorded; None is as fast as possible.
-        needs_times: refuse a file without times, instead of sending it as fast as possible.
-        loop: start again at the end, for each listener from the beginning.
-        source: the open file, if it is open already; standard input has to be. It is used for the
-            first turn and closed after it.
-        times: send a part only, by arrival times, as in `Selection`.
+        needs_times: whether a file without times is an error; if False, such a file is sent as fast
+            as possible.
+        loop: whether to start again at the end. Each listener receives the file from the beginning.
+        source: the transport of the file, if it is already open, as for standard input. It is used
+            for the first pass only, and closed.
+        times: the arrival times of the part to send, as in `Selection`.
 
     Attributes:
-        chunks, bytes: numbers sent so far.
-        late: the number of chunks that were sent more than 20 ms late.
-        latest: the greatest lateness in ns.
+        chunks: number of chunks sent so far.
+        bytes: number of bytes sent so far.
+        late: number of chunks that were sent more than 20 ms late.
+        latest: the greatest delay of a chunk, ns.
         is_timed: whether the file has times.
         digest: SHA-256 of all bytes.
     """
@@ -132,7 +139,7 @@ class Replay:
 
     @property
     def seconds(self) -> float:
-        """The time since the first listener came."""
+        """The time since the first listener connected, in seconds."""
         return time.monotonic() - self._start
 
     @property
@@ -144,8 +151,8 @@ class Replay:
         """Send the file once, or repeatedly; yield a message or "" after each chunk.
 
         Raises:
-            UsageError: for a file without times, if they are required.
-            WireError: for an empty file.
+            UsageError: if the file has no times, but they are required.
+            WireError: if the file contains no received data.
             SourceError: if the file cannot be read, or nothing can be sent.
         """
         while True:
@@ -183,7 +190,7 @@ class Replay:
             self._destination.write(chunk)
 
     def _check_times(self, chunks: Iterable[Chunk]) -> Iterator[Chunk]:
-        """Yield the chunks; a chunk without time makes it impossible to keep a speed."""
+        """Yield the chunks; if one has no time, raise or set `is_timed` to False."""
         for chunk in chunks:
             if chunk.at is None and self._speed is not None and self.is_timed:
                 if self._needs_times:

@@ -1,12 +1,11 @@
 """Read and write serial ports.
 
-A port is opened for one program alone, read as bytes arrive, and opened again after it was
-unplugged.
+A port is opened exclusively, read as bytes arrive, and opened again after it was unplugged.
 
-After a hang-up pyserial raises SerialException, a bare OSError, `termios.error` (not an OSError),
-or TypeError if the port is closed at the same time; all of them mean that the device is gone. On
-POSIX the port is read through its descriptor: wait, then one `read` of everything available, with a
-short pause after each read so that a fast line does not wake the thread for every byte.
+If the device disappears, pyserial raises SerialException, OSError, `termios.error` (which is not an
+OSError), or TypeError if the port is closed at the same time. On POSIX the port is read through its
+descriptor: wait, then read everything available, then pause, so that a fast line does not wake the
+thread for every byte.
 """
 
 from __future__ import annotations
@@ -40,12 +39,13 @@ try:
 except ImportError:  # no POSIX
     TermiosError = OSError  # type: ignore[assignment,misc]
 
-#: the exceptions of a port that disappeared.
+#: the exceptions that a port raises if the device has disappeared.
 GONE = (serial.SerialException, OSError, TermiosError, TypeError, ValueError)
-#: maximum bytes per read.
-BLOCK = 1 << 16
-#: seconds that a device may take to accept written bytes.
-WRITE_TIMEOUT = 2.0
+#: maximum number of bytes per read.
+MAX_READ_BYTES = 1 << 16
+#: time limit for a device to accept written bytes.
+WRITE_TIMEOUT_S = 2.0
+#: options of a serial SOURCE.
 OPTIONS = ("baud", "dtr", "rts")
 
 
@@ -53,12 +53,13 @@ class SerialTransport(StreamTransport):
     """A serial port, 8N1.
 
     Args:
-        port: its name, "/dev/ttyUSB0" or "COM4".
+        port: the name of the port, "/dev/ttyUSB0" or "COM4".
         baud: any rate that the port supports.
-        dtr, rts: levels of the control lines while it is open; None does not set them.
+        dtr, rts: levels of the control lines while the port is open; None does not set a line.
+        sensor: the sensor, for the length of a silence and for messages; None if unknown.
 
     Raises:
-        SourceError: if it cannot be opened: missing, in use, no permission, unsupported rate.
+        SourceError: if the port is missing, in use or not permitted, or does not support the rate.
     """
 
     baud: int
@@ -80,9 +81,8 @@ class SerialTransport(StreamTransport):
             longest = max((frame.max_length for frame in sensor.frames.values()), default=0)
         else:
             longest = 0
-        self.silence = max(
-            self.silence, 2 * longest * 10 / baud
-        )  # longer than a frame takes on the line
+        # Longer than the duration of a frame on the line, with 10 bits per byte.
+        self.silence = max(self.silence, 2 * longest * 10 / baud)
         self._port = self._open()
 
     def write(self, data: bytes) -> None:
@@ -95,11 +95,11 @@ class SerialTransport(StreamTransport):
             raise disconnected_error(self.label, error) from None
 
     def _send(self, descriptor: int, left: memoryview) -> None:
-        """Write through the descriptor.
+        """Write all bytes through the descriptor.
 
-        pyserial calls `select`, which does not support descriptors above 1,023.
+        pyserial is not used, because it calls `select`, which supports no descriptor above 1,023.
         """
-        limit = time.monotonic() + WRITE_TIMEOUT
+        limit = time.monotonic() + WRITE_TIMEOUT_S
         while left:
             if not wait_ready([], [descriptor], max(limit - time.monotonic(), 0.0))[1]:
                 raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
@@ -114,26 +114,25 @@ class SerialTransport(StreamTransport):
             try:
                 setattr(self._port, name, level)
             except GONE as error:
-                if not {errno.ENOTTY, errno.EINVAL} & set(
-                    error_numbers(error)
-                ):  # the port has no control lines, as a pseudo-terminal
+                has_no_lines = {errno.ENOTTY, errno.EINVAL} & set(error_numbers(error))
+                if not has_no_lines:  # pseudo-terminals have no control lines
                     raise disconnected_error(self.label, error) from None
 
     def reopen(self) -> None:
-        self._shut()
+        self._close_port()
         self._port = self._open()
 
     def close(self) -> None:
         self.closed = True
-        self._shut()
+        self._close_port()
 
-    def _shut(self) -> None:
+    def _close_port(self) -> None:
         with contextlib.suppress(*GONE):
             self._port.close()
 
     def _open(self) -> serial.Serial:
         port = serial.Serial(
-            baudrate=self.baud, timeout=0, write_timeout=WRITE_TIMEOUT, exclusive=True
+            baudrate=self.baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True
         )
         port.port = self.label
         for name, level in self._levels.items():
@@ -144,10 +143,10 @@ class SerialTransport(StreamTransport):
         except GONE as error:
             with contextlib.suppress(*GONE):
                 port.close()
-            raise self._refusal(error) from None
+            raise self._make_open_error(error) from None
         return port
 
-    def _refusal(self, error: Exception) -> SourceError:
+    def _make_open_error(self, error: Exception) -> SourceError:
         """Return the error for a port that cannot be opened, with the next command."""
         number = error.errno if isinstance(error, OSError) else None
         source = f"serial://{self.label}{sensor_option(self._sensor)}"
@@ -178,13 +177,12 @@ class SerialTransport(StreamTransport):
             return bytes(self._port.read(max(1, self._port.in_waiting)))
         descriptor = self._port.fileno()
         with contextlib.suppress(BlockingIOError):
-            if data := os.read(descriptor, BLOCK):
-                # usually after the pause; an empty read can mean a hang-up, which only a wait
-                # detects
+            if data := os.read(descriptor, MAX_READ_BYTES):
                 return data
+        # An empty read may mean that the device has disappeared, which only a wait detects.
         if not wait_readable(descriptor, timeout):
             return b""
-        data = os.read(descriptor, BLOCK)
+        data = os.read(descriptor, MAX_READ_BYTES)
         if not data:
             raise disconnected_error(self.label, "it hung up")
         return data
@@ -196,16 +194,17 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTrans
     Examples are "serial:///dev/ttyUSB0?baud=230400&dtr=0", "/dev/ttyUSB0" and "COM4".
 
     Args:
-        sensor: the source of defaults: baud rate and control lines.
+        address: the SOURCE.
+        sensor: supplies defaults: baud rate and control lines.
 
     Raises:
         UsageError: if the baud rate is unknown, or for an option that ports do not have.
-        SourceError: if it cannot be opened.
+        SourceError: if the port cannot be opened.
     """
     address.check(OPTIONS)
     declared = data_link(sensor, Serial)
     baud = address.number("baud", 50, 20_000_000) or (declared.baud if declared else None)
-    if not address.place:
+    if not address.location:
         raise UsageError(f"{address.text}: it names no port, as in serial:///dev/ttyUSB0")
     if baud is None:
         raise UsageError(
@@ -217,4 +216,4 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTrans
         name: default if (level := address.switch(name)) is None else level
         for name, default in (("dtr", dtr), ("rts", rts))
     }
-    return SerialTransport(address.place, baud, sensor=sensor, **levels)
+    return SerialTransport(address.location, baud, sensor=sensor, **levels)

@@ -1,8 +1,8 @@
 """Run a simulated sensor at an outlet, in real time.
 
-One loop asks the device which bytes it has sent by now, passes them to the outlet, waits until the
-device sends again or a command arrives, and gives the commands to the device. `serve` runs the loop
-in the calling thread and `Served` in a thread of its own.
+One loop gets the bytes that the device has sent by now, passes them to the outlet, waits until the
+device sends again or a command arrives, and passes the commands to the device. `serve` runs the
+loop in the calling thread, and `Served` runs it in a new thread.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
 from lidarspec.transports.outlets import LOCALHOST, Outlet
-from lidarspec.transports.protocol import POLL, Chunk, ClosingContext, Sender
+from lidarspec.transports.protocol import POLL_S, Chunk, ClosingContext, Sender
 
-#: The shortest time between two passes, so that a fast sensor gathers some frames.
+#: Shortest time between two passes, in which the frames of a fast sensor accumulate.
 _MIN_PAUSE_S = 0.001
 _PASS_TIMEOUT_S = 0.1
 
 
 class FairLock:
-    """A lock for the threads that simulate; they get it in the order in which they asked.
+    """A lock for the simulating threads, which get it in the order of their requests.
 
-    With a plain lock, or none, a hundred such threads make hardly any progress and do not end: each
-    waits for all others whenever it wants the interpreter back.
+    With a plain lock, or without a lock, a hundred simulating threads make hardly any progress,
+    because each waits for all others whenever it needs the interpreter lock.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class FairLock:
 
     @contextlib.contextmanager
     def hold(self, stop: threading.Event) -> Iterator[bool]:
-        """Wait for the lock and hold it; yield False if the wait was cancelled.
+        """Wait for the lock and hold it; yield False if `cancel` was called.
 
         Args:
             stop: identifies the waiting thread for `cancel`.
@@ -56,7 +56,7 @@ class FairLock:
                 self._wake_first()
 
     def cancel(self, stop: threading.Event) -> None:
-        """Set `stop`, and end the wait of the thread that it identifies."""
+        """Set `stop`, and end the wait of the thread with this event."""
         stop.set()
         with self._lock:
             if stop in self._tickets:
@@ -83,10 +83,12 @@ def serve(
     """Run a device at an outlet.
 
     Args:
-        seconds: how long; by default without end.
+        device: the simulated device.
+        outlet: the outlet.
+        seconds: the duration; None for no limit.
         stop: ends the loop when it is set.
         on_pass: called in every pass of the loop, at least every 50 ms.
-        patient: switch the device on when there is a listener.
+        patient: whether the device is switched on only when there is a listener.
 
     Raises:
         SourceError: if nothing can be sent any more.
@@ -94,7 +96,7 @@ def serve(
     stop = stop or threading.Event()
     early_commands = []
     while patient and not outlet.has_listener and not stop.is_set():
-        early_commands += outlet.receive(POLL)
+        early_commands += outlet.receive(POLL_S)
     start_ns = time.monotonic_ns()
     device.start(start_ns)
     for link, data in early_commands:
@@ -122,35 +124,36 @@ def serve(
 
 
 def _send_due(device: SimulatedDevice, outlet: Outlet, now: int, stop: threading.Event) -> None:
-    """Send the frames that are due; a device without a pace sends as fast as it is read."""
-    has_no_pace = math.isinf(device.rate)
-    if has_no_pace and not outlet.has_listener:
+    """Send the frames that are due; if `rate` is inf, send as fast as they are read."""
+    is_unlimited = math.isinf(device.rate)
+    if is_unlimited and not outlet.has_listener:
         return
     with _SIMULATION_LOCK.hold(stop) as is_held:
         chunks = due_chunks(device, now) if is_held else {}
     for link, sent in chunks.items():
-        outlet.send(link, sent, patient=has_no_pace and link == "data")
+        outlet.send(link, sent, patient=is_unlimited and link == "data")
 
 
 def _find_wait(device: SimulatedDevice, outlet: Outlet) -> float:
-    """Return the seconds until the device sends again, at most `POLL`."""
+    """Return the seconds until the device sends again, at most `POLL_S`."""
     deadline = device.deadline
     if deadline is None:
-        return POLL
+        return POLL_S
     until_deadline = (deadline - time.monotonic_ns()) / SECOND
     if math.isinf(device.rate) and outlet.has_listener:
-        return min(POLL, max(until_deadline, 0.0))
-    return min(POLL, max(until_deadline, _MIN_PAUSE_S))
+        return min(POLL_S, max(until_deadline, 0.0))
+    return min(POLL_S, max(until_deadline, _MIN_PAUSE_S))
 
 
 def due_chunks(
     device: SimulatedDevice, now: int, arrival_ns: int | None = None
 ) -> dict[str, list[Chunk]]:
-    """Return the bytes that a device sends until `now`, by link.
+    """Advance a device to the time `now`, and return the bytes that it sends, by link.
 
     Args:
-        now: the device's time in ns.
-        arrival_ns: the arrival time of all chunks, ns since 1970.
+        device: the simulated device.
+        now: the device's time, ns.
+        arrival_ns: the arrival time of all chunks, ns since 1970; None to leave it unknown.
     """
     sensor = device.sensor
     chunks: dict[str, list[Chunk]] = {}
@@ -163,9 +166,10 @@ def due_chunks(
 
 
 def _find_endpoint(sensor: Sensor, frame: str) -> Sender:
-    """Return the address of a datagram: data frames use the first declared port.
+    """Return the address and port of a datagram.
 
-    All other frames use the second one, if it is declared.
+    Data frames use the first declared port. All other frames use the second port, if it is
+    declared.
     """
     link = sensor.links.get("data")
     ports = link.ports[:2] if isinstance(link, Udp) else ()
@@ -176,14 +180,14 @@ def _find_endpoint(sensor: Sensor, frame: str) -> Sender:
 
 
 class Served(ClosingContext):
-    """A simulated sensor at an outlet, in a thread of its own; a context manager.
+    """Runs a simulated sensor at an outlet in a separate thread; a context manager.
 
     Args:
-        patient: switch the device on when there is a listener.
+        patient: whether the device is switched on only when there is a listener.
 
     Attributes:
-        device: the simulated device; its `heard` has the names of the commands that it recognized.
-        outlet: the outlet that it is reached through.
+        device: the simulated device; its `commands_received` are the recognized commands.
+        outlet: the outlet.
     """
 
     def __init__(self, device: SimulatedDevice, outlet: Outlet, *, patient: bool = False) -> None:
@@ -214,7 +218,7 @@ class Served(ClosingContext):
         self._call_in_thread(lambda: self.device.start(time.monotonic_ns()))
 
     def stop_sending(self) -> None:
-        """Send no further bytes; sent ones can still be read."""
+        """Send no further bytes; bytes that were already sent can still be read."""
         _SIMULATION_LOCK.cancel(self._stop)
         self._thread.join()
 
@@ -230,14 +234,14 @@ class Served(ClosingContext):
             raise self._failure
 
     def _call_in_thread(self, function: Callable[[], None]) -> None:
-        """Call a function between two passes of the thread; return when it has taken effect."""
+        """Call a function between two passes of the loop; return after the next pass."""
         self._calls.put(function)
         while not self._calls_done.acquire(timeout=_PASS_TIMEOUT_S):
             if not self._thread.is_alive():
                 raise RuntimeError(f"the simulated {self.device.sensor.id} has ended")
 
     def _make_calls(self) -> None:
-        """Make the calls that wait. Those of the last pass have taken effect by now."""
+        """Call the queued functions, and report the calls of the last pass as done."""
         if self._calls_in_pass:
             self._calls_done.release(self._calls_in_pass)
         self._calls_in_pass = 0

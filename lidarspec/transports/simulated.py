@@ -19,8 +19,9 @@ from lidarspec.transports.base import source_error
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport
 
+#: options of a ``sim:`` SOURCE.
 OPTIONS = ("rate", "scene", "seed", *FAULTS)
-#: The shortest time between two reads, so that a fast sensor gathers some packets.
+#: Shortest time between two reads, in which the packets of a fast sensor accumulate.
 _MIN_READ_INTERVAL_NS = 2_000_000
 
 
@@ -31,12 +32,14 @@ class SimulatedTransport(LiveTransport):
     links.
 
     Args:
+        label: the SOURCE, for messages.
+        sensor: the simulated sensor.
+        device: the simulated device.
         name: the name of the link.
-        data: the data link of the same device, for another link.
+        data: the data link of the same device; None if this is the data link.
 
     Attributes:
-        sensor, device: the simulated sensor and device.
-        baud: the baud rate of a serial link, None for another one.
+        baud: the baud rate of a serial link; None for other links.
     """
 
     def __init__(
@@ -61,8 +64,7 @@ class SimulatedTransport(LiveTransport):
         self._clock = HostClock()
         self._next_read_ns = 0
         self._changed: threading.Condition
-        #: The bytes that the device has sent over each open link and that were not read.
-        self._unread: dict[str, list[bytes]]
+        self._unread: dict[str, list[bytes]]  # link -> sent bytes that were not read yet
         if data is None:
             self._changed = threading.Condition()
             self._unread = {}
@@ -110,9 +112,9 @@ class SimulatedTransport(LiveTransport):
             self._changed.notify_all()
 
     def _next_data_ns(self) -> float:
-        """Return the time at which the device sends again.
+        """Return the time at which the device sends again, ns; inf if it is unknown.
 
-        Other links wait for the data link.
+        It is unknown for other links, which receive data only when the data link is read.
         """
         if self._name == "data":
             deadline = self.device.deadline
@@ -123,7 +125,7 @@ class SimulatedTransport(LiveTransport):
         return max(deadline, self._next_read_ns)
 
     def _take(self, now: int) -> list[Chunk]:
-        """Advance the device's time over the data link, and return the bytes of this link."""
+        """Return the unread bytes of this link; the data link first advances the device."""
         if self._name == "data":
             for link, data in self.device.outgoing(now):
                 if link in self._unread:
@@ -141,30 +143,32 @@ class SimulatedTransport(LiveTransport):
 
 
 def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTransport:
-    """Return the open transport of ``sim:ID?rate=2&errors=0.01``.
+    """Open a simulated SOURCE, for example ``sim:ID?rate=2&errors=0.01``.
 
     Args:
-        sensor: the sensor that reads it. If it has the same id, it is simulated with its options.
+        address: the SOURCE.
+        sensor: the sensor that reads the source. If it has the same id, it is simulated with its
+            options.
 
     Raises:
         UnknownSensor, UnknownOption, UsageError: for an invalid source.
         SourceError: if the scene cannot be read.
     """
     address.check(OPTIONS)
-    if not address.place and sensor is None:
+    if not address.location and sensor is None:
         raise UsageError(
             f"{address.text}: name the sensor, as in sim:ID; lidarspec sensors lists them"
         )
-    if sensor is None or (address.place and named_sensor(address.place).id != sensor.id):
-        sensor = named_sensor(address.place)
+    if sensor is None or (address.location and named_sensor(address.location).id != sensor.id):
+        sensor = named_sensor(address.location)
     return SimulatedTransport(address.text, sensor, _make_device(sensor, address.options))
 
 
 def parse_rate(text: str) -> float:
-    """Return a factor of the speed of real time; inf for "max" and "0".
+    """Return the speed relative to real time; inf for "max" and "0".
 
     Raises:
-        UsageError: unless it is a number above 0, or "max".
+        UsageError: if the text is not a number above 0, "max" or "0".
     """
     if text in ("max", "0"):
         return math.inf
@@ -178,7 +182,7 @@ def parse_rate(text: str) -> float:
 
 
 def _make_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
-    """Return a device for options such as ``{"rate": "2", "scene": "hall.toml"}``."""
+    """Return a device for options like ``{"rate": "2", "scene": "hall.toml"}``."""
     if "scene" in options:
         scene = read_scene(options["scene"])
     else:

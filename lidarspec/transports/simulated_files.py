@@ -1,7 +1,7 @@
 """Write the bytes of a simulated sensor to a file, without waiting.
 
-The times in the file are those of the device. The file has the content of a recording that begins
-when the device is switched on and opened.
+The times in the file are the times of the simulated device. The file has the same content as a
+recording that begins when the device is switched on and opened.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.transports.protocol import Chunk
 from lidarspec.transports.serving import due_chunks
 
-#: The device's time between two calls; the health of the file is checked as often.
+#: Step of the device's time between two writes; each write also checks the file for errors.
 _STEP_NS = SECOND // 100
 
 _Transfer = tuple[Chunk, Literal["in", "out"]]
@@ -30,21 +30,24 @@ _Transfer = tuple[Chunk, Literal["in", "out"]]
 def write_file(
     device: SimulatedDevice, path: str | Path, seconds: float, *, overwrite: bool = False
 ) -> int:
-    """Write the bytes that a device sends in a period, from its start on.
+    """Write the bytes that a device sends in a period after its start.
 
-    The commands that open the device are sent to it, and recorded too. The file is only made if
-    there is something to write.
+    The commands that open the device are sent to it and recorded. No file is created if the device
+    sends nothing.
 
     Args:
+        device: the simulated device.
         path: an .lsr, .pcap, .pcapng or .bin file.
+        seconds: the length of the period.
+        overwrite: whether the file may exist.
 
     Returns:
         The number of bytes that the device sent.
 
     Raises:
-        UnknownFormat, UsageError: if the file exists or cannot hold the bytes, or nothing is sent
-            in this time.
-        SpecError: if the sensor, as it is declared, never sends anything.
+        UnknownFormat, UsageError: if the file exists, if its format cannot contain the bytes, or if
+            nothing is sent in this time.
+        SpecError: if the sensor's declaration never starts its data.
         SourceError: if the file cannot be written.
     """
     transfers = _simulate_opened(device, seconds)
@@ -65,7 +68,7 @@ def write_file(
 
 
 def _take_until_data(transfers: Iterator[_Transfer]) -> list[_Transfer]:
-    """Return the transfers up to the first data of the device; empty if there is no data."""
+    """Return the transfers up to the device's first data; empty if there is no data."""
     taken = []
     for transfer in transfers:
         taken.append(transfer)
@@ -75,7 +78,7 @@ def _take_until_data(transfers: Iterator[_Transfer]) -> list[_Transfer]:
 
 
 def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Transfer]:
-    """Yield the transfers over the data link of a device, and the commands that open it."""
+    """Yield a device's transfers over the data link, and the commands that open it."""
     sensor = device.sensor
     start_ns = time.time_ns()
     opening = _commands_on_open(sensor)
@@ -93,12 +96,12 @@ def _simulate_opened(device: SimulatedDevice, seconds: float) -> Iterator[_Trans
 
 
 def _commands_on_open(sensor: Sensor) -> list[str]:
-    """Return the commands that open a device and have a frame: others only move control lines."""
+    """Return the commands for opening, without commands that only set control lines."""
     return [name for name in sensor.on_open if sensor.commands[name].frame]
 
 
 def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
-    """Return the error that says why a device has sent nothing over its data link."""
+    """Return the error with the reason why a device has sent no data."""
     sensor = device.sensor
     sent = {name: device.sent[name] for name in sensor.data_frames if device.sent[name]}
     if sent:

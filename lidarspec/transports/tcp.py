@@ -22,34 +22,35 @@ from lidarspec.transports.base import (
 )
 from lidarspec.transports.protocol import Disconnected
 
-#: maximum bytes per read.
-BLOCK = 1 << 18
-#: timeouts of the first connection and of later attempts, in seconds.
-PATIENCE = 5.0
-AGAIN = 0.5
-#: seconds without a byte after which an incomplete frame is discarded: lost segments are sent again
-#: after 0.2 s, 0.4 s, 0.8 s ...
-SILENCE = 10.0
+#: maximum number of bytes per read.
+MAX_READ_BYTES = 1 << 18
+#: timeout of the first connection, and of writing.
+CONNECT_TIMEOUT_S = 5.0
+#: timeout of each attempt to connect again.
+RECONNECT_TIMEOUT_S = 0.5
+#: time without a byte after which an incomplete frame is discarded. It is long because TCP sends
+#: lost segments again after 0.2 s, 0.4 s, 0.8 s ...
+SILENCE_S = 10.0
 
 
 class TcpTransport(StreamTransport):
-    """A connection to a sensor.
+    """A TCP connection to a sensor.
 
     Raises:
         SourceError: if the connection fails.
     """
 
-    silence = SILENCE
+    silence = SILENCE_S
 
     def __init__(self, label: str, host: str, port: int, *, sensor: Sensor | None = None) -> None:
         super().__init__(label, sensor)
         self._address = (host, port)
-        self._socket = self._connect(PATIENCE)
+        self._socket = self._connect(CONNECT_TIMEOUT_S)
 
     def _receive(self, timeout: float) -> bytes:
         if not wait_readable(self._socket.fileno(), timeout):
             return b""
-        data = self._socket.recv(BLOCK)
+        data = self._socket.recv(MAX_READ_BYTES)
         if not data:
             raise Disconnected(f"{self.label}: the sensor closed the connection")
         return data
@@ -62,7 +63,7 @@ class TcpTransport(StreamTransport):
 
     def reopen(self) -> None:
         self._socket.close()
-        self._socket = self._connect(AGAIN)
+        self._socket = self._connect(RECONNECT_TIMEOUT_S)
 
     def peer(self) -> str | None:
         return self._address[0]
@@ -71,18 +72,18 @@ class TcpTransport(StreamTransport):
         self.closed = True
         self._socket.close()
 
-    def _connect(self, patience: float) -> socket.socket:
+    def _connect(self, timeout: float) -> socket.socket:
         try:
-            connection = socket.create_connection(self._address, patience)
+            connection = socket.create_connection(self._address, timeout)
         except OSError as error:
-            raise self._refusal(error) from None
-        connection.settimeout(PATIENCE)
+            raise self._make_connection_error(error) from None
+        connection.settimeout(CONNECT_TIMEOUT_S)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with contextlib.suppress(OSError):
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         return connection
 
-    def _refusal(self, error: OSError) -> SourceError:
+    def _make_connection_error(self, error: OSError) -> SourceError:
         host, port = self._address
         doctor = f"lidarspec doctor {quote(self.label)}{sensor_option(self._sensor)}"
         if isinstance(error, socket.gaierror):
@@ -105,10 +106,11 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTranspor
     """Open the connection of a TCP SOURCE: "tcp://192.168.1.200:2111".
 
     Args:
-        sensor: its port is used if the source has none.
+        address: the SOURCE.
+        sensor: supplies the port if the SOURCE has none.
 
     Raises:
-        UsageError: if host or port are missing, or for an option.
+        UsageError: if host or port is missing, or for an option: TCP has none.
         SourceError: if the connection fails.
     """
     address.check(())

@@ -4,15 +4,15 @@ Sensors send to the address of this computer or to the broadcast address. Socket
 bound to all interfaces ("udp://"), unless the SOURCE names one ("udp://127.0.0.1:2368"). Nothing is
 sent until `write` is called.
 
-Linux stores with each datagram its arrival time and the number of datagrams that the socket dropped
-before it. A short pause after each read, in which datagrams accumulate, therefore costs no
-accuracy. The receive buffer bridges the time in which the program does not read. The kernel may
-grant a smaller buffer than requested, so its size is read back.
+Linux stores the arrival time with each datagram, and the number of datagrams that the socket
+dropped before it. A short pause after each read, in which datagrams accumulate, therefore costs no
+accuracy. The receive buffer stores datagrams while the program does not read. The kernel may grant
+a smaller buffer than requested, so its size is read back.
 
-`ReceiveSlots` fetches many datagrams in one system call, recvmmsg, through ctypes, since Python has
-no function for it. Each socket call in Python releases the interpreter lock. Taking it back needs
-milliseconds if another thread computes, and one call per datagram is then too slow for a fast
-sensor.
+`ReceiveSlots` fetches many datagrams with one system call, recvmmsg. It uses ctypes because Python
+has no function for this call. Each socket call in Python releases the interpreter lock, and getting
+it back takes milliseconds if another thread computes. One call per datagram would therefore be too
+slow for a fast sensor.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ from lidarspec.transports.base import (
 from lidarspec.transports.host_clock import HostClock
 from lidarspec.transports.protocol import Chunk, LiveTransport, Sender
 
-#: Number of datagrams that one system call fetches, at most.
+#: Maximum number of datagrams that one system call fetches.
 SLOT_COUNT = 256
 #: Buffer sizes per datagram, in bytes. Pages that are never written to need no memory.
 PAYLOAD_SLOT_BYTES = 1 << 16
 ADDRESS_SLOT_BYTES = 32
 CONTROL_SLOT_BYTES = 128
-#: Header of a control message: size, level, type.
+#: Layout of the header of a control message: size, level, type.
 _CONTROL_HEADER = struct.Struct("@Nii")
-#: A control message with two 64-bit numbers.
-_CONTROL_WITH_TWO_NUMBERS = struct.Struct("@Niiqq")
+#: Layout of a control message with two 64-bit integers.
+_CONTROL_WITH_TWO_INTEGERS = struct.Struct("@Niiqq")
 _CONTROL_ALIGNMENT = struct.calcsize("@N")
-#: Requested size of the receive buffer, in bytes.
-BUFFER = 8 << 20
-#: Number of datagrams that are fetched from one socket before the other sockets are read.
+#: Requested size of the receive buffer.
+REQUESTED_BUFFER_BYTES = 8 << 20
+#: Maximum number of datagrams that are fetched from one socket before the other sockets are read.
 MAX_DATAGRAMS_PER_READ = 1024
 #: Pause between two reads if the kernel records arrival times. One wake-up per datagram would cost
 #: more than all other work.
@@ -70,8 +70,8 @@ MAX_KERNEL_DELAY_NS = 60_000_000_000
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
-#: Value of SO_TIMESTAMPNS: seconds and nanoseconds.
-TIME = struct.Struct("qq")
+#: Layout of the value of SO_TIMESTAMPNS: seconds and nanoseconds.
+TIMESTAMP = struct.Struct("qq")
 #: Options of a UDP SOURCE.
 OPTIONS = ("port", "group", "src")
 
@@ -85,7 +85,7 @@ class _MessageHeader(ctypes.Structure):
         ("name", ctypes.c_void_p),
         ("name_size", ctypes.c_uint32),
         ("vectors", ctypes.POINTER(_Vector)),
-        ("vectors_number", ctypes.c_size_t),
+        ("vector_count", ctypes.c_size_t),
         ("control", ctypes.c_void_p),
         ("control_size", ctypes.c_size_t),
         ("flags", ctypes.c_int),
@@ -144,30 +144,30 @@ class ReceiveSlots:
             message.name = ctypes.addressof(self._names) + index * ADDRESS_SLOT_BYTES
             message.name_size = ADDRESS_SLOT_BYTES
             message.vectors = ctypes.pointer(self._vectors[index])
-            message.vectors_number = 1
+            message.vector_count = 1
             message.control = ctypes.addressof(self._control) + index * CONTROL_SLOT_BYTES
             message.control_size = CONTROL_SLOT_BYTES
-        self._fresh = self._headers.raw
-        self._known: dict[bytes, tuple[str, int]] = {}
+        self._initial_headers = self._headers.raw
+        self._senders: dict[bytes, tuple[str, int]] = {}  # cache of `_parse_address`
 
     def fill(self, descriptor: int) -> int:
         """Fetch the datagrams that wait in a socket, and return their number.
 
         Returns:
-            At most `SLOT_COUNT`; 0 if none waits.
+            At most `SLOT_COUNT`; 0 if no datagram waits.
 
         Raises:
             OSError: if the system call fails.
         """
         # The previous call has overwritten the sizes.
-        ctypes.memmove(self._headers, self._fresh, len(self._fresh))
-        number: int = self._call(descriptor, self._datagrams, SLOT_COUNT, socket.MSG_DONTWAIT, None)
-        if number < 0:
+        ctypes.memmove(self._headers, self._initial_headers, len(self._initial_headers))
+        count: int = self._call(descriptor, self._datagrams, SLOT_COUNT, socket.MSG_DONTWAIT, None)
+        if count < 0:
             code = ctypes.get_errno()
             if code in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR):
                 return 0
             raise OSError(code, os.strerror(code))
-        return number
+        return count
 
     def datagram(self, index: int) -> tuple[bytes, tuple[str, int]]:
         """Return a fetched datagram and its sender."""
@@ -177,31 +177,31 @@ class ReceiveSlots:
         name = self._name_bytes[
             index * ADDRESS_SLOT_BYTES : index * ADDRESS_SLOT_BYTES + ADDRESS_SLOT_BYTES
         ].tobytes()
-        sender = self._known.get(name)
+        sender = self._senders.get(name)
         if sender is None:
-            if len(self._known) >= SLOT_COUNT:
-                self._known.clear()
-            sender = self._known[name] = _parse_address(name)
+            if len(self._senders) >= SLOT_COUNT:
+                self._senders.clear()
+            sender = self._senders[name] = _parse_address(name)
         return data, sender
 
-    def numbers(self, index: int) -> tuple[int, int, int] | None:
-        """Return type and values of the control message of a datagram.
+    def single_control_message(self, index: int) -> tuple[int, int, int] | None:
+        """Return type and values of the only control message of a datagram.
 
-        None unless the datagram has exactly one control message, with two 64-bit numbers. This is a
-        fast path of `control_messages` for datagrams with an arrival time and nothing else.
+        Returns None if the datagram has not exactly one control message with two 64-bit integers.
+        This is a fast path of `control_messages` for datagrams with only an arrival time.
         """
         control_size = self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
-        if control_size != _CONTROL_WITH_TWO_NUMBERS.size:
+        if control_size != _CONTROL_WITH_TWO_INTEGERS.size:
             return None
-        size, level, kind, first, second = _CONTROL_WITH_TWO_NUMBERS.unpack_from(
+        size, level, kind, first, second = _CONTROL_WITH_TWO_INTEGERS.unpack_from(
             self._control_bytes, index * CONTROL_SLOT_BYTES
         )
-        if size == _CONTROL_WITH_TWO_NUMBERS.size and level == socket.SOL_SOCKET:
+        if size == _CONTROL_WITH_TWO_INTEGERS.size and level == socket.SOL_SOCKET:
             return (kind, first, second)
         return None
 
     def control_messages(self, index: int) -> list[tuple[int, memoryview]]:
-        """Return type and value of each control message of the socket layer for a datagram."""
+        """Return type and value of each control message (socket level) of a datagram."""
         start = index * CONTROL_SLOT_BYTES
         messages = []
         end = start + self._control_sizes[_CONTROL_SIZE_INDEX + index * _CONTROL_SIZE_STEP]
@@ -234,14 +234,14 @@ class UdpTransport(LiveTransport):
     Args:
         label: the SOURCE, for messages.
         ports: the ports to listen on; 0 for any free port.
-        host: address of the interface, "" for all.
-        group: multicast group to join.
+        host: address of the interface; "" for all interfaces.
+        group: multicast group to join; None for none.
         sender: accept only datagrams from this "HOST" or "HOST:PORT", and count others as
-            `foreign`.
-        datagrams: whether each datagram is a whole frame instead of a piece of a stream.
-        sensor: used for suggested commands in messages.
-        remote: the address that `write` sends to; by default `sender` if it has a port, else the
-            sender that was accepted.
+            `foreign`; None to accept all.
+        datagrams: whether each datagram is a whole frame, not a piece of a stream.
+        sensor: the sensor, for suggested commands in messages.
+        remote: the destination of `write`. The default is `sender` if it has a port, else the
+            sender passed to `accept`.
         broadcast: whether `remote` may be a broadcast address.
 
     Attributes:
@@ -292,9 +292,11 @@ class UdpTransport(LiveTransport):
         except BaseException:
             self.close()
             raise
-        self.ports = tuple(one.address[1] for one in self._sockets)
-        smallest = min((one.buffer for one in self._sockets), default=BUFFER)
-        self.warnings = warn_of_small_buffer(BUFFER, smallest)
+        self.ports = tuple(opened.address[1] for opened in self._sockets)
+        smallest = min(
+            (opened.buffer_bytes for opened in self._sockets), default=REQUESTED_BUFFER_BYTES
+        )
+        self.warnings = warn_of_small_buffer(REQUESTED_BUFFER_BYTES, smallest)
 
     def read(self, timeout: float) -> list[Chunk]:
         sleep_until(self._next_read)
@@ -303,11 +305,11 @@ class UdpTransport(LiveTransport):
             ready = []
         else:
             ready = [key.data for key, _ in self._selector.select(timeout)]
-        for one in ready:
-            self._fetch(one, chunks)
-        self.kernel_drops = sum(each.drops for each in self._sockets)
-        gathers = 0 < len(chunks) < SLOT_COUNT and all(one.is_timed for one in ready)
-        self._next_read = time.monotonic() + READ_PAUSE_S if gathers else 0.0
+        for opened in ready:
+            self._fetch(opened, chunks)
+        self.kernel_drops = sum(opened.drops for opened in self._sockets)
+        has_pause = 0 < len(chunks) < SLOT_COUNT and all(opened.is_timed for opened in ready)
+        self._next_read = time.monotonic() + READ_PAUSE_S if has_pause else 0.0
         return chunks
 
     def write(self, data: bytes) -> None:
@@ -325,7 +327,7 @@ class UdpTransport(LiveTransport):
 
     @property
     def addressed(self) -> bool:
-        """Whether `write` has a destination: the configured address or the accepted sender."""
+        """Whether `write` has a destination: `remote` or an accepted sender."""
         return self._remote is not None
 
     def accept(self, sender: Sender) -> None:
@@ -345,20 +347,20 @@ class UdpTransport(LiveTransport):
     def close(self) -> None:
         self.closed = True
         self._selector.close()
-        for one in self._sockets:
-            one.socket.close()
+        for opened in self._sockets:
+            opened.socket.close()
 
-    def _fetch(self, one: _Socket, chunks: list[Chunk]) -> None:
+    def _fetch(self, opened: _Socket, chunks: list[Chunk]) -> None:
         """Append the datagrams that wait in a socket, up to a limit, to `chunks`."""
         start = len(chunks)
         try:
-            own = self._origin
-            for data, sender, at in one.datagrams(*self.clock.now_and_wall()):
-                if own is not None and sender not in own:
-                    self.foreign = self.foreign + 1
+            origin = self._origin
+            for data, sender, at in opened.iter_datagrams(*self.clock.now_and_wall()):
+                if origin is not None and sender not in origin:
+                    self.foreign += 1
                     self.other_sender = sender
                     continue
-                chunks.append(Chunk(data, at, sender, one.address))
+                chunks.append(Chunk(data, at, sender, opened.address))
         except ConnectionRefusedError:
             return  # an ICMP reply to a sent datagram; the socket still receives
         except OSError as error:
@@ -377,14 +379,16 @@ class UdpTransport(LiveTransport):
                 opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             opened.bind(("" if group is not None else host, port))
             if group is not None:
-                _join(opened, group, host)
+                _join_group(opened, group, host)
         except OSError as error:
             opened.close()
-            raise self._open_error(error, host, port, group) from None
+            raise self._make_open_error(error, host, port, group) from None
         opened.setblocking(False)
         return opened
 
-    def _open_error(self, error: OSError, host: str, port: int, group: str | None) -> SourceError:
+    def _make_open_error(
+        self, error: OSError, host: str, port: int, group: str | None
+    ) -> SourceError:
         doctor = f"lidarspec doctor {quote(self.label)}{sensor_option(self._sensor)}"
         if error.errno == errno.EADDRINUSE:
             return source_error(
@@ -412,11 +416,11 @@ class _Socket:
     """One socket and its kernel statistics.
 
     Args:
-        slots: buffers to fetch many datagrams at once; None to fetch them one by one.
+        slots: buffers to fetch many datagrams at once; None to fetch single datagrams.
 
     Attributes:
         address: the local address and port.
-        buffer: size of the receive buffer, in bytes of payload and overhead.
+        buffer_bytes: size of the receive buffer, including the kernel's overhead.
         is_timed: whether the kernel records the arrival time of each datagram.
         drops: number of datagrams that the kernel dropped because the buffer was full.
     """
@@ -426,14 +430,14 @@ class _Socket:
         self._slots = slots
         self.drops = 0
         self.address: tuple[str, int] = opened.getsockname()[:2]
-        self.buffer = _enlarge_buffer(opened)
+        self.buffer_bytes = _enlarge_buffer(opened)
         self.is_timed = False
         for option in (SO_TIMESTAMPNS, SO_RXQ_OVFL) if slots is not None else ():
             with contextlib.suppress(OSError):
                 opened.setsockopt(socket.SOL_SOCKET, option, 1)
                 self.is_timed |= option == SO_TIMESTAMPNS
 
-    def datagrams(self, now: int, wall: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
+    def iter_datagrams(self, now: int, wall: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
         """Yield the waiting datagrams with sender and arrival time, and update `drops`.
 
         Args:
@@ -448,16 +452,16 @@ class _Socket:
             yield from self._fetch_singly(now)
             return
         for _ in range(MAX_DATAGRAMS_PER_READ // SLOT_COUNT):
-            number = self._slots.fill(self.socket.fileno())
-            for index in range(number):
+            count = self._slots.fill(self.socket.fileno())
+            for index in range(count):
                 data, sender = self._slots.datagram(index)
-                message = self._slots.numbers(index)
+                message = self._slots.single_control_message(index)
                 if message is not None and message[0] == SO_TIMESTAMPNS:
                     yield data, sender, _convert_time(message[1], message[2], now, wall)
                 else:
                     messages = self._slots.control_messages(index)
                     yield data, sender, self._read_control(messages, now, wall)
-            if number < SLOT_COUNT:
+            if count < SLOT_COUNT:
                 return
 
     def _fetch_singly(self, now: int) -> Iterator[tuple[bytes, tuple[str, int], int]]:
@@ -469,11 +473,11 @@ class _Socket:
             yield data, sender[:2], now
 
     def _read_control(self, messages: Iterable[tuple[int, memoryview]], now: int, wall: int) -> int:
-        """Return the arrival time in the control messages of a datagram, and update `drops`."""
+        """Return the arrival time from the control messages, and update `drops`."""
         at = now
         for kind, data in messages:
             if kind == SO_TIMESTAMPNS and len(data) == 16:
-                seconds, nanoseconds = TIME.unpack(data)
+                seconds, nanoseconds = TIMESTAMP.unpack(data)
                 at = _convert_time(seconds, nanoseconds, now, wall)
             elif kind == SO_RXQ_OVFL and len(data) == 4:
                 drops = int.from_bytes(data, sys.byteorder)
@@ -482,10 +486,14 @@ class _Socket:
 
 
 def _order_times(chunks: list[Chunk], start: int) -> None:
-    """Lower the times of the chunks from `start` on, so that they never decrease.
+    """Correct arrival times that are later than the times of following chunks.
 
     For some milliseconds after a socket is opened, Linux records the time at which a datagram is
-    fetched instead of its arrival time. Such a time can be later than that of the next datagrams.
+    fetched instead of its arrival time. This time can be later than the times of the next
+    datagrams.
+
+    Args:
+        start: index of the first chunk to correct.
     """
     times = [chunk.at or 0 for chunk in chunks[start:]]
     if times == sorted(times):
@@ -515,10 +523,12 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
     "udp://?port=6699,7788&group=239.255.0.1&src=192.168.1.200".
 
     Args:
-        sensor: its ports are used if the SOURCE names none.
+        address: the SOURCE.
+        sensor: supplies the ports if the SOURCE names none.
 
     Raises:
-        UsageError: if neither SOURCE nor sensor names a port, or for an option unknown to UDP.
+        UsageError: if neither SOURCE nor sensor names a port, or for an option that UDP does not
+            have.
         SourceError: if a socket cannot be opened.
     """
     address.check(OPTIONS)
@@ -528,7 +538,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
         link = sensor.links.get("data")
     else:
         link = None
-    ports = _ports(address) or (
+    ports = _parse_ports(address) or (
         [port] if port else list(link.ports) if isinstance(link, Udp) else []
     )
     if not ports:
@@ -553,7 +563,12 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
 
 
 def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
-    """Return a warning with a fix if the kernel granted a smaller buffer than requested."""
+    """Return a warning, with the command that fixes it, if a buffer is too small.
+
+    Args:
+        requested: the requested size, in bytes.
+        granted: the size that the kernel granted, in bytes.
+    """
     if granted >= requested:
         return []
     text = (
@@ -568,20 +583,20 @@ def _enlarge_buffer(opened: socket.socket) -> int:
     for option in (
         (socket.SO_RCVBUF, SO_RCVBUFFORCE) if sys.platform == "linux" else (socket.SO_RCVBUF,)
     ):
-        if _buffer_size(opened) < BUFFER:
+        if _read_buffer_size(opened) < REQUESTED_BUFFER_BYTES:
             with contextlib.suppress(OSError):
-                opened.setsockopt(socket.SOL_SOCKET, option, BUFFER)
-    return _buffer_size(opened)
+                opened.setsockopt(socket.SOL_SOCKET, option, REQUESTED_BUFFER_BYTES)
+    return _read_buffer_size(opened)
 
 
-def _buffer_size(opened: socket.socket) -> int:
+def _read_buffer_size(opened: socket.socket) -> int:
     # Linux reports twice the size that was set.
     return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // (
         2 if sys.platform == "linux" else 1
     )
 
 
-def _ports(address: SourceAddress) -> list[int]:
+def _parse_ports(address: SourceAddress) -> list[int]:
     text = address.options.get("port", "")
     ports = [part for part in text.split(",") if part]
     if any(not part.isdecimal() or not 0 < int(part) < 65536 for part in ports):
@@ -599,7 +614,7 @@ def _is_multicast(host: str) -> bool:
         return False
 
 
-def _join(opened: socket.socket, group: str, interface: str) -> None:
+def _join_group(opened: socket.socket, group: str, interface: str) -> None:
     if opened.family == socket.AF_INET6:
         opened.setsockopt(
             socket.IPPROTO_IPV6,

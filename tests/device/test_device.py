@@ -649,7 +649,7 @@ def test_iterators_continue_after_latest(tmp_path: Path) -> None:
 def test_a_second_iterator_continues_in_a_long_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lidarspec.transports.files, "BLOCK", 1 << 13)
+    monkeypatch.setattr(lidarspec.transports.files, "BLOCK_BYTES", 1 << 13)
     monkeypatch.setattr(lidarspec.device.device_input, "BATCH_BYTES", 1 << 13)
     path = tmp_path / "raw.bin"
     frames = turning(TURNING, 400) * 8

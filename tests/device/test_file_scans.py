@@ -121,7 +121,7 @@ def test_pieces_have_the_scans_of_one_pass(
 ) -> None:
     for module, size in (
         (lidarspec.captures.bulk.CaptureBatches, "largest"),
-        (lidarspec.transports.files, "BLOCK"),
+        (lidarspec.transports.files, "BLOCK_BYTES"),
     ):
         monkeypatch.setattr(module, size, 1 << 13)
     monkeypatch.setattr(lidarspec.device.device_input, "BATCH_BYTES", 1 << 13)

@@ -16,7 +16,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.recording.format import Recording
-from lidarspec.transports.udp import BUFFER
+from lidarspec.transports.udp import REQUESTED_BUFFER_BYTES
 from tests.lines import Port, free_port, port, turning, udp, until, working
 from tests.shapes import SHAPES
 
@@ -33,7 +33,9 @@ BURST = 630
 
 def skip_without_buffer(device: ls.Device) -> None:
     """Skip the test if the system grants less than the receive buffer that was asked for."""
-    short = [warning for warning in device.warnings if f"of {BUFFER >> 10}" in warning]
+    short = [
+        warning for warning in device.warnings if f"of {REQUESTED_BUFFER_BYTES >> 10}" in warning
+    ]
     if short:
         pytest.skip(short[0])
 

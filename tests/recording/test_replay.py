@@ -129,7 +129,7 @@ def test_a_replayed_stream_is_unchanged_at_every_speed(
 ) -> None:
     target = Outlet(PtyLine() if kind == "pty" else TcpLine("127.0.0.1", 0, sole=True))
     with playing(stream, target, speed=speed) as failed:
-        received = (from_pty if kind == "pty" else from_tcp)(target.place)
+        received = (from_pty if kind == "pty" else from_tcp)(target.local_source)
     assert not failed
     assert hashlib.sha256(received).hexdigest() == hashlib.sha256(content(stream)).hexdigest()
     sensor = ls.sensor(STREAM)
@@ -196,7 +196,7 @@ def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
 def test_arrivals_keep_the_times_of_then(stream: Path, speed: float) -> None:
     target, began, arrived = Outlet(PtyLine()), list[float](), list[tuple[float, int]]()
     with playing(stream, target, speed=speed, began=began):
-        descriptor, total = os.open(target.place, os.O_RDWR | os.O_NOCTTY), 0
+        descriptor, total = os.open(target.local_source, os.O_RDWR | os.O_NOCTTY), 0
         with contextlib.suppress(OSError):
             while data := os.read(descriptor, 4096):
                 total += len(data)
@@ -256,14 +256,14 @@ def test_times_that_go_back_hold_nothing_up() -> None:
 def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
     target = Outlet(PtyLine())
     with playing(stream, target, speed=1.0) as failed:
-        descriptor = os.open(target.place, os.O_RDWR | os.O_NOCTTY)
+        descriptor = os.open(target.local_source, os.O_RDWR | os.O_NOCTTY)
         os.read(descriptor, 1)
         os.close(descriptor)
     assert [type(error) for error in failed] == [Disconnected]
     server = Outlet(TcpLine("127.0.0.1", 0, sole=True))
     with (
         playing(stream, server, speed=1.0) as failed,
-        socket.create_connection(("127.0.0.1", int(server.place.split(":")[2]))) as reader,
+        socket.create_connection(("127.0.0.1", int(server.local_source.split(":")[2]))) as reader,
     ):
         reader.recv(1)
     assert [type(error) for error in failed] == [Disconnected]
@@ -272,7 +272,7 @@ def test_a_reader_that_leaves_is_noticed(stream: Path) -> None:
 def test_a_flooding_reader_does_not_delay_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outlets, "FETCH_TIMEOUT_S", 0.2)
     target = TcpLine("127.0.0.1", 0, sole=True)
-    with socket.create_connection(("127.0.0.1", int(target.place.split(":")[2]))) as reader:
+    with socket.create_connection(("127.0.0.1", int(target.local_source.split(":")[2]))) as reader:
         target.await_listener()
 
         def flood(stop: threading.Event) -> None:
@@ -292,7 +292,7 @@ def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
     target = Outlet(PtyLine())
     received = bytearray()
     with playing(stream, target, speed=None):
-        descriptor = os.open(target.place, os.O_RDWR | os.O_NOCTTY)
+        descriptor = os.open(target.local_source, os.O_RDWR | os.O_NOCTTY)
         time.sleep(0.4)
         for data in until_the_end(lambda: os.read(descriptor, 4096)):
             received += data

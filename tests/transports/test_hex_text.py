@@ -50,7 +50,7 @@ def test_a_line_without_end_is_read_in_pieces(
     form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     block = 1 << 13
-    monkeypatch.setattr(hex_text, "BLOCK", block)
+    monkeypatch.setattr(hex_text, "BLOCK_BYTES", block)
     line = form * (3 * block // len(form))
     (tmp_path / "a.hex").write_text(
         f"0000: {line}# {line}\n{line}\n{line[: block // len(form) * len(form)]}", encoding="ascii"
@@ -152,7 +152,7 @@ TIMED = {
 
 @pytest.mark.parametrize("text", TIMED)
 def test_times_before_the_bytes_are_when_they_came(text: str) -> None:
-    chunk = HexText().line(text)
+    chunk = HexText().read_line(text)
     assert (chunk.data, chunk.at) == TIMED[text]
 
 

@@ -17,7 +17,7 @@ from lidarspec.transports.open_url import transport
 from lidarspec.transports.outlets import UdpLine
 from lidarspec.transports.protocol import Origin, endpoint
 from lidarspec.transports.udp import (
-    BUFFER,
+    REQUESTED_BUFFER_BYTES,
     UdpTransport,
     _order_times,
     _Socket,
@@ -153,10 +153,10 @@ def test_without_recvmmsg_datagrams_come_one_by_one() -> None:
     with udp() as sender, udp() as receiver:
         receiver.setblocking(False)
         one = _Socket(receiver, None)
-        assert list(one.datagrams(7, 0)) == []
+        assert list(one.iter_datagrams(7, 0)) == []
         for data in (b"a", b"", bytes(65_507)):
             sender.sendto(data, receiver.getsockname())
-        assert list(one.datagrams(7, 0)) == [
+        assert list(one.iter_datagrams(7, 0)) == [
             (data, sender.getsockname(), 7) for data in (b"a", b"", bytes(65_507))
         ]
 
@@ -248,7 +248,7 @@ def test_a_multicast_group_is_joined() -> None:
 
 
 def test_a_small_buffer_is_a_warning_with_a_command() -> None:
-    assert warn_of_small_buffer(BUFFER, BUFFER) == []
+    assert warn_of_small_buffer(REQUESTED_BUFFER_BYTES, REQUESTED_BUFFER_BYTES) == []
     (text,) = warn_of_small_buffer(8 << 20, 212_992)
     assert text.endswith("next: sudo sysctl -w net.core.rmem_max=8388608")
     assert "208 KiB of 8192" in text
@@ -258,8 +258,8 @@ def test_the_buffer_is_read_back() -> None:
     one = open_socket(f"udp://127.0.0.1:{free_port()}")
     (inner,) = one._sockets
     kernel = inner.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    assert inner.buffer == kernel // (2 if sys.platform == "linux" else 1)
-    assert bool(one.warnings) == (inner.buffer < BUFFER)
+    assert inner.buffer_bytes == kernel // (2 if sys.platform == "linux" else 1)
+    assert bool(one.warnings) == (inner.buffer_bytes < REQUESTED_BUFFER_BYTES)
     one.close()
 
 
