@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 from lidarspec.errors import SpecError
 from lidarspec.framing.example_frames import random_frame
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 #: Examples of each frame type that streams are made of.
@@ -102,7 +102,7 @@ def _makers(subject: SensorUnderTest) -> dict[str, Callable[[random.Random], byt
     def header(source: random.Random) -> bytes:
         name = source.choice(names)
         data = bytearray(source.randbytes(source.randint(MAX_HEAD_BYTES, 3 * MAX_HEAD_BYTES)))
-        for spot, (mask, value) in codec(incoming[name]).prefix.items():
+        for spot, (mask, value) in get_codec(incoming[name]).prefix.items():
             data[spot : spot + 1] = bytes([data[spot] & ~mask | value]) if spot < len(data) else b""
         return behind(source, name, bytes(data))
 
@@ -136,7 +136,7 @@ def _of_random_header(subject: SensorUnderTest, name: str, seed: int) -> bytes:
 
     Returns no bytes if the type has one layout, or if no such frame can be generated.
     """
-    engine = codec(subject.sensor.frames[name])
+    engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec) and engine.size is None:
         with contextlib.suppress(SpecError):
             return random_frame(

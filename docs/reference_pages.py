@@ -13,7 +13,7 @@ from pathlib import Path
 
 import lidarspec as ls
 from lidarspec.exports import export, select_frame
-from lidarspec.exports.reference import page
+from lidarspec.exports.reference import make_page
 
 FOLDER = Path(__file__).parent / "reference" / "sensors"
 INTRODUCTION = """\
@@ -30,7 +30,7 @@ def make_sensor_files(sensor: ls.Sensor) -> dict[str, str]:
     else:
         diagrams = {name: f"{sensor.id}-{name}.svg" for name in data_frames}
     files = {file: export(select_frame(sensor, name), "svg") for name, file in diagrams.items()}
-    files[f"{sensor.id}.md"] = page(sensor, diagrams)
+    files[f"{sensor.id}.md"] = make_page(sensor, diagrams)
     return files
 
 

@@ -171,7 +171,7 @@ def _quote(word: str) -> str:
     return f"'{word}'"
 
 
-def no_sensors() -> str:
+def no_sensors_text() -> str:
     """Return the message for an environment without sensors, with the install command."""
     vendors = sorted({row.distribution.removeprefix(_PREFIX) for row in known_sensors()})
     return (
@@ -180,7 +180,7 @@ def no_sensors() -> str:
     )
 
 
-def unknown_sensor(
+def unknown_sensor_error(
     name: str,
     installed: Iterable[str],
     aliases: Mapping[str, str],

@@ -52,7 +52,12 @@ from lidarspec.errors import (
     UsageError,
     suggest,
 )
-from lidarspec.known_sensors import KnownLink, KnownSensor, describe_entry_points, unknown_sensor
+from lidarspec.known_sensors import (
+    KnownLink,
+    KnownSensor,
+    describe_entry_points,
+    unknown_sensor_error,
+)
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.checksums import Checksum
 from lidarspec.spec.description import Frame
@@ -481,7 +486,7 @@ class Registry:
         for name, sensor in self._found().items():
             home = self._holder(name)
             if name not in rows and home is not None:
-                rows[name] = summarize(sensor, home[0], self._version(home[0]))
+                rows[name] = make_row(sensor, home[0], self._version(home[0]))
         return [rows[name] for name in sorted(rows)]
 
     def _has_name(self, distribution: str, name: str) -> bool:
@@ -526,7 +531,7 @@ class Registry:
         if plugin_sensor is None:
             known = self._found()
             aliases = {alias: one.id for one in known.values() for alias in one.aliases}
-            raise self._load_error(name) or unknown_sensor(
+            raise self._load_error(name) or unknown_sensor_error(
                 name, known, aliases, self._failed_modules()
             )
         if name not in self._ready:
@@ -610,7 +615,7 @@ class Registry:
                 )
 
 
-def summarize(sensor: Sensor, distribution: str, version: str) -> KnownSensor:
+def make_row(sensor: Sensor, distribution: str, version: str) -> KnownSensor:
     """Return the row of a sensor, without its signatures."""
     return KnownSensor(
         sensor.id,
@@ -919,7 +924,7 @@ def load_hooks(entry: EntryPoint) -> Registry:
     return hooks
 
 
-def verb(entry: EntryPoint) -> click.Command:
+def load_verb(entry: EntryPoint) -> click.Command:
     """Return the verb that an entry point names, from the hook of its module.
 
     Raises:
@@ -961,17 +966,17 @@ def sensor(name: str | Path | Sensor) -> Sensor:
     if isinstance(name, Sensor):
         return name
     text = str(name)
-    if names_file(text):
+    if is_file_name(text):
         return _from_file(text)
     return registry().sensor(text)
 
 
-def names_file(text: str) -> bool:
+def is_file_name(text: str) -> bool:
     """Return whether a sensor's name is a file, which would be executed, not an id."""
     return "/" in text or "\\" in text or text.endswith(".py")
 
 
-def file_and_id(text: str) -> tuple[Path, str]:
+def split_file_and_id(text: str) -> tuple[Path, str]:
     """Split "FILE" or "FILE.py:id" into the file and the id, "" without one."""
     from pathlib import Path
 
@@ -980,8 +985,8 @@ def file_and_id(text: str) -> tuple[Path, str]:
 
 
 def _from_file(text: str) -> Sensor:
-    file, wanted = file_and_id(text)
-    module = file_module(file)
+    file, wanted = split_file_and_id(text)
+    module = import_file(file)
     local = Registry()
     with _faults_of(file):
         ids = local.add(module, name=str(file))
@@ -1001,7 +1006,7 @@ def _from_file(text: str) -> Sensor:
     return registry().apply_hooks(chosen)
 
 
-def file_module(file: Path) -> ModuleType:
+def import_file(file: Path) -> ModuleType:
     """Import a file as a module.
 
     It gets a unique name in `sys.modules`, as dataclasses, pickle and typing require.

@@ -171,10 +171,10 @@ class Sensor(SensorDescription):
             UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
                 before it is configured.
         """
-        from lidarspec.framing.decoder import frames_of, is_stream
+        from lidarspec.framing.decoder import decode_all, is_stream
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        return [found for frames in frames_of(decoder, data) for found in frames.found()]
+        return [found for frames in decode_all(decoder, data) for found in frames.found()]
 
     def decode(self, data: Any, frame: str | None = None, *, backend: str = "auto") -> Packets:
         """Return the data frames, or those of another type, as columns.
@@ -200,12 +200,12 @@ class Sensor(SensorDescription):
         self, data: Any, frame: str | None, backend: str
     ) -> tuple[Packets, WaitingSamples | None]:
         """Return the packets of a frame type, and the IMU samples if no type is named."""
-        from lidarspec.framing.decoder import frames_of, is_stream
-        from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
+        from lidarspec.framing.decoder import decode_all, is_stream
+        from lidarspec.packets.stream import ImuStream, PacketStream, choose_data_frame
 
         decoder = self.decoder(stream=is_stream(data), backend=backend)
-        frames = frames_of(decoder, data)
-        name = frame or data_frame(self, frames) or self.data_frame
+        frames = decode_all(decoder, data)
+        name = frame or choose_data_frame(self, frames) or self.data_frame
         stream = PacketStream(self, name, decoder.stats, backend=decoder.backend)
         packets = stream.add(frames, whole=True)
         if frame is not None or not self.imu_frames:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec import Packets, PointCloud, Sensor, SpecError
-from lidarspec.framing.decoder import Decoder, frames_of, is_stream
+from lidarspec.framing.decoder import Decoder, decode_all, is_stream
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.packets.stream import PacketStream
 from lidarspec.testing.cloud_assertions import ULPS, assert_same_places, assert_well_formed, same
@@ -86,7 +86,7 @@ def assert_backends_agree(sensor: Sensor, data: Any) -> None:
     """
     judges = sensor, by_construct(sensor)
     decoders = [judge.decoder(stream=is_stream(data)) for judge in judges]
-    found = [frames_of(decoder, data) for decoder in decoders]
+    found = [decode_all(decoder, data) for decoder in decoders]
     split = [cuts(frame for frames in each for frame in frames.found()) for each in found]
     assert split[0] == split[1]
     for name in dict.fromkeys((sensor.data_frame, *(name for name, _, _ in split[0]))):

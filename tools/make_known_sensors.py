@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 
 from lidarspec.detect.uninstalled_sensors import make_signatures
-from lidarspec.plugins import registry, summarize
+from lidarspec.plugins import make_row, registry
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "lidarspec" / "known_sensors.json"
@@ -26,7 +26,7 @@ def table() -> str:
     rows = []
     for name, sensor in registry().sensors().items():
         if name in homes:
-            row = summarize(sensor, homes[name].distribution, homes[name].version)
+            row = make_row(sensor, homes[name].distribution, homes[name].version)
             rows.append(
                 json.dumps(
                     row._replace(signatures=make_signatures(sensor)).to_dict(), ensure_ascii=False

@@ -27,7 +27,7 @@ from lidarspec.captures.records import (
     make_record_reader,
 )
 from lidarspec.captures.source import BufferedInput, TruncatedError
-from lidarspec.frames.layout import rows_at
+from lidarspec.frames.layout import gather_rows
 from lidarspec.framing.results import Frames, Indices
 from lidarspec.transports.protocol import Origin, Sender
 
@@ -240,7 +240,7 @@ class CapturedDatagrams:
         """The bytes of all datagrams, concatenated."""
         size = self.sizes.item(0) if len(self) else 0
         if (self.sizes == size).all():
-            return rows_at(self.buffer, self.starts, size).tobytes()
+            return gather_rows(self.buffer, self.starts, size).tobytes()
         return b"".join(map(self.data, range(len(self))))
 
     def of(self, origin: Origin) -> CapturedDatagrams:

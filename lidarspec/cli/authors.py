@@ -25,9 +25,9 @@ from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, ExportError, export as exported, select_frame
 from lidarspec.optional_libraries import import_library
 from lidarspec.plugins import sensor as named_sensor, sensors
-from lidarspec.testing.check import Report, reports, target
+from lidarspec.testing.check import Report, find_target, reports
 from lidarspec.testing.sensor_under_test import EXAMPLES
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 
 #: Maximum number of bytes of a capture that are analysed.
@@ -114,7 +114,7 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
     If several senders or ports occur, the group with the most bytes is used.
     """
     groups: dict[object, list[Chunk]] = {}
-    with contextlib.closing(transport(capture)) as opened:
+    with contextlib.closing(open_transport(capture)) as opened:
         for chunk in read_beginning(opened, MOST):
             groups.setdefault((chunk.sender, chunk.receiver and chunk.receiver[1]), []).append(
                 chunk
@@ -188,7 +188,7 @@ def check(
 
         line(lambda: f"{name}: loading", (0, 1))
         found_reports = list(
-            reports(target(name), name, examples=max_examples, vectors=file, watch=show)
+            reports(find_target(name), name, examples=max_examples, vectors=file, watch=show)
         )
     if as_json:
         emit_json([report.to_dict() for report in found_reports], output)

@@ -21,7 +21,7 @@ from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageEr
 from lidarspec.explaining.assignments import arguments, values
 from lidarspec.explaining.explanation import describe_reply, explain
 from lidarspec.explaining.input_segments import explain_piece, iter_pieces
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.hex_text import parse_hex
@@ -66,7 +66,8 @@ def build(
         )
     try:
         data = sensor.build(
-            frame, values(schema(sensor.frames[frame].tree), assignments, f"{sensor.id} {frame}")
+            frame,
+            values(make_schema(sensor.frames[frame].tree), assignments, f"{sensor.id} {frame}"),
         )
     except LidarSpecError as error:
         raise suggest(error, f"lidarspec show {quote(str(sensor_id))}") from None

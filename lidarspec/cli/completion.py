@@ -24,7 +24,7 @@ from click.shell_completion import (
 from lidarspec.detect.identification import find_declared_sensor
 from lidarspec.device.named_devices import find_device, read_devices
 from lidarspec.errors import LidarSpecError
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo
@@ -160,7 +160,7 @@ def _assignments(ctx: click.Context, incomplete: str) -> Iterable[str]:
     frame = ctx.params.get("frame") or ""
     command = ctx.params.get("command") or ""
     if sensor and frame in sensor.frames:
-        fields = schema(sensor.frames[frame].tree).all_fields
+        fields = make_schema(sensor.frames[frame].tree).all_fields
         return [
             f"{_format_path(path, info)}=" for path, info in fields.items() if info.const is None
         ]

@@ -40,7 +40,7 @@ from lidarspec.remote_files import find_files
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import EVERYTHING, Selection, Times, iter_received
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.open_url import is_live, transport
+from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
 
 #: The suffixes of files that hold packets. `.bin` means points here, as in KITTI's data set.
@@ -242,7 +242,7 @@ def _write_packets(
             f"lidarspec record {quote(source)} -o {quote(target)}",
         )
     with (
-        contextlib.closing(transport(source)) as opened,
+        contextlib.closing(open_transport(source)) as opened,
         Progress(size) as progress,
         replace_file(Path(target)) as part,
     ):
@@ -310,7 +310,7 @@ def _open_packets(source: str, *, wanted: bool) -> Iterator[Iterator[Chunk] | No
         raise UsageError(
             f"--packets reads IN twice, but {source} can be read only once: record it first"
         )
-    with contextlib.closing(transport(source)) as opened:
+    with contextlib.closing(open_transport(source)) as opened:
         if not opened.datagrams:
             raise UsageError(f"--packets requires datagrams, but {source} is a byte stream")
         yield opened.chunks()

@@ -14,7 +14,7 @@ import click
 
 from lidarspec import errors
 from lidarspec.cli.terminal import note, voice
-from lidarspec.known_sensors import no_sensors
+from lidarspec.known_sensors import no_sensors_text
 
 FINDINGS = 1
 USAGE = 2
@@ -58,7 +58,7 @@ def report(error: Exception, verb: str) -> int:
     message = _message(error)
     note(message)
     if _lacks_sensors(error):
-        note(f"  {no_sensors()}")
+        note(f"  {no_sensors_text()}")
         return code
     if not errors.suggestion(error):
         errors.suggest(error, _following(error, command, verb))

@@ -41,7 +41,7 @@ from lidarspec.drafting.checksum_search import search
 from lidarspec.drafting.periods import FrameStructure, find_structure, split_frames
 from lidarspec.drafting.samples import ChecksumMatch
 from lidarspec.errors import SourceError, UsageError, WireError, suggest
-from lidarspec.known_sensors import KnownSensor, find_known_sensor, install_command, no_sensors
+from lidarspec.known_sensors import KnownSensor, find_known_sensor, install_command, no_sensors_text
 from lidarspec.plugins import sensor as named_sensor, sensors
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
@@ -87,7 +87,7 @@ def ports(as_json: bool, output: str | None) -> None:
     note(
         f"next: lidarspec detect{f' {serial[0].path}' if len(serial) == 1 else ''}"
         if sensors()
-        else no_sensors()
+        else no_sensors_text()
     )
 
 
@@ -423,7 +423,7 @@ def _conclusions(
 ) -> Iterator[str]:
     missing = _find_uninstalled(verdicts)
     if not sensors() and not missing:
-        yield no_sensors()
+        yield no_sensors_text()
     yield from dict.fromkeys(warning for verdict in verdicts for warning in verdict.sample.warnings)
     for verdict in verdicts:
         if verdict.sample.failure is not None:
@@ -653,6 +653,6 @@ def doctor(
         ]
         emit("\n".join(lines) or "no problem found with the ports of this computer", output)
     if sensor is None and not sensors():
-        note(no_sensors())
+        note(no_sensors_text())
     if any(not finding.ok for finding in diagnoses):
         raise click.exceptions.Exit(FINDINGS)

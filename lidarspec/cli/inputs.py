@@ -113,9 +113,9 @@ def _is_file(text: str) -> bool:
 @contextlib.contextmanager
 def _file(path: str, times: Times) -> Iterator[tuple[SampleBytes, Iterator[Chunk]]]:
     from lidarspec.transports.files import FileTransport
-    from lidarspec.transports.open_url import transport
+    from lidarspec.transports.open_url import open_transport
 
-    with contextlib.closing(transport(path)) as file:
+    with contextlib.closing(open_transport(path)) as file:
         if path == "-" and type(file) is FileTransport:
             chunks = _standard_input(file)
         else:
@@ -393,11 +393,11 @@ def conclude(device: Device) -> None:
 
 def reread(source: str) -> SampleBytes | None:
     """Read the beginning of a file a second time; return None if that is not possible."""
-    from lidarspec.transports.open_url import transport
+    from lidarspec.transports.open_url import open_transport
 
     if not Path(source.partition("?")[0]).is_file():
         return None
-    with contextlib.closing(transport(source)) as file:
+    with contextlib.closing(open_transport(source)) as file:
         try:
             chunks = tuple(chunk.data for chunk in read_beginning(file, MAX_SAMPLE_BYTES))
             return SampleBytes(source, chunks, file.datagrams, warnings=tuple(file.warnings))

@@ -30,9 +30,9 @@ from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.recording.recorders import SUFFIXES, Recorder, check_suffix, declared_port
 from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.destinations import replay_outlet
+from lidarspec.transports.destinations import make_replay_outlet
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import is_live, live_address, transport
+from lidarspec.transports.open_url import is_live, live_address, open_transport
 from lidarspec.transports.outlets import Outlet
 from lidarspec.transports.protocol import Transport
 from lidarspec.transports.replays import LATE_NS, Replay
@@ -269,14 +269,14 @@ def replay(
     if is_file:
         refuse_overwriting(place, file, sensor_id)
     with contextlib.ExitStack() as undo:
-        source = undo.enter_context(contextlib.closing(transport(file)))
+        source = undo.enter_context(contextlib.closing(open_transport(file)))
         sensor = _find_sensor(source, sensor_id)
         destination: Outlet | BackgroundWriter
         if is_file:
             destination = _make_file(source, file, place, sensor, force=force)
         else:
             port = declared_port(sensor)
-            destination = replay_outlet(place, datagrams=source.datagrams, port=port)
+            destination = make_replay_outlet(place, datagrams=source.datagrams, port=port)
         undo.pop_all()  # the replay closes it
     if isinstance(destination, Outlet):
         place = destination.local_source

@@ -154,9 +154,9 @@ class Verbs(click.Group):
                 importlib.import_module(f"lidarspec.cli.{VERBS[cmd_name][0]}"), cmd_name
             )
         elif cmd_name in find_added_verbs():
-            from lidarspec.plugins import verb
+            from lidarspec.plugins import load_verb
 
-            command = verb(find_added_verbs()[cmd_name])
+            command = load_verb(find_added_verbs()[cmd_name])
         else:
             return None
         parameters = {param.name for param in command.params}

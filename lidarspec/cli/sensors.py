@@ -17,7 +17,7 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import emit, emit_json, output_options, table
 from lidarspec.cli.terminal import note, say
 from lidarspec.errors import SpecError
-from lidarspec.known_sensors import KnownLink, KnownSensor, list_described_sensors, no_sensors
+from lidarspec.known_sensors import KnownLink, KnownSensor, list_described_sensors, no_sensors_text
 from lidarspec.trusted_files import FILE, TRUSTED, trust as trusted, user_folder
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def guide() -> str:
     vendors = {sensor.vendor for sensor in installed}
     lines = [
         f"lidarspec {__version__}",
-        f"{len(installed)} sensors of {len(vendors)} vendors" if vendors else no_sensors(),
+        f"{len(installed)} sensors of {len(vendors)} vendors" if vendors else no_sensors_text(),
         f"serial ports: {', '.join(ports) or 'none'}",
     ]
     if named:
@@ -105,7 +105,7 @@ def sensors(as_json: bool, output: str | None) -> None:
         ]
         emit(table(["id", "device", "link", "status", "distribution"], rows, output), output)
     if not installed:
-        note(no_sensors())
+        note(no_sensors_text())
     if broken:
         note(
             f"{len(broken)} plugin{'s' * (len(broken) > 1)} could not be loaded;"
@@ -178,11 +178,11 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
 
 def _unit(sensor: Sensor, path: str) -> str:
     """Return the unit of a field, "frame.path", after a comma."""
-    from lidarspec.frames.schema import schema
+    from lidarspec.frames.schema import make_schema
 
     frame, _, field = path.partition(".")
     if frame in sensor.frames:
-        unit = schema(sensor.frames[frame].tree).scan_names[field].unit
+        unit = make_schema(sensor.frames[frame].tree).scan_names[field].unit
     else:
         unit = ""
     if unit:
@@ -238,7 +238,7 @@ def plugins(ctx: click.Context, as_json: bool, output: str | None) -> None:
         emit(
             table(["distribution", "version", "entry point", "sensors"], rows, output)
             if rows
-            else no_sensors(),
+            else no_sensors_text(),
             output,
         )
     if any(plugin.error or plugin.remark for plugin in tried):

@@ -19,7 +19,7 @@ from lidarspec.cli.terminal import handle_sigterm, note, say
 from lidarspec.detect.identification import format_sensor_options
 from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.errors import UsageError, suggest
-from lidarspec.known_sensors import no_sensors
+from lidarspec.known_sensors import no_sensors_text
 from lidarspec.plugins import registry, sensor as named_sensor
 from lidarspec.points.appearance import choose_appearance
 from lidarspec.recording.recorders import SUFFIXES
@@ -30,12 +30,12 @@ from lidarspec.simulation.faults import BLOCKED, Faults
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial
 from lidarspec.transports.base import data_link
-from lidarspec.transports.destinations import simulated_outlet
+from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, Outlet, has_terminals
 from lidarspec.transports.serving import serve
 from lidarspec.transports.simulated import parse_rate
 from lidarspec.transports.simulated_files import write_file
-from lidarspec.view.polar import picture
+from lidarspec.view.polar import draw_cloud
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -168,7 +168,7 @@ def sim(
         note(f"{_format_sent(device)}, {size(written)}")
         return
     try:
-        opened = simulated_outlet(sensor, place, link)
+        opened = make_simulated_outlet(sensor, place, link)
     except UsageError as error:
         raise suggest(
             error,
@@ -259,7 +259,7 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
     )
     sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)
     if sensor is None:
-        raise UsageError(no_sensors())
+        raise UsageError(no_sensors_text())
     result = demonstrate(sensor, turns=count, errors=errors)
     whole = [scan for scan in result.scans if scan.whole]
     if as_json:
@@ -274,7 +274,7 @@ def _picture(scan: Scan) -> Text:
     columns, lines = shutil.get_terminal_size((80, HIGHEST))
     width = min(columns, WIDEST)
     height = max(min(lines - SUMMARY, HIGHEST), 12)
-    return picture(
+    return draw_cloud(
         scan.points, width=width, height=height, look=choose_appearance(scan.points)
     ).text()
 

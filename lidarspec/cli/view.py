@@ -27,7 +27,7 @@ from lidarspec.transports.protocol import Origin
 from lidarspec.view.canvas import CellGrid
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.page_server import PageServer, open_page_server
-from lidarspec.view.polar import picture
+from lidarspec.view.polar import draw_cloud
 from lidarspec.view.terminal_screen import (
     Screen,
     TerminatedError,
@@ -273,7 +273,7 @@ def _draw_once(
         raise no_scan_error(device, source, patience)
     columns, lines = shutil.get_terminal_size((80, 24))
     chosen = choose_appearance(feed.scan.points, ramp=ramp)
-    cells: CellGrid = picture(
+    cells: CellGrid = draw_cloud(
         feed.scan.points, width=columns, height=max(lines - 2, 4), look=chosen
     )
     if not find_plain_characters(sys.stdout):

@@ -36,9 +36,9 @@ from lidarspec.errors import CommandError, LidarSpecError, UsageError, WireError
 from lidarspec.expressions.columns import Fields
 from lidarspec.frames.layout import Bytes2D, Seal, Sums
 from lidarspec.frames.parse import identify
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import VALID, Found
 from lidarspec.packets.packets import Packets
 from lidarspec.plugins import registry, sensor as named_sensor, sensors
@@ -49,7 +49,7 @@ from lidarspec.spec.links import Serial
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.transports.base import data_link
 from lidarspec.transports.files import RecordingTransport
-from lidarspec.transports.open_url import live_address, resolve, transport
+from lidarspec.transports.open_url import live_address, open_transport, resolve
 from lidarspec.transports.protocol import no_bytes
 
 #: Relative tolerance of the pace of a clock.
@@ -314,7 +314,7 @@ def _field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
 
     For a field of repeated parts the value is that of the first part with the field, or "".
     """
-    fields = schema(sensor.frames[item.frame].tree)
+    fields = make_schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
     axis, _, rest = fields.within(path) or ("", "", path)
     if axis:
@@ -678,7 +678,7 @@ def find_declared_sensor(source: str | Path) -> Sensor | None:
     address = live_address(source)
     if address is not None and address.scheme != "sim":
         return None
-    opened = transport(source)
+    opened = open_transport(source)
     opened.close()
     if isinstance(opened, RecordingTransport) and opened.header.sensor:
         return opened.known_sensor()
@@ -760,7 +760,7 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
     frame = sensor.frames[name]
     if not 0 < len(data) <= frame.max_length:
         return False
-    engine = codec(frame)
+    engine = get_codec(frame)
     if any(
         offset >= len(data) or data[offset] & mask != value
         for offset, (mask, value) in engine.prefix.items()
@@ -777,7 +777,7 @@ def _begins_like_frame(fault: WireError) -> bool:
     """
     if not fault.frame:
         return False
-    prefix = codec(sensors()[fault.sensor].frames[fault.frame]).prefix
+    prefix = get_codec(sensors()[fault.sensor].frames[fault.frame]).prefix
     constants = [
         (fault.data[offset], mask, value)
         for offset, (mask, value) in prefix.items()

@@ -23,7 +23,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.links import Serial, Udp
 from lidarspec.transports.addresses import with_option
 from lidarspec.transports.base import data_link
-from lidarspec.transports.open_url import live, live_address, transport
+from lidarspec.transports.open_url import live_address, open_live, open_transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
 
 #: maximum number of datagrams read from a file.
@@ -134,7 +134,7 @@ def has_no_baud(port: str) -> bool:
 
 
 def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> Iterator[SampleBytes]:
-    with contextlib.closing(transport(source)) as opened:
+    with contextlib.closing(open_transport(source)) as opened:
         number = DATAGRAMS if opened.datagrams else None
         warnings: tuple[str, ...] = ()
         if isinstance(opened, LiveTransport):
@@ -181,7 +181,7 @@ def read_sensor_sample(source: str | Path, sensor: Sensor, seconds: float) -> li
     """
     address = live_address(source)
     chunks = list[Chunk]()
-    with contextlib.closing(transport(source, sensor)) as opened:
+    with contextlib.closing(open_transport(source, sensor)) as opened:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
             chunks += opened.read(min(left, LOOK))
@@ -240,7 +240,7 @@ def probe(source: str | Path) -> Iterator[SampleBytes]:
                 text = str(source)
             else:
                 text = with_option(source, "baud", baud)
-            with contextlib.closing(live(text, sensor)) as opened:
+            with contextlib.closing(open_live(text, sensor)) as opened:
                 chunks = _StartProbe(sensor, opened).run()
             yield SampleBytes(str(source), tuple(chunks), baud=None if plain else baud)
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.errors import WireError, suggest
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.known_sensors import KnownSensor, Signature, install_command, known_sensors
 from lidarspec.plugins import registry
 from lidarspec.sensor_operations import Sensor
@@ -37,7 +37,7 @@ def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
     """Return the signatures of the data frames of a sensor that have enough constant bytes."""
     signatures = []
     for name in sensor.data_frames:
-        engine = codec(sensor.frames[name])
+        engine = get_codec(sensor.frames[name])
         constant = {
             offset: value
             for offset, (mask, value) in engine.prefix.items()

@@ -73,8 +73,10 @@ class BoundedQueue:
         self._max_chunks = chunks
         self._max_bytes = size
         self._events: deque[Event] = deque()
-        self._kept: dict[Event, None] = {}  # events other than data that left the full queue
-        self._cut: set[str] = set()  # links with dropped chunks; their next chunk has a gap
+        self._kept_events: dict[Event, None] = {}  # events other than data that left the full queue
+        self._links_with_gap: set[str] = (
+            set()
+        )  # links with dropped chunks; their next chunk has a gap
         self._waiting = self._size = 0
         self._changed = threading.Condition()
         self.produced = self.consumed = self.dropped = 0
@@ -117,11 +119,11 @@ class BoundedQueue:
             time.sleep(pause)  # data that arrives meanwhile does not wake this thread
         with self._changed:
             self._changed.wait_for(
-                lambda: self._events or self._kept or self.closed, timeout - max(pause, 0.0)
+                lambda: self._events or self._kept_events or self.closed, timeout - max(pause, 0.0)
             )
-            events = list(self._kept)
-            self._kept.clear()
-            if len(events) + len(self._events) <= chunks and not self._cut:
+            events = list(self._kept_events)
+            self._kept_events.clear()
+            if len(events) + len(self._events) <= chunks and not self._links_with_gap:
                 events += self._events
                 self._events.clear()
                 self.consumed += self._waiting
@@ -143,8 +145,8 @@ class BoundedQueue:
             self.consumed += 1
             self._waiting -= 1
             self._size -= len(item.data)
-            if link in self._cut:
-                self._cut.discard(link)
+            if link in self._links_with_gap:
+                self._links_with_gap.discard(link)
                 item = replace(item, gap=True)
         return link, item
 
@@ -163,10 +165,10 @@ class BoundedQueue:
                 self.dropped += 1
                 self._waiting -= 1
                 self._size -= len(item.data)
-                self._cut.add(link)
+                self._links_with_gap.add(link)
             else:
-                self._kept.pop((link, item), None)
-                self._kept[(link, item)] = None
+                self._kept_events.pop((link, item), None)
+                self._kept_events[(link, item)] = None
 
 
 class CaptureThread:

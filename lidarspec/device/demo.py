@@ -27,7 +27,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.spec.links import Serial
 from lidarspec.transports.base import data_link
-from lidarspec.transports.destinations import simulated_outlet
+from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.outlets import LOCALHOST, has_terminals
 from lidarspec.transports.serving import Served
 
@@ -128,7 +128,7 @@ def _run_live(
         address = f"udp://{LOCALHOST}:{port}"
         with (
             open_device(address, sensor, start=False, record=path) as device,
-            Served(simulated, simulated_outlet(sensor, address)) as served,
+            Served(simulated, make_simulated_outlet(sensor, address)) as served,
         ):
             return address, *_read(device, served, turns)
     if has_terminals() and data_link(sensor, Serial):
@@ -136,7 +136,7 @@ def _run_live(
     else:
         destination = f"tcp://{LOCALHOST}:0"
     with (
-        Served(simulated, simulated_outlet(sensor, destination), patient=True) as served,
+        Served(simulated, make_simulated_outlet(sensor, destination), patient=True) as served,
         open_device(served.path, sensor, start=False, record=path) as device,
     ):
         return served.path, *_read(device, served, turns)

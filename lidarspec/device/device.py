@@ -34,12 +34,12 @@ from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.points.mount import Mount
 from lidarspec.recording.background_writer import TrafficLog
-from lidarspec.recording.recorders import RecordTo, recorder_for
+from lidarspec.recording.recorders import RecordTo, get_recorder
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import ScanSelector, Selection
 from lidarspec.scans.stream import ScanStream
 from lidarspec.sensor_operations import Sensor
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import ClosingContext, LiveTransport, Transport
 
 #: number of frames at the start that are compared with related models.
@@ -424,7 +424,7 @@ class Device(ClosingContext):
         *,
         will_begin: bool,
     ) -> DeviceInput:
-        opened = transport(self.source, self.sensor)
+        opened = open_transport(self.source, self.sensor)
         try:
             if not isinstance(opened, LiveTransport):
                 if record is not None:
@@ -639,7 +639,7 @@ def _make_recorder(
     """
     if record is None:
         return None
-    log, is_own = recorder_for(record, sensor, source, opened)
+    log, is_own = get_recorder(record, sensor, source, opened)
     if is_own:
         own_recorders.append(log)
     return log

@@ -23,13 +23,13 @@ from lidarspec.device.first_frames import FirstFrames, find_first_frames, needs_
 from lidarspec.device.sender_filter import SenderCheck, frame_senders
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, SourceError
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Counters, Found, Frames
 from lidarspec.remote_files import is_remote
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.files import CaptureTransport
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk, Transport
 
 
@@ -87,7 +87,7 @@ class DeviceInput(Protocol):
     def _lacks_values(self, item: Found) -> bool:
         """Return whether a frame of several parts lacks values of an earlier frame."""
         earlier = self.info_frames.get(item.frame)
-        if earlier is None or not schema(self.sensor.frames[item.frame].tree).parts:
+        if earlier is None or not make_schema(self.sensor.frames[item.frame].tree).parts:
             return False
         return not read_info(self.sensor, [earlier]).keys() <= read_info(self.sensor, [item]).keys()
 
@@ -367,7 +367,7 @@ class FileInput(DeviceInput):
             is_remote(self._source) or path.is_file() or path.is_dir()
         ):
             return FirstFrames()
-        with contextlib.closing(transport(self._source)) as source:
+        with contextlib.closing(open_transport(self._source)) as source:
             decoder = self.sensor.decoder(stream=not source.datagrams)
             if isinstance(source, CaptureTransport) and source.datagrams:
                 batches = (

@@ -28,14 +28,14 @@ from lidarspec.errors import UsageError
 from lidarspec.expressions.columns import AROUND
 from lidarspec.frames.frame_table import CompiledTable, ParsedTable, Table
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets, StateOf
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import ScanStream
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.files import CaptureTransport, FileTransport
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import ClosingContext, LiveTransport
 
 #: types whose values are pickled, not referred to by name.
@@ -57,7 +57,7 @@ class FileScans(ClosingContext):
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, bookmark: bytes | None = None) -> None:
-        opened = transport(source, sensor)
+        opened = open_transport(source, sensor)
         if isinstance(opened, LiveTransport):
             opened.close()
             raise UsageError(f"{source} is no file")
@@ -176,7 +176,7 @@ def _find_constants(sensor: Sensor, decoder: Decoder) -> dict[tuple[Any, ...], A
     """
     constants = dict[tuple[Any, ...], Any]()
     _name_parts(sensor, (), constants, set())
-    codecs = {("codec", name): codec(frame) for name, frame in sensor.frames.items()}
+    codecs = {("codec", name): get_codec(frame) for name, frame in sensor.frames.items()}
     return {**constants, **codecs, ("framing",): decoder.framing}
 
 
@@ -208,7 +208,7 @@ class _StatePickler(pickle.Pickler):
         self._names = {id(value): name for name, value in self._constants.items()} | {
             id(source): ("file",)
         }
-        self._frames = {id(codec(frame).schema): name for name, frame in sensor.frames.items()}
+        self._frames = {id(get_codec(frame).schema): name for name, frame in sensor.frames.items()}
 
     def persistent_id(self, obj: Any) -> Any:
         """Return the name of a constant, None for an object that has to be pickled.
@@ -259,7 +259,7 @@ class _Loader(pickle.Unpickler):
 
 
 def _make_table(sensor: Sensor, frame: str, frames: list[bytes]) -> Table:
-    return codec(sensor.frames[frame]).table_of_structs(frames)
+    return get_codec(sensor.frames[frame]).table_of_structs(frames)
 
 
 def _take_states(table: Table | None, which: Any) -> StateOf:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import ClockReference, reference_readings, reported_seconds
 from lidarspec.sensor_operations import Sensor
@@ -80,7 +80,7 @@ def _find_reference(
 ) -> ClockReference | None:
     """Return the first reference of the clock in some frames; None if none is valid."""
     assert sensor.clock is not None
-    table = codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
+    table = get_codec(sensor.frames[name]).table([frames.data(int(row)) for row in rows])
     try:
         seconds = reported_seconds(sensor.clock, table)
         readings = reference_readings(sensor, table)

@@ -114,7 +114,7 @@ class LiveInput(DeviceInput):
         self._clock = HostClock()
         self._decoder_lock = threading.RLock()
         self._session_lock = threading.RLock()
-        self._due = 0.0  # time of the next decoding, by `time.monotonic`
+        self._decode_due_s = 0.0  # time of the next decoding, by `time.monotonic`
         self._was_opened = False  # whether the commands for opening were sent
         self._closed = False
         self._failure: SourceError | None = None
@@ -239,7 +239,7 @@ class LiveInput(DeviceInput):
                     return None
 
     def delay_decoding(self, until: float) -> None:
-        self._due = max(self._due, until)
+        self._decode_due_s = max(self._decode_due_s, until)
 
     def read_ahead(self, size: int) -> None:
         """Do nothing: live data cannot be read ahead."""
@@ -386,9 +386,9 @@ class LiveInput(DeviceInput):
         else:
             left = (deadline - self._clock.now()) / 1e9
         wait = wait if left < -MAX_PUMP_S else min(wait, max(left, 0.0))
-        events = self.queue.take(wait, until=self._due, chunks=MAX_CHUNKS)
+        events = self.queue.take(wait, until=self._decode_due_s, chunks=MAX_CHUNKS)
         if events:
-            self._due = time.monotonic() + self._period
+            self._decode_due_s = time.monotonic() + self._period
         for link, item in _join_chunks(events):
             self._handle(link, item)
         if deadline is not None:

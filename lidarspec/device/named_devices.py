@@ -27,7 +27,7 @@ from shlex import quote
 from typing import Any
 
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggest
-from lidarspec.plugins import names_file, sensor as named_sensor
+from lidarspec.plugins import is_file_name, sensor as named_sensor
 from lidarspec.points.mount import Mount
 from lidarspec.remote_files import is_remote
 from lidarspec.sensor_operations import Sensor
@@ -103,7 +103,7 @@ class NamedDevice:
         folder = Path(self.file).parent
         file = self.source.partition("?")[0]
         reason = ""
-        if self.sensor is not None and names_file(self.sensor):
+        if self.sensor is not None and is_file_name(self.sensor):
             reason = f"sensor {self.sensor!r} is Python, which would run"
         elif is_remote(self.source):
             reason = (

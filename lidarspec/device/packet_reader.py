@@ -15,7 +15,7 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.results import Frames
 from lidarspec.packets.imu import WaitingSamples, join_samples
 from lidarspec.packets.packets import Packets
-from lidarspec.packets.stream import ImuStream, PacketStream, data_frame
+from lidarspec.packets.stream import ImuStream, PacketStream, choose_data_frame
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.stream import ScanStream, release_yielded
 from lidarspec.sensor_operations import Sensor
@@ -78,7 +78,7 @@ class PacketReader:
         self._undecided += batch.frames
         frames = list(self._undecided)
         if self._stream is None:
-            name = data_frame(self._sensor, frames)
+            name = choose_data_frame(self._sensor, frames)
             if name is None:
                 return None
             self._stream = self._make_stream(name)

@@ -26,7 +26,7 @@ from typing import Any
 
 from lidarspec.errors import CommandError, ReplyTimeout, UnknownField, UsageError
 from lidarspec.frames.field_paths import split_path
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import Found
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.arguments import Address, Filled
@@ -485,7 +485,7 @@ class Session:
         return value.at(self._count - 1)
 
     def _table(self, frame: str) -> Mapping[str, FieldInfo]:
-        return codec(self.sensor.frames[frame]).schema.fields
+        return get_codec(self.sensor.frames[frame]).schema.fields
 
     def _advance(self, link: str, now: int) -> None:
         """Send queued requests, up to the first that waits for a reply or is held back."""

@@ -25,11 +25,11 @@ from lidarspec.device.device import Device
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.recording.format import Header
-from lidarspec.recording.recorders import RecorderFactory, recorder
+from lidarspec.recording.recorders import RecorderFactory, open_recorder
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.files import RecordingTransport
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.transports.open_url import is_live, transport
+from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, LiveTransport, Transport
 
 #: time between two checks of the limits and of the disk.
@@ -53,13 +53,13 @@ def make_recorder(
         overwrite: whether the file may exist.
 
     Raises:
-        UnknownFormat, UsageError, SourceError: the same as `recorder`.
+        UnknownFormat, UsageError, SourceError: the same as `open_recorder`.
     """
     if isinstance(opened, RecordingTransport):
         header = opened.header
     else:
         header = Header(source=source, baud=opened.baud)
-    return recorder(
+    return open_recorder(
         target,
         sensor or header.sensor,
         header.source,
@@ -256,7 +256,7 @@ class SourceRecording:
         source = (
             RecordingTransport(self._source, salvage=True)
             if self._salvage
-            else transport(self._source, self._sensor)
+            else open_transport(self._source, self._sensor)
         )
         with (
             contextlib.closing(source),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from lidarspec.explaining.formatting import FieldValue
 from lidarspec.frames.arrays import count_up
 from lidarspec.framing.frame_codec import Codec
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import formulas, nodes, refs
@@ -73,7 +73,7 @@ def find_changes(
     Args:
         offsets: the bytes at which changes are tried; by default all.
     """
-    engine = codec(frame)
+    engine = get_codec(frame)
     for kind in kinds if data else ():
         longer, values = KINDS[kind]
         size = len(data) - longer

@@ -25,10 +25,10 @@ from lidarspec.explaining.formatting import (
 from lidarspec.explaining.frame_rows import FrameRows
 from lidarspec.explaining.listing import Line, Listing, join_text
 from lidarspec.frames.parse import identify
-from lidarspec.frames.schema import schema, without_indices
+from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import examine
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import IMPLAUSIBLE, Counters, Found, pack_found
 from lidarspec.notebook_display import make_display_method
 from lidarspec.packets.stream import PacketStream
@@ -223,7 +223,7 @@ def _add_points(
 ) -> tuple[tuple[ExplainedRow, ...], tuple[str, ...]]:
     """Return the rows with their points, and notes on the frame."""
     frame = sensor.frames[name]
-    survey = codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
+    survey = get_codec(frame).survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp))
     notes = ["not plausible: decoders skip this frame"] * bool(survey.status[0] == IMPLAUSIBLE)
     if not (frame.data or frame.points):
         return rows, tuple(notes)
@@ -278,13 +278,13 @@ def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]
     """
     frame = sensor.frames[name]
     path = sensor.parts_with("points", name)
-    location = schema(frame.tree).within(path) if path else None
+    location = make_schema(frame.tree).within(path) if path else None
     if location is None:
         return []
     axis, kind_name, _ = location
     struct = frame_coder(frame).decode(data).struct
     examined = examine(frame.tree, struct, frame.room)
-    node = schema(frame.tree).parts[axis]
+    node = make_schema(frame.tree).parts[axis]
     kind = next(kind for kind in node.kinds if kind.name == kind_name)
     return [part.prefix for part in examined.parts_of(axis) if part.root is kind.root]
 

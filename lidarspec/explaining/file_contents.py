@@ -32,7 +32,7 @@ from lidarspec.transports.files import (
     RecordingTransport,
     StreamCaptureTransport,
 )
-from lidarspec.transports.open_url import is_live, transport
+from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
 from lidarspec.transports.robotics_logs import BagTransport
 from lidarspec.view.live_scans import LiveScans
@@ -203,7 +203,7 @@ def read_contents(path: str | Path) -> FileContents:
             UsageError(f"{path} is not a file"),
             f"lidarspec detect {quote(str(path))}" if str(path) != "-" else "lidarspec info FILE",
         )
-    with contextlib.closing(transport(path)) as opened:
+    with contextlib.closing(open_transport(path)) as opened:
         kind = KINDS.get(type(opened), "raw bytes")
         if not os.path.exists(path):
             file = str(path).partition("?")[0]
@@ -228,7 +228,7 @@ def measure_duration(path: str | Path) -> float | None:
     Raises:
         SourceError: if the file cannot be opened.
     """
-    with contextlib.closing(transport(path)) as opened:
+    with contextlib.closing(open_transport(path)) as opened:
         described = FileContents(str(path), "", 0)
         _count(described, opened)
     return described.seconds

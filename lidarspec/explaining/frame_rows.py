@@ -13,12 +13,12 @@ from lidarspec.explaining.formatting import ExplainedRow, FieldValue
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import plain_fields
-from lidarspec.frames.schema import schema, without_indices
+from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import PlacedSeal, WireField, examine
 from lidarspec.frames.wire_table import bit_text, format_hex
 from lidarspec.spec import Frame
-from lidarspec.spec.tree import UNNAMED, FieldInfo, exact, format_values
+from lidarspec.spec.tree import UNNAMED, FieldInfo, format_values, to_exact
 
 #: Maximum number of decimals to distinguish steps, and of decimals to add to show a step in full.
 MAX_DIGITS = 12
@@ -37,7 +37,7 @@ class FrameRows:
 
     def __init__(self, frame: Frame, data: bytes, fault: WireError | None = None) -> None:
         self._data = data
-        self._schema = schema(frame.tree)
+        self._schema = make_schema(frame.tree)
         self._fault = fault
         self._has_form = frame.wire is not None
         self._axes = self._array_axes()
@@ -185,7 +185,7 @@ def _digits(scale: float, offset: float) -> int:
 
     A few more are added if they show each step in full.
     """
-    steps = (exact(scale), exact(offset))
+    steps = (to_exact(scale), to_exact(offset))
     apart = next(
         (digits for digits in range(MAX_DIGITS) if abs(steps[0]) * 10**digits >= 1), MAX_DIGITS
     )

@@ -20,7 +20,7 @@ from lidarspec.explaining.formatting import ExplainedRow
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.parse import identify, layout_of
 from lidarspec.frames.wire_coder import frame_coder
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import Sensor
 from lidarspec.spec.sensor import with_frames
 from lidarspec.transports.protocol import Chunk
@@ -213,7 +213,7 @@ def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
     """
     starts: set[int] = set()
     for frame in sensor.incoming.values():
-        prefix = codec(frame).prefix
+        prefix = get_codec(frame).prefix
         size = next(
             (index for index in range(len(prefix) + 1) if prefix.get(index, (0, 0))[0] != 0xFF), 0
         )

@@ -30,9 +30,9 @@ EXPORTS: dict[str, str] = {
     "wireshark": "lidarspec.exports.wireshark:dissector",
     "c": "lidarspec.exports.c:header",
     "ksy": "lidarspec.exports.ksy:ksy",
-    "md": "lidarspec.exports.reference:page",
+    "md": "lidarspec.exports.reference:make_page",
     "svg": "lidarspec.exports.diagram:svg",
-    "json": "lidarspec.exports.json:text",
+    "json": "lidarspec.exports.json:to_text",
     "pyi": "lidarspec.exports.stubs:pyi",
 }
 

@@ -46,10 +46,10 @@ from lidarspec.spec.tree import (
     Op,
     Repeat,
     Sealed,
+    find_runs,
     formulas,
     parts,
     refs,
-    runs_of,
 )
 
 _FUNCTION = """\
@@ -396,7 +396,7 @@ def _format_allowed(expression: str, allowed: tuple[int, ...]) -> str:
     """Return a C condition that an expression has one of the allowed values."""
     ranges = (
         f"(lidarspec_int({expression}) >= {first} && lidarspec_int({expression}) <= {last})"
-        for first, last in runs_of(allowed)
+        for first, last in find_runs(allowed)
     )
     return " || ".join(ranges) or "0"
 

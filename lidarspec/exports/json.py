@@ -22,16 +22,16 @@ from lidarspec.spec.links import Link, Udp
 VERSION = 1
 
 
-def text(sensor: Sensor) -> str:
+def to_text(sensor: Sensor) -> str:
     """Return the spec as JSON.
 
     Raises:
         ExportError: if a frame contains Python code that data cannot represent.
     """
-    return json.dumps(spec(sensor), indent=2, ensure_ascii=False) + "\n"
+    return json.dumps(to_data(sensor), indent=2, ensure_ascii=False) + "\n"
 
 
-def spec(sensor: Sensor) -> dict[str, Any]:
+def to_data(sensor: Sensor) -> dict[str, Any]:
     """Return the spec as plain data: dicts, lists, numbers, texts.
 
     Raises:

@@ -43,7 +43,7 @@ RULES = {
 RINGS = 128
 
 
-def page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
+def make_page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
     """Return the page as Markdown.
 
     Args:

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from lidarspec.exports import ExportedFrame, ExportError, messages
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_table import describe_field, unit_text
 from lidarspec.spec import Command, Sensor
 from lidarspec.spec.arguments import Address, Octets, Range, Text
@@ -187,7 +187,7 @@ def _sensor(sensor: Sensor, frames: tuple[ExportedFrame, ...], names: dict[str, 
         rest = ""
     literals = ", ".join(f'"{name}"' for name in names)
     data = next((message.frame for message in frames if message.frame.data), frames[0].frame)
-    fields = ", ".join(f'"{path}"' for path in schema(data.tree).all_fields)
+    fields = ", ".join(f'"{path}"' for path in make_schema(data.tree).all_fields)
     return f'''FrameName = Literal[{literals}]
 FieldPath = Literal[{fields}]
 

@@ -25,8 +25,8 @@ from lidarspec.exports import (
     find_references,
     messages,
 )
-from lidarspec.frames.layout_tree import prefix_of
-from lidarspec.framing.frame_engine import codec
+from lidarspec.frames.layout_tree import find_prefix
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import (
     Checksum,
     Crc,
@@ -333,7 +333,7 @@ class _TableWriter:
             magic = [
                 [offset, mask, value]
                 for offset, (mask, value) in sorted(
-                    prefix_of(kind.root, self.message.frame.max_length).items()
+                    find_prefix(kind.root, self.message.frame.max_length).items()
                 )
             ]
             after = node.following(kind)
@@ -385,7 +385,7 @@ class _TableWriter:
         if info.allowed is None:
             table["allowed"] = None
         else:
-            table["allowed"] = [list(run) for run in tree.runs_of(info.allowed)]
+            table["allowed"] = [list(run) for run in tree.find_runs(info.allowed)]
         return table | {"keep": self._keep(info.path)}
 
     def _new(
@@ -595,7 +595,7 @@ def dissector(sensor: Sensor) -> str:
     # because they match less often by chance.
     by_direction = sorted(
         messages(sensor),
-        key=lambda message: (message.frame.direction, -len(codec(message.frame).prefix)),
+        key=lambda message: (message.frame.direction, -len(get_codec(message.frame).prefix)),
     )
     about = {
         "title": title,
@@ -618,7 +618,7 @@ def dissector(sensor: Sensor) -> str:
 
 
 def _frame(message: ExportedFrame, name: str) -> dict[str, Any]:
-    prefix = codec(message.frame).prefix
+    prefix = get_codec(message.frame).prefix
     return {
         "name": message.name,
         "longest": message.frame.max_length,

@@ -8,7 +8,7 @@ A `Column` is an array with one axis for the packets and one for each array leve
 axis has length 1 if the field is further out. Each axis is named after its array, so arithmetic
 aligns columns by name, and sibling arrays cannot be mixed by accident. A column also knows its
 batch, and therefore where packets were lost and how long variable arrays are, and how many packets
-are final (``ready``) if values depend on later packets. `RowOfValues` is a column as one run of
+are final (``ready``) if values depend on later packets. `FlatColumn` is a column as one run of
 values in stream order, without padding; `previous`, `following` and `last` work on it.
 
 `align` also aligns other arrays: an array made by `along` by the name of its array; a plain array
@@ -295,7 +295,7 @@ class Column(NDArrayOperatorsMixin):
 
         A negative step returns earlier values. Values across a loss and beyond the end are nan.
         """
-        row = RowOfValues(self)
+        row = FlatColumn(self)
         size = abs(step)
         slot = len(self.batch.left)
         carried = self.batch.carry.get(slot, np.empty(0))
@@ -344,7 +344,7 @@ class Column(NDArrayOperatorsMixin):
             Column(np.broadcast_to(array, shape), axes, self.batch, ready=ready)
             for array in (values, flags)
         ]
-        row, known = (RowOfValues(column) for column in both)
+        row, known = (FlatColumn(column) for column in both)
         slot = len(self.batch.left)
         carried = self.batch.carry.get(slot, np.full(1, np.nan))
         numbers = np.concatenate([carried, row.values])
@@ -354,7 +354,7 @@ class Column(NDArrayOperatorsMixin):
         return Column(row.unflatten(latest[1:]), axes, self.batch, ready=ready)
 
 
-class RowOfValues:
+class FlatColumn:
     """A column as one run of values in stream order, without padding.
 
     Attributes:

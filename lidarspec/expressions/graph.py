@@ -1,7 +1,7 @@
 """Trace a function of fields: record its steps as a graph by calling it once.
 
 `trace` calls a `points`, `plausible` or clock function with `TracedFields`, and returns its result
-and the `Tape` of its steps. A step is a `Node`: a field, a state column, an elementwise call, or a
+and the `Trace` of its steps. A step is a `Node`: a field, a state column, an elementwise call, or a
 step that depends on the order of packets (`on`, `shift`, `latest`). Every node carries the result
 for two sample packets, so shapes and axes need no rules of their own. A step that cannot be
 recorded (a branch on data, a reduction, an attribute of an array) raises `UntraceableError` with
@@ -136,7 +136,7 @@ class Node:
 
 
 @dataclass
-class Tape:
+class Trace:
     """The nodes of a trace in the order in which they were made, and its assumptions.
 
     Attributes:
@@ -160,7 +160,7 @@ class Tape:
         """Return a new node as a traced column; reuse the node of a field that was read before."""
         if path in self._read:
             return TracedColumn(self._read[path], self)
-        node = Node(kind, function, tuple(map(node_of, args)), sample, len(self.nodes), path)
+        node = Node(kind, function, tuple(map(get_node, args)), sample, len(self.nodes), path)
         self.nodes.append(node)
         if path:
             self._read[path] = node
@@ -170,7 +170,7 @@ class Tape:
 class TracedColumn(NDArrayOperatorsMixin):
     """A column that records the operations on it; it has the same methods as `Column`."""
 
-    def __init__(self, node: Node, tape: Tape) -> None:
+    def __init__(self, node: Node, tape: Trace) -> None:
         self.node = node
         self._tape = tape
 
@@ -309,7 +309,7 @@ class TracedFields:
     def __init__(
         self,
         real: Any,
-        tape: Tape,
+        tape: Trace,
         path: str = "",
         read: Callable[[Any], Any] = lambda fields: fields,
     ) -> None:
@@ -381,20 +381,20 @@ def _fold(
     return None
 
 
-def node_of(value: Any) -> Any:
+def get_node(value: Any) -> Any:
     """Return the node of a traced column; return other values unchanged."""
     if isinstance(value, TracedColumn):
         return value.node
     return value
 
 
-def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Tape]:
+def trace(function: Callable[[Any], Any], sample: Batch) -> tuple[Any, Trace]:
     """Return the result of a function of traced columns, and the tape of its steps.
 
     Raises:
         UntraceableError: if a step cannot be recorded.
     """
-    tape = Tape()
+    tape = Trace()
     with np.errstate(all="ignore"):
         return function(TracedFields(Fields(sample), tape)), tape
 
@@ -416,7 +416,7 @@ def traverse(*values: Any, into: Callable[[Node], bool] = lambda node: True) -> 
         into: whether to continue to the arguments of a node.
     """
     seen = set[Node]()
-    waiting = [node_of(value) for value in values]
+    waiting = [get_node(value) for value in values]
     while waiting:
         node = waiting.pop()
         if isinstance(node, Node) and node not in seen:
@@ -453,7 +453,7 @@ def compute(
     return value
 
 
-def only_field(node: Node) -> Node | None:
+def get_only_field(node: Node) -> Node | None:
     """Return the field of an expression of one field and numbers, None for others."""
     if node.fields is not None and len(node.fields) == 1:
         return node.fields[0]
@@ -491,11 +491,11 @@ class Expression:
 
         Fields without a value are nan.
         """
-        (values,) = values_of([self], raw)
+        (values,) = evaluate_expressions([self], raw)
         return values
 
 
-def values_of(
+def evaluate_expressions(
     expressions: Sequence[Expression], raw: Mapping[str, NDArray[Any]]
 ) -> list[NDArray[Any]]:
     """Return `Expression.values` of each expression; compute common nodes once."""
@@ -665,7 +665,9 @@ def find_choice(node: Node, width: int) -> tuple[Node, Any, Any] | None:
         return None
     condition, *options = node.args
     fits = [
-        only_field(o) is not None and is_full(o, width) if isinstance(o, Node) else np.size(o) == 1
+        get_only_field(o) is not None and is_full(o, width)
+        if isinstance(o, Node)
+        else np.size(o) == 1
         for o in options
     ]
     if not isinstance(condition, Node) or is_full(condition, width) or not all(fits):
@@ -705,7 +707,7 @@ def split_sum(value: Any, width: int) -> list[Term]:
         return [Term(np.ones(()), low=value)]
     function = value.function
     args = value.args
-    if value.kind == "call" and only_field(value) is None:
+    if value.kind == "call" and get_only_field(value) is None:
         if function in FACTORS:
             return _scale(value, split_sum(args[0], width), FACTORS[function])
         if function in (np.add, np.subtract):

@@ -130,7 +130,7 @@ def select_columns(
     "valid" and additional columns may be requested too.
     """
     cloud = scan.points
-    named = tuple(name for name in names if name == "valid" or cloud.shows(name))
+    named = tuple(name for name in names if name == "valid" or cloud.has_column(name))
     cloud.load(*named, "valid")
     columns = {
         name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name)

@@ -170,7 +170,7 @@ def describe_fields(cloud: PointCloud, points: NDArray[Any]) -> list[tuple[str, 
     lacking = {
         name
         for name in ("intensity", "ring", "time")
-        if not cloud.shows(name) or getattr(cloud, name) is None
+        if not cloud.has_column(name) or getattr(cloud, name) is None
     }
     return [
         (name, place[1], place[0].str[1:])

@@ -33,7 +33,7 @@ _LEVEL = 1
 
 
 @contextlib.contextmanager
-def text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str], None]]:
+def open_text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str], None]]:
     """Open a text file, compressed or not; yield a function that writes to it.
 
     It writes in a thread, while the next text is made. A compressed file contains neither name nor
@@ -50,7 +50,7 @@ def text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str]
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bool = False) -> None:
     """Write the columns that the first scan has, and the number of the scan."""
     names: tuple[str, ...] = ()
-    with text_file(path, is_zipped=is_zipped) as put:
+    with open_text_file(path, is_zipped=is_zipped) as put:
         for number, scan in enumerate(scans):
             cloud = select_points(scan, every_point=every_point)
             if not names:
@@ -67,7 +67,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bo
 
 def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write x y z in metres, nothing else; missing points as nan."""
-    with text_file(path) as put:
+    with open_text_file(path) as put:
         for scan in scans:
             which = find_points(scan.points, every_point=every_point)
             columns = scan.points.read("x", "y", "z").values()
@@ -84,7 +84,7 @@ def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
         ",".join("%d" if column.dtype.kind == "i" else "%.15g" for column in columns.values())
         + "\n"
     )
-    with text_file(path) as put:
+    with open_text_file(path) as put:
         put(",".join(columns) + "\n")
         _put_rows(put, template, [*columns.values()])
 

@@ -20,7 +20,7 @@ from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.encode import encode, fill_counts, list_paths
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.plain import build_plain
-from lidarspec.frames.schema import Schema, schema
+from lidarspec.frames.schema import Schema, make_schema
 from lidarspec.frames.wire_coder import SPELLING, frame_coder
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import WireNaN
@@ -51,11 +51,11 @@ def build(
         raise UsageError(f"{sensor.id} {frame}: fields come by name, not as {type(value).__name__}")
     declared = sensor.frames[frame]
     place = f"{sensor.id} {frame}"
-    checker = _Values(schema(declared.tree), list_paths(declared.tree), place, units=units)
+    checker = _Values(make_schema(declared.tree), list_paths(declared.tree), place, units=units)
     checked = checker.check({**(value or {}), **values}, "")
     layouts = frame_layouts(declared)
     if isinstance(layouts, NotCompilableError):
-        fill_counts(checked, schema(declared.tree))
+        fill_counts(checked, make_schema(declared.tree))
         return build_plain(declared, checked, place)
     try:
         struct = encode(layouts, checked, place)

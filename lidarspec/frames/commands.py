@@ -19,7 +19,7 @@ from lidarspec.errors import (
 )
 from lidarspec.frames.build import build
 from lidarspec.frames.field_paths import put_value, split_path
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.spec.arguments import Address, Count, Filled, Range, Taken
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.tree import FieldInfo
@@ -107,7 +107,7 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
 def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> ArgumentSlot:
     frame = sensor.commands[name].frame or ""
     names = split_path(path)
-    table = schema(sensor.frames[frame].tree) if frame else None
+    table = make_schema(sensor.frames[frame].tree) if frame else None
     if table is not None:
         info = table.all_fields.get(".".join(step for step in names if isinstance(step, str)))
     else:
@@ -123,7 +123,7 @@ def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> Argume
         arrays |= {
             f"{axis}.{below}": count
             for kind in node.kinds
-            for below, count in schema(kind.root).arrays.items()
+            for below, count in make_schema(kind.root).arrays.items()
         }
     indices = [step for step in names if isinstance(step, int)]
     counts = [arrays.get(axis) for axis in info.axes]

@@ -6,7 +6,7 @@ frame is then interpreted by construct.
 
 from __future__ import annotations
 
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.spec import tree
 
 
@@ -79,7 +79,7 @@ def _check_part(kind: tree.Kind, path: str) -> None:
 
 def _check_columns(root: tree.Node) -> None:
     """Raise `NotCompilableError` if a field of a tree has values that no column holds."""
-    for info in schema(root).fields.values():
+    for info in make_schema(root).fields.values():
         if info.dtype is None:
             wide = f"its {info.bits} bits are more than a column holds"
             raise NotCompilableError(

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from lidarspec.errors import MissingField, OutOfRange, UsageError
 from lidarspec.frames.field_paths import split_path
 from lidarspec.frames.layout import Layout, Leaf, Seal
-from lidarspec.frames.layout_tree import TooLongError, kinds_of
+from lidarspec.frames.layout_tree import TooLongError, find_kinds
 from lidarspec.frames.parts import FOUND, LayoutLookup, PartsSize
-from lidarspec.frames.schema import Schema, counting_field, schema
+from lidarspec.frames.schema import Schema, counting_field, make_schema
 from lidarspec.spec.syntax import WireNaN, get_member
 from lidarspec.spec.tree import (
     Blob,
@@ -82,7 +82,7 @@ class _Encoder:
         self._prefix = prefix
         #: values of fields of the frame around a part, by their path there.
         self._around = around or {}
-        self._schema = schema(layouts.root)
+        self._schema = make_schema(layouts.root)
         #: paths of the fields that hold checksums, which need not be given.
         self._checksums = set[str]()
         #: bytes of the parts at a path, by the path of their size.
@@ -186,7 +186,7 @@ class _Encoder:
         kinds = [find_kind(node, part) for part in parts]
         layouts = {
             kind.node: kind.layouts
-            for kind in kinds_of(node, tuple(around.items()), self._layouts.limit)
+            for kind in find_kinds(node, tuple(around.items()), self._layouts.limit)
         }
         encoded: list[bytes] = []
         following = 0
@@ -194,7 +194,7 @@ class _Encoder:
         for index in reversed(range(len(parts))):
             kind = kinds[index]
             part = parts[index]
-            fill_in(kind.following, part, following, schema(kind.root).fields, node.axis)
+            fill_in(kind.following, part, following, make_schema(kind.root).fields, node.axis)
             prefix = self._shown(f"{node.axis}[{index}]")
             encoder = _Encoder(layouts[kind], part, self._place, prefix, around)
             encoded.insert(0, encoder.encode())
@@ -517,7 +517,7 @@ def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     It is the first that has all fields of these, and no other constant; else the first.
     """
     for kind in node.kinds:
-        fields = schema(kind.root)
+        fields = make_schema(kind.root)
         constants = [(info, part.get(path)) for path, info in fields.fields.items()]
         is_known = part.keys() <= {*list_paths(kind.root), *fields.parts}
         if is_known and all(
@@ -532,7 +532,7 @@ def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
 @functools.lru_cache(maxsize=1024)
 def list_paths(root: Node) -> frozenset[str]:
     """Return the paths of all fields of a frame type, and of the structs and arrays around them."""
-    table = schema(root)
+    table = make_schema(root)
     paths = {*table.all_fields, *table.arrays, *table.derived}
     for node in nodes(root):
         if isinstance(node, Struct):

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.frames.arrays import add_axes, count_up, is_counted, repeat
-from lidarspec.frames.layout import Bytes2D, Derivation, Layout, Leaf, rows_at
-from lidarspec.frames.schema import Schema, schema, without_indices
+from lidarspec.frames.layout import Bytes2D, Derivation, Layout, Leaf, gather_rows
+from lidarspec.frames.schema import Schema, make_schema, without_indices
 from lidarspec.spec.syntax import get_member, leaves
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class LayoutRows:
     @cached_property
     def is_in_order(self) -> bool:
         """Whether the frames are in stream order."""
-        return ascends(self.where)
+        return is_ascending(self.where)
 
     @cached_property
     def stream_order(self) -> NDArray[np.intp] | slice:
@@ -184,7 +184,7 @@ class CompiledTable:
             len(self.groups) == 1
             and len(which)
             and which[-1] - which[0] == len(which) - 1
-            and ascends(which)
+            and is_ascending(which)
         ):
             only = self.groups[0]
             if only.is_in_order:
@@ -240,7 +240,7 @@ class CompiledTable:
             ranks.append(following[piece.frames])
             following[piece.frames] += 1
         return CompiledTable(
-            schema(node.kinds[wanted].root), _group_by_layout(part_rows, ranks)
+            make_schema(node.kinds[wanted].root), _group_by_layout(part_rows, ranks)
         ), np.repeat(np.arange(len(self)), counts)
 
     @staticmethod
@@ -315,7 +315,7 @@ def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> Layout
     return LayoutRows(
         first.layout,
         where[order],
-        rows_at(first.buffer, offsets[order], first.layout.size, gathered=False),
+        gather_rows(first.buffer, offsets[order], first.layout.size, gathered=False),
     )
 
 
@@ -359,7 +359,7 @@ def _address(array: NDArray[Any]) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def ascends(where: NDArray[np.intp]) -> bool:
+def is_ascending(where: NDArray[np.intp]) -> bool:
     """Return whether indices ascend strictly."""
     return is_counted(where) or bool(
         np.count_nonzero(where[1:] > where[:-1]) == max(len(where) - 1, 0)
@@ -516,7 +516,9 @@ class ParsedTable:
         frames = np.array([index for index, _, _ in parts], np.intp)
         return (
             ParsedTable(
-                schema(own.root), [part for _, part, _ in parts], [data for _, _, data in parts]
+                make_schema(own.root),
+                [part for _, part, _ in parts],
+                [data for _, _, data in parts],
             ),
             frames,
         )

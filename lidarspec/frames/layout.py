@@ -28,7 +28,7 @@ from lidarspec.spec.tree import (
     Formula,
     Node,
     arrays,
-    element_of,
+    get_element,
     parts,
     refs,
     width,
@@ -37,7 +37,7 @@ from lidarspec.spec.tree import (
 Bytes2D = NDArray[np.uint8]
 
 
-def elements(
+def view_elements(
     rows: Bytes2D,
     dtype: np.dtype[Any],
     offset: int,
@@ -56,7 +56,7 @@ def elements(
     return np.lib.stride_tricks.as_strided(first, (len(rows), *shape), (rows.strides[0], *strides))
 
 
-def span(rows: Bytes2D) -> NDArray[np.uint8]:
+def view_span(rows: Bytes2D) -> NDArray[np.uint8]:
     """Return a view of all bytes from the first row to the last, (k,).
 
     Bytes between the rows are included.
@@ -68,7 +68,7 @@ def span(rows: Bytes2D) -> NDArray[np.uint8]:
     )
 
 
-def rows_at(
+def gather_rows(
     buffer: NDArray[np.uint8], offsets: NDArray[np.intp], size: int, *, gathered: bool = True
 ) -> NDArray[np.uint8]:
     """Return `size` bytes from each of these offsets, (n, size).
@@ -171,7 +171,7 @@ class Leaf:
                 (len(buffer) - self.size + 1,), self.wire, buffer.data, 0, (1,)
             )
             return which, windows[starts].astype(self._native)
-        return which, self._is_scalar.load(rows_at(buffer, starts, self.size))
+        return which, self._is_scalar.load(gather_rows(buffer, starts, self.size))
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
         """Return its value in the first bytes of a frame, None if they are too few."""
@@ -240,7 +240,7 @@ class Leaf:
         shape = self.shape[: len(self.strides)]
         if not len(rows) or 0 in shape:
             return np.empty((len(rows), *shape), dtype)
-        return elements(rows, dtype, self.offset + offset, shape, self.strides)
+        return view_elements(rows, dtype, self.offset + offset, shape, self.strides)
 
     def _bits(self, rows: Bytes2D, element: BitField) -> NDArray[Any]:
         assert self.info.dtype is not None
@@ -309,7 +309,7 @@ class Leaf:
         A negative index counts from the last element. An array with an index that contains an
         array without one keeps its axis, with length 1.
         """
-        info = element_of(self.info, path, indices)
+        info = get_element(self.info, path, indices)
         if info is None:
             return None
         offset = self.offset
@@ -393,7 +393,7 @@ class Derivation:
 
     def element(self, path: str, indices: Mapping[str, int]) -> Derivation | None:
         """Return one element of its arrays, None if it does not exist."""
-        info = element_of(self.info, path, indices)
+        info = get_element(self.info, path, indices)
         picked = tuple(indices.get(axis) for axis in self.info.axes)
         exists = all(
             index is None or -length <= index < length
@@ -794,7 +794,7 @@ def match_constants(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bo
         offset, dtype, _, _ = word
         if offset + dtype.itemsize > rows.shape[1]:
             return np.zeros(len(rows), np.bool_)
-        each = match_word(elements(rows, dtype, offset, (), ()), word)
+        each = match_word(view_elements(rows, dtype, offset, (), ()), word)
         number = np.count_nonzero(each)
         if number < len(rows):
             if held is None:

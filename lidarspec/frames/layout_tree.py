@@ -1,7 +1,7 @@
 """Compute the layouts of a frame type: the offset of each field, for each variant of the header.
 
 A count, condition or key in a struct makes the layout depend on header fields, here called
-*selectors*. `layout_of` walks the tree of the struct with a cursor, for given values of the
+*selectors*. `find_layout` walks the tree of the struct with a cursor, for given values of the
 selectors. If it needs another selector, it raises `UnknownSelectorError`.
 
 `HeaderTree` is a decision tree that caches the results. Each inner node is a selector, each branch
@@ -69,7 +69,7 @@ class CutOffError(Exception):
     """The input ends before the end of a frame."""
 
 
-def layout_of(
+def find_layout(
     root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None
 ) -> Layout:
     """Return the layout of the frames whose header fields have these values.
@@ -93,7 +93,7 @@ def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
     """Return the layout that a walk leads to.
 
     Raises:
-        Exception: as `layout_of`, or what `walk.asked` raises; the walk then keeps what it found.
+        Exception: as `find_layout`, or what `walk.asked` raises; the walk then keeps what it found.
     """
     walk.visit(root, "")
     if not walk.cursor:
@@ -101,7 +101,7 @@ def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
     return walk.layout()
 
 
-def prefix_of(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
+def find_prefix(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
     """Return the constants whose place depends on no header field: offset -> (mask, value)."""
     walk = HeaderWalk({}, limit)
     with contextlib.suppress(
@@ -322,7 +322,7 @@ class HeaderWalk:
         )
         region = Region(
             node,
-            kinds_of(node, tuple(given.items()), self.limit),
+            find_kinds(node, tuple(given.items()), self.limit),
             self.cursor,
             rule,
             self.limit,
@@ -814,7 +814,7 @@ class HeaderTree:
 
     @functools.cached_property
     def _prefix(self) -> dict[int, tuple[int, int]]:
-        return prefix_of(self.root, self.limit)
+        return find_prefix(self.root, self.limit)
 
     def classify(
         self,
@@ -890,7 +890,7 @@ class HeaderTree:
             leaves = self._root.result.leaves
         else:
             leaves = self._root.before
-        return tuple(leaves.values()), prefix_of(self.root, self.limit)
+        return tuple(leaves.values()), find_prefix(self.root, self.limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
         """Return the common layout of candidates, one a row, else None.
@@ -950,7 +950,7 @@ class HeaderTree:
             read: returns the value of a field that decides the layout.
 
         Raises:
-            Exception: as `layout_of`, or what `read` raises.
+            Exception: as `find_layout`, or what `read` raises.
         """
         self._forget_many()
         node = self._root
@@ -961,7 +961,7 @@ class HeaderTree:
                 node = node.child(node.find_representative(read(node.leaf)))
         if isinstance(node.result, Layout):
             return node.result
-        return layout_of(self.root, node.values, self.limit, self._given)  # raises the reason
+        return find_layout(self.root, node.values, self.limit, self._given)  # raises the reason
 
     def _end(
         self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False
@@ -1058,13 +1058,13 @@ class HeaderTree:
 
 
 @functools.lru_cache(maxsize=256)
-def kinds_of(
+def find_kinds(
     node: tree.PartSequence, given: tuple[tuple[str, int], ...], limit: int
 ) -> tuple[PartKind, ...]:
     """Return the possible kinds of parts for given values of the fields around them."""
     values = dict(given)
     return tuple(
-        PartKind(kind, HeaderTree(kind.root, limit, values), prefix_of(kind.root, limit))
+        PartKind(kind, HeaderTree(kind.root, limit, values), find_prefix(kind.root, limit))
         for kind in node.kinds
     )
 

@@ -24,7 +24,7 @@ from lidarspec.frames.layout import Derivation, Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.parts import Region
 from lidarspec.frames.plain import parse_plain, plain_fault
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.frames.wire_fields import ExaminedFrame, examine
 from lidarspec.spec.bits import BitField
@@ -72,7 +72,7 @@ def parse(
         typed_values = _parse_unsound(sensor, data, frame, verify=verify)
     name, values = typed_values
     if units:
-        return _convert_units(schema(sensor.frames[name].tree).all_fields, values, "")
+        return _convert_units(make_schema(sensor.frames[name].tree).all_fields, values, "")
     return values
 
 

@@ -28,7 +28,7 @@ from lidarspec.frames.layout import (
     match_word,
     merge_constants,
     sort_constants,
-    span,
+    view_span,
 )
 from lidarspec.spec import tree
 
@@ -212,7 +212,7 @@ class Region:
 
     def in_rows(self, rows: Bytes2D) -> tuple[NDArray[np.uint8], FoundParts]:
         """Return a buffer with whole frames, given as rows of bytes, and their parts."""
-        return span(rows), self.walk(span(rows), np.arange(len(rows)) * rows.strides[0])
+        return view_span(rows), self.walk(view_span(rows), np.arange(len(rows)) * rows.strides[0])
 
     def sound(self, frame: bytes) -> bool:
         """Return whether all parts of one frame are valid and fill the region exactly."""

@@ -14,7 +14,7 @@ from typing import Any
 import construct
 
 from lidarspec.errors import MissingField, SpecError, UsageError, WireError, struct_error
-from lidarspec.frames.schema import schema, without_indices
+from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_fields import WireField
 from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
@@ -77,7 +77,7 @@ def plain_fields(frame: Frame, data: bytes) -> list[WireField] | None:
         values = frame.prepared.parse(data, _verify=False)
     except Exception:  # an expression of the struct may raise anything
         return None
-    infos = schema(frame.tree).all_fields
+    infos = make_schema(frame.tree).all_fields
     return list(_fields_of(values, "", data, infos))
 
 

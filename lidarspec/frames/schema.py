@@ -33,7 +33,7 @@ from lidarspec.spec.tree import (
     Struct,
     When,
     children,
-    element_of,
+    get_element,
     nodes,
     refs,
 )
@@ -161,7 +161,8 @@ class Schema:
             for kind in node.kinds:
                 before = f"{axis}.{kind.name}".rstrip(".")
                 names |= {
-                    f"{before}.{path}": info for path, info in schema(kind.root).scan_names.items()
+                    f"{before}.{path}": info
+                    for path, info in make_schema(kind.root).scan_names.items()
                 }
         return names
 
@@ -227,7 +228,7 @@ def counting_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str | N
 
 
 @lru_cache(maxsize=4096)
-def schema(root: Node) -> Schema:
+def make_schema(root: Node) -> Schema:
     """Return the table of fields of a frame's tree."""
     fields: dict[str, FieldInfo] = {}
     arrays: dict[str, Formula | None] = {}
@@ -266,7 +267,7 @@ def _element(
 
     The element is optional if the header determines the number of elements.
     """
-    element = element_of(info, path, indices)
+    element = get_element(info, path, indices)
     counts = [(arrays.get(axis), index) for axis, index in indices.items()]
     if element is None or any(
         isinstance(count, int) and not -count <= index < count for count, index in counts

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.layout import Bytes2D, Layout, LayoutRefusal, Leaf
-from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, frame_layouts, prefix_of
+from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, find_prefix, frame_layouts
 from lidarspec.frames.parts import PartsSize
 from lidarspec.spec.description import Frame
 from lidarspec.spec.wire_forms import Decoded, NumberRun, Problem, Run, TextRun, WireForm
@@ -49,7 +49,7 @@ class Coder:
     """
 
     def __init__(self, frame: Frame) -> None:
-        known = prefix_of(frame.tree, frame.room)
+        known = find_prefix(frame.tree, frame.room)
         self.begins = _run_of_bytes(
             {offset: value for offset, (mask, value) in known.items() if mask == 0xFF}
         )
@@ -99,7 +99,7 @@ class _FieldFinder:
                 path=self._node.leaf.info.path,
             )
         leaves, end = _known_fields(self._node)
-        return runs_between(leaves, len(struct), end)
+        return list_runs_between(leaves, len(struct), end)
 
 
 def _known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
@@ -141,7 +141,7 @@ class FormCoder(Coder):
         known = {offset: value for offset, (mask, value) in constants.items() if mask == 0xFF}
         texts = list[list[int | None]]()
         offset = 0
-        for run in runs_between(leaves, 0, max(constants, default=-1) + 1):
+        for run in list_runs_between(leaves, 0, max(constants, default=-1) + 1):
             if isinstance(run, NumberRun):
                 break
             texts.append([known.get(place) for place in range(offset, offset + run.size)])
@@ -184,7 +184,7 @@ class FormCoder(Coder):
         layout = self.tree.header(struct, is_all=True).result
         if not isinstance(layout, Layout) or layout.size != len(struct):
             return None
-        data = self.form.encode(struct, runs_of(layout))
+        data = self.form.encode(struct, list_runs(layout))
         decoded = self.decode(data)
         if decoded.problem is None and decoded.struct == struct:
             return data
@@ -197,7 +197,7 @@ class FormCoder(Coder):
 
     def make_encodable(self, rows: Bytes2D, layout: Layout) -> None:
         begin = 0
-        for run in runs_of(layout):
+        for run in list_runs(layout):
             part = rows[:, begin : begin + int(run.sizes.sum())]
             begin += part.shape[1]
             if isinstance(run, NumberRun):
@@ -256,7 +256,7 @@ def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[st
     if index >= 0 and offset < offsets[index] + leaves[owners[index]].size:
         offset = offsets.item(index)
         path = leaves[owners[index]].info.path
-    runs = runs_between(leaves, offset, end)
+    runs = list_runs_between(leaves, offset, end)
     if not runs:
         return "", offset, "the end of the frame"
     size = runs[0].sizes.item(0)
@@ -276,13 +276,13 @@ def frame_coder(frame: Frame) -> Coder:
     return FormCoder(frame, frame.wire)
 
 
-def runs_of(layout: Layout) -> Sequence[Run]:
+def list_runs(layout: Layout) -> Sequence[Run]:
     """Return the runs of fields that the structs of a layout consist of."""
-    return runs_between(tuple(layout.leaves.values()), 0, layout.size)
+    return list_runs_between(tuple(layout.leaves.values()), 0, layout.size)
 
 
 @functools.lru_cache(maxsize=1024)
-def runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
+def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
     """Return the runs of fields from one byte of the struct to another.
 
     Bytes between fields, such as constants without a name, are text.

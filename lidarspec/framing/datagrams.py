@@ -30,7 +30,7 @@ from lidarspec.framing.results import (
     Indices,
     Numbers,
     Status,
-    array_of,
+    to_array,
 )
 
 
@@ -50,7 +50,7 @@ def sort_datagrams(
     steady = find_regular_datagrams(framing, buffer, starts, sizes, mode)
     if steady is not None and steady.is_sound:
         return PieceResult(steady, len(buffer))
-    return _DatagramBatch(framing, buffer, array_of(starts), sizes, steady).sort(mode)
+    return _DatagramBatch(framing, buffer, to_array(starts), sizes, steady).sort(mode)
 
 
 class _DatagramBatch:

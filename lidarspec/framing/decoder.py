@@ -23,15 +23,15 @@ from lidarspec.frames.layout import Sums
 from lidarspec.framing.candidates import Bytes1D, Framing, PieceResult, SearchState
 from lidarspec.framing.datagram_assembly import FragmentAssembler, JoinedMessages
 from lidarspec.framing.datagrams import sort_datagrams
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.regular_rows import find_regular_frames
-from lidarspec.framing.results import Counters, Found, Frames, Numbers, array_of
+from lidarspec.framing.results import Counters, Found, Frames, Numbers, to_array
 from lidarspec.framing.search import find_frames
 from lidarspec.spec.description import Frame
 from lidarspec.spec.links import Udp
 from lidarspec.spec.sensor import SensorDescription
 
-__all__ = ["BACKENDS", "Decoder", "select_backend", "frames_of", "is_stream"]
+__all__ = ["BACKENDS", "Decoder", "select_backend", "decode_all", "is_stream"]
 
 #: bytes of a stream looked at in one go: at most, where frames follow one another and where not;
 #: and at least.
@@ -286,7 +286,7 @@ class Decoder:
             gaps = self._lost(buffer, frames.starts, sizes, good, joined)
             if not is_good:
                 frames = frames.select(good)
-                places = array_of(places)[good]
+                places = to_array(places)[good]
                 at = at[good]
         self._count(frames.kinds)
         return self._observe(frames.locate(self.framing.names, places, gaps, at))
@@ -442,7 +442,7 @@ class Decoder:
 @lru_cache(maxsize=256)
 def _framing(names: tuple[str, ...], frames: tuple[Frame, ...], sums: Sums | None) -> Framing:
     return Framing(
-        {name: codec(frame) for name, frame in zip(names, frames, strict=True)},
+        {name: get_codec(frame) for name, frame in zip(names, frames, strict=True)},
         sums,
     )
 
@@ -474,7 +474,7 @@ def select_backend(name: str) -> str:
     return name
 
 
-def frames_of(decoder: Decoder, data: Any) -> list[Frames]:
+def decode_all(decoder: Decoder, data: Any) -> list[Frames]:
     """Return all frames of a whole input.
 
     Args:

@@ -28,12 +28,12 @@ from lidarspec.errors import (
 from lidarspec.frames.build import build
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout, Leaf
-from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, layout_of
+from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
 from lidarspec.frames.parts import PartsSize
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.frame_codec import Codec
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.plausibility import check_plausibility
 from lidarspec.framing.results import VALID
 from lidarspec.spec.description import Frame
@@ -77,7 +77,7 @@ def random_frame(
     Args:
         drawn: field path -> what draws its raw value, for what random values never make.
     """
-    engine = codec(sensor.frames[frame])
+    engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.parts:
         return _make_of_values(sensor, frame, engine, source, drawn)
     for attempt in range(
@@ -117,7 +117,7 @@ def _header(
     values: dict[str, int] = {}
     while True:
         try:
-            return layout_of(frame.tree, values, frame.room), values
+            return find_layout(frame.tree, values, frame.room), values
         except UnknownSelectorError as unknown:
             if isinstance(unknown.leaf, PartsSize):
                 raise SpecError(
@@ -209,7 +209,7 @@ def _left_open(values: Any, root: Node) -> Any:
 
     `build` fills them in.
     """
-    for node in schema(root).parts.values():
+    for node in make_schema(root).parts.values():
         rules = (node.count, node.size, node.within)
         asked = [ref.path for rule in rules if rule is not None for ref in refs(rule)[:1]]
         for kind, part in (
@@ -248,7 +248,7 @@ def _plausible(
     if layout.conditions:
         rows = rows[layout.meets(rows)]
     table = CompiledTable(
-        codec(sensor.frames[frame]).schema, [LayoutRows(layout, np.arange(len(rows)), rows)]
+        get_codec(sensor.frames[frame]).schema, [LayoutRows(layout, np.arange(len(rows)), rows)]
     )
     if sensor.frames[frame].plausible is None:
         return _sent(sensor, frame, layout, rows)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.layout import Layout, Sums, sort_constants
-from lidarspec.frames.layout_tree import prefix_of
-from lidarspec.frames.schema import schema
+from lidarspec.frames.layout_tree import find_prefix
+from lidarspec.frames.schema import make_schema
 from lidarspec.framing.plausibility import CandidateChecker, StructConditions
 from lidarspec.framing.results import Frames, Status
 from lidarspec.spec.description import Frame
@@ -38,8 +38,8 @@ class Codec:
 
     def __init__(self, frame: Frame) -> None:
         self.frame = frame
-        self.schema = schema(frame.tree)
-        self.prefix = prefix_of(frame.tree, frame.room)
+        self.schema = make_schema(frame.tree)
+        self.prefix = find_prefix(frame.tree, frame.room)
         self.marks = sort_constants(self.prefix)
         self.size = fixed_size(frame.prepared) or None
         self._conditions: StructConditions | None = None

@@ -3,7 +3,7 @@
 `CompiledCodec` works on whole batches: the header of a candidate is looked at once, when it is
 judged, and its layout goes with it into the columns. Frames with a wire form have an engine of
 their own (`lidarspec.framing.text_frames`), and so have frames without layouts
-(`lidarspec.framing.plain_frames`). `codec` returns the engine of a frame type.
+(`lidarspec.framing.plain_frames`). `get_codec` returns the engine of a frame type.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lidarspec.errors import PluginError
 from lidarspec.frames.arrays import broadcast_value, count_up, repeat
 from lidarspec.frames.compilability import NotCompilableError
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
-from lidarspec.frames.layout import Layout, LayoutRefusal, Sums, rows_at
+from lidarspec.frames.layout import Layout, LayoutRefusal, Sums, gather_rows
 from lidarspec.frames.layout_tree import frame_layouts
 from lidarspec.frames.wire_coder import FormCoder, frame_coder
 from lidarspec.framing.frame_codec import Codec
@@ -208,13 +208,13 @@ class CompiledCodec(Codec):
         step = max(BLOCK // layout.size, 1)
         kept = None
         if count <= step or not gathered:
-            rows = rows_at(buffer, own, layout.size, gathered=gathered)
+            rows = gather_rows(buffer, own, layout.size, gathered=gathered)
             judged = judge(rows, errors, sums)
             kept = rows if gathered else None
         else:
             blocks = (own[start : start + step] for start in range(0, count, step))
             judged = np.concatenate(
-                [judge(rows_at(buffer, block, layout.size), errors, sums) for block in blocks]
+                [judge(gather_rows(buffer, block, layout.size), errors, sums) for block in blocks]
             )
         if count == number:
             return judged, repeat(layout.size, number), kept
@@ -262,7 +262,9 @@ class CompiledCodec(Codec):
             is_sparse = 2 * len(which) * layout.size < len(frames.buffer)
             groups.append(
                 LayoutRows(
-                    layout, which, rows_at(frames.buffer, starts, layout.size, gathered=is_sparse)
+                    layout,
+                    which,
+                    gather_rows(frames.buffer, starts, layout.size, gathered=is_sparse),
                 )
             )
         return CompiledTable(self.schema, groups)
@@ -297,7 +299,7 @@ def _partial(
 
 
 @functools.lru_cache(maxsize=2048)
-def codec(frame: Frame) -> CompiledCodec | PlainCodec | TextCodec:
+def get_codec(frame: Frame) -> CompiledCodec | PlainCodec | TextCodec:
     """Return the engine of a frame type, always the same one.
 
     Frames without layouts are parsed by construct, one at a time.

@@ -25,10 +25,10 @@ from lidarspec.expressions.columns import Batch, Fields
 from lidarspec.expressions.graph import (
     Expression,
     TracedColumn,
+    evaluate_expressions,
     make_sample,
     split_condition,
     trace,
-    values_of,
 )
 from lidarspec.frames.arrays import take_rows
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
@@ -39,12 +39,12 @@ from lidarspec.frames.layout import (
     Leaf,
     Seal,
     Sums,
-    elements,
     find_passing,
+    gather_rows,
     match_constants,
     merge_constants,
-    rows_at,
     sort_constants,
+    view_elements,
 )
 from lidarspec.frames.parts import Region
 from lidarspec.frames.schema import Schema
@@ -183,7 +183,7 @@ def _check_parts(
     status = OF_PARTS[walked.status]
     errors += walked.errors
     for piece in (piece for pieces in walked.rounds for piece in pieces):
-        parts = rows_at(buffer, piece.offsets, piece.layout.size)
+        parts = gather_rows(buffer, piece.offsets, piece.layout.size)
         verdicts = np.zeros(len(parts), np.uint8)
         _check_valid_parts(piece.layout, verdicts, parts, errors, sums)
         for seal in piece.layout.seals:
@@ -327,7 +327,7 @@ class ConditionGroup:
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
         """Return whether all conditions hold, frame by frame; see `Expression.values`."""
-        return functools.reduce(np.bitwise_and, values_of(self.parts, raw))
+        return functools.reduce(np.bitwise_and, evaluate_expressions(self.parts, raw))
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,7 +409,7 @@ class LookupCondition:
 
     def _each(self, rows: Bytes2D) -> NDArray[np.bool_]:
         """Return whether it holds for each element, (n, *shape)."""
-        view = elements(rows, self.table.dtype, self.offset, self.shape, self.strides)
+        view = view_elements(rows, self.table.dtype, self.offset, self.shape, self.strides)
         if view.itemsize == 1:
             values = view
         else:

@@ -265,12 +265,12 @@ class Frames:
     @cached_property
     def starts(self) -> Indices:
         """The offset of each frame in the buffer, (n,)."""
-        return array_of(self._starts)
+        return to_array(self._starts)
 
     @cached_property
     def offsets(self) -> NDArray[np.int64]:
         """The offset of each frame in the input, (n,)."""
-        return array_of(self.places)
+        return to_array(self.places)
 
     @cached_property
     def gaps(self) -> NDArray[np.int64]:
@@ -417,7 +417,7 @@ def pack_found(frames: Sequence[Found]) -> Frames:
     return Frames(buffer, kinds, np.cumsum(sizes) - sizes, sizes).locate(names, offsets, gaps, at)
 
 
-def array_of(numbers: Numbers) -> NDArray[np.int64]:
+def to_array(numbers: Numbers) -> NDArray[np.int64]:
     """Return the numbers as an array, (n,)."""
     if isinstance(numbers, range):
         return np.arange(numbers.start, numbers.stop, numbers.step)
@@ -435,4 +435,4 @@ def _shift(forms: Indices, first: int) -> Indices:
 def _choose(numbers: Numbers, which: NDArray[np.bool_] | Indices | slice) -> Numbers:
     if isinstance(which, slice):
         return numbers[which]
-    return array_of(numbers)[which]
+    return to_array(numbers)[which]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import PluginError, SpecError
 from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
-from lidarspec.frames.layout import LayoutRefusal, Sums, rows_at, sort_constants
+from lidarspec.frames.layout import LayoutRefusal, Sums, gather_rows, sort_constants
 from lidarspec.frames.wire_coder import FormCoder
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.results import CHECKSUM, LENGTH, PLUGIN, SHORT, VALID, Frames
@@ -144,7 +144,7 @@ class TextCodec(Codec):
                 continue
             fitting = which[sizes[which] == layout.size]
             groups.append(
-                LayoutRows(layout, fitting, rows_at(joined, starts[fitting], layout.size))
+                LayoutRows(layout, fitting, gather_rows(joined, starts[fitting], layout.size))
             )
         return groups, refused
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Seal, Sums, rows_at
+from lidarspec.frames.layout import Bytes2D, Layout, Leaf, Seal, Sums, gather_rows
 from lidarspec.framing.plausibility import CandidateChecker, Check, LookupCondition
 from lidarspec.framing.results import CHECKSUM, IMPLAUSIBLE, VALID
 from lidarspec.spec.checksums import Checksum, Sum, WordXor, Xor
@@ -265,7 +265,7 @@ def _rows(buffer: Bytes1D, offsets: Offsets, size: int) -> Bytes2D:
     if int(offsets.max()) + size > len(buffer):
         buffer = np.concatenate([buffer[first:], np.zeros(size, np.uint8)])
         offsets = offsets - first
-    return np.ascontiguousarray(rows_at(buffer, offsets, size))
+    return np.ascontiguousarray(gather_rows(buffer, offsets, size))
 
 
 def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) -> NDArray[np.bool_]:
@@ -284,7 +284,7 @@ def _are_intact(seal: Seal, rows: Bytes2D, sizes: Offsets, sums: Sums | None) ->
     stops = sizes - tail
     moved = rows * (np.arange(size) < stops[:, None])
     if tail:
-        moved[:, size - tail :] = rows_at(
+        moved[:, size - tail :] = gather_rows(
             rows.reshape(-1), np.arange(len(rows)) * size + stops, tail
         )
     return seal.intact(moved, sums)

@@ -18,7 +18,7 @@ from lidarspec.frames.schema import Schema
 from lidarspec.spec.fields import factor
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock
-from lidarspec.spec.tree import exact
+from lidarspec.spec.tree import to_exact
 
 Times = NDArray[np.int64]
 
@@ -309,7 +309,7 @@ def _in_parts(sensor: SensorDescription, place: tuple[str, str], table: Table) -
 @lru_cache(maxsize=256)
 def _turn(seconds: float) -> int:
     """Return seconds as nanoseconds, rounded as the number is written."""
-    return int(exact(seconds) * 10**9)
+    return int(to_exact(seconds) * 10**9)
 
 
 def paths(clock: Clock) -> tuple[str, ...]:
@@ -361,7 +361,7 @@ def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
     per_unit = factor(unit, "s")
     if per_unit is None:
         return None
-    step, zero = (exact(part) * per_unit * 10**9 for part in (scale, offset))
+    step, zero = (to_exact(part) * per_unit * 10**9 for part in (scale, offset))
     if step.denominator == 1 and zero.denominator == 1 and step < 2**62:
         return int(step), int(zero)
     return step, zero

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import plugin_errors
 from lidarspec.expressions.columns import Batch, Fields, align_points, padding_mask
 from lidarspec.points.conventions import vendor_turn
-from lidarspec.points.reference_evaluator import flat
+from lidarspec.points.reference_evaluator import flatten_valid
 from lidarspec.spec.results import Imu
 from lidarspec.spec.sensor import SensorDescription
 
@@ -108,9 +108,14 @@ def read_samples(
         arrays, axes, _, shape = align_points(values, batch)
         mask = padding_mask(axes, shape, batch)
         after = np.rint(np.nan_to_num(np.asarray(arrays.pop(), np.float64)) * 1e9).astype(np.int64)
-        time = flat(time_ns.reshape(-1, *(1,) * len(axes)) + after, shape, mask, len(batch))
+        time = flatten_valid(
+            time_ns.reshape(-1, *(1,) * len(axes)) + after, shape, mask, len(batch)
+        )
         values_of = np.stack(
-            [np.asarray(flat(array, shape, mask, len(batch)), np.float64) for array in arrays],
+            [
+                np.asarray(flatten_valid(array, shape, mask, len(batch)), np.float64)
+                for array in arrays
+            ],
             axis=1,
         )
     own_samples = ImuSamples(time, values_of[:, :3], values_of[:, 3:])

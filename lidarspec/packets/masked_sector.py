@@ -63,7 +63,7 @@ class Sector:
     @classmethod
     def between(cls, start: float, stop: float, direction: int) -> Sector:
         """Return the sector from one angle to another."""
-        return cls(start, forward(stop - start, direction), direction)
+        return cls(start, forward_step(stop - start, direction), direction)
 
     @property
     def stop(self) -> float:
@@ -77,11 +77,11 @@ class Sector:
 
     def contains(self, angle: float) -> bool:
         """Return whether an angle lies within."""
-        return forward(angle - self.start, self.direction) < self.width
+        return forward_step(angle - self.start, self.direction) < self.width
 
     def common(self, other: Sector) -> Sector | None:
         """Return the sector that lies in both; None if there is none."""
-        offset = forward(other.start - self.start, self.direction)
+        offset = forward_step(other.start - self.start, self.direction)
         if offset < self.width:
             return Sector(other.start, min(self.width - offset, other.width), self.direction)
         if other.contains(self.start):
@@ -89,7 +89,7 @@ class Sector:
         return None
 
 
-def forward(step: float, direction: int) -> float:
+def forward_step(step: float, direction: int) -> float:
     """Return a step in the direction of rotation, from 0 to 1; a little back is none."""
     ahead = (direction * step) % 1
     if ahead > 1 - JITTER:
@@ -319,7 +319,7 @@ class MaskedGaps:
         finder = self._finder
         if finder is None or finder.sector is not None or math.isnan(start) or math.isnan(stop):
             return 0
-        width = forward(stop - start, finder.direction)
+        width = forward_step(stop - start, finder.direction)
         step = width / (loss.missing + 1)
         if width < max(MIN_WIDTH, MIN_WIDTH_STEPS * step):
             return 0

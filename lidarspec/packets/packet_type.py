@@ -12,7 +12,7 @@ from typing import Any
 
 from lidarspec.errors import UnknownFrame
 from lidarspec.framing.frame_codec import Codec
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.clocks import clock_parts, clock_terms, paths
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock
@@ -50,11 +50,11 @@ class PacketType:
     is_ordered_by_clock: bool
 
     def __reduce__(self) -> Any:
-        return packet_type, (self.sensor, self.frame)
+        return get_packet_type, (self.sensor, self.frame)
 
 
 @lru_cache(maxsize=256)
-def packet_type(sensor: SensorDescription, frame: str) -> PacketType:
+def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
     """Return the packets of a frame type, always the same object.
 
     Raises:
@@ -62,7 +62,7 @@ def packet_type(sensor: SensorDescription, frame: str) -> PacketType:
     """
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
-    own_codec = codec(sensor.frames[frame])
+    own_codec = get_codec(sensor.frames[frame])
     is_data = sensor.frames[frame].data
     clock = find_clock(sensor, frame)
     timed_sensor = sensor
@@ -112,7 +112,7 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
         return None
     if declared.imu is None or not paths(shared):
         return None
-    schema = codec(declared).schema
+    schema = get_codec(declared).schema
     if all(path in schema.fields for path in paths(shared)):
         return shared
     return None
@@ -120,7 +120,7 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
 
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
     """Return whether packets of this type have a field, or should, since no data frame has it."""
-    schemas = {name: codec(sensor.frames[name]).schema for name in sensor.data_frames}
+    schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.data_frames}
     having = [
         name
         for name, schema in schemas.items()

@@ -13,7 +13,7 @@ from lidarspec.errors import SpecError, UnknownField
 from lidarspec.expressions.columns import AROUND, Batch, physical
 from lidarspec.frames.frame_table import Table
 from lidarspec.frames.schema import Schema
-from lidarspec.framing.results import Counters, Numbers, array_of
+from lidarspec.framing.results import Counters, Numbers, to_array
 from lidarspec.notebook_display import make_display_method
 from lidarspec.packets.clocks import part_times
 from lidarspec.packets.imu import ImuSamples, read_samples
@@ -81,7 +81,7 @@ class Packets:
     @cached_property
     def offset(self) -> NDArray[np.int64]:
         """The first byte of each in the input, (n,)."""
-        return array_of(self._offset)
+        return to_array(self._offset)
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
@@ -91,7 +91,7 @@ class Packets:
         """
         if callable(self._index):
             return self._index()
-        return array_of(self._index)
+        return to_array(self._index)
 
     @property
     def order(self) -> NDArray[np.int64]:
@@ -301,7 +301,7 @@ def join_packets(parts: Sequence[Packets]) -> Packets:
             np.where(part.state[name][1] < 0, -1, part.state[name][1] + start)
             for part, start in zip(parts, starts[:-1], strict=True)
         ]
-        state[name] = (joined_tables(batches) if batches else None, np.concatenate(which))
+        state[name] = (join_tables(batches) if batches else None, np.concatenate(which))
     columns: dict[str, Any] = {
         key: np.concatenate([getattr(part, key) for part in parts]) for key in _COLUMNS
     }
@@ -314,7 +314,7 @@ def join_packets(parts: Sequence[Packets]) -> Packets:
                 for part in parts
             ]
         )
-    table = joined_tables([part.table for part in parts])
+    table = join_tables([part.table for part in parts])
     return Packets(
         head.sensor,
         head.frame,
@@ -326,7 +326,7 @@ def join_packets(parts: Sequence[Packets]) -> Packets:
     )
 
 
-def joined_tables(tables: Sequence[Any]) -> Table:
+def join_tables(tables: Sequence[Any]) -> Table:
     """Several tables of one frame type, one after another."""
     return tables[0] if len(tables) == 1 else type(tables[0]).join(tables)  # type: ignore[no-any-return]
 

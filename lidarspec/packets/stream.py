@@ -20,8 +20,8 @@ from lidarspec.errors import PluginError, SpecError
 from lidarspec.expressions.columns import Batch
 from lidarspec.frames.arrays import broadcast_value, repeat
 from lidarspec.frames.frame_table import Table
-from lidarspec.framing.frame_engine import codec
-from lidarspec.framing.results import Counters, Frames, Numbers, array_of
+from lidarspec.framing.frame_engine import get_codec
+from lidarspec.framing.results import Counters, Frames, Numbers, to_array
 from lidarspec.packets.arrival_order import ArrivalOrder
 from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.clocks import (
@@ -34,8 +34,8 @@ from lidarspec.packets.clocks import (
 from lidarspec.packets.counter_order import CounterOrder
 from lidarspec.packets.imu import ImuSamples, WaitingSamples, join_samples
 from lidarspec.packets.masked_sector import MaskedGaps
-from lidarspec.packets.packet_type import find_clock, packet_type
-from lidarspec.packets.packets import Index, Packets, StateOf, joined_tables
+from lidarspec.packets.packet_type import find_clock, get_packet_type
+from lidarspec.packets.packets import Index, Packets, StateOf, join_tables
 from lidarspec.spec.sensor import SensorDescription
 
 Integers = NDArray[np.int64]
@@ -68,13 +68,13 @@ class PacketStream:
         state: Mapping[str, bytes] | None = None,
         reference: ClockReference | None = None,
     ) -> None:
-        self._type = packet_type(sensor, frame)
+        self._type = get_packet_type(sensor, frame)
         self.stats = stats
         self._backend = backend
         self._last_frames: dict[str, Table] = {}  # last frame of each other type, by name
         for name in self._type.others:
             if state and name in state:
-                self._last_frames[name] = codec(sensor.frames[name]).table([state[name]])
+                self._last_frames[name] = get_codec(sensor.frames[name]).table([state[name]])
         self._skipped = 0  # bytes since the last packet
 
         clock = self._type.clock
@@ -305,7 +305,7 @@ class PacketStream:
         last_frame = self._last_frames.get(name)
         if not others:
             return last_frame, repeat(-1 if last_frame is None else 0, packet_count)
-        engine = codec(self._type.sensor.frames[name])
+        engine = get_codec(self._type.sensor.frames[name])
         tables: list[Table] = [engine.gather(frames) for frames, _ in others]
         before = np.concatenate([counts for _, counts in others])
         if last_frame is not None:
@@ -317,7 +317,7 @@ class PacketStream:
         self._last_frames[name] = engine.table([newest.data(len(newest) - 1)])
         packets_between = np.diff(before, prepend=0, append=packet_count)
         which = np.repeat(np.arange(-1, len(before)), packets_between)
-        return joined_tables(tables), which
+        return join_tables(tables), which
 
 
 class ImuStream:
@@ -428,7 +428,7 @@ class OwnFrames:
         return len(self.frames) < len(self.piece)
 
 
-def data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> str | None:
+def choose_data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> str | None:
     """Return the default data frame type of an input.
 
     It is the configured type, or else the type of the first data frame that arrived. None if the
@@ -467,7 +467,7 @@ def _join(parts: Sequence[_Columns]) -> _Columns | None:
     if len(parts) < 2:
         return parts[0] if parts else None
     return _Columns(
-        joined_tables([part.table for part in parts]),
+        join_tables([part.table for part in parts]),
         _join_offsets([part.offset for part in parts]),
         _join_values([part.at for part in parts]),
         _join_values([part.skipped for part in parts]),
@@ -478,11 +478,11 @@ def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
     """Return the offsets of all parts; a range if all steps are equal."""
     first = parts[0]
     if not isinstance(first, range):
-        return np.concatenate([array_of(part) for part in parts])
+        return np.concatenate([to_array(part) for part in parts])
     stop = first.stop
     for part in parts[1:]:
         if not isinstance(part, range) or part.step != first.step or part.start != stop:
-            return np.concatenate([array_of(part) for part in parts])
+            return np.concatenate([to_array(part) for part in parts])
         stop = part.stop
     return range(first.start, stop, first.step)
 

@@ -22,11 +22,11 @@ from lidarspec.points.column_sources import ColumnSource
 from lidarspec.points.conventions import (
     TYPES,
     Grids,
+    convert_numbers,
     grid_of,
-    narrow,
-    numbers_of,
+    narrow_angle,
     seconds_since,
-    turned_azimuth,
+    turn_azimuth,
     vendor_turn,
 )
 from lidarspec.points.layout_groups import GroupPoints
@@ -176,9 +176,9 @@ class BatchColumns(ColumnSource):
         if "azimuth" in columns:
             angles = columns["azimuth"]
             if self._turn is not None:
-                columns["azimuth"] = narrow(turned_azimuth(angles, self._turn))
+                columns["azimuth"] = narrow_angle(turn_azimuth(angles, self._turn))
             elif angles.dtype != np.float32:
-                columns["azimuth"] = narrow(angles)
+                columns["azimuth"] = narrow_angle(angles)
         return columns
 
     def _compute_plainly(self, name: str, start: int, stop: int) -> NDArray[Any]:
@@ -189,7 +189,7 @@ class BatchColumns(ColumnSource):
             return self._plan.extra[name].column(column)
         if name == "elevation":
             return column.astype(TYPES[name], copy=False)
-        return numbers_of(column, TYPES[name])
+        return convert_numbers(column, TYPES[name])
 
     def _fill(self, names: tuple[str, ...], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return columns that a program or a kernel computes."""

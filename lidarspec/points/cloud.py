@@ -49,7 +49,7 @@ class PointCloud:
         extra: (N,) columns that the sensor gives besides, by name, such as "velocity"; each in its
             type.
         units: of those in `extra`, by name; "" for a plain number.
-        chosen: the columns that `columns` and files have, see `only`; () for all.
+        chosen: the columns that `columns` and files have, see `select_columns`; () for all.
     """
 
     x: Floats
@@ -109,11 +109,11 @@ class PointCloud:
         }
         return {name: column for name, column in columns.items() if column is not None}
 
-    def shows(self, name: str) -> bool:
+    def has_column(self, name: str) -> bool:
         """Return whether a column was chosen, or is a place, which every file of points has."""
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
-    def only(self, *names: str) -> PointCloud:
+    def select_columns(self, *names: str) -> PointCloud:
         """Return the same points with these columns alone.
 
         They apply to `columns`, `to_structured` and files. x, y and z remain if a format requires
@@ -194,7 +194,7 @@ class PointCloud:
 
         The result is organised only if a slice holds whole columns. One index gives scalars.
         """
-        picked = {f.name: _pick(getattr(self, f.name), which) for f in fields(self)}
+        picked = {f.name: _select(getattr(self, f.name), which) for f in fields(self)}
         picked["extra"] = {name: column[which] for name, column in self.extra.items()}
         shape = None
         if self.shape and isinstance(which, slice) and which.step in (None, 1):
@@ -288,7 +288,7 @@ class PointCloud:
         The columns in `extra` follow from byte 32 on, each where its type allows, and the itemsize
         is a multiple of 16.
         """
-        names = [name for name in STRUCTURED.names or () if self.shows(name)]
+        names = [name for name in STRUCTURED.names or () if self.has_column(name)]
         self.load(*names, *self.extra)
         columns = {name: getattr(self, name) for name in names} | dict(self.extra)
         structured = np.zeros(
@@ -352,7 +352,7 @@ def units_of(cloud: PointCloud) -> dict[str, str]:
     }
 
 
-def _pick(value: Any, which: Any) -> Any:
+def _select(value: Any, which: Any) -> Any:
     if isinstance(value, np.ndarray) and value.ndim:
         return value[which]
     return value

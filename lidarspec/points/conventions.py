@@ -54,7 +54,9 @@ def shown_range(measured: Any, invalid: Any) -> Any:
 
     It is inf without a return, and nan if the sensor marks the point as invalid.
     """
-    return mark(np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid)
+    return mark_invalid(
+        np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid
+    )
 
 
 def returned_range(measured: Any) -> Any:
@@ -67,7 +69,7 @@ def returned_range(measured: Any) -> Any:
     return np.where((measured > 0) & (measured < np.inf), measured, np.nan)
 
 
-def mark(measured: Any, invalid: Any) -> Any:
+def mark_invalid(measured: Any, invalid: Any) -> Any:
     """Ranges, nan where the sensor marks a point as wrong."""
     if isinstance(invalid, TracedColumn) or np.any(invalid):
         return np.where(invalid, np.nan, measured)
@@ -115,7 +117,7 @@ def place_points(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
     return [np.where(lost, np.nan, place) for place in coordinates]
 
 
-def direction_of(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+def find_direction(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
     """Range, azimuth and elevation of points that are given by coordinates: metres and radians."""
     level = np.hypot(x, y)
     return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
@@ -248,10 +250,10 @@ class ExtraType(NamedTuple):
         """Values in the type, of the same shape."""
         if self.dtype.kind == "f":
             return values.astype(self.dtype, copy=False)
-        return numbers_of(values, self.dtype)
+        return convert_numbers(values, self.dtype)
 
 
-def numbers_of(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
+def convert_numbers(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
     """Return a column of numbers in its type, of the same shape; nan is 0."""
     return np.asarray(np.nan_to_num(values) if values.dtype.kind == "f" else values, dtype)
 
@@ -268,7 +270,7 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
     return matrix
 
 
-def axes_of(sensor: SensorDescription) -> tuple[str, str, str]:
+def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
     """Return the directions of x, y and z of a sensor's points.
 
     They follow REP-103, or the vendor's axes if these are configured.
@@ -286,13 +288,13 @@ def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
 
     Returns None if these are the axes of REP-103.
     """
-    axes = axes_of(sensor)
+    axes = find_axes(sensor)
     if axes == REP_103:
         return None
     return axis_matrix(axes)
 
 
-def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+def turn_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return azimuths of the same directions in turned axes, radians in [-pi, pi].
 
     The shape is that of `angles`. `turn` is (3, 3).
@@ -301,7 +303,7 @@ def turned_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[n
     return np.asarray(np.arctan2(direction[1], direction[0]))
 
 
-def narrow(angle: NDArray[np.float64]) -> Floats:
+def narrow_angle(angle: NDArray[np.float64]) -> Floats:
     """Angles in radians as float32 in [-pi, pi), of the same shape."""
     turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
     far = np.abs(angle) > _FAR

@@ -27,7 +27,7 @@ from lidarspec.points.reference_evaluator import (
     EvaluatedPoints,
     PacketBatch,
     evaluate_plainly,
-    stamp_of,
+    find_stamp,
 )
 
 #: numbers that are checked together, so that they stay in the cache.
@@ -96,7 +96,7 @@ def _evaluate_by_plans(
     ready = len(packets)
     if not final:
         ready = min((column.ready for column in remembered.values()), default=ready)
-    source = _source_of(packets, shares, batch, ready, stamp_of(packets, epoch))
+    source = _source_of(packets, shares, batch, ready, find_stamp(packets, epoch))
     counts = _counts(shares, len(packets))[:ready]
     return EvaluatedPoints(source, ready, counts, plans[0].axes, batch)
 

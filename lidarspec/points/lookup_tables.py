@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.expressions.graph import Expression, Node, only_field
+from lidarspec.expressions.graph import Expression, Node, get_only_field
 from lidarspec.frames.layout import Leaf
 
 #: what costs hardly more than looking its result up; with these, whatever is made of numbers stays
@@ -57,7 +57,7 @@ class FieldWindow:
         return np.dtype(f"<u{self.size}")
 
 
-def window(leaf: Leaf) -> FieldWindow | None:
+def find_window(leaf: Leaf) -> FieldWindow | None:
     """Return the window of a field.
 
     Returns None if it takes more than two bytes, or if it is an array inside a bit block.
@@ -91,19 +91,19 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 
     The shape is (256,) or (65536,). Returns None if the field has no window.
     """
-    field_window = window(leaf)
+    field_window = find_window(leaf)
     if field_window is None:
         return None
     raw = raw_values(leaf, field_window)
     return Expression(node, (leaf.info,)).values({leaf.info.path: raw}).reshape(raw.shape)
 
 
-def possible(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
+def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
     """Return all values that an expression can have, (256,) or (65536,).
 
     Returns None if it is not an expression of one field with a window.
     """
-    source = only_field(node)
+    source = get_only_field(node)
     if source is not None:
         leaf = leaves.get(source.path)
     else:
@@ -124,7 +124,7 @@ def is_number(value: Any, leaves: Any) -> bool:
         return value.path in leaves
     if value.kind != "call":
         return False
-    values = possible(value, leaves)
+    values = list_possible_values(value, leaves)
     if values is not None:
         return bool(np.isfinite(values).all())
     if value.function in _DIVISIONS:

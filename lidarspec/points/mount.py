@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.conventions import narrow
+from lidarspec.points.conventions import narrow_angle
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Mount:
             "x": x,
             "y": y,
             "z": z,
-            "azimuth": narrow(np.arctan2(beam[1], beam[0])),
+            "azimuth": narrow_angle(np.arctan2(beam[1], beam[0])),
             "elevation": raised,
         }
         return PointCloud(**{**same, **turned})

@@ -26,20 +26,26 @@ from numpy.typing import NDArray
 
 from lidarspec.expressions import graph
 from lidarspec.expressions.columns import Batch, align_points
-from lidarspec.expressions.graph import Node, TracedColumn, UntraceableError, is_full, only_field
+from lidarspec.expressions.graph import (
+    Node,
+    TracedColumn,
+    UntraceableError,
+    get_only_field,
+    is_full,
+)
 from lidarspec.frames.frame_table import LayoutRows
 from lidarspec.frames.layout import Bytes2D, Layout, Leaf
 from lidarspec.points.conventions import (
     coordinates,
-    direction_of,
+    find_direction,
     is_zero,
-    mark,
+    mark_invalid,
     place_points,
     returned_range,
     shown_range,
 )
 from lidarspec.points.lookup_tables import is_number
-from lidarspec.points.reference_evaluator import kinds_of, parts_of
+from lidarspec.points.reference_evaluator import list_extra_types, list_parts
 from lidarspec.spec.results import Cartesian, Polar
 from lidarspec.spec.vocabulary import AlongAxis, row_numbers
 
@@ -105,18 +111,18 @@ class Plan:
         self.function = function
         self.layout = layout
         self.nominal = result.nominal
-        parts = parts_of(result)
+        parts = list_parts(result)
         samples = {
             name: part.node.sample if isinstance(part, TracedColumn) else part
             for name, part in parts.items()
         }
         arrays, self.axes, _, shape = align_points(samples, sample)
-        self.extra = kinds_of(result, samples)
+        self.extra = list_extra_types(result, samples)
         parts = {
             name: part if isinstance(part, TracedColumn) else array
             for (name, part), array in zip(parts.items(), arrays, strict=True)
         }
-        self.parts = {name: graph.node_of(part) for name, part in parts.items()}
+        self.parts = {name: graph.get_node(part) for name, part in parts.items()}
         self.shape = shape[1:]
         self.varying = {name for name, count in schema.arrays.items() if not isinstance(count, int)}
         self.tables = _TABLES.setdefault(function, {})
@@ -133,7 +139,7 @@ class Plan:
             )
         self.positive = list[Node]()
         named = {
-            name: part for name, part in parts_of(result).items() if isinstance(part, AlongAxis)
+            name: part for name, part in list_parts(result).items() if isinstance(part, AlongAxis)
         }
         if self.exact:
             expressions = self._by_coordinates(parts)
@@ -154,7 +160,7 @@ class Plan:
             if (leaf := self._sent(self.parts[name], kind.dtype)) is not None
         }
         expressions |= {name: self.parts[name] for name in self.sent}
-        self.expressions = {name: graph.node_of(value) for name, value in expressions.items()}
+        self.expressions = {name: graph.get_node(value) for name, value in expressions.items()}
 
     @cached_property
     def width(self) -> int:
@@ -238,7 +244,7 @@ class Plan:
         Args:
             named: the parts with named arrays.
         """
-        distance = mark(self._distance(parts["range"]), parts["invalid"])
+        distance = mark_invalid(self._distance(parts["range"]), parts["invalid"])
         azimuth, elevation, *origin = (
             named.get(name, parts[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz")
         )
@@ -252,7 +258,7 @@ class Plan:
     def _by_coordinates(self, parts: Mapping[str, Any]) -> dict[str, Any]:
         """Return the columns that back ends make, of the parts of `Cartesian`."""
         places = parts["x"], parts["y"], parts["z"]
-        measured, azimuth, elevation = direction_of(*places)
+        measured, azimuth, elevation = find_direction(*places)
         columns = {
             "range": shown_range(measured, parts["invalid"]),
             "azimuth": azimuth,
@@ -266,11 +272,11 @@ class Plan:
         If a low value only scales the distance, that value has to be positive.
         """
         node = measured.node
-        if only_field(node) is None and node.kind == "call" and node.function is np.multiply:
+        if get_only_field(node) is None and node.kind == "call" and node.function is np.multiply:
             for full, low in (node.args, node.args[::-1]):
                 if (
                     is_full(full, self.width)
-                    and only_field(full) is not None
+                    and get_only_field(full) is not None
                     and isinstance(low, Node)
                     and not is_full(low, self.width)
                 ):

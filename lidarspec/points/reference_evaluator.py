@@ -123,10 +123,10 @@ def evaluate_plainly(
         result = function(Fields(batch))
         if not isinstance(result, Polar | Cartesian):
             raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
-        return _flatten(packets, result, batch, stamp_of(packets, epoch), final=final)
+        return _flatten(packets, result, batch, find_stamp(packets, epoch), final=final)
 
 
-def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
+def find_stamp(packets: PacketBatch, epoch: int | None) -> int:
     """The stamp of a batch's cloud, int64 ns: a given one, else the time of the first packet."""
     if epoch is not None:
         return epoch
@@ -135,7 +135,7 @@ def stamp_of(packets: PacketBatch, epoch: int | None) -> int:
     return 0
 
 
-def parts_of(result: Points) -> dict[str, Any]:
+def list_parts(result: Points) -> dict[str, Any]:
     """Return the parts of a `points` result by name, without missing parts.
 
     The origin is split into ox, oy and oz.
@@ -151,7 +151,7 @@ def parts_of(result: Points) -> dict[str, Any]:
     return {name: value for name, value in parts.items() if value is not None}
 
 
-def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
+def list_extra_types(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
     """Return the types of the additional columns, by name; `parts`: those of the result."""
     return {name: ExtraType.of(extra, parts[name]) for name, extra in result.extra.items()}
 
@@ -159,15 +159,16 @@ def kinds_of(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
 def _flatten(
     packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool
 ) -> EvaluatedPoints:
-    parts = parts_of(result)
+    parts = list_parts(result)
     arrays, axes, ready, shape = align_points(parts, batch)
     ready = len(packets) if final else ready
     mask = padding_mask(axes, shape, batch)
     every = {
-        name: flat(array, shape, mask, ready) for name, array in zip(parts, arrays, strict=True)
+        name: flatten_valid(array, shape, mask, ready)
+        for name, array in zip(parts, arrays, strict=True)
     }
     offsets = conventions.seconds_since(packets.time_ns, stamp_ns).reshape(-1, *(1,) * len(axes))
-    every["time"] = every["time"] + flat(offsets, shape, mask, ready)
+    every["time"] = every["time"] + flatten_valid(offsets, shape, mask, ready)
     if mask is None:
         inside = np.ones(shape, np.bool_)
     else:
@@ -175,7 +176,7 @@ def _flatten(
     cloud = make_cloud(
         every,
         conventions.vendor_turn(packets.sensor),
-        kinds_of(result, parts),
+        list_extra_types(result, parts),
         stamp_ns=stamp_ns,
         shape=find_organised_shape(len(every["time"]), conventions.grid_of(shape[1:], axes)),
         nominal=np.bool_(batch.nominal or result.nominal),
@@ -208,7 +209,7 @@ def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventio
     return conventions.Grids(np.cumsum(counts), which.reshape(-1), grids)
 
 
-def flat(
+def flatten_valid(
     array: NDArray[Any], shape: tuple[int, ...], mask: NDArray[np.bool_] | None, ready: int
 ) -> NDArray[Any]:
     """Return an array that broadcasts to a shape, (n, ...), flattened, (N,).
@@ -243,16 +244,16 @@ def make_cloud(
         valid = is_finite & (np.abs(distance) <= conventions.FARTHEST)
         if turn is not None:
             xyz = turn @ np.where(valid, xyz, 0)
-            azimuth = conventions.turned_azimuth(azimuth, turn)
+            azimuth = conventions.turn_azimuth(azimuth, turn)
         angles = {
-            "azimuth": conventions.narrow(azimuth),
+            "azimuth": conventions.narrow_angle(azimuth),
             "elevation": elevation.astype(np.float32),
         }
         columns = (
             dict(zip("xyz", np.where(valid, xyz, np.nan).astype(np.float32), strict=True)) | angles
         )
         columns |= {
-            name: conventions.numbers_of(flat[name], conventions.TYPES[name])
+            name: conventions.convert_numbers(flat[name], conventions.TYPES[name])
             for name in _OPTIONAL
             if name in flat
         }
@@ -283,7 +284,7 @@ def _by_direction(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> 
 
 def _by_coordinates(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Places:
     places = [flat[name].astype(np.float64) for name in "xyz"]
-    measured, azimuth, elevation = conventions.direction_of(*places)
+    measured, azimuth, elevation = conventions.find_direction(*places)
     return (
         conventions.shown_range(measured, invalid),
         azimuth,

@@ -187,11 +187,13 @@ class BackgroundWriter:
         self._changed = threading.Condition()
         self._waiting = bytearray()
         self._unreported_drops = 0
-        self._raised = False
+        self._has_raised = False
         self._closing = False
-        self._taken = 0
-        self._asked = 0
-        self._kept = 0  # counts of records added, requested to be on the disk, and on the disk
+        self._records_added = 0
+        self._records_requested = 0
+        self._records_synced = (
+            0  # counts of records added, requested to be on the disk, and on the disk
+        )
         self._file = RecordFile(self.path, size_at, overwrite=overwrite)
         self._thread = threading.Thread(target=self._work, name=f"recorder of {path}", daemon=True)
         self._thread.start()
@@ -211,10 +213,11 @@ class BackgroundWriter:
             SourceError: if that is not possible.
         """
         with self._changed:
-            target = self._asked = self._taken
+            target = self._records_requested = self._records_added
             self._changed.notify_all()
             if not self._changed.wait_for(
-                lambda: self._kept >= target or self.error or not self._thread.is_alive(), PATIENCE
+                lambda: self._records_synced >= target or self.error or not self._thread.is_alive(),
+                PATIENCE,
             ):
                 raise SourceTimeout(
                     f"{self.path}: the disk has not taken the recording within {PATIENCE:.0f} s"
@@ -285,7 +288,7 @@ class BackgroundWriter:
                 self._waiting += self._make_drop_record(self._unreported_drops)
                 self._unreported_drops = 0
             self._waiting += record
-            self._taken += 1
+            self._records_added += 1
             if size is not None:
                 self.records += 1
                 self.bytes += size
@@ -297,8 +300,8 @@ class BackgroundWriter:
         return b""
 
     def _raise_failure(self) -> None:
-        if self.error and not self._raised:
-            self._raised = True
+        if self.error and not self._has_raised:
+            self._has_raised = True
             raise self.error
 
     def _finish(self) -> None:
@@ -312,16 +315,22 @@ class BackgroundWriter:
         """Write the waiting records until the end or a failure; runs in the thread."""
         try:
             due = time.monotonic() + DISK_SECONDS
-            while not (self._closing and not self._waiting and self._kept == self._taken):
+            while not (
+                self._closing and not self._waiting and self._records_synced == self._records_added
+            ):
                 with self._changed:
                     self._changed.wait_for(
-                        lambda: self._waiting or self._kept < self._taken or self._closing
+                        lambda: (
+                            self._waiting
+                            or self._records_synced < self._records_added
+                            or self._closing
+                        )
                     )
                     self._changed.wait_for(self._is_urgent, FLUSH_SECONDS)
                     waiting = self._waiting
                     self._waiting = bytearray()
-                    taken = self._taken
-                    asked = self._asked > self._kept or self._closing
+                    taken = self._records_added
+                    asked = self._records_requested > self._records_synced or self._closing
                     is_begun = self.records > 0
                 self._file.append(waiting)
                 if is_begun:
@@ -330,7 +339,7 @@ class BackgroundWriter:
                     self._file.keep()
                     due = time.monotonic() + DISK_SECONDS
                     with self._changed:
-                        self._kept = taken
+                        self._records_synced = taken
                         self._changed.notify_all()
         except Exception as error:
             with self._changed:
@@ -345,4 +354,8 @@ class BackgroundWriter:
             self._file.close()
 
     def _is_urgent(self) -> bool:
-        return len(self._waiting) >= FLUSH_BYTES or self._asked > self._kept or self._closing
+        return (
+            len(self._waiting) >= FLUSH_BYTES
+            or self._records_requested > self._records_synced
+            or self._closing
+        )

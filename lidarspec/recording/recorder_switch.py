@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from lidarspec.errors import LidarSpecError, SourceError
 from lidarspec.recording.background_writer import BackgroundWriter, TrafficLog
-from lidarspec.recording.recorders import recorder
+from lidarspec.recording.recorders import open_recorder
 from lidarspec.transports.protocol import Chunk, Transport
 
 
@@ -110,7 +110,7 @@ class RecordingSwitch:
             for number in itertools.count()
         )
         path = next(path for path in paths if not path.exists())
-        self._recorder = recorder(
+        self._recorder = open_recorder(
             path, self.sensor_id, self._source, datagrams=opened.datagrams, baud=opened.baud
         )
 

@@ -251,7 +251,7 @@ def check_suffix(path: str | Path) -> str:
     return suffix
 
 
-def recorder(
+def open_recorder(
     path: str | Path,
     sensor: Sensor | str | None = None,
     source: str | Path = "",
@@ -300,7 +300,7 @@ def recorder(
     return RawRecorder(path, overwrite=overwrite)
 
 
-def recorder_for(
+def get_recorder(
     target: RecordTo, sensor: Sensor | str | None, source: str | Path, opened: Transport
 ) -> tuple[TrafficLog, bool]:
     """Return the recorder for a target, and whether it was made here.
@@ -308,7 +308,9 @@ def recorder_for(
     A recorder that was made here has to be closed by the caller of this function.
     """
     if isinstance(target, str | Path):
-        return recorder(target, sensor, source, datagrams=opened.datagrams, baud=opened.baud), True
+        return open_recorder(
+            target, sensor, source, datagrams=opened.datagrams, baud=opened.baud
+        ), True
     if isinstance(target, BackgroundWriter):
         return target, False
     return target.make(opened, sensor) if isinstance(target, RecorderFactory) else target(

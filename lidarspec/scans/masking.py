@@ -208,7 +208,7 @@ class Masking:
         return marked
 
 
-def describe(sector: Sector) -> str:
+def describe_sector(sector: Sector) -> str:
     """Return what to say about a masked sector."""
     angles = sorted([sector.start * 360, sector.stop * 360], reverse=sector.direction < 0)
     if sector.contains(0.0):

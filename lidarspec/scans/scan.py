@@ -12,7 +12,7 @@ from lidarspec.errors import UsageError
 from lidarspec.notebook_display import make_display_method
 from lidarspec.packets.imu import ImuSamples
 from lidarspec.points.cloud import PointCloud
-from lidarspec.points.conventions import axes_of
+from lidarspec.points.conventions import find_axes
 from lidarspec.points.mount import Mount
 from lidarspec.scans.laserscan import FULL_TURN, LaserScan, find_nearest_returns, fit_times
 from lidarspec.scans.provenance import Provenance
@@ -97,7 +97,7 @@ class Scan:
         `sensor`; `source`, the source of its format; `frame`, the directions of x, y and z;
         `calibration`, "nominal" or "own".
         """
-        directions = zip("xyz", axes_of(self.sensor), strict=True)
+        directions = zip("xyz", find_axes(self.sensor), strict=True)
         return {
             "sensor": self.sensor.id,
             "source": self.sensor.source,

@@ -351,7 +351,7 @@ class ScanSelector:
         elif stamp_ns != cloud.stamp_ns:
             cloud = LazyCloud.of(CloudColumns(cloud), stamp_ns)
         if selection.columns:
-            cloud = cloud.only(*selection.columns)
+            cloud = cloud.select_columns(*selection.columns)
         return replace(
             scan,
             points=cloud,

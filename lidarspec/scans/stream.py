@@ -23,7 +23,7 @@ from lidarspec.points.evaluate import evaluate_guarded
 from lidarspec.points.mount import Mount
 from lidarspec.points.reference_evaluator import EvaluatedPoints
 from lidarspec.scans.cutter import ScanCutter
-from lidarspec.scans.masking import Masking, describe
+from lidarspec.scans.masking import Masking, describe_sector
 from lidarspec.scans.provenance import PointRun, Provenance, find_part
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.scan_ends import first_points
@@ -137,7 +137,7 @@ class ScanStream:
         sector = self._masking.sector
         assert sector is not None
         self._cutter.use_sector(sector, self._masking.angle_before_sector)
-        packets.stats.masked = describe(sector)
+        packets.stats.masked = describe_sector(sector)
         self._uses_sector = True
 
     def _with_points(self, packets: Packets) -> Packets:

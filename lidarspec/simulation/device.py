@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from lidarspec.errors import SpecError
 from lidarspec.frames.parse import parse
 from lidarspec.framing.decoder import Decoder
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.faults import Faults, FaultyLink
 from lidarspec.simulation.frame_maker import FrameMaker
@@ -152,7 +152,7 @@ class ReplyMaker:
 
     def _matching_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
         """Return the physical values that match a reply to its request."""
-        fields = codec(self._sensor.frames[name]).schema.fields
+        fields = get_codec(self._sensor.frames[name]).schema.fields
         raw = {
             path: request.values[path] for path in request.command.echoes if path in request.values
         } | dict(request.command.matches)
@@ -217,7 +217,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, An
             yield f"{prefix}{name}", value
 
 
-class _Due(NamedTuple):
+class _PlannedData(NamedTuple):
     """Data to be sent at a time, in ns since power-on; first planned, first sent."""
 
     at: float
@@ -227,7 +227,7 @@ class _Due(NamedTuple):
     data: bytes
 
 
-class _Stream:
+class _FrameStream:
     """The data frames of one type from a time on, in ns since power-on.
 
     Attributes:
@@ -250,22 +250,24 @@ class _Stream:
         self._end = began
         self._frames: list[bytes] = []
         self._times: list[float] = []
-        self._spot = 0
+        self._position = 0
         self.due = began
 
     def take(self, upto: float) -> list[tuple[float, bytes]]:
         """Return the frames that are due by a time, with their times."""
         taken: list[tuple[float, bytes]] = []
         while self.due <= upto:
-            if self._spot == len(self._frames):
+            if self._position == len(self._frames):
                 self._more()
-            first = self._spot
-            self._spot = bisect.bisect_right(self._times, upto)
+            first = self._position
+            self._position = bisect.bisect_right(self._times, upto)
             taken += zip(
-                self._times[first : self._spot], self._frames[first : self._spot], strict=True
+                self._times[first : self._position],
+                self._frames[first : self._position],
+                strict=True,
             )
-            if self._spot < len(self._frames):
-                self.due = self._times[self._spot]
+            if self._position < len(self._frames):
+                self.due = self._times[self._position]
             else:
                 self.due = self._end
         return taken
@@ -277,7 +279,7 @@ class _Stream:
         times = (self._end + block.times).tolist()
         self._frames = block.frames
         self._times = times[:-1]
-        self._spot = 0
+        self._position = 0
         self._next = self._next + count
         self._end = times[-1]
 
@@ -321,9 +323,9 @@ class SimulatedDevice:
         self._scene = scene or make_room(seed)
         self._source = random.Random(f"device {seed}")
         self._replies = ReplyMaker(sensor, self.faults.shake)
-        self._plan: list[_Due] = []
+        self._plan: list[_PlannedData] = []
         self._planned = 0
-        self._stream: _Stream | None = None
+        self._stream: _FrameStream | None = None
         self._powered = 0
         self._time = 0.0
         self._plug: int | None = None
@@ -443,7 +445,7 @@ class SimulatedDevice:
             sendings.sort(key=lambda item: item[0])
         return [item[1:] for item in sendings]
 
-    def _plan_next(self, due: _Due) -> None:
+    def _plan_next(self, due: _PlannedData) -> None:
         """Plan the next frame of a type that is sent unasked."""
         if due.frame:
             rate = self.sensor.frames[due.frame].simulation.rate
@@ -506,7 +508,9 @@ class SimulatedDevice:
         return at + seconds * SECOND
 
     def _begin(self, at: float, frame: str) -> None:
-        self._stream = _Stream(self._simulation(frame), frame, self._scene, at, self.faults.shake)
+        self._stream = _FrameStream(
+            self._simulation(frame), frame, self._scene, at, self.faults.shake
+        )
 
     def _simulation(self, frame: str) -> FrameSimulation:
         stream_simulation = frame_simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
@@ -520,7 +524,7 @@ class SimulatedDevice:
 
     def _put(self, at: float, link: str, frame: str, data: bytes) -> None:
         self._planned += 1
-        heapq.heappush(self._plan, _Due(at, self._planned, link, frame, data))
+        heapq.heappush(self._plan, _PlannedData(at, self._planned, link, frame, data))
 
     def _switch_plug(self, now: int) -> None:
         """Pull the plug or plug it in, if it is time."""

@@ -66,7 +66,7 @@ class Faults:
             raise UsageError(f"invalid rotor {self.rotor!r}: expected {BLOCKED!r} or nothing")
 
 
-def faults_of(options: Mapping[str, str]) -> Faults:
+def parse_faults(options: Mapping[str, str]) -> Faults:
     """Parse options such as ``{"errors": "1%", "loss": "0.01", "unplug": "30s"}``.
 
     Raises:

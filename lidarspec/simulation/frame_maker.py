@@ -17,10 +17,10 @@ from lidarspec.errors import SpecError
 from lidarspec.frames.encode import fill_in, find_kind
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.frames.layout import Layout
-from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, layout_of
-from lidarspec.frames.schema import schema, without_indices
+from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
+from lidarspec.frames.schema import make_schema, without_indices
 from lidarspec.frames.wire_coder import Coder, frame_coder
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.syntax import get_member
@@ -37,7 +37,7 @@ class FrameMaker:
     """
 
     def __init__(self, sensor: Sensor, frame: str) -> None:
-        engine = codec(sensor.frames[frame])
+        engine = get_codec(sensor.frames[frame])
         if isinstance(engine, PlainCodec):
             raise SpecError(
                 f"cannot be simulated, since it is not compiled: {engine.reason}",
@@ -48,7 +48,9 @@ class FrameMaker:
             others = sensor.data_frames
         else:
             others = ()
-        elsewhere = {path for other in others for path in codec(sensor.frames[other]).schema.fields}
+        elsewhere = {
+            path for other in others for path in get_codec(sensor.frames[other]).schema.fields
+        }
         self.engine = engine
         self._coder: Coder | None = frame_coder(engine.frame)
         self._makes(sensor.id, engine.frame.tree, engine.frame.room, {}, elsewhere)
@@ -73,7 +75,7 @@ class FrameMaker:
         self._limit = limit
         self._given = given
         self._elsewhere = elsewhere
-        self.schema = schema(root)
+        self.schema = make_schema(root)
         formulas = {
             axis: [ref.path for ref in refs(count)]
             for axis, count in self.schema.arrays.items()
@@ -210,7 +212,7 @@ class FrameMaker:
             key = tuple(header.values())
             try:
                 if key not in self._layouts:
-                    self._layouts[key] = layout_of(self._root, header, self._limit, self._given)
+                    self._layouts[key] = find_layout(self._root, header, self._limit, self._given)
                 return self._layouts[key]
             except UnknownSelectorError as unknown:
                 self._layout_fields.append(unknown.leaf.info.path)

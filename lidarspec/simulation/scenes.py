@@ -225,10 +225,10 @@ def read_scene(path: str | Path) -> Room:
         SourceError: if it cannot be read.
         UsageError: if it is invalid; the message names the key.
     """
-    return scene_of(read_document(Path(path)), str(path))
+    return parse_scene(read_document(Path(path)), str(path))
 
 
-def scene_of(table: Mapping[str, Any], place: str = "scene") -> Room:
+def parse_scene(table: Mapping[str, Any], place: str = "scene") -> Room:
     """Return the scene that a table describes; see the module's text.
 
     Args:

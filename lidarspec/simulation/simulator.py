@@ -31,10 +31,10 @@ from lidarspec.errors import SpecError, UsageError, plugin_errors
 from lidarspec.expressions.columns import AROUND, Batch, Column, Fields, align_points
 from lidarspec.frames.frame_table import CompiledTable, LayoutRows, Table
 from lidarspec.framing.example_frames import example
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.clocks import clock_ns
-from lidarspec.points.conventions import coordinates, direction_of
-from lidarspec.points.reference_evaluator import parts_of
+from lidarspec.points.conventions import coordinates, find_direction
+from lidarspec.points.reference_evaluator import list_parts
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.frame_maker import FrameMaker, seal_frames
 from lidarspec.simulation.scenes import Room, Scene
@@ -42,7 +42,7 @@ from lidarspec.spec.fields import factor
 from lidarspec.spec.links import Serial
 from lidarspec.spec.results import Cartesian, Points, Polar
 from lidarspec.spec.timing import Every
-from lidarspec.spec.tree import FieldInfo, exact
+from lidarspec.spec.tree import FieldInfo, to_exact
 
 Times = NDArray[np.int64]
 #: Bits on a serial line for each byte: start, eight, stop.
@@ -195,7 +195,7 @@ class Measurement:
             np.errstate(all="ignore"),
             plugin_errors(f"points of {self._frame}", self._sensor.id, self._points),
         ):
-            parts = {name: part for name, part in parts_of(result).items() if name in _MEASURED}
+            parts = {name: part for name, part in list_parts(result).items() if name in _MEASURED}
             arrays, axes, _, shape = align_points(parts, batch)
         depth = len(shape)
         full = {
@@ -205,7 +205,9 @@ class Measurement:
         places = None
         if isinstance(result, Cartesian):
             places = np.stack([np.broadcast_to(full[name], shape) for name in "xyz"])
-            full |= dict(zip(("range", "azimuth", "elevation"), direction_of(*places), strict=True))
+            full |= dict(
+                zip(("range", "azimuth", "elevation"), find_direction(*places), strict=True)
+            )
         origin = [full.get(name, np.zeros((1,) * depth)) for name in ("ox", "oy", "oz")]
         if isinstance(result.intensity, Column):
             intensity = result.intensity.source
@@ -759,7 +761,7 @@ class PacketTimes:
         assert self._sensor.clock is not None
         steps = np.diff(clock_ns(self._sensor, Batch(table, np.zeros(len(table), np.bool_))))
         if self._sensor.clock.wraps_at:
-            turn = int(exact(self._sensor.clock.wraps_at) * 10**9)
+            turn = int(to_exact(self._sensor.clock.wraps_at) * 10**9)
             steps = (steps + turn // 2) % turn - turn // 2
         times = np.concatenate([[0], np.cumsum(steps)])
         even = np.asarray(np.rint(np.linspace(0, times[-1], len(times))), np.int64)
@@ -820,9 +822,9 @@ class FrameSimulation:
         self._frame = frame
         self._sweep = sweep
         self._maker = FrameMaker(sensor, frame)
-        self._stuck = self._turning(sweep(1)) if blocked else {}
-        length = len(self._maker.frame(self._swept(range(1))[0]))
-        swept = self._swept(range(min(PROBED, max(PROBED_BYTES // length, LEAST_PROBED))))
+        self._blocked_values = self._angle_values(sweep(1)) if blocked else {}
+        length = len(self._maker.frame(self._sweep_values(range(1))[0]))
+        swept = self._sweep_values(range(min(PROBED, max(PROBED_BYTES // length, LEAST_PROBED))))
         table = self._maker.table(swept)
         self._parts = sensor.parts_with("points", frame)
         if self._parts:
@@ -850,7 +852,7 @@ class FrameSimulation:
             shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
         """
         numbers = range(start, start + count + AHEAD)
-        table = self._maker.table(self._swept(numbers))
+        table = self._maker.table(self._sweep_values(numbers))
         times = self._pace.times(table, functools.partial(self._beams, table))
         seconds = since + times / 1e9
         measured = self._with_points(table)
@@ -883,14 +885,14 @@ class FrameSimulation:
         counts = np.bincount(measured.which, beams.counts, len(table))
         return replace(beams, counts=counts.astype(np.intp))
 
-    def _swept(self, numbers: range) -> list[Mapping[str, Any]]:
+    def _sweep_values(self, numbers: range) -> list[Mapping[str, Any]]:
         """Return the values of packets before anything is measured."""
         with plugin_errors(f"sweep of {self._frame}", self._sensor.id, self._sweep):
-            return [{**self._sweep(number), **self._stuck} for number in numbers]
+            return [{**self._sweep(number), **self._blocked_values} for number in numbers]
 
-    def _turning(self, values: Mapping[str, Any]) -> dict[str, Any]:
+    def _angle_values(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of a frame that change because the rotor turns."""
-        fields = codec(self._sensor.frames[self._frame]).schema.fields
+        fields = get_codec(self._sensor.frames[self._frame]).schema.fields
         rule = self._sensor.scan
         cut_by = "" if isinstance(rule, Every) else rule.name
         return {

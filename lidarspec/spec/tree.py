@@ -55,7 +55,7 @@ from lidarspec.spec.checksums import Checksum
 UNNAMED = "(constant)"
 
 
-def exact(number: float | int) -> Fraction:
+def to_exact(number: float | int) -> Fraction:
     """Return a float as the decimal number that it prints as: 0.001 is 1/1000."""
     if isinstance(number, float):
         return Fraction(repr(float(number)))
@@ -128,7 +128,7 @@ class FieldInfo:
         if not self.scaled:
             return raw
         if isinstance(raw, Fraction):
-            return raw * exact(self.scale) + exact(self.offset)
+            return raw * to_exact(self.scale) + to_exact(self.offset)
         return raw * self.scale + self.offset
 
     def raw(self, physical: Any) -> Any:
@@ -144,7 +144,7 @@ class FieldInfo:
             field's limits.
         """
         if isinstance(physical, Fraction):
-            steps: Any = (physical - exact(self.offset)) / exact(self.scale)
+            steps: Any = (physical - to_exact(self.offset)) / to_exact(self.scale)
         else:
             if self.scaled:
                 steps = (physical - self.offset) / self.scale
@@ -174,7 +174,7 @@ class FieldInfo:
         return self.allowed[0]
 
 
-def runs_of(values: Sequence[int]) -> list[tuple[int, int]]:
+def find_runs(values: Sequence[int]) -> list[tuple[int, int]]:
     """Return the first and last value of each run of consecutive values.
 
     Args:
@@ -205,7 +205,7 @@ def format_values(values: Sequence[int]) -> str:
     formats = {0: "{0}", 1: "{0}, {1}"}
     return ", ".join(
         formats.get(last - first, "{0} to {1}").format(first, last)
-        for first, last in runs_of(values)
+        for first, last in find_runs(values)
     )
 
 
@@ -379,7 +379,7 @@ def write(formula: Formula, named: Callable[[Ref], str], operations: Mapping[str
     return str(formula)
 
 
-def element_of(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
+def get_element(info: FieldInfo, path: str, indices: Mapping[str, int]) -> FieldInfo | None:
     """Return the field of one array element, None if the field is not in these arrays.
 
     Args:
@@ -1099,7 +1099,7 @@ class Symbol:
         known = self.formula
         if isinstance(known, Ref) and len(known.info.axes) == 1 and type(key) is int and key >= 0:
             path = f"{known.path}[{key}]"
-            info = element_of(known.info, path, {known.info.axes[0]: key})
+            info = get_element(known.info, path, {known.info.axes[0]: key})
             return Symbol(Ref(path, info or known.info))
         raise UntraceableExpressionError("an expression takes an element of an array, or a byte")
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from lidarspec.entry_points import GROUP, SENSORS, EntryPoint, entry_points
 from lidarspec.errors import SourceError, SpecError, UnknownSensor
-from lidarspec.plugins import Registry, file_and_id, file_module, registry
+from lidarspec.plugins import Registry, import_file, registry, split_file_and_id
 from lidarspec.sensor_operations import Sensor
 from lidarspec.testing.declaration import check_declaration
 from lidarspec.testing.findings import Finding, unacknowledged
@@ -68,7 +68,7 @@ class CheckTarget:
     family: tuple[str, ...] = ()
 
 
-def target(text: str | Path) -> CheckTarget:
+def find_target(text: str | Path) -> CheckTarget:
     """Return the target of a name.
 
     The name is a file, a sensor of a file ("FILE.py:id"), the id or alias of an installed sensor, a
@@ -82,7 +82,7 @@ def target(text: str | Path) -> CheckTarget:
     name = str(text)
     if (Path(name) / "pyproject.toml").is_file():
         return _folder(Path(name))
-    file, wanted = file_and_id(name)
+    file, wanted = split_file_and_id(name)
     if "/" in name or "\\" in name or file.suffix == ".py":
         return _file(file, wanted)
     entries = _entries(name)
@@ -105,7 +105,7 @@ def target(text: str | Path) -> CheckTarget:
 def _file(file: Path, wanted: str) -> CheckTarget:
     found_target = CheckTarget(files=[file], vectors=_vectors([file]))
     try:
-        found_target.sensors = _load_sensors(file_module(file), str(file))
+        found_target.sensors = _load_sensors(import_file(file), str(file))
         found_target.family = tuple(
             sensor.id for sensor in found_target.sensors[1:] and found_target.sensors
         )
@@ -117,7 +117,7 @@ def _file(file: Path, wanted: str) -> CheckTarget:
     except SourceError:
         raise
     except (Exception, SystemExit) as error:
-        found_target.findings.append(loading(error, [file]))
+        found_target.findings.append(describe_loading_error(error, [file]))
         found_target.files = found_target.files if _readable(file) else []
         return found_target
     ids = [sensor.id for sensor in found_target.sensors]
@@ -168,7 +168,7 @@ def _distribution(entries: list[EntryPoint]) -> CheckTarget:
         try:
             sensors = _load_sensors(entry.load(), entry.value)
         except (Exception, SystemExit) as error:
-            finding = loading(error, module_files(entry.value))
+            finding = describe_loading_error(error, module_files(entry.value))
             found_target.findings.append(
                 replace(finding, path=finding.path or f"{entry.name} = {entry.value}")
             )
@@ -258,7 +258,7 @@ def _load_sensors(plugin: Any, name: str) -> list[Sensor]:
     return [registry().apply_hooks(sensor) for sensor in sensors]
 
 
-def loading(error: BaseException, files: list[Path]) -> Finding:
+def describe_loading_error(error: BaseException, files: list[Path]) -> Finding:
     """Return the finding for an error while loading a plugin."""
     if isinstance(error, SpecError) and error.__cause__ is not None:
         cause = error.__cause__

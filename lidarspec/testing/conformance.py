@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import pytest
 
 from lidarspec.sensor_operations import Sensor
-from lidarspec.testing.check import CheckTarget, Report, reports, target
+from lidarspec.testing.check import CheckTarget, Report, find_target, reports
 from lidarspec.testing.sensor_under_test import EXAMPLES
 
 #: The rule about an id that another installed plugin has.
@@ -45,7 +45,7 @@ def assert_conformance(
     if isinstance(sensor, Sensor):
         check_target = CheckTarget([sensor])
     else:
-        check_target = target(sensor)
+        check_target = find_target(sensor)
     made = list(
         reports(
             check_target,

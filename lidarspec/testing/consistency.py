@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import LidarSpecError
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.packets.clocks import clock_ns
 from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.spec import Clock
-from lidarspec.spec.tree import exact
+from lidarspec.spec.tree import to_exact
 from lidarspec.testing.findings import require
 from lidarspec.testing.geometry import BACK, SMALL, make_sweep, read
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -51,7 +51,7 @@ def the_clock_stays_below_its_wrap(subject: SensorUnderTest, name: str) -> None:
     message = (
         f"it reaches {most / 1e9:g} s in the sweep, but wraps_at is {float(clock.wraps_at):g} s"
     )
-    require(most <= exact(clock.wraps_at) * 10**9, "LS512", message, "clock")
+    require(most <= to_exact(clock.wraps_at) * 10**9, "LS512", message, "clock")
 
 
 def times_of_points_fit_the_clock(subject: SensorUnderTest, name: str) -> None:
@@ -84,7 +84,7 @@ def turned_angles_turn_the_points(subject: SensorUnderTest, name: str) -> None:
         return
     values = sweep(1)
     following = sweep(2)
-    fields = codec(subject.sensor.frames[name]).schema.fields
+    fields = get_codec(subject.sensor.frames[name]).schema.fields
     known = [
         path
         for path in values

@@ -21,7 +21,7 @@ from lidarspec.expressions.graph import TracedColumn, UntraceableError
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.schema import without_indices
 from lidarspec.framing.example_frames import make_random_header, random_frame, return_raw
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.points.conventions import TYPES
 from lidarspec.simulation.scenes import Room
 from lidarspec.simulation.simulator import frame_simulation
@@ -117,7 +117,9 @@ def _sensor(sensor: Sensor) -> Findings:
 def _check_required_fields(sensor: Sensor) -> Findings:
     """Yield the missing fields of scans, clock and counter."""
     known = {
-        path for name in sensor.data_frames for path in codec(sensor.frames[name]).schema.scan_names
+        path
+        for name in sensor.data_frames
+        for path in get_codec(sensor.frames[name]).schema.scan_names
     }
     if isinstance(sensor.scan, OnWrap):
         cut_by = known | set(TYPES)
@@ -154,7 +156,7 @@ def _clock(sensor: Sensor) -> Findings:
         or not sensor.frames
     ):
         return
-    named = codec(sensor.frames[sensor.data_frame]).schema.scan_names
+    named = get_codec(sensor.frames[sensor.data_frame]).schema.scan_names
     paths = (clock.source,) if isinstance(clock.source, str) else clock.source
     infos = [named.get(without_indices(path)[0]) for path in paths]
     spans = [
@@ -218,7 +220,7 @@ def _changes_nothing(sensor: Sensor, name: str, values: Iterable[Any]) -> bool:
 
 
 def _frame(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
-    engine = codec(frame)
+    engine = get_codec(frame)
     if not isinstance(frame.tree, Struct | Sealed):
         yield "LS114", f"it is a {type(frame.struct).__name__}", name
     if not engine.is_compiled:
@@ -294,7 +296,7 @@ def _raised_sizes(subject: SensorUnderTest, name: str) -> Iterator[int]:
     a `sweep` may have the same count in all packets.
     """
     frame = subject.sensor.frames[name]
-    engine = codec(frame)
+    engine = get_codec(frame)
     if not isinstance(engine, CompiledCodec) or engine.schema.parts:
         return
     source = subject.source(f"lengths of {name}")
@@ -319,7 +321,7 @@ def _names(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     `Scaled(..., "")` declares a pure number.
     """
     pure = _find_pure_numbers(frame) | (_find_multiplied(subject, name) if frame.data else set())
-    for path, info in codec(frame).schema.all_fields.items():
+    for path, info in get_codec(frame).schema.all_fields.items():
         if (
             info.name in MEASURES
             and info.kind in ("int", "float")
@@ -367,9 +369,9 @@ def _find_pure_numbers(frame: Frame, *, with_scale: bool = False) -> set[str]:
 
 def _plausible(subject: SensorUnderTest, name: str, frame: Frame) -> Findings:
     try:
-        table = codec(frame).table([subject.example(name)])
+        table = get_codec(frame).table([subject.example(name)])
     except LidarSpecError:
-        table = codec(frame).table([])
+        table = get_codec(frame).table([])
     try:
         with np.errstate(all="ignore"):
             answer = frame.plausible(Fields(Batch(table, np.zeros(len(table), np.bool_))))  # type: ignore[misc]

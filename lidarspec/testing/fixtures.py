@@ -12,7 +12,7 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Scene
-from lidarspec.transports.destinations import simulated_outlet
+from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.serving import Served
 
 
@@ -60,4 +60,4 @@ def virtual_port(
                 Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarspec-port-")))
                 / "port"
             )
-        yield stack.enter_context(Served(device, simulated_outlet(resolved, to, link)))
+        yield stack.enter_context(Served(device, make_simulated_outlet(resolved, to, link)))

@@ -21,7 +21,7 @@ from lidarspec.errors import SpecError, UsageError, WireError
 from lidarspec.explaining.damage_search import find_changes
 from lidarspec.explaining.explanation import is_valid_frame
 from lidarspec.frames.layout import Layout
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.framing.results import VALID
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.testing import sensor_under_test as material
@@ -81,7 +81,7 @@ def examples_are_valid_and_repeat(subject: SensorUnderTest, name: str) -> None:
     fixed = material.seals(subject.sensor, name, examples[0])
     free = [
         info
-        for info in codec(frame).schema.fields.values()
+        for info in get_codec(frame).schema.fields.values()
         if info.const is None and not info.held and info.path not in fixed
     ]
     require(
@@ -113,7 +113,7 @@ def every_raw_value_survives(subject: SensorUnderTest, name: str) -> None:
     Applies to frames that plain construct reads: they may contain functions of the author's own,
     which may lose values.
     """
-    engine = codec(subject.sensor.frames[name])
+    engine = get_codec(subject.sensor.frames[name])
     if engine.is_compiled:
         return
     sealed = material.seals(subject.sensor, name, b"")
@@ -162,7 +162,7 @@ def what_follows_is_held(subject: SensorUnderTest, name: str) -> None:
     Such a frame would be built as a different one.
     """
     sensor = subject.sensor
-    engine = codec(subject.sensor.frames[name])
+    engine = get_codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
         return
     for data in (subject.example(name, seed=seed) for seed in range(3)):
@@ -302,12 +302,16 @@ def values_survive_building_and_parsing(subject: SensorUnderTest, name: str) -> 
         sensor.parse(subject.example(name, seed=base), frame=name)
         for base in range(min(BASES, number))
     ]
-    if not any(free(fields.get(path)) for base in bases for _, _, path in material.integers(base)):
+    if not any(
+        has_free_values(fields.get(path))
+        for base in bases
+        for _, _, path in material.integers(base)
+    ):
         return
     values = {
         path: _values(info, subject.strategies.get(f"{name}.{path}"), st)
         for path, info in fields.items()
-        if free(info)
+        if has_free_values(info)
     }
 
     quiet: dict[str, Any] = {
@@ -384,7 +388,7 @@ def _values(info: FieldInfo, own: Any, st: Any) -> Any:
     )
 
 
-def free(info: FieldInfo | None) -> bool:
+def has_free_values(info: FieldInfo | None) -> bool:
     return (
         info is not None
         and info.kind == "int"
@@ -442,7 +446,7 @@ def every_single_bit_error_is_seen(subject: SensorUnderTest, name: str) -> None:
 
     The share of other flipped bits that pass is measured.
     """
-    engine = codec(subject.sensor.frames[name])
+    engine = get_codec(subject.sensor.frames[name])
     if not isinstance(engine, CompiledCodec):
         return
     source = subject.source(f"flipped bits of {name}")

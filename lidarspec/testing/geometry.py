@@ -26,7 +26,7 @@ from lidarspec.expressions.columns import Fields, align, padding_mask
 from lidarspec.expressions.graph import Node, make_sample, trace, traverse
 from lidarspec.frames.frame_table import CompiledTable
 from lidarspec.framing.example_frames import make_random_header, random_frame
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.packets.masked_sector import FULL_TURNS
 from lidarspec.packets.packets import Packets
 from lidarspec.points.cloud import PointCloud
@@ -172,7 +172,7 @@ def field_of(subject: SensorUnderTest, name: str, node: Node) -> FieldInfo | Non
         _, frame, path = node.path.split(".", 2)
         return subject.fields(frame).get(path)
     parts = subject.sensor.parts_with("points", name)
-    return codec(subject.sensor.frames[name]).schema.scan_names.get(
+    return get_codec(subject.sensor.frames[name]).schema.scan_names.get(
         f"{parts}.{node.path}" if parts else node.path
     )
 
@@ -267,7 +267,7 @@ def a_single_point_has_a_direction(subject: SensorUnderTest, name: str) -> None:
 
     Applies if the number of points is in the header.
     """
-    engine = codec(subject.sensor.frames[name])
+    engine = get_codec(subject.sensor.frames[name])
     source = random.Random(subject.sensor.id)
     if not isinstance(engine, CompiledCodec) or engine.schema.parts:
         return

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidarspec.errors import SpecError
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.testing import commands, consistency, frames, geometry, streams, vectors
 from lidarspec.testing.findings import Finding, ViolationError
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -25,7 +25,7 @@ def _no_sweep(subject: SensorUnderTest) -> str:
     names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
         return "it declares no `sweep`, so that it cannot be simulated"
-    alone = [name for name in names if not codec(subject.sensor.frames[name]).is_compiled]
+    alone = [name for name in names if not get_codec(subject.sensor.frames[name]).is_compiled]
     if alone:
         return f"{', '.join(alone)} is not compiled, so that it cannot be simulated"
     return ""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.framing.example_frames import random_frame
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import Frame, Sensor
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 
@@ -122,7 +122,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
 
     Returns None if a number is too wide to be exact as a float.
     """
-    fields = codec(sensor.frames[name]).schema.all_fields
+    fields = get_codec(sensor.frames[name]).schema.all_fields
     parsed = sensor.parse(data, frame=name)
     for holder, key, path in list(integers(parsed, kinds=(int, float))):
         info = fields.get(path)
@@ -142,7 +142,7 @@ def physical(sensor: Sensor, name: str, data: bytes) -> Any:
 
 def seals(sensor: Sensor, name: str, data: bytes) -> set[str]:
     """Return the fields of a frame that hold a checksum, which callers do not set."""
-    engine = codec(sensor.frames[name])
+    engine = get_codec(sensor.frames[name])
     layout = getattr(engine, "tree", None)
     if layout is None or engine.schema.parts:
         return {
@@ -236,7 +236,7 @@ class SensorUnderTest:
 
     def fields(self, frame: str) -> Mapping[str, FieldInfo]:
         """Return the fields of a frame type, by path."""
-        return codec(self.sensor.frames[frame]).schema.all_fields
+        return get_codec(self.sensor.frames[frame]).schema.all_fields
 
     def source(self, purpose: str = "") -> random.Random:
         """Return a random generator for one purpose, the same in every run."""

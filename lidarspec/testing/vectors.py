@@ -30,7 +30,7 @@ from lidarspec.drafting.checksum_search import search
 from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.frames.layout import Layout
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.spec.tree import FieldInfo, Sealed, nodes
 from lidarspec.testing.commands import an_exchange_holds
 from lidarspec.testing.findings import ViolationError, require
@@ -261,7 +261,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     except ViolationError:  # reported by `vectors_hold`
         frames = []
     is_told = isinstance(
-        codec(subject.sensor.frames[name]), CompiledCodec
+        get_codec(subject.sensor.frames[name]), CompiledCodec
     )  # otherwise the offset of a checksum has no field
     for match in _common(frames) if is_told and not sealing else []:
         path = _standing(subject, name, match, frames[0])
@@ -302,7 +302,7 @@ def _fitting(
     If some are of the library, those that need a class of their own are left out: they match only
     because these do.
     """
-    engine = codec(subject.sensor.frames[name])
+    engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
         layout = engine.tree.layout(frame)
     else:
@@ -359,7 +359,7 @@ def _common(frames: list[bytes]) -> list[ChecksumMatch]:
 
 def _standing(subject: SensorUnderTest, name: str, match: ChecksumMatch, frame: bytes) -> str:
     """Return the field that holds a checksum; "" if it cannot be determined."""
-    engine = codec(subject.sensor.frames[name])
+    engine = get_codec(subject.sensor.frames[name])
     if isinstance(engine, CompiledCodec):
         layout = engine.tree.layout(frame)
     else:

@@ -13,7 +13,9 @@ from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.outlets import LOCALHOST, Outlet, OutletLine, PtyLine, TcpLine, UdpLine
 
 
-def simulated_outlet(sensor: Sensor, destination: str, link: str | Path | None = None) -> Outlet:
+def make_simulated_outlet(
+    sensor: Sensor, destination: str, link: str | Path | None = None
+) -> Outlet:
     """Return the outlet of a simulated sensor, with lines for all links with commands.
 
     Args:
@@ -31,7 +33,7 @@ def simulated_outlet(sensor: Sensor, destination: str, link: str | Path | None =
     return Outlet(data, _make_control_lines(sensor))
 
 
-def replay_outlet(destination: str, *, datagrams: bool, port: int = 0) -> Outlet:
+def make_replay_outlet(destination: str, *, datagrams: bool, port: int = 0) -> Outlet:
     """Return the outlet of a replay.
 
     Args:

@@ -76,7 +76,7 @@ class HttpLine(OutletLine):
         self._server.shutdown()
         self._server.server_close()
 
-    def ask(self, request: bytes) -> bytes | None:
+    def handle_request(self, request: bytes) -> bytes | None:
         """Return the simulated sensor's reply to a request; None if it is not in time."""
         reply = _ReplyQueue()
         with self._lock:
@@ -109,7 +109,7 @@ class _Handler(BaseHTTPRequestHandler):
                 "body": body,
             }
         )
-        reply_data = self._line.ask(request)
+        reply_data = self._line.handle_request(request)
         if reply_data is None:
             self.send_error(504, "the simulated sensor has no answer to that")
             return

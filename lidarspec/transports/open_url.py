@@ -36,7 +36,7 @@ _PORT_NAME = re.compile(
 _FILE_DEVICES = {"null", "zero", "full", "random", "urandom", "stdin", "fd"}
 
 
-def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
+def open_transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
     """Open the transport of a SOURCE.
 
     Args:
@@ -65,7 +65,7 @@ def transport(source: str | Path, sensor: Sensor | None = None) -> Transport:
     return open_file(text)
 
 
-def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
+def open_live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
     """Open the transport of a live SOURCE.
 
     Args:
@@ -77,7 +77,7 @@ def live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport:
             accept.
         SourceError: if the source cannot be opened.
     """
-    opened = transport(source, sensor)
+    opened = open_transport(source, sensor)
     if isinstance(opened, LiveTransport):
         return opened
     opened.close()
@@ -143,11 +143,11 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
     else:
         control = ""
     if live_address(control) is not None:
-        return live(control)
+        return open_live(control)
     control_host, port = SourceAddress(control, "", control).host_and_port()
     remote_host = control_host or host
     if isinstance(link, Tcp) and remote_host:
-        return live(f"tcp://{_bracket(remote_host)}:{port or link.port}")
+        return open_live(f"tcp://{_bracket(remote_host)}:{port or link.port}")
     if isinstance(link, Http) and remote_host:
         from lidarspec.transports.http import HttpTransport
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from lidarspec.errors import UsageError, WireError
 from lidarspec.recording.background_writer import BackgroundWriter
 from lidarspec.scans.selection import Times, iter_received
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.outlets import Outlet
 from lidarspec.transports.protocol import Chunk, Disconnected, Sender, Transport, sender_names
 
@@ -167,7 +167,7 @@ class Replay:
                 return
 
     def _run_once(self) -> Iterator[str]:
-        opened = self._source or transport(self._file)
+        opened = self._source or open_transport(self._file)
         self._source = None
         with contextlib.closing(opened) as source:
             chunks = self._check_times(iter_received(source, self._times, self._file))

@@ -11,7 +11,7 @@ from lidarspec.errors import UsageError
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.simulation.faults import FAULTS, faults_of
+from lidarspec.simulation.faults import FAULTS, parse_faults
 from lidarspec.simulation.scenes import read_scene
 from lidarspec.spec.links import Serial, is_datagram
 from lidarspec.transports.addresses import SourceAddress
@@ -187,7 +187,7 @@ def _make_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
         scene = read_scene(options["scene"])
     else:
         scene = None
-    faults = faults_of({name: text for name, text in options.items() if name in FAULTS})
+    faults = parse_faults({name: text for name, text in options.items() if name in FAULTS})
     seed = options.get("seed", "0")
     if not seed.isdecimal():
         raise UsageError(f"seed is a whole number, not {seed!r}")

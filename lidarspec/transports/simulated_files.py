@@ -15,7 +15,7 @@ from typing import Literal
 
 from lidarspec.errors import LidarSpecError, SpecError, UsageError
 from lidarspec.frames.commands import build_command
-from lidarspec.recording.recorders import recorder
+from lidarspec.recording.recorders import open_recorder
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.transports.protocol import Chunk
@@ -57,7 +57,9 @@ def write_file(
     sensor = device.sensor
     sent_bytes = 0
     with contextlib.closing(
-        recorder(path, sensor, f"sim:{sensor.id}", datagrams=sensor.datagrams, overwrite=overwrite)
+        open_recorder(
+            path, sensor, f"sim:{sensor.id}", datagrams=sensor.datagrams, overwrite=overwrite
+        )
     ) as log:
         for chunk, direction in itertools.chain(until_first_data, transfers):
             log.write(chunk, direction)

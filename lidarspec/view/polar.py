@@ -23,7 +23,7 @@ HEIGHTS = (1, 2, 5, 10)
 FILLED = 0.9
 
 
-def picture(points: PointCloud, *, width: int, height: int, look: CloudAppearance) -> CellGrid:
+def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppearance) -> CellGrid:
     """Return the cloud in `width` by `height` cells, from above.
 
     Unless the look is flat, the view from its right side is below.

@@ -17,7 +17,7 @@ from lidarspec.recording.recorder_switch import RecordingSwitch
 from lidarspec.scans.scan import Scan
 from lidarspec.view.canvas import ALARM, GOOD, PLAIN, STRONG, CellGrid
 from lidarspec.view.live_scans import LiveScans
-from lidarspec.view.polar import picture
+from lidarspec.view.polar import draw_cloud
 from lidarspec.view.rate_meter import NOTHING, MeterReading, format_figure
 from lidarspec.view.terminal_screen import Screen
 from lidarspec.view.terminal_window_parts import (
@@ -204,7 +204,7 @@ class Window:
         if self._scan is None:
             drawn = CellGrid.blank(width, height)
         else:
-            drawn = picture(self._scan.points, width=width, height=height, look=current_look)
+            drawn = draw_cloud(self._scan.points, width=width, height=height, look=current_look)
         warning = self._warning()
         if warning:
             _paste_in_middle(drawn, draw_message(width, warning))

@@ -23,7 +23,7 @@ import lidarspec as ls
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.simulation.simulator import simulate
 from lidarspec.transports.files import CaptureTransport
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
 from tests import made_captures as made
 from tests.captures.test_memory import CHILD, SENSOR, written
@@ -80,7 +80,7 @@ def capture(number: int = 40, form: str = "pcap") -> bytes:
 
 
 def read(source: Path | str) -> list[Chunk]:
-    with contextlib.closing(transport(source)) as opened:
+    with contextlib.closing(open_transport(source)) as opened:
         return list(opened.chunks())
 
 
@@ -99,7 +99,7 @@ def test_compressed_files_are_read_unchanged(packing: str) -> None:
             assert b"".join(chunk.data for chunk in chunks) == plain.read_bytes()
         else:
             assert chunks == read(plain)
-        with contextlib.closing(transport("it.x")) as opened:
+        with contextlib.closing(open_transport("it.x")) as opened:
             if isinstance(opened, CaptureTransport):
                 assert [
                     batch.data(number) for batch in opened.batches() for number in range(len(batch))
@@ -176,7 +176,7 @@ def test_a_truncated_compressed_file_is_read_to_its_end(packing: str) -> None:
     sent = [np.random.default_rng(number).bytes(1200) for number in range(2000)]
     whole = PACKED[packing](made.pcap(*map(made.frame, sent)))
     Path("it.pcap.x").write_bytes(whole[: len(whole) * 3 // 4])
-    with contextlib.closing(transport("it.pcap.x")) as opened:
+    with contextlib.closing(open_transport("it.pcap.x")) as opened:
         packets = [chunk.data for chunk in opened.chunks()]
         assert packets == sent[: len(packets)]
         assert 900 < len(packets) < 1501  # of bzip2, its last block is lost
@@ -194,7 +194,7 @@ def test_data_before_damage_is_read_with_one_warning(packing: str) -> None:
     middle = len(whole) * 3 // 4
     whole[middle : middle + 4000] = b"\xff" * 4000
     Path("it.pcap.x").write_bytes(whole)
-    with contextlib.closing(transport("it.pcap.x")) as opened:
+    with contextlib.closing(open_transport("it.pcap.x")) as opened:
         packets = [chunk.data for chunk in opened.chunks()]
         assert packets[:900] == sent[:900]
         assert (

@@ -14,7 +14,7 @@ from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import CaptureReader, CaptureStats, Datagram, datagram_record
 from lidarspec.captures.records import capture_head
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.recorders import recorder
+from lidarspec.recording.recorders import open_recorder
 from lidarspec.spec import Chunk
 from tests import made_captures as made
 
@@ -97,7 +97,7 @@ def test_ipv6_is_written_with_its_checksum() -> None:
 )
 def test_writer_refuses_too_large_packets(datagram: Datagram, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "it.pcap"
-    with recorder(path, datagrams=True) as writer:
+    with open_recorder(path, datagrams=True) as writer:
         with pytest.raises(UsageError, match=reason):
             writer.write(chunk(datagram))
         writer.write(chunk(DATAGRAM))
@@ -116,7 +116,7 @@ def test_full_disk_leaves_whole_records_and_one_clear_error(tmp_path: Path, room
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (24 + 2 * 1058 + room, before[1]))
     try:
-        writer = recorder(path, datagrams=True)
+        writer = open_recorder(path, datagrams=True)
         for _ in range(100):
             writer.write(chunk(BIG))
         with pytest.raises(SourceError, match="whole up to byte 2140"):
@@ -135,7 +135,7 @@ def test_a_partial_write_ends_writing_to_a_pipe(tmp_path: Path) -> None:
     path = tmp_path / "pipe.pcap"
     os.mkfifo(path)
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", 0) as reading:
-        writer = recorder(path, datagrams=True, overwrite=True)
+        writer = open_recorder(path, datagrams=True, overwrite=True)
         for _ in range(100):
             writer.write(chunk(BIG))
         os.set_blocking(reading.fileno(), True)

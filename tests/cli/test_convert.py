@@ -22,7 +22,7 @@ import lidarspec as ls
 from lidarspec.captures.records import WRITINGS
 from lidarspec.recording.background_writer import RecordFile
 from lidarspec.simulation.simulator import simulate
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from tests.cli.running import COIN_D4, EXAMPLE, LD06, process, ran, run_json
 from tests.evidence import capture
 from tests.shapes import SHAPES
@@ -354,15 +354,15 @@ def test_packets_go_from_container_to_container_as_they_are(name: str, tmp_path:
         assert f"{other}: " in ran("convert", one, other).stderr
     for file in files[1:]:
         with (
-            contextlib.closing(transport(files[0])) as before,
-            contextlib.closing(transport(file)) as after,
+            contextlib.closing(open_transport(files[0])) as before,
+            contextlib.closing(open_transport(file)) as after,
         ):
             assert list(after.chunks()) == list(before.chunks())
     assert files[3].read_bytes() == files[0].read_bytes()
     part = tmp_path / "part.pcapng"
     told = run_json("convert", files[2], part, "--slice", "100ms:200ms", "-s", name)
     assert told["packets"] < run_json("info", files[0])["packets"] / 2
-    with contextlib.closing(transport(part)) as opened:
+    with contextlib.closing(open_transport(part)) as opened:
         times = [chunk.at or 0 for chunk in opened.chunks()]
     assert len(times) == told["packets"]
     assert 0 <= min(times) - run_json("info", files[0])["first_ns"] - 100_000_000 < 20_000_000

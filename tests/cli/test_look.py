@@ -15,7 +15,7 @@ import lidarspec as ls
 from lidarspec.cli.options import SHARE
 from lidarspec.cli.root import VERBS, main
 from lidarspec.plugins import Registry
-from lidarspec.simulation.faults import faults_of
+from lidarspec.simulation.faults import parse_faults
 from tests.cli.running import EXAMPLE, ran, run_json
 from tests.representatives import REPRESENTATIVES
 
@@ -229,7 +229,7 @@ def test_a_share_is_written_in_per_cent_or_as_a_number_everywhere() -> None:
     for text in ("1%", "0.01"):
         assert (
             SHARE.convert(text, None, None)
-            == faults_of({"errors": text, "loss": text}).errors
+            == parse_faults({"errors": text, "loss": text}).errors
             == 0.01
         )
     assert "[default: 1%]" in ran("demo", "--help").stdout

@@ -14,7 +14,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.cli.options import DURATION
-from lidarspec.simulation.faults import faults_of
+from lidarspec.simulation.faults import parse_faults
 from lidarspec.spec.fields import duration
 from lidarspec.transports.addresses import SourceAddress
 from lidarspec.transports.simulated import connect
@@ -146,7 +146,9 @@ def test_an_existing_link_is_a_source_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["2m", "2min", "1.5h", "300ms", "20us", "3s", "7"])
 def test_a_duration_reads_the_same_as_an_option_and_in_a_source(text: str) -> None:
     assert (
-        DURATION.convert(text, None, None) == duration(text) == faults_of({"unplug": text}).unplug
+        DURATION.convert(text, None, None)
+        == duration(text)
+        == parse_faults({"unplug": text}).unplug
     )
     assert connect(
         SourceAddress.parse(f"sim:ldrobot-stl27l?unplug={text}")

@@ -22,7 +22,7 @@ from lidarspec.recording.format import Recording
 from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Fields
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.transports.open_url import live
+from lidarspec.transports.open_url import open_live
 from tests.lines import free_port, send_paced, turning, udp, until, working
 from tests.shapes import SHAPES
 
@@ -129,7 +129,7 @@ def test_a_clock_change_changes_no_time_and_is_recorded(tmp_path: Path) -> None:
     with udp() as sender, Recorder(path, sensor) as kept:
         clock = HostClock(wall=lambda: time.time_ns() + wall[0])
         with contextlib.closing(
-            CaptureThread(live(f"udp://:{number}", sensor), queue, log=kept, clock=clock)
+            CaptureThread(open_live(f"udp://:{number}", sensor), queue, log=kept, clock=clock)
         ) as capture:
             for index, step in enumerate((0, 20_000_000, 3_000_000_000, 3_000_000_000)):
                 wall[0] = step

@@ -26,7 +26,7 @@ from lidarspec.drafting.samples import ChecksumPlace
 from lidarspec.expressions.columns import align
 from lidarspec.simulation.simulator import simulate
 from lidarspec.spec import Checksum, Crc, Fold15, Sequence, Sum, WordXor, Xor
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from tests.cli.running import ran
 from tests.evidence import capture
 from tests.shapes import SHAPES
@@ -46,7 +46,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def draft_file(name: str) -> Draft:
-    opened = transport(str(capture(name)))
+    opened = open_transport(str(capture(name)))
     try:
         return draft([chunk.data for chunk in opened.chunks()], datagrams=opened.datagrams)
     finally:
@@ -70,7 +70,7 @@ def module(tmp_path: Path, source: Path, *more: str) -> ls.Sensor:
 
 
 def share(sensor: ls.Sensor, source: Path) -> float:
-    opened = transport(str(source))
+    opened = open_transport(str(source))
     chunks = [chunk.data for chunk in opened.chunks()]
     opened.close()
     stats = sensor.decode(chunks if opened.datagrams else b"".join(chunks)).stats
@@ -180,7 +180,7 @@ def test_the_draft_reads_the_capture_that_it_came_from(
 
 
 def transport_data(name: str) -> bytes | list[bytes]:
-    opened = transport(str(capture(name)))
+    opened = open_transport(str(capture(name)))
     chunks = [chunk.data for chunk in opened.chunks()]
     opened.close()
     return chunks if opened.datagrams else b"".join(chunks)

@@ -19,7 +19,7 @@ import pytest
 from construct import Construct
 
 from lidarspec import Packets, Sensor, SpecError, WireError
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.spec import Every, Fields, Frame, Polar, Udp
 from lidarspec.spec.syntax import frame_tree
 from tests.by_construct import reader
@@ -149,7 +149,7 @@ def clouds_agree(
     kept = [(data, wanted) for data, wanted in whole if wanted is not None]
     if not has_raw_form(plain_sensor.decode([data for data, _ in kept])):
         return 0  # what is an array in one branch alone has no length in the others
-    table, tried = schema(frame_tree(struct)), 0
+    table, tried = make_schema(frame_tree(struct)), 0
     for path, info in table.fields.items():
         is_small = info.kind == "int" and info.bits <= 16 and not info.scaled
         if (

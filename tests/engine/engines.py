@@ -8,11 +8,11 @@ values at the edges of their fields.
 from __future__ import annotations
 
 from lidarspec import Sensor
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.framing.plain_frames import PlainCodec
 from lidarspec.spec import Frame
 from lidarspec.testing import sensor_under_test as material
-from lidarspec.testing.frames import acceptable, free
+from lidarspec.testing.frames import acceptable, has_free_values
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import assert_backends_agree
 
@@ -22,12 +22,12 @@ EDGE_EXAMPLES = 5
 
 def is_compiled(frame: Frame) -> bool:
     """Return whether a frame type has layouts of its own."""
-    return isinstance(codec(frame), CompiledCodec)
+    return isinstance(get_codec(frame), CompiledCodec)
 
 
 def interpreted_reason(frame: Frame) -> str:
     """Return why construct parses a frame type one candidate at a time; "" if it does not."""
-    engine = codec(frame)
+    engine = get_codec(frame)
     return engine.reason if isinstance(engine, PlainCodec) else ""
 
 
@@ -58,14 +58,14 @@ def assert_edge_values_read_alike(sensor: Sensor, count: int = EDGE_EXAMPLES) ->
         frame = sensor.frames[name]
         if frame.max_length > material.SHORT or not is_compiled(frame):
             continue
-        fields = codec(frame).schema.fields
+        fields = get_codec(frame).schema.fields
         source = subject.source(f"edges {name}")
         edged = []
         for seed in range(count):
             parsed = sensor.parse(subject.example(name, seed=seed), frame=name)
             for holder, key, path in list(material.integers(parsed)):
                 info = fields.get(path)
-                if info is not None and free(info) and source.random() < 0.3:
+                if info is not None and has_free_values(info) and source.random() < 0.3:
                     holder[key] = source.choice(info.limits)
             built = acceptable(subject, name, parsed)
             if built is not None:

@@ -16,7 +16,7 @@ from construct import ConstructError
 
 from lidarspec import Sensor
 from lidarspec.expressions.columns import Batch
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import Fields, Frame
 from tests.by_construct import construct_frame
 from tests.engine.plain_forms import plain_row
@@ -32,7 +32,9 @@ class Oracle:
         self._frames = {
             name: frame for name, frame in sensor.frames.items() if frame.direction == "in"
         }
-        self._codecs = {name: codec(construct_frame(frame)) for name, frame in self._frames.items()}
+        self._codecs = {
+            name: get_codec(construct_frame(frame)) for name, frame in self._frames.items()
+        }
         self._named = {frame.after for frame in self._frames.values()} - {None}
         answer = sensor.options.get("answer")
         self._mode = self._frames[answer].after if answer else None

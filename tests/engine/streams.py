@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 from lidarspec import Counters, Sensor, SpecError
 from lidarspec.framing.example_frames import make_random_header, random_frame
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests.agreement import cuts
@@ -112,7 +112,7 @@ def _header(sensor: Sensor, name: str, source: random.Random) -> bytes:
     """Return the bytes up to the last constant at the start of a frame type, random where they are
     no constants.
     """
-    prefix = codec(sensor.frames[name]).prefix
+    prefix = get_codec(sensor.frames[name]).prefix
     header = bytearray(source.randbytes(max(prefix, default=-1) + 1))
     for offset, (mask, value) in prefix.items():
         header[offset] = header[offset] & ~mask | value
@@ -138,7 +138,7 @@ def longest_example(subject: SensorUnderTest, name: str, headers: int = MANY_HEA
     found = [
         subject.example(name, seed=seed) for seed in range(8 if headers < MANY_HEADERS else 20)
     ]
-    engine = codec(subject.sensor.frames[name])
+    engine = get_codec(subject.sensor.frames[name])
     source = subject.source(f"longest {name}")
     is_drawn = isinstance(engine, CompiledCodec) and engine.size is None
     if is_drawn and (headers >= MANY_HEADERS or not engine.schema.parts):

@@ -9,7 +9,7 @@ import re
 import pytest
 
 from lidarspec import Sensor, WireError
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from tests.broken import sound
 from tests.engine.engines import (
     assert_damaged_input_reads_alike,
@@ -54,7 +54,7 @@ def fault_paths_in_arrays(sensor: Sensor, name: str) -> tuple[list[str], list[st
     one.
     """
     indexed, unindexed = list[str](), list[str]()
-    schema = codec(sensor.frames[name]).schema
+    schema = get_codec(sensor.frames[name]).schema
     data = sensor.example(name, seed=2)
     step = max(len(data) // MAX_CUTS, 1)
     for end in range(0, len(data), step):

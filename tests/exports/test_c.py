@@ -21,7 +21,7 @@ import lidarspec
 from lidarspec import Sensor, WireError
 from lidarspec.exports import ExportError, export, make_prefix
 from lidarspec.frames.schema import Schema
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.testing import sensor_under_test as material
 from tests.exports.trees import (
     SHAPED,
@@ -105,7 +105,7 @@ def test_a_header_has_a_function_for_every_field(name: str) -> None:
     for frame in sensor.frames:
         prefix = f"{_word(make_prefix(sensor))}_{frame}"
         assert f" {prefix}_is_frame(" in text
-        for path in codec(sensor.frames[frame]).schema.fields:
+        for path in get_codec(sensor.frames[frame]).schema.fields:
             assert re.search(rf"\b{prefix}_{_word(path)}{'_' * (path in OWN)}\(", text), path
 
 
@@ -257,7 +257,7 @@ def _dump(sensor: Sensor, name: str) -> str:
     """A function that prints the fields of one frame type: which they are, and in which arrays,
     comes from the schema of lidarspec.
     """
-    table = codec(sensor.frames[name]).schema
+    table = get_codec(sensor.frames[name]).schema
     prefix = f"{_word(make_prefix(sensor))}_{name}"
     text = export_of(sensor.id)
     lines = [

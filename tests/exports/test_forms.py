@@ -21,7 +21,7 @@ import lidarspec as ls
 from lidarspec import Sensor
 from lidarspec.exports import EXPORTS, ExportError, UnknownExport, export, select_frame
 from lidarspec.exports.diagram import BIT_WIDTH, LEFT_MARGIN, ROW_BITS
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.spec import Command, Frame
 from tests.broken import sound
 from tests.cli.running import ran
@@ -120,7 +120,7 @@ def assert_diagram_is_complete(sensor: Sensor) -> None:
     root = ElementTree.fromstring(export(sensor, "svg"))
     says = {title.text or "" for title in root.iter("{http://www.w3.org/2000/svg}title")}
     for frame in sensor.frames.values():
-        for path in schema(frame.tree).fields:
+        for path in make_schema(frame.tree).fields:
             assert any(said.split("; ")[0] == path for said in says), path
     boxes = [
         box
@@ -166,7 +166,7 @@ def assert_page_is_complete(sensor: Sensor) -> None:
     text = export(sensor, "md")
     for frame, value in sensor.frames.items():
         assert f"## `{frame}`: " in text
-        for field in schema(value.tree).fields.values():
+        for field in make_schema(value.tree).fields.values():
             assert re.search(rf"`(\w+(\[\w\])*\.)*{field.name}(\[\w\])*`", text), field.path
     assert all(f"| `{command}` |" in text for command in sensor.commands)
     for table in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE):
@@ -208,7 +208,7 @@ def test_stubs_are_python_that_names_every_field(name: str) -> None:
     fields = {
         field.name
         for frame in SHAPES[name].frames.values()
-        for field in schema(frame.tree).fields.values()
+        for field in make_schema(frame.tree).fields.values()
     }
     assert fields <= names
 

@@ -29,7 +29,7 @@ import lidarspec
 from lidarspec import Sensor
 from lidarspec.exports import ExportError, export
 from lidarspec.exports.ksy import identifier, yaml
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.spec import Every, Frame, Polar, Serial
 from tests.exports import kaitai, trees
 from tests.exports.trees import distinct_sensors, find_recoded, installed_sensors
@@ -123,7 +123,7 @@ def test_a_spec_has_a_type_for_every_frame_and_an_id_for_every_field(name: str) 
     text = export(SHAPED[name], "ksy")
     for frame, value in SHAPED[name].frames.items():
         assert f"  {identifier(frame)}:\n" in text
-        for field in schema(value.tree).fields.values():
+        for field in make_schema(value.tree).fields.values():
             assert re.search(rf"\b{identifier(field.name)}\b", text), field.path
 
 

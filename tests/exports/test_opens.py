@@ -14,8 +14,8 @@ import lidarspec
 from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import CaptureStats, Datagram, StreamReader, datagram_frame
 from lidarspec.captures.records import WRITINGS
-from lidarspec.recording.recorders import FrameRecorder, recorder
-from lidarspec.transports.open_url import transport
+from lidarspec.recording.recorders import FrameRecorder, open_recorder
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
 from tests.cli.running import ran
 from tests.exports.sharks import columns, needs_tshark, tshark, written
@@ -83,7 +83,7 @@ def test_a_byte_stream_becomes_packets_of_frames_and_invalid_bytes(tmp_path: Pat
         assert b"".join(packets) == stream
         assert [packet for packet in packets if packet in frames] == frames[:3]
         assert reader.stats == CaptureStats(packets=len(packets), datagrams=len(packets))
-        opened = transport(capture)
+        opened = open_transport(capture)
         assert b"".join(chunk.data for chunk in opened.chunks()) == stream
         opened.close()
 
@@ -105,9 +105,9 @@ def test_a_long_gap_and_a_lost_line_are_kept(tmp_path: Path) -> None:
 
 def test_a_byte_stream_without_a_sensor_has_no_frames(tmp_path: Path) -> None:
     with pytest.raises(lidarspec.UsageError, match="name the sensor"):
-        recorder(tmp_path / "it.pcap", datagrams=False)
+        open_recorder(tmp_path / "it.pcap", datagrams=False)
     assert isinstance(
-        recorder(tmp_path / "it.pcap", "ldrobot-stl27l", datagrams=False), FrameRecorder
+        open_recorder(tmp_path / "it.pcap", "ldrobot-stl27l", datagrams=False), FrameRecorder
     )
 
 

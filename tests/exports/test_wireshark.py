@@ -15,7 +15,7 @@ import lidarspec
 from lidarspec import Sensor
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.exports import ExportError, export
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.testing import sensor_under_test as material
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 from tests import made_captures as made
@@ -60,7 +60,7 @@ def test_a_dissector_has_a_field_for_every_field_of_every_frame(name: str) -> No
     sensor = SHAPED[name]
     text = dissector(sensor)
     for frame, value in sensor.frames.items():
-        for path in codec(value).schema.fields:
+        for path in get_codec(value).schema.fields:
             assert f"{name.replace('-', '_')}.{frame}.{path}" in text, path
 
 
@@ -126,7 +126,7 @@ def _answer(sensor: Sensor, name: str, data: bytes) -> str:
     if name not in sensor.incoming:
         return next((other for other in sensor.incoming if _reads(sensor, other, data)), name)
     in_turn = sorted(
-        sensor.incoming, key=lambda other: -len(codec(sensor.frames[other]).prefix)
+        sensor.incoming, key=lambda other: -len(get_codec(sensor.frames[other]).prefix)
     )  # as the dissector tries them
     awaited = [
         other
@@ -163,7 +163,7 @@ def assert_shown(
     paths = [
         (name, path)
         for name in dict.fromkeys(name for name, _ in frames)
-        for path in codec(sensor.frames[name]).schema.fields
+        for path in get_codec(sensor.frames[name]).schema.fields
     ]
     wanted_names = [
         "_ws.expert.message",

@@ -15,9 +15,9 @@ from lidarspec.expressions.columns import Batch
 from lidarspec.expressions.graph import (
     Node,
     compute,
+    get_node,
+    get_only_field,
     make_sample,
-    node_of,
-    only_field,
     split_condition,
     trace,
     traverse,
@@ -32,7 +32,7 @@ PACKETS = STL27L.decode(b"".join(STL27L.example("data", seed=seed) for seed in r
 
 
 def graph_of(function: Any) -> Node:
-    node = node_of(trace(function, make_sample(PACKETS.batch(), PACKETS.table.groups[0]))[0])  # type: ignore[attr-defined]
+    node = get_node(trace(function, make_sample(PACKETS.batch(), PACKETS.table.groups[0]))[0])  # type: ignore[attr-defined]
     assert isinstance(node, Node)
     return node
 
@@ -79,13 +79,13 @@ def test_columns_and_arrays_give_equal_results() -> None:
     ],
 )
 def test_the_one_field_that_an_expression_is_made_of(function: Any, path: str | None) -> None:
-    source = only_field(graph_of(function))
+    source = get_only_field(graph_of(function))
     assert (source.path if source is not None else None) == path
 
 
 def test_combined_conditions_are_split() -> None:
     node = graph_of(lambda f: (f.start_angle < 360) & ((f.end_angle < 360) & (f.speed > 0)))
-    assert [only_field(part).path for part in split_condition(node)] == [
+    assert [get_only_field(part).path for part in split_condition(node)] == [
         "start_angle",
         "end_angle",
         "speed",

@@ -31,7 +31,7 @@ from construct import (
 
 from lidarspec import SpecError
 from lidarspec.exports import messages
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.spec import Scaled
 from lidarspec.spec.tree import Select, nodes
 from tests.by_construct import reader
@@ -127,7 +127,7 @@ def test_headers_that_mean_the_same_have_one_layout() -> None:
         ),
         max_length=100,
     )
-    engine, source = codec(ours.frames["data"]), random.Random(1)
+    engine, source = get_codec(ours.frames["data"]), random.Random(1)
     assert isinstance(engine, CompiledCodec)
     found = set[object]()
     for number in range(3000):
@@ -186,7 +186,7 @@ def test_plain_examples_use_the_number_of_a_named_constant() -> None:
 
 def test_a_constant_is_one_of_the_names() -> None:
     with pytest.raises(SpecError, match="bsuy"):
-        codec(sensor(Struct("kind" / Const("bsuy", KIND))).frames["data"])
+        get_codec(sensor(Struct("kind" / Const("bsuy", KIND))).frames["data"])
 
 
 def test_one_field_has_one_unit() -> None:

@@ -12,7 +12,7 @@ from construct import Array, BitsInteger, Bitwise, Const, Struct
 
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.framing.example_frames import make_random_header
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.spec import Frame
 from tests.shapes import SHAPES
 
@@ -27,12 +27,12 @@ def layouts() -> list[tuple[str, Layout]]:
     """A layout of each frame type of the shapes that a header alone decides, and of one with an
     array within a bit block.
     """
-    packed = codec(PACKED)
+    packed = get_codec(PACKED)
     assert isinstance(packed, CompiledCodec)
     found = [("packed", make_random_header(packed, random.Random(1))[0])]
     for sensor in SHAPES.values():
         for name, frame in sensor.frames.items():
-            engine = codec(frame)
+            engine = get_codec(frame)
             if isinstance(engine, CompiledCodec) and not engine.schema.parts:
                 layout, _ = make_random_header(engine, random.Random(f"{sensor.id} {name}"))
                 found.append((f"{sensor.id} {name}", layout))

@@ -32,7 +32,7 @@ from construct import (
 
 import lidarspec as ls
 from lidarspec import SpecError, UsageError, WireError
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.spec import Checksummed, Parts, SizeOf, Sum
 from tests.by_construct import construct_frame
 from tests.engine.against_construct import plain, sensor
@@ -248,7 +248,7 @@ def test_lengths_are_filled_in_and_round_trip(name: str) -> None:
 @pytest.mark.parametrize("name", MEASURED)
 def test_frames_are_held_to_their_lengths_as_by_construct(name: str) -> None:
     ours, source = make_sensor(name), random.Random(name)
-    codecs = codec(ours.frames["data"]), codec(construct_frame(ours.frames["data"]))
+    codecs = get_codec(ours.frames["data"]), get_codec(construct_frame(ours.frames["data"]))
     refused = 0
     for seed in range(8):
         example = ours.example("data", seed=seed)

@@ -12,7 +12,7 @@ from construct import Bytes, BytesInteger, Enum, If, Int8ul, Struct, this
 import lidarspec as ls
 from lidarspec.frames.layout import Layout
 from lidarspec.frames.wire_table import INDICES, SizeFormula, WireRow, frame_size, wire_table
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.spec import Frame
 from tests.representatives import each_sensor, each_shape, load_sensor
 from tests.shapes import SHAPES
@@ -29,7 +29,7 @@ def evaluate_formula(formula: str, names: dict[str, object]) -> int:
 def test_offsets_are_those_of_the_layout(name: str) -> None:
     sensor = load_sensor(name)
     for frame in sensor.frames:
-        engine = codec(sensor.frames[frame])
+        engine = get_codec(sensor.frames[frame])
         if isinstance(engine, CompiledCodec):
             assert_offsets_are_those_of_the_layout(sensor, frame, engine)
 
@@ -68,7 +68,7 @@ def assert_offsets_are_those_of_the_layout(
 @each_sensor
 def test_every_field_has_a_row(name: str) -> None:
     for frame in load_sensor(name).frames.values():
-        engine = codec(frame)
+        engine = get_codec(frame)
         if not isinstance(engine, CompiledCodec):
             continue
         rows = {

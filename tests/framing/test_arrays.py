@@ -21,7 +21,7 @@ from lidarspec import Counters
 from lidarspec.expressions.columns import Batch
 from lidarspec.frames.arrays import repeat
 from lidarspec.frames.frame_table import CompiledTable
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.framing.results import Frames
 from lidarspec.packets.clocks import Unwrapper, clock_ns
 from lidarspec.packets.packets import join_packets
@@ -160,10 +160,10 @@ def test_a_clock_can_be_a_function(spread: int) -> None:
     assert callable(sensor.clock.source)
     random = np.random.default_rng(spread)
     rows = np.tile(np.frombuffer(sensor.example("data"), np.uint8), (400, 1))
-    start, _ = codec(sensor.frames["data"]).tree.layout(rows[0].tobytes()).places["utc"]
+    start, _ = get_codec(sensor.frames["data"]).tree.layout(rows[0].tobytes()).places["utc"]
     dates = random.integers(1, 60, (spread, 6), np.uint8)
     rows[:, start : start + 6] = dates[np.sort(random.integers(0, spread, len(rows)))]
-    table = codec(sensor.frames["data"]).table([row.tobytes() for row in rows])
+    table = get_codec(sensor.frames["data"]).table([row.tobytes() for row in rows])
     for some in (np.arange(400), np.arange(1), np.arange(150, 250)):
         batch = Batch(table.take(some), np.zeros(len(some), np.bool_))
         seconds = [

@@ -15,7 +15,7 @@ from construct import Array, Byte, Const, Int8ub, Int16ub, Struct, this
 import lidarspec as ls
 import lidarspec.spec
 from lidarspec import Sensor, UsageError
-from lidarspec.framing.frame_engine import CompiledCodec, codec
+from lidarspec.framing.frame_engine import CompiledCodec, get_codec
 from lidarspec.spec import Checksummed, Frame, Sum, tree
 from lidarspec.testing.sensor_under_test import SensorUnderTest, mutate
 from tests.agreement import assert_backends_agree
@@ -106,7 +106,7 @@ def test_a_new_header_is_gone_through_once(monkeypatch: pytest.MonkeyPatch) -> N
         *(f"n{i}" / Int8ub for i in range(4)),
     )
     frame = counts + Struct(*(f"a{i}" / Array(getattr(this, f"n{i}"), Byte) for i in range(4)))
-    engine = codec(Frame(frame, max_length=2000))
+    engine = get_codec(Frame(frame, max_length=2000))
     assert isinstance(engine, CompiledCodec)
     asked.clear()
     assert (

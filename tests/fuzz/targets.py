@@ -28,7 +28,7 @@ from lidarspec.captures.bulk import CaptureBatches
 from lidarspec.captures.pcap import CaptureReader, StreamReader
 from lidarspec.device.named_devices import FILE as SETTINGS, read_devices
 from lidarspec.frames.layout import Layout
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.recording.format import (
     DATAGRAM,
     EVENT,
@@ -209,7 +209,7 @@ def _frame(sensor: Sensor, name: str) -> Target:
 
     @functools.lru_cache(maxsize=256)
     def layout(data: bytes) -> Layout | None:
-        tree = getattr(codec(sensor.frames[name]), "tree", None)
+        tree = getattr(get_codec(sensor.frames[name]), "tree", None)
         found = tree.layout(data) if tree is not None else None
         return found if isinstance(found, Layout) and found.size <= len(data) else None
 

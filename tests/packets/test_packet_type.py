@@ -8,7 +8,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import UnknownFrame
-from lidarspec.packets.packet_type import packet_type
+from lidarspec.packets.packet_type import get_packet_type
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ def test_a_counter_comes_before_the_clock_of_datagrams(
     name: str, *, is_counted: bool, is_ordered_by_clock: bool
 ) -> None:
     sensor = ls.sensor(name)
-    found = packet_type(sensor, sensor.data_frame)
+    found = get_packet_type(sensor, sensor.data_frame)
     assert (found.is_counted, found.is_ordered_by_clock) == (is_counted, is_ordered_by_clock)
     assert found.clock is sensor.clock
     assert found.timed_sensor is sensor
@@ -31,8 +31,8 @@ def test_a_counter_comes_before_the_clock_of_datagrams(
 
 def test_a_type_is_worked_out_once_and_pickled_by_its_name() -> None:
     sensor = ls.sensor("velodyne-vlp16")
-    found = packet_type(sensor, "data")
-    assert packet_type(sensor, "data") is found
+    found = get_packet_type(sensor, "data")
+    assert get_packet_type(sensor, "data") is found
     again = pickle.loads(pickle.dumps(found))
     assert (again.sensor.id, again.frame) == (sensor.id, "data")
     assert "position" in again.others
@@ -40,4 +40,4 @@ def test_a_type_is_worked_out_once_and_pickled_by_its_name() -> None:
 
 def test_an_unknown_type_is_an_error() -> None:
     with pytest.raises(UnknownFrame, match="nothing"):
-        packet_type(ls.sensor("velodyne-vlp16"), "nothing")
+        get_packet_type(ls.sensor("velodyne-vlp16"), "nothing")

@@ -11,7 +11,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.expressions.columns import Fields
-from lidarspec.frames.schema import schema
+from lidarspec.frames.schema import make_schema
 from lidarspec.spec import Frame
 from tests.installed import sensor_modules, sensors_in
 
@@ -52,7 +52,7 @@ def test_device_information_is_a_field_of_an_incoming_frame(module: str) -> None
         for role, path in sensor.info.items():
             name, _, field = path.partition(".")
             assert name in sensor.incoming, f"{sensor.id} {role}: {path}"
-            assert field in schema(sensor.frames[name].tree).scan_names, (
+            assert field in make_schema(sensor.frames[name].tree).scan_names, (
                 f"{sensor.id} {role}: {path}"
             )
 

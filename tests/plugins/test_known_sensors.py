@@ -23,7 +23,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.entry_points import EntryPoint
 from lidarspec.known_sensors import KnownSensor, install_command, known_sensors
-from lidarspec.plugins import Registry, registry, summarize
+from lidarspec.plugins import Registry, make_row, registry
 from tests.made_captures import ethernet, ipv4, pcap
 from tools.make_known_sensors import TABLE, table
 
@@ -117,7 +117,7 @@ def test_every_installed_sensor_is_listed_as_it_is() -> None:
     listed = {row.id: row._replace(signatures=()) for row in registry().list_sensors()}
     homes = {name: plugin for plugin in registry().plugins for name in plugin.sensors}
     assert listed == {
-        name: summarize(sensor, homes[name].distribution, homes[name].version)
+        name: make_row(sensor, homes[name].distribution, homes[name].version)
         for name, sensor in ls.sensors().items()
     }
 

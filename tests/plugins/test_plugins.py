@@ -14,7 +14,7 @@ import lidarspec
 from lidarspec import SourceError, SpecError, UsageError
 from lidarspec.entry_points import GROUP, SENSORS, entry_points
 from lidarspec.errors import UnknownSensor
-from lidarspec.plugins import Registry, file_module, use_registry
+from lidarspec.plugins import Registry, import_file, use_registry
 from lidarspec.testing import SensorConformance
 from tests.plugins.test_installed import distribution
 
@@ -172,7 +172,7 @@ def test_a_file_may_have_dataclasses_with_annotations_that_are_texts(tmp_path: P
     file.write_text(text + own, encoding="utf-8")
     assert "from __future__ import annotations" in text
     assert lidarspec.sensor(str(file)).frames
-    module = file_module(file)
+    module = import_file(file)
     assert pickle.loads(pickle.dumps(module.Laser(2.0))) == module.Laser(2.0)
     broken.write_text("1 / 0", encoding="utf-8")
     before = set(sys.modules)

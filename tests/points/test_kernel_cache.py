@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from lidarspec.points.numba_kernels import cache
-from lidarspec.points.numba_kernels.kernels import _module_name, compiled_before, function_of
+from lidarspec.points.numba_kernels.kernels import _module_name, compile_source, compiled_before
 from lidarspec.points.numba_kernels.source import HEAD
 from tests.points.backends import COMPILED
 
@@ -43,14 +43,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def _forget() -> None:
-    function_of.cache_clear()
+    compile_source.cache_clear()
     sys.modules.pop(_module_name(SOURCE), None)
 
 
 def _is_read() -> bool:
     """Whether the kernel, as in a new process, comes out of the folder; right it is in any case."""
     _forget()
-    kernel = function_of(SOURCE)
+    kernel = compile_source(SOURCE)
     assert kernel(41) == 42
     return bool(kernel.stats.cache_hits)
 

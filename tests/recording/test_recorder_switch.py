@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from lidarspec.recording.recorder_switch import RecordingSwitch
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
 
 FLAT = "ldrobot-stl27l"
@@ -19,7 +19,7 @@ def open_switch(folder: Path) -> RecordingSwitch:
     """Return a switch that records a simulated sensor."""
     switch = RecordingSwitch(f"sim:{FLAT}", folder)
     switch.sensor_id = FLAT
-    with contextlib.closing(transport(f"sim:{FLAT}")) as opened:
+    with contextlib.closing(open_transport(f"sim:{FLAT}")) as opened:
         switch.attach(opened)
     return switch
 

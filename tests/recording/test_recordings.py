@@ -36,7 +36,7 @@ from lidarspec.recording.format import (
 )
 from lidarspec.recording.recorders import Recorder
 from lidarspec.spec import Chunk
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from tests.evidence import capture
 from tests.lines import until
 
@@ -505,7 +505,7 @@ def test_recorded_commands_are_not_decoded(path: Path) -> None:
 
 def test_recorded_datagrams_decode_as_the_capture_does(path: Path) -> None:
     source = capture(HDL32E)
-    with contextlib.closing(transport(source)) as opened:
+    with contextlib.closing(open_transport(source)) as opened:
         chunks = list(opened.chunks())
     record(path, chunks, sensor=DATAGRAMS)
     with ls.open(source, DATAGRAMS) as one, ls.open(path) as other:
@@ -599,7 +599,7 @@ def test_an_invalid_event_is_damage_of_the_recording(path: Path) -> None:
     record(path, CHUNKS[:2])
     with path.open("ab") as file:
         file.write(b"".join(pack_record(3, event) for event in NO_EVENTS))
-    with contextlib.closing(transport(path)) as opened:
+    with contextlib.closing(open_transport(path)) as opened:
         assert len(list(opened.chunks())) == 2
     assert opened.warnings == [
         f"{path}: {len(NO_EVENTS)} events were passed over, which have no name"

@@ -18,11 +18,11 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
-from lidarspec.recording.recorders import Recorder, recorder
+from lidarspec.recording.recorders import Recorder, open_recorder
 from lidarspec.spec import Chunk, Disconnected
 from lidarspec.transports import outlets
-from lidarspec.transports.destinations import replay_outlet
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.destinations import make_replay_outlet
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.outlets import Outlet, PtyLine, TcpLine, UdpLine
 from lidarspec.transports.replays import Deadlines, Replay, iter_paced
 from tests.lines import TIMEOUT_S, until, working
@@ -76,7 +76,7 @@ def playing(
             target.await_listener()
             if began is not None:
                 began.append(time.monotonic())
-            with contextlib.closing(transport(path)) as source:
+            with contextlib.closing(open_transport(path)) as source:
                 for chunk, _ in iter_paced(source.chunks(), speed=speed):
                     target.deliver(chunk)
         except BaseException as error:
@@ -95,7 +95,7 @@ def playing(
 
 
 def content(path: Path) -> bytes:
-    with contextlib.closing(transport(path)) as source:
+    with contextlib.closing(open_transport(path)) as source:
         return b"".join(chunk.data for chunk in source.chunks())
 
 
@@ -148,7 +148,7 @@ def test_replayed_datagrams_are_unchanged_at_every_speed(
         with playing(datagrams, target, speed=speed) as failed:
             received = [receiver.recv(65536) for _ in range(100)]
     assert not failed
-    with contextlib.closing(transport(datagrams)) as source:
+    with contextlib.closing(open_transport(datagrams)) as source:
         sent = [chunk.data for chunk in source.chunks()]
     assert received == sent
     sensor = ls.sensor(DATAGRAMS)
@@ -160,11 +160,11 @@ def test_into_a_file_datagrams_keep_their_times_and_addresses(
     datagrams: Path, tmp_path: Path, suffix: str
 ) -> None:
     copy = tmp_path / f"copy{suffix}"
-    with contextlib.closing(recorder(copy, DATAGRAMS, datagrams=True)) as log:
+    with contextlib.closing(open_recorder(copy, DATAGRAMS, datagrams=True)) as log:
         assert not any(Replay(str(datagrams), log, speed=None).run())
     with (
-        contextlib.closing(transport(datagrams)) as before,
-        contextlib.closing(transport(copy)) as after,
+        contextlib.closing(open_transport(datagrams)) as before,
+        contextlib.closing(open_transport(copy)) as after,
     ):
         assert list(after.chunks()) == list(before.chunks())
     with ls.open(datagrams) as one, ls.open(copy, DATAGRAMS) as other:
@@ -315,7 +315,7 @@ def test_impossible_destinations_give_a_reason(
     place: str, *, holds_datagrams: bool, reason: str
 ) -> None:
     with pytest.raises(UsageError, match=reason):
-        replay_outlet(place, datagrams=holds_datagrams)
+        make_replay_outlet(place, datagrams=holds_datagrams)
 
 
 def test_an_address_in_use_is_reported() -> None:

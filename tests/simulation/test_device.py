@@ -16,7 +16,7 @@ import lidarspec as ls
 from lidarspec import Sensor, UsageError
 from lidarspec.errors import OutOfRange
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.simulation.faults import Faults, FaultyLink, faults_of
+from lidarspec.simulation.faults import Faults, FaultyLink, parse_faults
 from lidarspec.simulation.simulator import RestingImu
 from lidarspec.spec import Command, Frame, Scaled
 from lidarspec.spec.fields import duration
@@ -351,7 +351,7 @@ def test_a_start_begins_anew() -> None:
 )
 def test_faults_that_cannot_be_are_refused(options: dict[str, str], error: type[Exception]) -> None:
     with pytest.raises(error):
-        faults_of(options)
+        parse_faults(options)
 
 
 def test_faults_by_text() -> None:
@@ -362,7 +362,7 @@ def test_faults_by_text() -> None:
         "unplug": "30s",
         "absent": "500ms",
     }
-    assert faults_of(asked_for) == Faults(0.01, 0.02, 4, 30.0, 0.5)
+    assert parse_faults(asked_for) == Faults(0.01, 0.02, 4, 30.0, 0.5)
     assert (duration("2min"), duration("1.5h"), duration("7"), duration("20us")) == (
         120,
         5400,

@@ -28,7 +28,7 @@ from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Room, read_scene
 from lidarspec.spec import Command, Simulation, Udp
 from lidarspec.testing.fixtures import virtual_port
-from lidarspec.transports.destinations import simulated_outlet
+from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.serving import FairLock, Served
 from lidarspec.transports.simulated_files import write_file
 from lidarspec.view.terminal_screen import Keyboard
@@ -202,11 +202,11 @@ def test_a_link_replaces_no_other_file(tmp_path: Path) -> None:
     taken = tmp_path / "notes"
     taken.write_text("mine")
     with pytest.raises(SourceError, match="File exists"):
-        simulated_outlet(stl(), "pty", taken)
+        make_simulated_outlet(stl(), "pty", taken)
     assert taken.read_text() == "mine"
     stale = tmp_path / "ttyOLD"
     stale.symlink_to("/dev/pts/does-not-exist")
-    simulated_outlet(stl(), "pty", stale).close()
+    make_simulated_outlet(stl(), "pty", stale).close()
     assert not stale.is_symlink()
 
 
@@ -250,7 +250,7 @@ def test_a_slow_tcp_client_does_not_delay_others() -> None:
             assert scans(device, 2)
             assert scans(other, 2)
         with pytest.raises(SourceError, match="in use"):
-            simulated_outlet(stl(), port.path)
+            make_simulated_outlet(stl(), port.path)
         port.unplug()
         with pytest.raises(SourceError):
             ls.open(port.path, stl())
@@ -339,13 +339,13 @@ def test_a_destination_that_cannot_carry_the_sensor_is_refused(tmp_path: Path) -
         (vlp(), "udp://127.0.0.1:99999", "a port is a number"),
     ):
         with pytest.raises(UsageError, match=said):
-            simulated_outlet(sensor, place)
+            make_simulated_outlet(sensor, place)
     with pytest.raises(UsageError, match="goes with pty alone"):
-        simulated_outlet(vlp(), "udp://", tmp_path / "link")
+        make_simulated_outlet(vlp(), "udp://", tmp_path / "link")
     with pytest.raises(UnknownFormat):
         write_file(SimulatedDevice(stl()), tmp_path / "made.csv", 1)
     with pytest.raises(SourceError):
-        simulated_outlet(vlp(), "udp://no-such-host.invalid")
+        make_simulated_outlet(vlp(), "udp://no-such-host.invalid")
 
 
 @posix
@@ -357,7 +357,7 @@ def test_an_exception_of_the_serving_thread_is_raised_at_the_end() -> None:
             tried.set()
             raise ZeroDivisionError
 
-    port = Served(Broken(stl(), faults=Faults()), simulated_outlet(stl(), "pty"))
+    port = Served(Broken(stl(), faults=Faults()), make_simulated_outlet(stl(), "pty"))
     assert tried.wait(TIMEOUT_S)
     with pytest.raises(ZeroDivisionError):
         port.close()
@@ -404,7 +404,7 @@ def test_keys_come_over_any_descriptor() -> None:
 @posix
 def test_many_simulators_take_turns_and_end() -> None:
     """Of as many in one process as it can hardly keep up with, each sends, and all end."""
-    ports = [Served(SimulatedDevice(stl()), simulated_outlet(stl(), "pty")) for _ in range(12)]
+    ports = [Served(SimulatedDevice(stl()), make_simulated_outlet(stl(), "pty")) for _ in range(12)]
     until(lambda: all(port.device.sent["data"] for port in ports))
 
     def end() -> None:

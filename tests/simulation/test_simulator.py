@@ -15,7 +15,7 @@ import lidarspec as ls
 from lidarspec import Sensor, SourceError, SpecError, UsageError, simulate
 from lidarspec.errors import PluginError
 from lidarspec.simulation.device import SECOND, SimulatedDevice
-from lidarspec.simulation.scenes import Box, Mover, Room, make_room, read_scene, scene_of
+from lidarspec.simulation.scenes import Box, Mover, Room, make_room, parse_scene, read_scene
 from lidarspec.simulation.simulator import frame_simulation
 from lidarspec.spec import Cartesian, Frame, Polar, Scaled, Serial, Simulation, Udp, stack
 from lidarspec.testing.geometry import distance_outside
@@ -415,7 +415,7 @@ def test_a_scene_can_be_a_small_file(tmp_path: Path) -> None:
     assert read_scene(path) == Room(
         Room().walls, (Box((2.0, 0.8, -1.2), (2.7, 1.6, 0.9)),), (walker,)
     )
-    assert scene_of({}) == Room(None, ())
+    assert parse_scene({}) == Room(None, ())
 
 
 @pytest.mark.parametrize(

@@ -163,7 +163,7 @@ EVERY = (
         "P22",
         "files from others run no code",
         (
-            "tests/device/test_settings.py",
+            "tests/device/test_named_devices.py",
             RECORDINGS,
             "tests/points/test_kernel_cache.py",
             "tests/plugins/test_installed.py",

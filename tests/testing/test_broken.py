@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarspec.testing.check import reports, target
+from lidarspec.testing.check import find_target, reports
 from lidarspec.testing.findings import Finding
 
 HERE = Path(__file__).resolve().parents[1] / "broken"
@@ -142,7 +142,7 @@ def check_module(name: str) -> list[Finding]:
     file = HERE / f"{name}.py"
     return [
         finding
-        for report in reports(target(file), str(file), examples=4)
+        for report in reports(find_target(file), str(file), examples=4)
         for finding in report.findings
     ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import lidarspec as ls
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from lidarspec.testing import assert_conformance
 from tests.installed import CONFORMANCE_EXAMPLES
 from tests.shapes import SHAPES
@@ -43,7 +43,7 @@ def _list_plain_frames(sensors: dict[str, ls.Sensor]) -> set[str]:
         f"{sensor_id} {name}"
         for sensor_id, sensor in sensors.items()
         for name, frame in sensor.frames.items()
-        if not codec(frame).is_compiled
+        if not get_codec(frame).is_compiled
     }
 
 

@@ -17,7 +17,7 @@ import lidarspec as ls
 from lidarspec.errors import WireError
 from lidarspec.transports import hex_text
 from lidarspec.transports.hex_text import HexText, parse_hex
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from tests.cli.running import ran
 
 
@@ -39,7 +39,7 @@ from tests.cli.running import ran
 def test_bytes_are_read_as_people_print_them(text: str, tmp_path: Path) -> None:
     assert parse_hex(text) == b"\x8b\x13\x5a"
     (tmp_path / "a.hex").write_text(text, encoding="ascii")
-    with contextlib.closing(transport(tmp_path / "a.hex")) as opened:
+    with contextlib.closing(open_transport(tmp_path / "a.hex")) as opened:
         assert b"".join(chunk.data for chunk in opened.chunks()) == b"\x8b\x13\x5a"
 
 
@@ -55,7 +55,7 @@ def test_a_line_without_end_is_read_in_pieces(
     (tmp_path / "a.hex").write_text(
         f"0000: {line}# {line}\n{line}\n{line[: block // len(form) * len(form)]}", encoding="ascii"
     )
-    with contextlib.closing(transport(tmp_path / "a.hex")) as opened:
+    with contextlib.closing(open_transport(tmp_path / "a.hex")) as opened:
         found = [chunk.data for chunk in opened.chunks()]
     assert b"".join(found) == parse_hex(line) * 2 + parse_hex(form) * (block // len(form))
     assert max(map(len, found)) <= block
@@ -170,13 +170,13 @@ def test_tables_of_logic_analysers_are_read_with_their_times(table: str, tmp_pat
         (tmp_path / name).write_bytes(
             gzip.compress(table.encode()) if name.endswith("gz") else table.encode()
         )
-        with contextlib.closing(transport(tmp_path / name)) as opened:
+        with contextlib.closing(open_transport(tmp_path / name)) as opened:
             assert [(chunk.data, chunk.at) for chunk in opened.chunks() if chunk.data] == [
                 (b"\x54", 12500),
                 (b"\x2c", 1_500_000_000),
             ]
     (tmp_path / "raw.log").write_bytes(b"\x54\x2c\xff")
-    with contextlib.closing(transport(tmp_path / "raw.log")) as opened:
+    with contextlib.closing(open_transport(tmp_path / "raw.log")) as opened:
         assert [chunk.data for chunk in opened.chunks()] == [b"\x54\x2c\xff"]
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec.plugins import Registry, hookimpl, use_registry
-from lidarspec.transports.open_url import live, transport
+from lidarspec.transports.open_url import open_live, open_transport
 from lidarspec.transports.protocol import Chunk, Transport
 
 
@@ -39,7 +39,7 @@ def registry() -> Iterator[None]:
 
 
 def test_a_minimal_transport_of_a_plugin_has_defaults() -> None:
-    opened = transport("once:")
+    opened = open_transport("once:")
     assert [chunk.data for chunk in opened.chunks()] == [b"once"]
     assert (opened.datagrams, opened.baud, list(opened.warnings), opened.foreign) == (
         False,
@@ -48,17 +48,17 @@ def test_a_minimal_transport_of_a_plugin_has_defaults() -> None:
         0,
     )
     with pytest.raises(ls.UsageError, match="is a file"):
-        live("once:")
+        open_live("once:")
 
 
 def test_anything_else_is_the_fault_of_the_plugin() -> None:
     with pytest.raises(ls.SpecError, match="has to derive from Transport"):
-        transport("other:")
+        open_transport("other:")
     with pytest.raises(ls.UsageError, match="no transport is installed"):
-        transport("unknown:")
+        open_transport("unknown:")
 
 
 @pytest.mark.parametrize("name", ["a" * 5000, "udp:/" + "a" * 5000, "a" * 5000 + "?src=x", "a\0b"])
 def test_a_name_that_no_file_can_have_is_no_file(name: str) -> None:
     with pytest.raises((ls.SourceError, ls.UsageError)):
-        transport(name)
+        open_transport(name)

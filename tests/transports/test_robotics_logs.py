@@ -17,7 +17,7 @@ from lidarspec.captures.ip import ETHERNET
 from lidarspec.captures.pcap import Datagram, datagram_record
 from lidarspec.captures.records import capture_head
 from lidarspec.formats import write
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.protocol import Chunk
 from tests.cli.running import ran
 
@@ -154,7 +154,7 @@ def header(store: Any, at: int) -> Any:
 
 
 def read(source: Path | str) -> list[Chunk]:
-    with contextlib.closing(transport(source)) as opened:
+    with contextlib.closing(open_transport(source)) as opened:
         assert opened.datagrams
         return list(opened.chunks())
 
@@ -211,7 +211,7 @@ def test_packets_of_several_sensors_are_chosen_by_namespace_or_topic(tmp_path: P
     assert f"{path}?src=/front" in said
     for asked in ("/rear", "/rear/packets"):
         assert [chunk.data for chunk in read(f"{path}?src={asked}")] == other
-    with contextlib.closing(transport(f"{path}?src=/left")) as opened:
+    with contextlib.closing(open_transport(f"{path}?src=/left")) as opened:
         assert list(opened.chunks()) == []
         assert opened.warnings == [
             f"{path} is an MCAP file, as ROS 2 bags are without packets of /left:"

@@ -11,7 +11,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec import Disconnected
-from lidarspec.transports.open_url import is_port, transport
+from lidarspec.transports.open_url import is_port, open_transport
 from lidarspec.transports.serial import SerialTransport
 from tests.lines import Port, port, until
 from tests.shapes import SHAPES
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are
 
 
 def open_port(source: str, sensor: ls.Sensor | None = None) -> SerialTransport:
-    made = transport(source, sensor)
+    made = open_transport(source, sensor)
     assert isinstance(made, SerialTransport)
     return made
 
@@ -81,7 +81,7 @@ def test_a_port_that_cannot_be_opened_gives_a_reason(
     source: str, error: type[Exception], text: str, following: str
 ) -> None:
     with pytest.raises(error, match=text) as caught:
-        transport(source)
+        open_transport(source)
     assert not following or caught.value.__notes__ == [f"next: {following}"]
 
 
@@ -89,7 +89,7 @@ def test_a_port_is_for_one_program(tmp_path: Path) -> None:
     with port(tmp_path) as line:
         one = open_port(f"serial://{line.name}?baud=9600")
         with pytest.raises(SourceError, match="in use by another program"):
-            transport(f"serial://{line.name}?baud=9600")
+            open_transport(f"serial://{line.name}?baud=9600")
         one.close()
         open_port(f"serial://{line.name}?baud=9600").close()
 
@@ -99,7 +99,7 @@ def test_a_port_without_permission(tmp_path: Path) -> None:
     with port(tmp_path) as line:
         os.chmod(line.name, 0)
         with pytest.raises(SourceError, match="permission denied"):
-            transport(f"serial://{line.name}?baud=9600")
+            open_transport(f"serial://{line.name}?baud=9600")
 
 
 def test_a_hang_up_is_a_disconnection_and_the_port_can_be_opened_again(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_no_descriptor_is_left_behind(tmp_path: Path) -> None:
         for _ in range(20):
             open_port(f"serial://{line.name}?baud=9600").close()
             with pytest.raises(SourceError):
-                transport("/dev/ttyNONE9?baud=9600")
+                open_transport("/dev/ttyNONE9?baud=9600")
         assert len(os.listdir("/dev/fd")) == before
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec import Disconnected
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.tcp import TcpTransport
 from tests.lines import until
 
@@ -22,7 +22,7 @@ def server() -> Iterator[socket.socket]:
 
 def test_a_stream_is_read_written_and_connected_again(server: socket.socket) -> None:
     port = server.getsockname()[1]
-    one = transport(f"tcp://127.0.0.1:{port}")
+    one = open_transport(f"tcp://127.0.0.1:{port}")
     assert isinstance(one, TcpTransport)
     assert one.peer() == "127.0.0.1"
     peer = server.accept()[0]
@@ -61,7 +61,7 @@ def test_a_failed_connection_gives_a_reason(
     port = server.getsockname()[1]
     server.close()
     with pytest.raises(error, match=text) as caught:
-        transport(source.format(free=port))
+        open_transport(source.format(free=port))
     assert error is UsageError or caught.value.__notes__[0].startswith(
         "next: lidarspec doctor tcp://"
     )

@@ -13,7 +13,7 @@ from lidarspec.errors import SourceError, UsageError
 from lidarspec.spec import Chunk
 from lidarspec.transports.addresses import parse_origin
 from lidarspec.transports.host_clock import HostClock
-from lidarspec.transports.open_url import transport
+from lidarspec.transports.open_url import open_transport
 from lidarspec.transports.outlets import UdpLine
 from lidarspec.transports.protocol import Origin, endpoint
 from lidarspec.transports.udp import (
@@ -30,7 +30,7 @@ LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
 
 
 def open_socket(source: str, sensor: ls.Sensor | None = None) -> UdpTransport:
-    made = transport(source, sensor)
+    made = open_transport(source, sensor)
     assert isinstance(made, UdpTransport)
     return made
 
@@ -291,7 +291,7 @@ def test_a_port_that_cannot_be_opened_gives_a_reason(
     with udp() as busy:
         names = {"busy": busy.getsockname()[1], "free": free_port()}
         with pytest.raises(error, match=text.format(**names)) as caught:
-            transport(source.format(**names))
+            open_transport(source.format(**names))
     assert not following or caught.value.__notes__ == [f"next: {following.format(**names)}"]
 
 

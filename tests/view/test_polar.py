@@ -23,7 +23,7 @@ from lidarspec.points.appearance import (
     round_up,
 )
 from lidarspec.view.canvas import BLANK, FIRST_STEP
-from lidarspec.view.polar import picture
+from lidarspec.view.polar import draw_cloud
 
 DOTS = {
     0x01: (0, 0),
@@ -53,7 +53,7 @@ def cloud(*xyz: tuple[float, float, float], intensity: Iterable[float] | None = 
 def draw_lines(
     points: PointCloud, look: CloudAppearance = FLAT, width: int = 60, height: int = 30
 ) -> list[str]:
-    return picture(points, width=width, height=height, look=look).lines()
+    return draw_cloud(points, width=width, height=height, look=look).lines()
 
 
 def dots(lines: Iterable[str]) -> set[tuple[int, int]]:
@@ -184,7 +184,7 @@ def test_a_fitted_picture_shows_the_sensor_if_that_costs_little() -> None:
 def test_colours_go_from_near_to_far_and_from_weak_to_strong() -> None:
     points = cloud((0.1, 0.1, 0), (3.4, 3.4, 0), intensity=(200, 1))
     for ramp, last in (("range", [0, STEPS - 1]), ("intensity", [STEPS - 1, 0])):
-        inks = picture(
+        inks = draw_cloud(
             points,
             width=60,
             height=30,

@@ -15,6 +15,6 @@ package. Numba is imported with the first kernel that runs. Modules in reading o
 from __future__ import annotations
 
 from lidarspec.points.numba_kernels.checksums import compile_sums as compiled_sums
-from lidarspec.points.numba_kernels.kernels import is_available, kernel_of as compile
+from lidarspec.points.numba_kernels.kernels import get_kernel as compile, is_available
 
 __all__ = ["compile", "compiled_sums", "is_available"]

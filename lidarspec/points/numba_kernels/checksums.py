@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarspec.frames.layout import Bytes2D, Seal, Sums
 from lidarspec.frames.row_checksums import compute_checksums, finalize, make_place_tables
-from lidarspec.points.numba_kernels.kernels import function_of, require
+from lidarspec.points.numba_kernels.kernels import compile_source, import_numba
 from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
 
@@ -114,7 +114,7 @@ def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) ->
     found = np.empty(len(rows), np.int64)
     edges = np.array(spans, np.int64).reshape(-1)
     start = int(np.uint64(algorithm.start).astype(np.int64))
-    function_of(_ALONG)(
+    compile_source(_ALONG)(
         rows.reshape(-1), rows.shape[1], edges, table.astype(np.uint64).view(np.int64), start, found
     )
     return finalize(algorithm, found.view(np.uint64).astype(table.dtype))
@@ -178,11 +178,11 @@ class _ByteShares:
         checksums = np.empty(len(rows), np.int64)
         flat = rows.reshape(-1)
         if self.is_plain:
-            function_of(_XORED)(
+            compile_source(_XORED)(
                 flat, rows.shape[1], self.words, self.lows, self.highs, self.start, checksums
             )
         else:
-            function_of(_SHARES)(
+            compile_source(_SHARES)(
                 flat, rows.shape[1], self.words, self.tables, self.start, checksums
             )
         return checksums.view(np.uint64)
@@ -226,5 +226,5 @@ def compile_sums() -> Sums:
     Raises:
         UsageError: where Numba is not installed, or does not work here.
     """
-    require()
+    import_numba()
     return checksums

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from lidarspec._version import __version__
 from lidarspec.errors import UsageError
-from lidarspec.frames.layout import Bytes2D, span
+from lidarspec.frames.layout import Bytes2D, view_span
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.numba_kernels.cache import StoredKernel, is_stored
 from lidarspec.points.numba_kernels.source import KernelText, write_kernel
@@ -67,7 +67,7 @@ class Kernel(ColumnMaker):
 
     def compile(self) -> None:
         """Have the code at hand."""
-        self._function = self._function or function_of(self._text.source)
+        self._function = self._function or compile_source(self._text.source)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
         return {
@@ -88,7 +88,7 @@ class Kernel(ColumnMaker):
             *arguments,
             *(columns[name] for name in self._text.columns),
         )
-        data = span(rows)
+        data = view_span(rows)
         self._share(count, lambda first, number: self._function(data, stride, first, number, *rest))
 
     def _share(self, count: int, run: Callable[[int, int], Any]) -> None:
@@ -121,7 +121,7 @@ def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float
     ) > 1 else 0
 
 
-def kernel_of(plan: Plan, names: tuple[str, ...]) -> Kernel:
+def get_kernel(plan: Plan, names: tuple[str, ...]) -> Kernel:
     """Return the kernel for these columns.
 
     It is for this layout alone, or for all layouts if there have been several.
@@ -162,7 +162,7 @@ def is_available() -> bool:
 
 
 @functools.cache  # reading the version takes as long as decoding a hundred packets
-def require() -> None:
+def import_numba() -> None:
     """Import Numba.
 
     Raises:
@@ -192,7 +192,7 @@ def compiled_before(source: str) -> bool:
 
 
 @functools.lru_cache(maxsize=256)
-def function_of(source: str) -> Any:
+def compile_source(source: str) -> Any:
     """Return the compiled function of a kernel's source.
 
     If it cannot be kept on disk, it is compiled for this run only.

@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import (
     FACTORS,
     Node,
+    get_only_field,
     is_full,
     is_nan_where,
     last_axis,
-    only_field,
     traverse,
 )
 from lidarspec.frames.layout import Leaf
 from lidarspec.points.conventions import returned_range
-from lidarspec.points.lookup_tables import every_value, is_number, possible, window
+from lidarspec.points.lookup_tables import every_value, find_window, is_number, list_possible_values
 from lidarspec.points.numba_kernels.writer import (
     TEMPLATES,
     KernelArguments,
@@ -67,7 +67,7 @@ class Beam(NamedTuple):
     step: float
 
 
-def beam_of(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
+def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
     """Return the beam of a sum.
 
     Returns None for other sums, and if float32 does not resolve the steps of the distance.
@@ -131,7 +131,7 @@ class Expressions(KernelWriter):
         if node.kind == "field":
             return self._physical(node)
         if node.kind == "call" and not self.is_shared(node):
-            source = only_field(node)
+            source = get_only_field(node)
             if source is not None and is_full(source, self.width) and not is_cheap(node):
                 text = self.looked_up(node, source, np.float64, 1.0)
                 if text is not None:
@@ -276,7 +276,7 @@ class Expressions(KernelWriter):
         if value is not None:
             return value
         if is_full(node, self.width) and node.kind == "call" and not exact:
-            beam = beam_of(node, self.layout.leaves) if root else None
+            beam = find_beam(node, self.layout.leaves) if root else None
             along = self._along(beam) if beam is not None else None
             if along is not None:
                 return along
@@ -365,12 +365,12 @@ class Expressions(KernelWriter):
 
     def _of_field(self, node: Node, *, exact: bool) -> KernelValue | None:
         """Return an expression of one field that each point has: by a straight line or a table."""
-        source = only_field(node)
+        source = get_only_field(node)
         if source is not None and is_full(source, self.width):
             leaf = self.layout.leaves.get(source.path)
         else:
             leaf = None
-        if leaf is None or source is None or window(leaf) is None:
+        if leaf is None or source is None or find_window(leaf) is None:
             return None
         values = every_value(node, leaf)
         assert values is not None
@@ -397,7 +397,7 @@ class Expressions(KernelWriter):
             return self.constant(np.asarray(value) * factor, depth)
         if not is_full(value, self.width) or value.kind != "call" or self.is_shared(value):
             return self._scale(value, factor)
-        source = only_field(value)
+        source = get_only_field(value)
         if source is not None and not is_cheap(value):
             found = self._small_angle(value, source, factor)
             if found is not None:
@@ -436,7 +436,7 @@ class Expressions(KernelWriter):
 
     def _small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
         """Return an angle by one field: a table in float32 where that is exact enough."""
-        values = possible(node, self.layout.leaves)
+        values = list_possible_values(node, self.layout.leaves)
         if values is None:
             return None
         with np.errstate(all="ignore"):

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import FACTORS, Node, last_axis, make_key, traverse
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
-from lidarspec.points.lookup_tables import CHEAP, every_value, raw_values, window
+from lidarspec.points.lookup_tables import CHEAP, every_value, find_window, raw_values
 from lidarspec.spec.bits import whole_bytes
 
 _SIGNS = {
@@ -157,7 +157,7 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None
 
     It is equal if `exact`, else within a unit in the last place.
     """
-    field_window = window(leaf)
+    field_window = find_window(leaf)
     assert field_window is not None
     raw = raw_values(leaf, field_window).astype(np.int64)
     good = np.isfinite(values)
@@ -218,7 +218,7 @@ class KernelArguments:
     nodes: list[Node] = field(default_factory=list)
 
 
-def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
+def find_run(leaf: Leaf) -> tuple[str, int, int, int] | None:
     """Return the place of a field of unsigned contiguous bits in up to four bytes.
 
     The place is byte order, first byte, number of bytes and lowest bit. Returns None for other
@@ -240,12 +240,12 @@ def run_of(leaf: Leaf) -> tuple[str, int, int, int] | None:
     return (run[0], leaf.offset + run[1], run[2], run[3])
 
 
-def word_of(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
+def find_word(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
     """Return the 4-byte little-endian word of its element that holds a field.
 
     It is given as offset, shift and mask. Returns None if there is no such word.
     """
-    run = run_of(leaf)
+    run = find_run(leaf)
     if run is None or (run[0] == ">" and run[2] > 1) or not leaf.strides or leaf.strides[-1] % 4:
         return None
     beside = [
@@ -379,7 +379,7 @@ class KernelWriter:
         return self._known[leaf.info.path]  # type: ignore[no-any-return]
 
     def _integer(self, leaf: Leaf) -> KernelValue | None:
-        word = None if self.varying else word_of(leaf, self.layout)
+        word = None if self.varying else find_word(leaf, self.layout)
         if word is not None:
             place, shift, mask = word
             four = self._read(leaf, place, "four_at").text
@@ -454,14 +454,14 @@ class KernelWriter:
     def looked_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
         """An expression of one field from a table; None where the field has too many values."""
         leaf = self.layout.leaves.get(source.path)
-        field_window = window(leaf) if leaf is not None else None
+        field_window = find_window(leaf) if leaf is not None else None
         if leaf is None or field_window is None:
             return None
         table = self._table(node, leaf, kind, factor)
         return self.let(self.inner, f"at({self.array(table)}, {self._code(leaf)})")
 
     def _table(self, node: Node, leaf: Leaf, kind: Any, factor: float) -> NDArray[Any]:
-        field_window = window(leaf)
+        field_window = find_window(leaf)
         assert field_window is not None
         name = (
             "kernel",
@@ -480,7 +480,7 @@ class KernelWriter:
         return self._tables[name]
 
     def _code(self, leaf: Leaf) -> str:
-        field_window = window(leaf)
+        field_window = find_window(leaf)
         assert field_window is not None
         first = self.byte(leaf, field_window.offset).text
         if field_window.size == 1:

@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import (
     Node,
     Term,
+    get_only_field,
     is_full,
     last_axis,
     make_key,
-    only_field,
     split_sum,
 )
 from lidarspec.frames.arrays import add_axes
-from lidarspec.frames.layout import Leaf, elements
-from lidarspec.points.lookup_tables import CHEAP, FieldWindow, every_value, window
+from lidarspec.frames.layout import Leaf, view_elements
+from lidarspec.points.lookup_tables import CHEAP, FieldWindow, every_value, find_window
 from lidarspec.points.numpy_plan.program import TYPES, Program, ProgramRun, RegisterRead
 from lidarspec.points.plan import Plan
 from lidarspec.spec.vocabulary import row_numbers
@@ -210,13 +210,13 @@ class Compiler:
 
         Returns None if neither is possible.
         """
-        source = only_field(node)
+        source = get_only_field(node)
         if source is None or not is_full(source, self._width):
             return None
         leaf = self._layout.leaves.get(source.path)
         if leaf is None:
             return None
-        field_window = window(leaf)
+        field_window = find_window(leaf)
         is_long = field_window is None or (self._is_exact and field_window.size > 1)
         if node is source and (is_long or not leaf.info.scaled):
             return self._load_whole(leaf, kind)
@@ -290,7 +290,7 @@ class Compiler:
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             rows = execution.part(execution.rows)
-            column = elements(rows, dtype, offset, shape, leaf.strides)
+            column = view_elements(rows, dtype, offset, shape, leaf.strides)
             np.copyto(out.reshape(column.shape), column, casting="unsafe")
 
         return self.program.step(f"{leaf.info.path}: {dtype} at byte {offset}", kind, run)

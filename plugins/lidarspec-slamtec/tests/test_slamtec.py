@@ -14,7 +14,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.errors import OutOfRange
 from lidarspec.frames.row_checksums import compute_checksums
-from lidarspec.framing.frame_engine import codec
+from lidarspec.framing.frame_engine import get_codec
 from tests.evidence import assert_points, clockwise, decode, vector_bytes, vectors
 
 from .rplidar import believing
@@ -79,7 +79,7 @@ def test_a_vector_parses_and_builds(name: str, frame: str) -> None:
 
 def physical(frame: str, parsed: Any, path: str) -> Any:
     """A field of a parsed frame in its unit."""
-    info = codec(A1.frames[frame]).schema.fields[path]
+    info = get_codec(A1.frames[frame]).schema.fields[path]
     for name in path.split("."):
         parsed = parsed[name]
     return parsed * info.scale + info.offset

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarspec import Decoder, Sensor, WireError
 from lidarspec.explaining.explanation import Explanation
 from lidarspec.explaining.input_segments import InputPiece, explain_piece
-from lidarspec.framing.results import Frames, Numbers, array_of
+from lidarspec.framing.results import Frames, Numbers, to_array
 from lidarspec.scans.provenance import PointOrigin
 
 #: Maximum bytes of stored input.
@@ -305,7 +305,7 @@ class RecentBytes:
         """Yield offset and bytes of each datagram that begins in a range of offsets."""
         for one in self._inputs:
             offsets = one.offset + np.cumsum(one.sizes) - one.sizes
-            starts = array_of(one.starts)
+            starts = to_array(one.starts)
             for index in np.flatnonzero((offsets >= begin) & (offsets < end)).tolist():
                 start = int(starts[index])
                 data = one.buffer[start : start + int(one.sizes[index])]

@@ -10,7 +10,7 @@ import pytest
 import lidarspec as ls
 from lidarspec.explaining.assignments import arguments
 from lidarspec.simulation.device import SimulatedDevice
-from lidarspec.transports.destinations import simulated_outlet
+from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.serving import Served
 from tests.installed import sensor_modules, sensors_in
 
@@ -101,7 +101,7 @@ def test_a_command_without_an_answer_is_sent(tmp_path: Path) -> None:
 def test_a_real_device_takes_commands_only_with_control(tmp_path: Path) -> None:
     sensor = ls.sensor(ANSWERING)
     with Served(
-        SimulatedDevice(sensor), simulated_outlet(sensor, "tcp://127.0.0.1:0"), patient=True
+        SimulatedDevice(sensor), make_simulated_outlet(sensor, "tcp://127.0.0.1:0"), patient=True
     ) as served:
         with Station(served.path, tmp_path, ANSWERING) as station, station.page() as page:
             hello = page.until("hello")
