@@ -328,8 +328,8 @@ class TracedFields:
             return value
         if not isinstance(value, Column):
             return TracedFields(value, self._tape, path, read)
-        if without_indices(path)[0] in value.batch.table.schema.derived and not value.frame:
-            raise UntraceableError(f"{path} is computed, and has no bytes of its own")
+        if not value.frame:
+            _check_raw(value.batch.table.schema, without_indices(path)[0])
         return self._tape.add("state" if self._real._is_around else "field", read, (), value, path)
 
     def __getitem__(self, index: Any) -> TracedFields:
@@ -340,6 +340,14 @@ class TracedFields:
             f"{self._path}[{index}]",
             lambda fields: before(fields)[index],
         )
+
+
+def _check_raw(schema: Schema, path: str) -> None:
+    """Raise UntraceableError unless a field's values are numbers on the wire."""
+    if path in schema.derived:
+        raise UntraceableError(f"{path} is computed, and has no bytes of its own")
+    if schema.fields[path].adapter is not None:
+        raise UntraceableError(f"a Python function makes the values of {path}")
 
 
 def _fold(

@@ -90,6 +90,8 @@ class _Values:
         info = self._table.all_fields.get(path)
         if info is not None and info.kind == "other" and not (self._units and info.scaled):
             return value  # construct alone knows what it takes
+        if info is not None and info.adapter is not None:
+            return value  # encoded by the functions of the field
         if isinstance(value, Mapping):
             return self._mapping(value, path, shown)
         if info is not None and info.kind == "bytes" and isinstance(value, bytes | bytearray):

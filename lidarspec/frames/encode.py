@@ -9,6 +9,7 @@ like a frame, and copied into the frame around it.
 from __future__ import annotations
 
 import bisect
+import contextlib
 import functools
 import itertools
 from collections.abc import Mapping
@@ -26,6 +27,7 @@ from lidarspec.frames.parts import FOUND, LayoutLookup, PartsSize
 from lidarspec.frames.schema import Schema, counting_field, make_schema
 from lidarspec.spec.syntax import WireNaN, get_member
 from lidarspec.spec.tree import (
+    Adapter,
     Blob,
     Block,
     FieldInfo,
@@ -312,12 +314,23 @@ class _Encoder:
             return
         if info.const is not None and to_raw(info, value) != info.const:
             raise self._wrong(shown, format_hex(info.const), value)
+        if info.adapter is not None:
+            value = self._encode_adapted(info.adapter, shown, value, size)
         if info.kind == "bytes":
             column.append(self._bytes(shown, value, size))
         elif info.kind == "float":
             column.append(self._float(shown, value))
         else:
             column.append(self._integer(info, shown, value))
+
+    def _encode_adapted(self, adapter: Adapter, shown: str, value: Any, size: int) -> Any:
+        try:
+            return adapter.encode(value, size)
+        except Exception as error:  # the author's function may raise anything
+            reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+            raise UsageError(
+                f"{self._place}: {shown}: {value!r:.60} is refused: {reason}"
+            ) from None
 
     def _bytes(self, shown: str, value: Any, size: int) -> bytes:
         if isinstance(value, int) and 0 <= value < 1 << 8 * size:
@@ -334,7 +347,7 @@ class _Encoder:
         return value
 
     def _integer(self, info: FieldInfo, shown: str, value: Any) -> int:
-        raw = to_raw(info, value)
+        raw = value if info.adapter is not None else to_raw(info, value)
         if not isinstance(raw, int):
             if info.labels and isinstance(raw, str):
                 raise self._wrong(shown, f"one of {', '.join(info.labels.values())}", raw)
@@ -426,6 +439,8 @@ class _Encoder:
 
 def to_raw(info: FieldInfo, value: Any) -> Any:
     """Return the raw value of a field: the number behind a name of an Enum, else the value."""
+    if info.adapter is not None and info.kind == "int" and value is not None:
+        return info.adapter.encode(value, 0)
     if isinstance(value, str) and info.labels:
         return next((raw for raw, name in info.labels.items() if name == value), value)
     if info.kind == "int" and isinstance(value, bytes) and len(value) == info.bits // 8 == 1:
@@ -442,9 +457,15 @@ def fill_counts(given: Container, table: Schema) -> None:
     for axis, count in table.arrays.items():
         array = get_member(given, axis, None)
         path = table.counting_fields[axis]
+        adapter = table.fields[axis].adapter if axis in table.fields else None
+        if adapter is not None and array is not None:
+            with contextlib.suppress(Exception):  # refused where it is encoded
+                array = adapter.encode(array, 0)
         if not isinstance(array, list | bytes) or path is None or path in counted:
             continue
         counted.add(path)
+        if axis in table.branched and get_member(given, path, None) is not None:
+            continue  # which of its lengths applies is not known yet
         if table.fields[path].held:
             holder, name = _holder(given, path)
             holder.pop(name, None)

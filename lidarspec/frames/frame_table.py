@@ -113,31 +113,34 @@ class CompiledTable:
             leaf = group.layout.column(path)
             # The general path handles empty arrays: an array in an empty one has length 0,
             # whatever its declared length.
-            if leaf is not None and 0 not in leaf.shape:
+            if leaf is not None and 0 not in _outer_shape(leaf):
                 values = self._load(leaf, path, group)[group.stream_order]
                 return values.astype(dtype, copy=False)
         lengths = [self.length(axis) for axis in info.axes]
-        column = np.zeros((len(self), *lengths), dtype)
+        column = np.full((len(self), *lengths), None if dtype.hasobject else 0, dtype)
         for group in self.groups:
             leaf = group.layout.column(path)
-            if leaf is not None and 0 not in leaf.shape:
+            if leaf is not None and 0 not in _outer_shape(leaf):
                 values = self._load(leaf, path, group)
                 corner: Any = (group.where, *(slice(0, length) for length in values.shape[1:]))
                 column[corner] = values
         return column
 
     def _load(self, leaf: Leaf | Derivation, path: str, group: LayoutRows) -> NDArray[Any]:
-        """Return the raw values of a field in the frames of a group.
+        """Return the values of a field in the frames of a group.
 
         An index in the path removes the axis of which it selects one element.
         """
         values = group.layout.load(path, group.rows)
-        if "[" not in path:
-            return values
-        axes = self.schema.columns[without_indices(path)[0]].axes
-        lengths = zip(axes, leaf.shape, strict=False)
-        kept = [length for axis, length in lengths if axis in leaf.info.axes]
-        return values.reshape(len(values), *kept)
+        if "[" in path:
+            axes = self.schema.columns[without_indices(path)[0]].axes
+            lengths = zip(axes, leaf.shape, strict=False)
+            kept = [length for axis, length in lengths if axis in leaf.info.axes]
+            values = values.reshape(len(values), *kept)
+        adapter = leaf.info.adapter
+        if adapter is not None and adapter.has_columns:
+            return adapter.decode_column(values, is_bytes=leaf.info.kind == "bytes")
+        return values
 
     def present(self, path: str) -> NDArray[np.bool_] | None:
         if not self.schema.columns[path].optional:
@@ -632,6 +635,13 @@ def _are_numbers(found: list[Any]) -> bool:
     return any(
         np.iinfo(kind).min <= least and most <= np.iinfo(kind).max for kind in (np.int64, np.uint64)
     )
+
+
+def _outer_shape(leaf: Leaf | Derivation) -> tuple[int, ...]:
+    """Return the lengths of the arrays around a field; a text without a character is a value."""
+    if leaf.info.adapter is not None and leaf.info.kind == "bytes":
+        return leaf.shape[:-1]
+    return leaf.shape
 
 
 def _make_object_column(values: list[Any]) -> NDArray[Any]:

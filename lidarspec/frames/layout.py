@@ -555,6 +555,9 @@ class Condition:
             return np.zeros(1, np.bool_)
         if self.formula is None:
             (values,) = raw.values()
+            info = self.fields[0]
+            if info.allowed is None and info.adapter is not None:
+                return info.adapter.can_decode(values, is_bytes=info.kind == "bytes")
             return np.isin(values, np.array(self.fields[0].allowed, values.dtype))
         depth = max(array.ndim for array in raw.values())
         columns = {

@@ -432,7 +432,8 @@ class HeaderWalk:
             self.constants[self.cursor + part.byte] = (mask | part.mask, byte)
 
     def _add(self, leaf: Leaf) -> None:
-        if leaf.info.allowed is not None:
+        is_partial = leaf.info.adapter is not None and leaf.info.adapter.is_partial
+        if leaf.info.allowed is not None or is_partial:
             self.conditions[leaf.info] = Condition.of(leaf.info)
         self.leaves[leaf.info.path] = self.parts[leaf.info.path] = leaf
         if leaf.shape and len(leaf.shape) > len(leaf.strides) - (

@@ -32,6 +32,7 @@ from lidarspec.spec.description import Frame
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import WireNaN, to_seen, to_unnamed
 from lidarspec.spec.tree import (
+    Adapter,
     Blob,
     Block,
     Derived,
@@ -420,7 +421,8 @@ def _make_unpacker(offsets: Sequence[int], order: str, code: str) -> Reader:
 
 def _make_field_reader(node: Number | Blob, leaf: Leaf) -> Reader:
     if isinstance(node, Blob):
-        return _make_unpacker(leaf.offsets(len(leaf.shape) - 1), "<", f"{leaf.size}s")
+        raw_bytes = _make_unpacker(leaf.offsets(len(leaf.shape) - 1), "<", f"{leaf.size}s")
+        return _add_labels(leaf.info, raw_bytes)
     offsets = leaf.offsets()
     order = "<" if node.order == "little" else ">"
     if leaf.wire is None:
@@ -460,9 +462,15 @@ def _read_floats(
 
 
 def _add_labels(info: FieldInfo, numbers: Reader) -> Reader:
+    if info.adapter is not None:
+        return functools.partial(_apply_adapter, info.adapter, numbers)
     if info.labels:
         return functools.partial(_look_up_labels, _LabelCache(info), numbers)
     return numbers
+
+
+def _apply_adapter(adapter: Adapter, raw: Reader, frame: bytes) -> Sequence[Any]:
+    return [adapter.decode(value) for value in raw(frame)]
 
 
 class _LabelCache(dict[int, Any]):

@@ -117,14 +117,23 @@ class Schema:
     parts: Mapping[str, PartSequence] = field(default_factory=dict)
     inside: Mapping[str, FieldInfo] = field(default_factory=dict)
     derived: Mapping[str, FieldInfo] = field(default_factory=dict)
+    #: arrays whose length follows from different formulas in different branches.
+    branched: frozenset[str] = frozenset()
 
     @cached_property
     def columns(self) -> Mapping[str, FieldInfo]:
-        """The fields of the frame and the values derived from them."""
-        if not self.derived:
+        """The values of the frame, as columns have them: its fields, with their adapters applied,
+        and the values derived from them.
+        """
+        every = {**self.fields, **self.derived}
+        adapted = {
+            path: _adapt(info)
+            for path, info in every.items()
+            if info.adapter is not None and info.adapter.has_columns
+        }
+        if not self.derived and not adapted:
             return self.fields
-        element = functools.partial(_element, self.arrays)
-        return PathMapping({**self.fields, **self.derived}, element)
+        return PathMapping(every | adapted, functools.partial(_element, self.arrays))
 
     @cached_property
     def all_fields(self) -> Mapping[str, FieldInfo]:
@@ -221,6 +230,21 @@ class Schema:
         return len(self.chain)
 
 
+def _adapt(info: FieldInfo) -> FieldInfo:
+    """Return a field with the type of the values that its adapter makes."""
+    assert info.adapter is not None
+    dtype = info.adapter.dtype
+    kinds = {"i": "int", "f": "float"}
+    axes = info.axes[:-1] if info.kind == "bytes" else info.axes
+    return replace(
+        info,
+        axes=axes,
+        dtype=None if dtype.hasobject else dtype,
+        kind=kinds.get(dtype.kind, "other"),
+        bits=8 * dtype.itemsize,
+    )
+
+
 def counting_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str | None:
     """Return the path of the field that a count or length follows from; None if there is none."""
     asked = refs(formula)
@@ -248,7 +272,24 @@ def make_schema(root: Node) -> Schema:
         {axis: node for axis, node in parts.items() if not node.total.axes},
         _with_docs(inside, structs),
         derived,
+        _find_branched(root),
     )
+
+
+def _find_branched(root: Node) -> frozenset[str]:
+    """Return the arrays for which branches declare different lengths."""
+    counts: dict[str, Formula] = {}
+    found = set[str]()
+    for node in nodes(root):
+        if isinstance(node, Repeat):
+            axis, count = node.axis, node.count
+        elif isinstance(node, Blob) and node.name:
+            axis, count = node.info.axes[-1], node.size
+        else:
+            continue
+        if counts.setdefault(axis, count) != count:
+            found.add(axis)
+    return frozenset(found)
 
 
 def _with_docs(fields: dict[str, FieldInfo], structs: dict[str, str]) -> dict[str, FieldInfo]:

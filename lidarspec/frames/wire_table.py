@@ -260,7 +260,8 @@ def _type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
             return f"{node.kind}{8 * node.size}" + f" {node.order[0]}e" * (node.size > 1)
         case tree.Opaque():
             return node.form or node.kind
-    return "bytes"
+    adapter = node.info.adapter
+    return "bytes" if adapter is None else adapter.form
 
 
 def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:

@@ -161,6 +161,10 @@ def _some_value(source: random.Random, leaf: Leaf, keys: list[int]) -> int:
     return value
 
 
+#: the characters of texts in examples.
+LETTERS = b"abcdefghijklmnopqrstuvwxyz"
+
+
 def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -> NDArray[np.uint8]:
     """Return `number` rows of random bytes with allowed values.
 
@@ -173,6 +177,10 @@ def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -
     )
     frame_coder(engine.frame).make_encodable(rows, layout)
     for leaf in layout.leaves.values():
+        adapter = leaf.info.adapter
+        if adapter is not None and adapter.is_partial and leaf.info.kind == "bytes":
+            letters = source.choices(LETTERS, k=number * math.prod(leaf.shape))
+            leaf.store(rows, np.array(letters, np.uint8).reshape(number, *leaf.shape))
         if leaf.info.allowed:
             leaf.store(
                 rows,

@@ -290,6 +290,7 @@ class StructConditions:
         first, last = _window(leaves.values())
         if (
             last - first > 2
+            or any(leaf.info.kind == "bytes" for leaf in leaves.values())
             or len(places) > 1
             or any(len(shape) != len(strides) for shape, strides in places)
         ):

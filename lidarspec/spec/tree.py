@@ -46,6 +46,7 @@ from fractions import Fraction
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
 from lidarspec.spec.bits import BitField
@@ -60,6 +61,75 @@ def to_exact(number: float | int) -> Fraction:
     if isinstance(number, float):
         return Fraction(repr(float(number)))
     return Fraction(number)
+
+
+@dataclass(frozen=True, eq=False)
+class Adapter:
+    """Functions between the raw values of a field and those of a parsed frame.
+
+    construct's ExprAdapter and texts are read so. A column has the values of the parsed frame.
+
+    Attributes:
+        decode: from an integer, or the bytes of the field.
+        encode: from a value and the size of a field of bytes.
+        dtype: of a column; uint8 for bytes, of which a column has those of the wire.
+        allowed: the raw values that can be decoded; None if all can, or if only decoding tells.
+        is_partial: whether some raw values cannot be decoded, so that such frames are invalid.
+        form: how it is stored, for people; "" for a plain number.
+    """
+
+    decode: Callable[[Any], Any]
+    encode: Callable[[Any, int], Any]
+    dtype: np.dtype[Any]
+    allowed: tuple[int, ...] | None = None
+    is_partial: bool = False
+    form: str = ""
+
+    @property
+    def has_columns(self) -> bool:
+        """Whether columns have the decoded values."""
+        return self.dtype != np.uint8
+
+    def decode_column(self, raw: NDArray[Any], *, is_bytes: bool) -> NDArray[Any]:
+        """Return the values of a column, of the shape of its fields.
+
+        Args:
+            raw: integers, or bytes along the last axis.
+        """
+        values, where, shape = _distinct(raw, is_bytes=is_bytes)
+        decoded = np.empty(len(values), self.dtype)
+        for index, value in enumerate(values):
+            decoded[index] = self.decode(value)
+        return np.asarray(decoded[where]).reshape(shape)
+
+    def can_decode(self, raw: NDArray[Any], *, is_bytes: bool) -> NDArray[np.bool_]:
+        """Return which raw values can be decoded, as booleans of the shape of the fields."""
+        values, where, shape = _distinct(raw, is_bytes=is_bytes)
+        valid = np.zeros(len(values), np.bool_)
+        for index, value in enumerate(values):
+            try:
+                self.decode(value)
+                valid[index] = True
+            except Exception:  # the author's code may raise anything
+                continue
+        return np.asarray(valid[where]).reshape(shape)
+
+
+def _distinct(
+    raw: NDArray[Any], *, is_bytes: bool
+) -> tuple[list[Any], NDArray[np.intp], tuple[int, ...]]:
+    """Return the distinct values of a column, the index of each value, and the column's shape."""
+    if not is_bytes:
+        values, where = np.unique(raw, return_inverse=True)
+        return values.tolist(), where.reshape(-1), raw.shape
+    shape = raw.shape[:-1]
+    size = raw.shape[-1]
+    if not raw.size:
+        count = int(np.prod(shape))
+        return [b""] if count else [], np.zeros(count, np.intp), shape
+    packed = np.ascontiguousarray(raw).reshape(-1, size).view(f"V{size}").reshape(-1)
+    found, where = np.unique(packed, return_inverse=True)
+    return [value.tobytes() for value in found], where.reshape(-1), shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +155,7 @@ class FieldInfo:
         labels: names of raw values (construct's Enum).
         optional: True if some headers leave the field out.
         measured: True if the author declared a unit, or that it is a pure number.
+        adapter: the functions that make other values of the raw ones; None without.
     """
 
     path: str
@@ -104,6 +175,7 @@ class FieldInfo:
     labels: Mapping[int, str] = field(default_factory=dict)
     optional: bool = False
     measured: bool = False
+    adapter: Adapter | None = None
 
     @functools.cached_property
     def name(self) -> str:

@@ -19,6 +19,8 @@ from construct import (
     BitStruct,
     Byte,
     Bytes,
+    BytesInteger,
+    Check,
     Checksum,
     Compressed,
     Computed,
@@ -26,6 +28,8 @@ from construct import (
     Construct,
     CString,
     Debugger,
+    ExprAdapter,
+    ExprSymmetricAdapter,
     FixedSized,
     FocusedSeq,
     GreedyBytes,
@@ -41,8 +45,10 @@ from construct import (
     LazyBound,
     LazyStruct,
     NamedTuple,
+    NullStripped,
     NullTerminated,
     Padded,
+    PaddedString,
     Padding,
     PascalString,
     Peek,
@@ -64,7 +70,7 @@ from construct import (
     this,
 )
 
-from lidarspec import Sensor, SpecError, WireError
+from lidarspec import Sensor, SpecError, UsageError, WireError
 from lidarspec.spec import Fields, Polar, Serial
 from tests.engine.against_construct import at, sensor
 from tests.engine.engines import interpreted_reason, is_compiled
@@ -90,6 +96,14 @@ def flip(data: bytes) -> bytes:
 
 def odd_or_even(found: Any) -> str:
     return "odd" if found.n % 2 else "even"
+
+
+def join_dots(numbers: Any, context: Any) -> str:
+    return ".".join(map(str, numbers))
+
+
+def split_dots(text: str, context: Any) -> list[int]:
+    return list(map(int, text.split(".")))
 
 
 class Celsius(construct.Adapter):  # type: ignore[misc]
@@ -131,6 +145,52 @@ def case(*members: Construct, frames: str, reason: str = "", is_rest: bool = Fal
 
 
 COMPILED: dict[str, Case] = {
+    "ExprAdapter": case("a" / ExprAdapter(Int8ub, obj_ + 1, obj_ - 1), frames="01 ff"),
+    "ExprAdapter to fractions": case(
+        "a" / ExprAdapter(Int16ub, lambda raw, _: raw / 10, lambda value, _: round(value * 10)),
+        frames="0102 ffff",
+    ),
+    "ExprAdapter that counts": case(
+        "n" / ExprAdapter(Int8ub, obj_ - 1, obj_ + 1), "d" / Bytes(this.n), frames="036162 01"
+    ),
+    "ExprAdapter to texts": case(
+        "a" / ExprAdapter(Byte[4], join_dots, split_dots), frames="0a000001 ffffffff"
+    ),
+    "ExprAdapter in elements": case(
+        "a" / Array(2, ExprAdapter(Int8ub, obj_ * 2, obj_ // 2)), frames="0102"
+    ),
+    "ExprSymmetricAdapter": case("a" / ExprSymmetricAdapter(Int8ub, obj_ ^ 0xFF), frames="01"),
+    "an adapter of numbers": case("a" / Celsius(Int8ub), frames="01 ff"),
+    "an adapter of bits": case(
+        "a" / BitStruct("x" / Celsius(BitsInteger(7)), "y" / BitsInteger(1)), frames="01 ff"
+    ),
+    "Mapping to numbers": case("a" / construct.Mapping(Int8ub, {100: 1, 200: 2}), frames="01 02"),
+    "FlagsEnum of all bits": case(
+        "a" / construct.FlagsEnum(Int8ub, **{f"b{bit}": 1 << bit for bit in range(8)}),
+        frames="01 ff",
+    ),
+    "BytesInteger of 16 bytes": case("a" / BytesInteger(16), frames="00" * 15 + "01 " + "ff" * 16),
+    "BytesInteger with a sign": case(
+        "a" / BytesInteger(9, signed=True, swapped=True), frames="00" * 8 + "ff"
+    ),
+    "PaddedString": case(
+        "a" / PaddedString(4, "ascii"), "b" / Int8ub, frames="6162000001 6162636401"
+    ),
+    "PascalString": case("a" / PascalString(Int8ub, "utf8"), "b" / Int8ub, frames="02c3a901 0001"),
+    "two PascalStrings": case(
+        "a" / PascalString(Int8ub, "ascii"),
+        "b" / PascalString(Int16ub, "ascii"),
+        frames="0161000262" + "63",
+    ),
+    "GreedyString behind its length": case(
+        "a" / Prefixed(Int8ub, GreedyString("utf8")), frames="026162 00"
+    ),
+    "texts in elements": case("a" / Array(2, PaddedString(2, "ascii")), frames="61006263"),
+    "NullStripped": case("a" / FixedSized(4, NullStripped(GreedyBytes)), frames="61620000"),
+    "Sequence": case("a" / Sequence(Int8ub, Int16ub), frames="010203"),
+    "NamedTuple of a struct": case("a" / NamedTuple("P", "x y", TWO), frames="0102"),
+    "NamedTuple of an array": case("a" / NamedTuple("P", "x y", Int8ub[2]), frames="0102"),
+    "a Check without a name": case("a" / Int8ub, Check(this.a < 3), frames="01"),
     "Tell that nobody uses": case("t" / Tell, "a" / Int8ub, frames="01 02"),
     "Tell behind a count": case("n" / Int8ub, "d" / Bytes(this.n), "t" / Tell, frames="026162 00"),
     "Tell in elements": case("r" / Array(3, Struct("t" / Tell, "a" / Int16ub)), frames="00" * 6),
@@ -237,7 +297,6 @@ PLAIN: dict[str, Case] = {
         frames="4b01",
         reason="PrefixedArray",
     ),
-    "Sequence": case("a" / Sequence(Int8ub, Int16ub), frames="010203", reason="have no names"),
     "VarInt": case("a" / VarInt, "b" / Int8ub, frames="810102 0102", reason="no fixed place"),
     "ZigZag": case("a" / ZigZag, "b" / Int8ub, frames="810102 0102", reason="no fixed place"),
     "CString": case(
@@ -258,14 +317,6 @@ PLAIN: dict[str, Case] = {
         "a" / Transformed(TWO, flip, 2, flip, 2), frames="0102", reason="not plain bits"
     ),
     "LazyBound of itself": case("a" / NODE, frames="00 020100", reason="contains itself"),
-    "NamedTuple of a struct": case(
-        "a" / NamedTuple("P", "x y", TWO), frames="0102", reason="the Array or Struct below it"
-    ),
-    "NamedTuple of an array": case(
-        "a" / NamedTuple("P", "x y", Int8ub[2]),
-        frames="0102",
-        reason="the Array or Struct below it",
-    ),
     "If in elements": case(
         "r" / Array(2, Struct("k" / Int8ub, "v" / If(this.k, Int8ub))),
         frames="000102 0000",
@@ -285,9 +336,6 @@ PLAIN: dict[str, Case] = {
         reason="Parts",
     ),
     "Index": case("r" / Array(2, Struct("i" / Index, "a" / Int8ub)), frames="0102", reason="Index"),
-    "an adapter of bits": case(
-        "a" / BitStruct("x" / Celsius(BitsInteger(8))), frames="01", reason="not plain bits"
-    ),
     "GreedyBytes": case("a" / GreedyBytes, frames="616263 61", reason="rest", is_rest=True),
     "GreedyString": case(
         "a" / GreedyString("utf8"), frames="6162 c3a9", reason="text", is_rest=True
@@ -448,11 +496,47 @@ def test_bytes_that_cannot_be_decompressed_are_no_frame() -> None:
     assert ours.decode([b"\1\2ab", data]).stats.implausible == 1
 
 
+def test_a_text_that_is_none_makes_the_frame_implausible() -> None:
+    ours = sensor(Struct("k" / Int8ub, "a" / PaddedString(2, "ascii")))
+    packets = ours.decode([b"\1ab", b"\1a\xff", b"\2c\0"])
+    assert packets.stats.implausible == 1
+    assert packets.table.raw("a").tolist() == ["ab", "c"]
+    with pytest.raises(WireError):
+        ours.parse(b"\1a\xff")
+
+
+def test_edited_texts_and_numbers_are_encoded() -> None:
+    ours = sensor(
+        Struct(
+            "t" / PascalString(Int8ub, "ascii"),
+            "p" / PaddedString(3, "ascii"),
+            "n" / ExprAdapter(Int8ub, obj_ * 2, obj_ // 2),
+        )
+    )
+    assert ours.build("data", t="abc", p="x", n=8) == b"\3abcx\0\0\4"
+    for values in (dict(t="\xe9"), dict(p="wxyz"), dict(n=1000), dict(n="x")):
+        with pytest.raises(UsageError):
+            ours.build("data", dict(t="", p="", n=0) | values)
+
+
+def test_adapters_are_applied_in_points() -> None:
+    ours = dataclasses.replace(
+        sensor(Struct("a" / Array(2, ExprAdapter(Int8ub, obj_ / 2, lambda obj, _: int(obj * 2))))),
+        points=lambda f: Polar(range=f.a, azimuth=0),
+    )
+    assert ours.decode([b"\1\2", b"\3\4"]).points().range.tolist() == [0.5, 1, 1.5, 2]
+
+
 REFUSED: dict[str, tuple[Callable[[], Construct], str]] = {
     "Union": (lambda: construct.Union(0, "x" / Int16ub, "y" / Bytes(2)), "declare one of them"),
     "Seek": (lambda: construct.Seek(4), "outside the frame"),
     "Pointer": (lambda: construct.Pointer(1, Byte), "outside the frame"),
     "Flag": (lambda: construct.Flag, "use a BitStruct"),
+    "FlagsEnum": (lambda: construct.FlagsEnum(Byte, a=1), "FlagsEnum loses undeclared bits"),
+    "an adapter that loses bits": (
+        lambda: ExprAdapter(Byte, obj_ & 0x7F, obj_ & 0x7F),
+        "ExprAdapter makes 0 of 128",
+    ),
     "Optional": (lambda: construct.Optional(Byte), "use If or Switch"),
     "Slicing": (lambda: construct.Slicing(Byte[3], 3, 0, 1), "use the Array below it"),
     "FocusedSeq of two": (lambda: FocusedSeq("v", "k" / Byte, "v" / Byte), "loses 'k'"),

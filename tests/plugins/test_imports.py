@@ -32,6 +32,7 @@ ALLOWED = {
     ),
     *(
         "spec.syntax",
+        "spec.syntax.adapters",
         "spec.syntax.meaning",
         "spec.syntax.raw_checksums",
         "spec.syntax.refusals",

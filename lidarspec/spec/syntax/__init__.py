@@ -6,6 +6,7 @@ In: an author's struct. Out: a copy of it for the engine (`prepare`), an error i
 (`check_struct`), its nodes (`frame_tree`). Modules in reading order:
 
 * `replacements`: classes that replace construct's, each with its reason, and additional ones.
+* `adapters`: adapters and texts as functions of raw values.
 * `raw_checksums`: translates construct's Checksum of a RawCopy to a seal.
 * `structs`: prepares a struct; properties of a construct, and random values for it.
 * `refusals`: checks for unsupported structs.

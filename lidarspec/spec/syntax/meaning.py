@@ -36,6 +36,12 @@ from construct.expr import BinExpr, ExprMixin, UniExpr
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
 from lidarspec.spec.bits import BitField, probe
+from lidarspec.spec.syntax.adapters import (
+    int_adapter,
+    part_adapter,
+    text_adapter,
+    without_int_adapters,
+)
 from lidarspec.spec.syntax.replacements import (
     BoundedPart,
     CountField,
@@ -333,9 +339,15 @@ class _Builder:
                     place = place.inside(docs=con.docs)
             elif isinstance(con, DescribedField):
                 place = replace(place, info=con.describe(place.info))
+            elif (adapter := self._adapter(con, place.info)) is not None:
+                place = place.inside(adapter=adapter, allowed=adapter.allowed)
             elif isinstance(con, construct.Enum):
                 place = place.inside(
-                    labels={int(value): str(name) for value, name in con.ksymapping.items()}
+                    labels={
+                        int(value): str(name)
+                        for value, name in con.ksymapping.items()
+                        if isinstance(value, int)
+                    }
                 )
             elif isinstance(con, Const):
                 place = place.inside(const=_constant(con))
@@ -357,6 +369,12 @@ class _Builder:
             else:
                 return con, place
             con = con.subcon
+
+    def _adapter(self, con: Construct, info: tree.FieldInfo) -> tree.Adapter | None:
+        """Return an adapter of an integer whose wrappers say nothing of its values."""
+        if info.const is not None or info.labels or info.scaled or info.rebuilt or info.adapter:
+            return None
+        return int_adapter(con)
 
     def _default(self, value: Any, place: _Context) -> Any:
         """Return the value of a construct Default: itself, or a formula of a function."""
@@ -674,11 +692,11 @@ class _Builder:
         name = place.name
         info = _add_type(con, place.info)
         if name and place.scope is not None:
-            place.scope.add(name, tree.Ref(info.path, info))
+            place.scope.add(name, _seen_value(info))
         if isinstance(con, FormatField) and con.fmtstr[-1] != "?":
             big = con.fmtstr[0] in ">!" or (con.fmtstr[0] == "=" and sys.byteorder == "big")
             node: tree.Node = _number(info, con.length, is_big=big)
-        elif isinstance(con, BytesInteger) and not _is_odd(con):
+        elif isinstance(con, BytesInteger) and not _is_odd(con) and con.length <= 8:
             node = _number(info, con.length, is_big=not con.swapped)
         elif place.room is not None and (
             isinstance(con, PaddingField) or con is construct.GreedyBytes
@@ -690,6 +708,10 @@ class _Builder:
             if isinstance(con, Reserved):
                 info = replace(info, default=con.pattern)
             node = tree.Blob(name, info, self._formula(con.length, place), info.const)
+        elif not place.in_bits and (blob := self._encoded_blob(con, place)) is not None:
+            node = blob
+            if name and place.scope is not None:
+                place.scope.names[name] = _seen_value(blob.info)
         else:
             kind = author_class(con)
             if isinstance(con, construct.FixedSized):
@@ -709,12 +731,48 @@ class _Builder:
             return tree.Blob("", info, con.length, con.build(info.const))
         return node
 
+    def _encoded_blob(self, con: Construct, place: _Context) -> tree.Blob | None:
+        """Return bytes with functions that make the value of a part of them; None if only
+        construct can read the part.
+        """
+        info = place.info
+        if not place.name or info.const is not None or info.labels or info.rebuilt:
+            return None
+        adapter: tree.Adapter | None
+        if isinstance(con, construct.StringEncoded):
+            size = self._text_size(con, place)
+            adapter = text_adapter(con)
+        else:
+            adapter = part_adapter(con)
+            size = None if adapter is None else int(con.sizeof())
+        if adapter is None or size is None:
+            return None
+        axes = (*info.axes, axis_path(info))
+        bits = 8 * size if isinstance(size, int) else 0
+        known = replace(info, dtype=np.dtype("u1"), kind="bytes", bits=bits, axes=axes)
+        return tree.Blob(place.name, replace(known, adapter=adapter), size)
+
+    def _text_size(self, con: construct.StringEncoded, place: _Context) -> tree.Formula | None:
+        """Return the bytes of a text; None if it ends with a terminator or the datagram."""
+        inner = con.subcon
+        if inner is construct.GreedyBytes:
+            return place.room
+        if isinstance(inner, BoundedPart | construct.FixedSized):
+            content = inner.subcon
+            if isinstance(content, construct.NullStripped):
+                content = content.subcon
+            is_whole = content is construct.GreedyBytes
+            return self._formula(inner.length, place) if is_whole else None
+        if isinstance(inner, Bytes):
+            return self._formula(inner.length, place)
+        return None
+
     def _block(self, con: Construct, place: _Context) -> tree.Node:
         """A bit block: the bits of each field come from probing construct itself."""
         inside = self.node(con, replace(place, in_bits=True))
         try:
             size = int(con.sizeof())
-            fields = _probe(con, size)
+            fields = _probe(without_int_adapters(con), size)
         except (construct.ConstructError, LookupError):
             fields = None
         if fields is None:
@@ -740,6 +798,19 @@ class _Builder:
                 )
             )
         return tree.Block(place.name, place.info, size, tuple(parts))
+
+
+def _seen_value(info: tree.FieldInfo) -> tree.Ref | tree.Value:
+    """Return a field as later expressions read it."""
+    ref = tree.Ref(info.path, info)
+    if info.adapter is None:
+        return ref
+    unknown = tree.Untraced(f"{info.path}: a Python function makes the value of {info.path}", "?")
+    try:
+        value = info.adapter.decode(tree.Symbol(ref))
+    except Exception:  # the author's function may do anything with a symbol
+        return tree.Value(unknown)
+    return tree.Value(value.formula if isinstance(value, tree.Symbol) else unknown)
 
 
 def _is_whole(formula: tree.Formula) -> bool:
@@ -1014,7 +1085,8 @@ def _constant(con: Const) -> Any:
 
 def _is_odd(con: BytesInteger) -> bool:
     """Whether its length or byte order is not plain."""
-    return not isinstance(con.length, int) or con.length > 8 or not isinstance(con.swapped, bool)
+    is_wide = isinstance(con.length, int) and con.length > 8
+    return not is_wide and not (isinstance(con.length, int) and isinstance(con.swapped, bool))
 
 
 @functools.lru_cache(maxsize=4096)
@@ -1044,7 +1116,7 @@ def _is_even(con: Construct) -> bool:
 def bytes_of(con: Construct, names: Iterable[str]) -> list[int]:
     """The offsets of the bytes of a block that hold any bit of one of its fields."""
     keys = tuple(names)
-    for field in _probe(con, con.sizeof()) or ():
+    for field in _probe(without_int_adapters(con), con.sizeof()) or ():
         if field.keys == keys:
             return [segment.byte for segment in field.segments]
     raise KeyError(".".join(keys))

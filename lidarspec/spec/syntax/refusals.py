@@ -11,6 +11,7 @@ from construct import Array, Const, Construct, Container, Struct
 
 from lidarspec.errors import SpecError
 from lidarspec.spec import tree
+from lidarspec.spec.syntax.adapters import is_int_adapter, try_values
 from lidarspec.spec.syntax.replacements import (
     BoundedPart,
     DescribedField,
@@ -99,8 +100,14 @@ def check_struct(con: Construct) -> SpecError | None:
     """
     endless = _check_ends(con, "", bounded=False)
     for path, part, in_bits in _walk(con, "", in_bits=False):
+        lost = try_values(part).lost if is_int_adapter(part) else None
+        if lost is not None and not isinstance(part, construct.FlagsEnum):
+            raw, back = lost
+            reason = f"{author_class(part)} makes {back!r:.80} of {raw} when a frame is built again"
+            raise SpecError(reason, path=path, rule="LS106")
         for kind, (rule, reason) in _REFUSED.items():
-            if isinstance(part, kind):
+            is_exact = kind is construct.FlagsEnum and is_int_adapter(part) and lost is None
+            if isinstance(part, kind) and not is_exact:
                 raise SpecError(reason, path=path, rule=rule)
         if isinstance(part, type(construct.Flag)) and not in_bits:
             raise SpecError(
@@ -229,7 +236,7 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
             raise SpecError(
                 "two fields of this name: the last one would win silently", path=place, rule="LS104"
             )
-        if name in RESERVED:
+        if name in RESERVED and not path:
             raise SpecError("no field may be called 'state' or 'on'", path=place, rule="LS102")
         if name in SHADOWED:
             raise SpecError(

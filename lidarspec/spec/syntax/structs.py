@@ -197,16 +197,18 @@ def _bind(con: construct.LazyBound, limit: int, *, in_bits: bool) -> Construct:
 
 
 def _name_padding(members: list[Construct]) -> list[Construct]:
-    """Return the members of a struct, with a name for each padding that has none."""
+    """Return the members of a struct, with a name for each padding and condition without one."""
     taken = {member.name for member in members}
     named = list[Construct]()
     for member in members:
-        if isinstance(member, construct.Padded) and member.subcon is construct.Pass:
+        is_padding = isinstance(member, construct.Padded) and member.subcon is construct.Pass
+        if is_padding or isinstance(member, construct.Check):
+            kind = "padding" if is_padding else "check"
             number = 1
-            name = "padding"
+            name = kind
             while name in taken:
                 number += 1
-                name = f"padding_{number}"
+                name = f"{kind}_{number}"
             taken.add(name)
             named.append(construct.Renamed(member, newname=name))
         else:
@@ -254,6 +256,15 @@ def _expand_macro(con: Construct) -> list[Construct]:
         if len(members) == 1:
             return [con]
         return list(optional)
+    if (
+        name
+        and isinstance(inner, construct.StringEncoded)
+        and isinstance(inner.subcon, construct.Prefixed)
+        and inner.subcon.subcon is construct.GreedyBytes
+    ):  # PascalString
+        text = construct.StringEncoded(construct.GreedyBytes, inner.encoding)
+        prefixed = construct.Prefixed(inner.subcon.lengthfield, text, inner.subcon.includelength)
+        return _expand_macro(construct.Renamed(prefixed, newname=name, newdocs=docs))
     if name and isinstance(inner, construct.Prefixed):
         if inner.includelength:
             plus = inner.lengthfield.sizeof()

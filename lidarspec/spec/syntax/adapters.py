@@ -1,0 +1,257 @@
+"""Adapters of construct as functions between the values on the wire and those of a parsed frame.
+
+An adapter is called with values of its field, and no context. If it needs one, or if it fails for
+some numbers, only construct can apply it. All values of a byte are tried, and some hundred of wider
+fields. An adapter that does not give the bytes back is refused: it would lose them.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import construct
+import numpy as np
+from construct import BitsInteger, BytesInteger, Construct, FormatField, Subconstruct
+
+from lidarspec.spec import tree
+
+#: how many values of a field wider than a byte are tried.
+SAMPLES = 200
+
+#: adapters with a meaning of their own.
+_KNOWN = (construct.Enum, construct.Validator, construct.StringEncoded)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The result of some values of an adapter.
+
+    Attributes:
+        valid: the raw values that it takes.
+        values: what it makes of them.
+        failed: whether it fails for some values.
+        lost: a raw value that it does not give back, and what it gives; None without.
+    """
+
+    valid: tuple[Any, ...]
+    values: tuple[Any, ...]
+    failed: bool
+    lost: tuple[Any, Any] | None
+
+
+def int_adapter(con: Construct) -> tree.Adapter | None:
+    """Return an adapter of an integer as functions; None for another construct, or if only
+    construct can apply it.
+    """
+    if not is_int_adapter(con):
+        return None
+    trial = try_values(con)
+    is_partial = trial.failed and _int_bits(con.subcon) > 8
+    if not trial.valid or is_partial or trial.lost is not None:
+        return None
+    allowed = trial.valid if trial.failed else None
+    return _make(
+        functools.partial(_decode_int, con), functools.partial(_encode_int, con), trial, allowed
+    )
+
+
+@functools.lru_cache(maxsize=4096)
+def without_int_adapters(con: Construct) -> Construct:
+    """Return a copy of a bit block with integers in place of their adapters."""
+    if int_adapter(con) is not None:
+        return without_int_adapters(con.subcon)
+    if not isinstance(con, Subconstruct | construct.Struct):
+        return con
+    same = copy.copy(con)
+    if isinstance(con, Subconstruct):
+        same.subcon = without_int_adapters(con.subcon)
+    else:
+        same.subcons = [without_int_adapters(child) for child in con.subcons]
+        same._subcons = construct.Container((child.name, child) for child in same.subcons)
+    return same
+
+
+def is_int_adapter(con: Construct) -> bool:
+    """Return whether a construct is an adapter of an integer without a meaning of its own."""
+    if not isinstance(con, construct.Adapter) or isinstance(con, _KNOWN):
+        return False
+    return _int_bits(con.subcon) > 0
+
+
+@functools.lru_cache(maxsize=4096)
+def try_values(con: Construct) -> Trial:
+    """Try values of an adapter of an integer."""
+    bits = _int_bits(con.subcon)
+    is_signed = _is_signed(con.subcon)
+    if bits <= 8:
+        raws: Sequence[int] = range(1 << bits)
+    else:
+        import random  # finding a sensor does without it
+
+        source = random.Random(bits)
+        edges = [0, 1, 2, (1 << bits) - 1, 1 << (bits - 1), (1 << (bits - 1)) - 1]
+        raws = [*edges, *(source.getrandbits(bits) for _ in range(SAMPLES))]
+    if is_signed:
+        raws = [raw - (1 << bits) if raw >> (bits - 1) else raw for raw in raws]
+    return _try(raws, functools.partial(_decode_int, con), functools.partial(_encode_int, con))
+
+
+def _try(
+    raws: Sequence[Any], decode: Callable[[Any], Any], encode: Callable[[Any, int], Any]
+) -> Trial:
+    valid = []
+    values = []
+    lost = None
+    for raw in raws:
+        try:
+            value = decode(raw)
+        except Exception:  # the author's code may raise anything, above all without a context
+            continue
+        valid.append(raw)
+        values.append(value)
+        try:
+            back = encode(value, len(raw) if isinstance(raw, bytes) else 0)
+        except Exception as error:
+            back = f"{type(error).__name__}: {error}"
+        if back != raw and value == value and lost is None:
+            lost = (raw, back)
+    return Trial(tuple(valid), tuple(values), len(valid) < len(raws), lost)
+
+
+def _make(
+    decode: Callable[[Any], Any],
+    encode: Callable[[Any, int], Any],
+    trial: Trial,
+    allowed: tuple[int, ...] | None = None,
+    *,
+    is_partial: bool = False,
+    form: str = "",
+) -> tree.Adapter:
+    kinds = {type(value) for value in trial.values}
+    is_small = all(-(1 << 63) <= value < 1 << 63 for value in trial.values if type(value) is int)
+    if kinds == {int} and is_small:
+        dtype: np.dtype[Any] = np.dtype(np.int64)
+    elif kinds <= {int, float} and is_small:
+        dtype = np.dtype(np.float64)
+    elif kinds == {bytes}:
+        dtype = np.dtype(np.uint8)
+    else:
+        dtype = np.dtype(object)
+    return tree.Adapter(decode, encode, dtype, allowed, is_partial, form)
+
+
+def _decode_int(con: Any, raw: int) -> Any:
+    return con._decode(raw, None, "")
+
+
+def _encode_int(con: Any, value: Any, size: int) -> Any:
+    return con._encode(value, None, "")
+
+
+def _int_bits(con: Construct) -> int:
+    """Return the width of an integer in bits; 0 for another construct."""
+    if isinstance(con, FormatField):
+        return 0 if con.fmtstr[-1] in "efd?" else 8 * int(con.length)
+    if isinstance(con, BytesInteger | BitsInteger) and isinstance(con.length, int):
+        bits = con.length * (8 if isinstance(con, BytesInteger) else 1)
+        return bits if bits <= 64 else 0
+    return 0
+
+
+def _is_signed(con: Any) -> bool:
+    if isinstance(con, FormatField):
+        return bool(con.fmtstr[-1].islower())
+    return bool(con.signed)
+
+
+def text_adapter(con: construct.StringEncoded) -> tree.Adapter:
+    """Return a text as functions: its encoding, and the characters that fill its field."""
+    inner = con.subcon
+    while isinstance(inner, Subconstruct) and not isinstance(inner, construct.NullStripped):
+        inner = inner.subcon
+    decode = functools.partial(_decode_text, con.encoding, _stripped(inner))
+    encode = functools.partial(_encode_text, con, _stripped(inner))
+    form = f"text {con.encoding}"
+    return tree.Adapter(decode, encode, np.dtype(object), is_partial=True, form=form)
+
+
+def _stripped(con: Construct) -> Construct | None:
+    return con if isinstance(con, construct.NullStripped) else None
+
+
+def _decode_text(encoding: str, stripped: Any, data: bytes) -> str:
+    content = data if stripped is None else stripped.parse(data)
+    return str(content.decode(encoding))
+
+
+def _encode_text(con: Any, stripped: Any, value: Any, size: int) -> bytes:
+    data = bytes(con._encode(value, None, ""))
+    return data if stripped is None else data.ljust(size, b"\0")
+
+
+def part_adapter(con: Construct) -> tree.Adapter | None:
+    """Return a part of a fixed number of bytes as functions; None if only construct can read it."""
+    size = _size_alone(con)
+    if not size:
+        return None
+
+    def decode(data: bytes) -> Any:
+        return con.parse(data)
+
+    def encode(value: Any, _: int) -> Any:
+        return con.build(value)
+
+    import random  # finding a sensor does without it
+
+    source = random.Random(size)
+    ascii_bytes = bytes(source.choice(b"abcdef") for _ in range(size))
+    raws = [bytes(size), ascii_bytes, *(source.randbytes(size) for _ in range(SAMPLES))]
+    trial = _try(raws, decode, encode)
+    is_struct = any(isinstance(value, dict) for value in trial.values)
+    if not trial.valid or trial.lost is not None or is_struct:
+        return None
+    return _make(decode, encode, trial, is_partial=trial.failed, form=_form(con))
+
+
+def _form(con: Construct) -> str:
+    """Return how a part is stored, for people."""
+    if isinstance(con, BytesInteger):
+        order = "le" if con.swapped else "be"
+        return f"{'int' if con.signed else 'uint'}{8 * int(con.length)} {order}"
+    return type(con).__name__
+
+
+#: what needs no more than its own bytes.
+_ALONE = (
+    FormatField,
+    BytesInteger,
+    construct.Bytes,
+    construct.Array,
+    construct.Sequence,
+    construct.Struct,
+    construct.Adapter,
+    construct.NullStripped,
+    construct.FixedSized,
+    construct.Renamed,
+    construct.Const,
+    construct.ProcessXor,
+    type(construct.GreedyBytes),
+)
+
+
+def _size_alone(con: Construct) -> int:
+    """Return the fixed size of a part that needs no more than its own bytes; else 0."""
+    pending = [con]
+    while pending:
+        part = pending.pop()
+        if not isinstance(part, _ALONE):
+            return 0
+        pending += [part.subcon] if isinstance(part, Subconstruct) else getattr(part, "subcons", [])
+    try:
+        return int(con.sizeof())
+    except Exception:  # a size that depends on other fields
+        return 0
