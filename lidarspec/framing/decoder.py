@@ -64,21 +64,21 @@ class DecoderObserver(Protocol):
         """
 
     def observe_frames(self, frames: Frames) -> None:
-        """Frames, in stream order."""
+        """Observe frames, in stream order."""
 
 
 class Decoder:
-    """Finds the frames of one sensor in what it is fed.
+    """Finds the frames of one sensor in its input.
 
     Args:
-        sensor: the sensor; only its incoming frames are looked for.
-        stream: a byte stream, or datagrams one for each `feed`.
-        backend: what makes points of its packets, "auto", "numpy" or "jit".
-        sums: what computes checksums; by default their algorithms.
+        sensor: the sensor; only its incoming frames are searched for.
+        stream: True for a byte stream, False if each `feed` is one datagram.
+        backend: how points are computed from its packets, "auto", "numpy" or "jit".
+        sums: function that computes checksums; by default the algorithm of each checksum.
 
     Attributes:
-        framing: the rules by which its frames are told apart, which no byte changes.
-        observer: who is shown its bytes and frames; None for nobody.
+        framing: the frame types, prepared for the search.
+        observer: receives the input and the frames; None for no observer.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class Decoder:
         return self._assembly is not None
 
     def feed(self, data: Data, at: int | None = None) -> list[Found]:
-        """The frames that these bytes complete, in stream order. Raises on no bytes whatever.
+        """Return the frames that these bytes complete, in stream order. No input raises.
 
         Args:
             data: the next bytes of the stream, or one datagram.
@@ -142,22 +142,18 @@ class Decoder:
         return [found for frames in self.frames(data, at) for found in frames.found()]
 
     def idle(self) -> list[Found]:
-        """Handle silence on the line: give up candidates that wait for bytes.
-
-        Their bytes are searched again.
+        """Handle silence on the line: reject incomplete candidates, search their bytes again.
 
         Returns:
-            The frames found.
+            The frames in these bytes.
         """
         return [found for frames in self.take_pending() for found in frames.found()]
 
     def finish(self) -> list[Found]:
-        """Handle the end of the input: give up candidates that wait for bytes.
-
-        Their bytes are searched again.
+        """Handle the end of the input: reject incomplete candidates, search their bytes again.
 
         Returns:
-            The frames found.
+            The frames in these bytes.
         """
         return self.idle()
 
@@ -197,7 +193,7 @@ class Decoder:
         return parts
 
     def take_pending(self) -> list[Frames]:
-        """The frames among the bytes that wait for others, as arrays: these will not come."""
+        """Return the frames in the pending bytes as arrays, since no more input follows."""
         parts: list[Frames] = []
         self._need = 0
         if self._assembly is not None:
@@ -211,11 +207,11 @@ class Decoder:
     def datagrams(
         self, data: Sequence[Any] | NDArray[np.uint8], at: Sequence[int | None] | None = None
     ) -> Frames:
-        """Datagrams, each one frame, whole, or none.
+        """Return the frames in datagrams, each of which is one whole frame or none.
 
         Args:
             data: a list of bytes, or the rows of an array.
-            at: their arrival times in ns, None where nobody knows.
+            at: their arrival times in ns, None if unknown.
         """
         if isinstance(data, np.ndarray):
             buffer = data.reshape(-1)
@@ -246,10 +242,9 @@ class Decoder:
         Each datagram is one whole frame or none.
 
         Args:
-            buffer: one-dimensional and contiguous; what stands between the datagrams does not
-                matter.
+            buffer: one-dimensional and contiguous; bytes between the datagrams are ignored.
             starts, sizes: of each datagram, in the order of their arrival.
-            at: their arrival times in ns, -1 where nobody knows.
+            at: their arrival times in ns, -1 if unknown.
         """
         size = broadcast_value(sizes)
         if size is None:
@@ -319,7 +314,7 @@ class Decoder:
         return np.diff(before)
 
     def _drop(self, size: int) -> None:
-        """Count bytes that are no frame, before the next one."""
+        """Count bytes that belong to no frame, before the next frame."""
         self._gap = self._gap + size
         self.stats.bytes_skipped = self.stats.bytes_skipped + size
 
@@ -332,14 +327,14 @@ class Decoder:
         lasting: bool = True,
         final: bool = False,
     ) -> int:
-        """Cut bytes into frames, piece by piece, and add those with frames to what is found.
+        """Find frames in bytes, piece by piece, and add them to `parts`.
 
         Args:
-            lasting: nobody will change the bytes.
-            final: nothing follows them.
+            lasting: the bytes will not be changed, so they need not be copied.
+            final: no bytes follow.
 
         Returns:
-            Where the rest begins that waits for what follows.
+            The offset of the pending bytes.
         """
         start = 0
         while start < len(buffer) and len(buffer) - start >= self._need:
@@ -359,9 +354,9 @@ class Decoder:
         return start
 
     def _piece(self, buffer: Bytes1D, *, final: bool) -> PieceResult:
-        """Return a piece of a stream cut into frames.
+        """Return the frames of a piece of a stream.
 
-        It is cut into rows as long as the frames are regular, else by search.
+        Regular frames are judged as rows of an array; other pieces are searched.
         """
         piece = None
         if not final:
@@ -408,7 +403,7 @@ class Decoder:
     def _count_skipped(
         self, buffer: NDArray[np.uint8], sizes: NDArray[np.int64], stops: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """The numbers of skipped bytes that end at these stops, fillers left out; counts them."""
+        """Count skipped bytes that end at these stops; return their numbers without fillers."""
         self.stats.bytes_skipped += int(sizes.sum())
         for index in np.flatnonzero(sizes).tolist() if self._fillers else ():
             skipped = buffer[stops[index] - sizes[index] : stops[index]]
@@ -463,7 +458,7 @@ def select_backend(name: str) -> str:
     For "auto" it is the value of LIDARSPEC_BACKEND, if that is set.
 
     Raises:
-        UsageError: for a name that is none.
+        UsageError: for an unknown name.
     """
     place = "backend"
     if name == "auto" and os.environ.get(BACKEND):
@@ -478,7 +473,7 @@ def decode_all(decoder: Decoder, data: Any) -> list[Frames]:
     """Return all frames of a whole input.
 
     Args:
-        data: bytes for a decoder of a stream, else an iterable or (n, size) array of datagrams.
+        data: bytes for a decoder of a stream, or an iterable or (n, size) array of datagrams.
     """
     if decoder.stream:
         return decoder.frames(data) + decoder.take_pending()

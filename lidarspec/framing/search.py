@@ -1,14 +1,13 @@
-"""Finding frames in a byte stream: the one rule, the same for every sensor.
+"""Find frames in a byte stream by one rule, which is the same for every sensor.
 
-A stream decodes to the leftmost valid candidate, then on after its last byte; an invalid candidate
-advances by one byte. At one offset the order of the frame types decides. A type with `after` is
-looked for only while the frame that it names is the last seen of those named by any `after`; a type
-with `confirm` counts only in unbroken runs (`lidarspec.framing.weak_frames`).
+A stream decodes to the leftmost valid candidate, and continues after its last byte; an invalid
+candidate advances the search by one byte. At one offset the order of the frame types decides. A
+type with `after` is active only while the last frame that any `after` names is the frame that it
+names. A type with `confirm` counts only in unbroken runs (`lidarspec.framing.weak_frames`).
 
-All candidates of a piece are judged in bulk, and those that are taken are found in bulk too, with a
-step for each conflict only, and one for each frame that changes what is looked for. So the work is
-linear in the input however often headers or changes appear in it, and the result is that of the
-byte-by-byte rule.
+All candidates of a piece are judged in bulk, and accepted in bulk, with one step for each conflict
+and for each frame that changes the active types. The work is therefore linear in the input,
+however often headers or changes appear in it, and the result is that of the byte-by-byte rule.
 """
 
 from __future__ import annotations
@@ -28,21 +27,21 @@ from lidarspec.framing.candidates import (
 )
 from lidarspec.framing.results import IMPLAUSIBLE, SHORT, VALID, Frames
 
-#: bytes from one change of what is looked for to the next, at which a piece ends there, and the
-#: next one is judged for what follows alone.
+#: bytes between two changes of the active types from which on a piece ends at the second change, so
+#: that its other bytes are not judged for types that are no longer active.
 MIN_STAY_BYTES = 1 << 12
 
 
 def find_frames(
     framing: Framing, buffer: Bytes1D, mode: SearchState, base: int, *, final: bool
 ) -> PieceResult:
-    """Cut one piece.
+    """Find the frames in one piece of a stream.
 
     Args:
-        buffer: the bytes not yet decided and those after them.
-        mode: remembered between pieces, changed here.
+        buffer: the undecided bytes and the bytes after them.
+        mode: state between pieces; changed here.
         base: offset of the buffer in the stream.
-        final: give up candidates that need more bytes than there are.
+        final: reject candidates that need more bytes than there are.
     """
     candidates = Candidates(framing, buffer, mode, final=final)
     piece = PieceResult(Frames.make_empty(candidates.buffer), len(candidates.buffer))
@@ -78,12 +77,11 @@ def find_frames(
 
 
 class _FrameWalk:
-    """A walk through a piece while the same types are looked for, as often as they are again.
+    """A walk through a piece for one set of active types; it may be resumed several times.
 
     Args:
-        live: the candidates that are valid or wait for bytes; one that waits takes all that there
-            are.
-        base: offset of the piece in the stream.
+        live: the candidates that are valid or incomplete; an incomplete candidate extends to the
+        end. base: offset of the piece in the stream.
     """
 
     def __init__(
@@ -118,16 +116,17 @@ class _FrameWalk:
         self._stops: list[int] = np.flatnonzero(stops).tolist()
         self._starts: list[int] = frames.starts.tolist() if any(self._changes) else []
         self._taken: list[tuple[int, int]] = []  # first and last rows that follow one another
-        self._continued: list[tuple[int, int]] = []  # kinds and offsets of runs that go on
+        self._continued: list[tuple[int, int]] = []  # kinds and offsets of continued runs
 
     def advance(self, position: int, piece: PieceResult) -> int:
-        """Take valid candidates up to the end, or to a frame that changes the mode.
-
-        Returns the end of that frame.
+        """Accept valid candidates up to the end, or to a frame that changes the active types.
 
         Args:
-            piece: where it ends and what it waits for is entered into it, unless what is looked for
-                changes.
+            position: the offset to start from.
+            piece: receives its end and the bytes it waits for, unless the active types change.
+
+        Returns:
+            The end of the last accepted frame, or of the piece.
         """
         position = self._continue_run(position)
         frames = self._frames
@@ -157,7 +156,7 @@ class _FrameWalk:
         return piece.end
 
     def frames(self) -> list[Frames]:
-        """Return all that were taken, in parts that may lie between one another."""
+        """Return all accepted frames, in parts that may overlap in order."""
         if len(self._taken) == 1:
             first, last = self._taken[0]
             taken = self._frames.select(slice(first, last + 1))
@@ -174,7 +173,7 @@ class _FrameWalk:
         return [part for part in parts if len(part)]
 
     def _take(self, first: int, last: int) -> None:
-        """Take the candidates of some rows, which follow one another."""
+        """Accept the candidates of consecutive rows."""
         self._taken.append((first, last))
         if self._runs and last >= first:
             kind = self._frames.kinds.item(last)
@@ -183,7 +182,7 @@ class _FrameWalk:
                 self._mode.run_end = self._base + self._ends.item(last)
 
     def _continue_run(self, position: int) -> int:
-        """Take the rest of a run that ends at an offset so far; return where it ends now."""
+        """Accept the rest of a run that ends at an offset so far; return its new end."""
         if self._mode.run_end != self._base + position:
             return position
         for kind, runs in self._runs.items():
@@ -198,7 +197,7 @@ class _FrameWalk:
         return position
 
     def _is_earlier(self, kind: int, position: int) -> bool:
-        """Return whether a type that is earlier in the order than another is live at an offset."""
+        """Return whether a live candidate at an offset has an earlier type than `kind`."""
         starts = self._frames.starts
         row = int(starts.searchsorted(position))
         if row == len(starts) or starts.item(row) != position:
@@ -207,7 +206,7 @@ class _FrameWalk:
 
 
 def _rows_of(runs: Offsets) -> Offsets:
-    """Return the numbers from each first to each last, (k,)."""
+    """Return all numbers from each first to its last, (k,)."""
     firsts = runs[:, 0]
     counts = runs[:, 1] - firsts + 1
     begins = np.cumsum(counts) - counts
@@ -237,7 +236,7 @@ def count_rejected(
     At the first byte of a frame, candidates of earlier types count as well.
 
     Args:
-        stays: from which offset on which types were looked for.
+        stays: (offset, `after` state) for each stretch with the same active types.
     """
     frames = piece.frames
     begins = np.array([begin for begin, _ in stays])
@@ -245,7 +244,7 @@ def count_rejected(
     modes = np.array([numbers[name] for _, name in stays])
     for kind, own in candidates.judged.items():
         status = own.status
-        if framing.is_weak(kind):  # valid ones that are not taken are in no run
+        if framing.is_weak(kind):  # a valid candidate that was not accepted is in no run
             status = np.where(status == VALID, IMPLAUSIBLE, status)
         elif own.is_sound:
             continue
