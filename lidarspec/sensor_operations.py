@@ -34,8 +34,8 @@ class Sensor(SensorDescription):
         frames: every message type by name, in both directions. If several types fit at one
             offset, the first one in this order is taken.
         points: a function of `Fields` that returns `Polar` or `Cartesian`; None if each data frame
-            has a function of its own.
-        scan: the rule by which a scan ends and the next one begins.
+            has a function of its own, or if the sensor has no points (no frame with ``data=True``).
+        scan: the rule by which a scan ends and the next one begins; None without points.
         links: the links by name. Data comes over "data", commands go over the link that they name.
         commands: the commands by name.
         clock: the sensor's clock, if it has one.
@@ -49,7 +49,8 @@ class Sensor(SensorDescription):
             that returns the options of `configure` which decode them, {} if the datagrams are not
             from such a sensor.
         on_open, on_close: names of the commands that are sent on opening and on closing.
-        range_limits: the shortest and the longest range that it can measure, metres.
+        range_limits: the shortest and the longest range that it can measure, metres; None without
+            points.
         vendor_axes: the directions of the vendor's x, y and z axes, for ``frame="vendor"``: three
             of forward, back, left, right, up and down.
         beams: points of a scan, if their number is constant.
@@ -190,8 +191,8 @@ class Sensor(SensorDescription):
 
         Raises:
             UnknownFrame: for a frame type that the sensor does not have.
-            UsageError: for a text or a path, an unknown back end, or a sensor that has no frames
-                before it is configured.
+            UsageError: for a text or a path, an unknown back end, a sensor that has no frames
+                before it is configured, or no `frame` for a sensor without points.
         """
         packets, _ = self._decode(data, frame, backend)
         return packets
@@ -230,7 +231,7 @@ class Sensor(SensorDescription):
 
         Raises:
             UsageError: for a text or a path, an unknown back end, a sensor that has no frames
-                before it is configured, or if no scan is selected.
+                before it is configured or has no points, or if no scan is selected.
         """
         from lidarspec.scans.selection import ScanSelector
         from lidarspec.scans.stream import iter_scans

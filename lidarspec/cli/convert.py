@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,6 +13,7 @@ from shlex import quote
 from typing import Any
 
 import click
+import numpy as np
 
 from lidarspec import batch
 from lidarspec.cli.failures import FINDINGS
@@ -30,15 +32,17 @@ from lidarspec.cli.terminal import note
 from lidarspec.detect.identification import detect
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.source_recording import make_recorder
-from lidarspec.errors import UsageError, WireError, WriteError, suggest, suggestion
+from lidarspec.errors import UnknownFrame, UsageError, WireError, WriteError, suggest, suggestion
 from lidarspec.formats import check_holds, find_existing, format_of, write, write_imu
 from lidarspec.formats.common import replace_file
+from lidarspec.formats.frame_tables import holds_several_types, write_frames
 from lidarspec.packets.imu import join_samples
+from lidarspec.packets.packets import Packets
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.recording.recorders import SUFFIXES
 from lidarspec.remote_files import find_files
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.selection import EVERYTHING, Selection, Times, iter_received
+from lidarspec.scans.selection import EVERYTHING, Selection, Times, TimeSlice, iter_received
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, no_bytes
@@ -93,6 +97,12 @@ class _Counts:
 )
 @click.option("--imu", "is_imu", is_flag=True, help="Write the IMU samples instead of the points.")
 @click.option(
+    "-f",
+    "--frame",
+    metavar="NAME",
+    help="Write the fields of this frame type, one row per frame, instead of the points.",
+)
+@click.option(
     "--force", is_flag=True, help="Overwrite OUT; with --to, also convert finished files again."
 )
 @click.option(
@@ -128,6 +138,7 @@ def convert(
     organized: bool,
     with_packets: bool,
     is_imu: bool,
+    frame: str | None,
     force: bool,
     suffix: str | None,
     jobs: int | None,
@@ -145,6 +156,9 @@ def convert(
     put a number into the name: scans/%05d.pcd. With %F, %H, %M or %S in the name, all scans of one
     date, hour, minute or second share a file.
 
+    With -f NAME, and for devices without points, .csv, .parquet, .arrow, .feather and .mcap hold
+    the fields of frames, in units.
+
     .lsr, .pcap and .pcapng hold the packets as they were received.
 
     Tables (.parquet, .arrow, .feather), surveys (.las, .laz, .e57), .zarr, and logs of ROS (.mcap,
@@ -155,6 +169,7 @@ def convert(
     (s3://bucket/a.pcap), and OUT is a folder. Its manifest.jsonl lists the finished pieces; repeat
     the command to convert only the missing ones. If a file fails, the others are still converted.
     """
+    chooses_scans = replace(selection, times=(None, None), time="device") != EVERYTHING
     properties = {
         "beams": selection.beams,
         "frame-id": selection.frame_id,
@@ -167,8 +182,10 @@ def convert(
     if not sources:
         raise UsageError(f"Missing argument 'OUT': the output file for the points of {target}")
     if suffix is not None:
-        if count or is_imu or organized or with_packets:
-            raise UsageError("-n, --imu, --organized and --packets cannot be combined with --to")
+        if count or is_imu or frame or organized or with_packets:
+            raise UsageError(
+                "-n, --imu, -f, --organized and --packets cannot be combined with --to"
+            )
         if jobs and scheduler:
             raise UsageError("--dask uses its own workers: omit --jobs")
         records = batch.convert(
@@ -191,19 +208,25 @@ def convert(
         raise suggest(error, "repeat with --to parquet")
     source = sources[0]
     if Path(target).suffix.lower() in _PACKET_SUFFIXES:
-        if count or is_imu or replace(selection, times=(None, None), time="device") != EVERYTHING:
+        if count or is_imu or frame or chooses_scans:
             raise UsageError(f"packets in {target} can be selected by --slice only")
         refuse_overwriting([target], source, sensor_id, force=force)
         _write_packets(source, target, sensor_id, selection.times, as_json=as_json)
         return
-    format_of(target)
+    if frame is None:
+        format_of(target)
     refuse_overwriting(find_existing(target), source, sensor_id, force=force)
     if sensor_id is None:
         sensor = _detect_sensor(source, target)
     else:
         sensor = named_sensor(sensor_id)
     with open_device(source, sensor) as device:
-        if is_imu:
+        if frame is not None or not (is_imu or device.sensor.has_points):
+            if is_imu or organized or with_packets or chooses_scans:
+                raise UsageError("frames can be selected by -n, --slice and --time only")
+            frames = _choose_frames(device, target, frame)
+            summary = _write_frames(device, target, frames, selection, count)
+        elif is_imu:
             summary = _write_imu(device, target, count)
         else:
             summary = _write_points(
@@ -230,6 +253,66 @@ def _write_imu(device: Device, target: str, count: int | None) -> dict[str, Any]
     write_imu(target, samples)
     note(f"{target}: {len(samples)} IMU samples of {device.sensor.id}; {device.stats}")
     return {"samples": len(samples)}
+
+
+def _choose_frames(device: Device, target: str, frame: str | None) -> Sequence[str]:
+    """Return the frame types to write: the requested one, else all of a device without points.
+
+    Raises:
+        UnknownFrame: for a frame type that the sensor does not send.
+        UsageError: if the file holds one type only, and none is requested.
+    """
+    sensor = device.sensor
+    known = sensor.incoming
+    if frame is not None:
+        if frame not in known:
+            raise UnknownFrame(frame, known, place=sensor.id)
+        return [frame]
+    if len(known) > 1 and not holds_several_types(target):
+        error = UsageError(
+            f"{sensor.id} has no points, and {target} holds one frame type: choose one of"
+            f" {', '.join(known)}"
+        )
+        raise suggest(error, f"repeat with -f {next(iter(known))}")
+    return list(known)
+
+
+def _write_frames(
+    device: Device,
+    target: str,
+    frames: Sequence[str],
+    selection: Selection,
+    count: int | None,
+) -> dict[str, Any]:
+    """Write the fields of frames; return the facts for the summary."""
+    batches = _select_frames(device, frames, selection, count)
+    first = next(batches, None)
+    if first is None:
+        raise _no_data_error(device, target)
+    written = write_frames(target, itertools.chain([first], batches))
+    note(f"{target}: {written} frames of {device.sensor.id}; {device.stats}")
+    return {"frames": written}
+
+
+def _select_frames(
+    device: Device, frames: Sequence[str], selection: Selection, count: int | None
+) -> Iterator[dict[str, Packets]]:
+    """Yield the selected frames in batches, none of them empty."""
+    slices = {frame: TimeSlice(selection.times) for frame in frames}
+    left = math.inf if count is None else count
+    for arrived in device.packets_by_frame(frames):
+        selected = dict[str, Packets]()
+        for frame, packets in arrived.items():
+            times = packets.host_ns if selection.time == "host" else packets.time_ns
+            which = np.flatnonzero(slices[frame].holds(times))
+            which = which[: int(min(left, len(which)))]
+            left -= len(which)
+            if len(which):
+                selected[frame] = packets.take(which)
+        if selected:
+            yield selected
+        if left <= 0 or all(wanted.ended for wanted in slices.values()):
+            return
 
 
 def _write_packets(

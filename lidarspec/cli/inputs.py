@@ -435,6 +435,16 @@ def identify_file(sensor: Sensor, source: str) -> tuple[str, str] | None:
     )
 
 
+def require_points(device: Device, source: str) -> None:
+    """Raise UsageError for a sensor without points, with a command that prints its frames."""
+    sensor = device.sensor
+    if not sensor.has_points:
+        frames = ", ".join(sensor.incoming)
+        error = UsageError(f"{sensor.id} has no points; its frames are {frames}")
+        frame = next(iter(sensor.incoming), "FRAME")
+        raise suggest(error, f"lidarspec read {quote(source)} -s {sensor.id} -f {frame}")
+
+
 class FirstFrameTimeout:
     """A timeout for the first frame of a live source.
 
@@ -447,7 +457,7 @@ class FirstFrameTimeout:
         self._source = source
         self._began = time.monotonic()
         if frame is None:
-            self._awaited = device.sensor.data_frames
+            self._awaited = device.sensor.main_frames
         else:
             self._awaited = (frame,)
 

@@ -17,6 +17,7 @@ from lidarspec.cli.inputs import (
     iter_device_scans,
     no_scan_error,
     refuse_overwriting,
+    require_points,
 )
 from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
 from lidarspec.cli.output import emit
@@ -99,6 +100,7 @@ def plot(
         raise UsageError(f"{output}: expected a suffix of {', '.join(matplotlib_figures.SUFFIXES)}")
     refuse_overwriting(output, source, sensor_id)
     with open_device(source, sensor_id) as device:
+        require_points(device, source)
         if kind == "scan":
             scan = _find_scan(device, source, selection, number)
             conclude(device)  # before drawing, during which a live source continues

@@ -15,7 +15,13 @@ import click
 import numpy as np
 
 from lidarspec.cli.failures import FINDINGS
-from lidarspec.cli.inputs import FirstFrameTimeout, conclude, iter_device_scans, no_scan_error
+from lidarspec.cli.inputs import (
+    FirstFrameTimeout,
+    conclude,
+    iter_device_scans,
+    no_scan_error,
+    require_points,
+)
 from lidarspec.cli.options import (
     DURATION,
     SHARE,
@@ -31,6 +37,7 @@ from lidarspec.points.conventions import UNITS
 from lidarspec.scans.scan import Scan
 from lidarspec.scans.selection import Selection, TimeSlice
 from lidarspec.sensor_operations import Sensor
+from lidarspec.view.live_frames import LiveFrames, open_live
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading, format_figure
 
@@ -99,6 +106,8 @@ def read(
         if frame is not None and frame not in device.sensor.frames:
             raise UnknownFrame(frame, device.sensor.frames, place=device.sensor.id)
         until = time.monotonic() + duration if duration else math.inf
+        if frame is None:
+            require_points(device, source)
         if whole or frame:
             rows = _packets(
                 device, frame, until, FirstFrameTimeout(device, source, frame), selection
@@ -288,10 +297,11 @@ class StatsPrinter:
             lasted = f" in {reading.seconds:.1f} s"
         else:
             lasted = ""
-        say(
-            f"\n{self.device.sensor.id}: {reading.packets} packets, {reading.scans} whole"
-            f" scans{lasted}; {self.device.stats}"
-        )
+        if self.device.sensor.has_points:
+            counted = f"{reading.packets} packets, {reading.scans} whole scans"
+        else:
+            counted = f"{reading.packets} frames"
+        say(f"\n{self.device.sensor.id}: {counted}{lasted}; {self.device.stats}")
         for name, unit, _, text in FIGURES:
             if text(reading) != "-":
                 say(f"  {name:<8} {text(reading):>10} {unit}")
@@ -355,7 +365,7 @@ def stats(
         with open_device(source, sensor_id, period=LOOK_S) as device:
             reading = _print_stats(
                 source,
-                LiveScans(device, select=selection),
+                open_live(device, selection),
                 StatsPrinter(device, as_json),
                 interval,
                 lasting,
@@ -373,7 +383,7 @@ def stats(
 
 
 def _print_stats(
-    source: str, feed: LiveScans, lines: StatsPrinter, interval: float, lasting: float
+    source: str, feed: LiveScans | LiveFrames, lines: StatsPrinter, interval: float, lasting: float
 ) -> MeterReading:
     """Print the lines and the summary of one source, and return the summary.
 
@@ -398,7 +408,7 @@ def _print_stats(
     return reading
 
 
-def _summary(feed: LiveScans, start: float) -> MeterReading:
+def _summary(feed: LiveScans | LiveFrames, start: float) -> MeterReading:
     """Return the figures of the whole input.
 
     Args:
@@ -410,7 +420,7 @@ def _summary(feed: LiveScans, start: float) -> MeterReading:
 
 
 def _print_by_clock(
-    feed: LiveScans,
+    feed: LiveScans | LiveFrames,
     lines: StatsPrinter,
     interval: float,
     start: float,
@@ -430,7 +440,7 @@ def _print_by_clock(
 
 
 def _print_by_packet_time(
-    feed: LiveScans, lines: StatsPrinter, interval: float, lasting: float
+    feed: LiveScans | LiveFrames, lines: StatsPrinter, interval: float, lasting: float
 ) -> None:
     """Print a line for each interval of the packets' time, at least one batch long."""
     start: int | None = None
@@ -438,12 +448,9 @@ def _print_by_packet_time(
     passed = 0.0
     while not feed.ended and passed < lasting:
         feed.read(0.0)
-        if not feed.packets:
+        times = feed.times_ns
+        if not len(times):
             continue
-        if feed.packets.host_ns.any():
-            times = feed.packets.host_ns
-        else:
-            times = feed.packets.time_ns
         start = int(times[0]) if start is None else start
         passed = (int(times[-1]) - start) * 1e-9
         if passed >= (edges + 1) * interval:

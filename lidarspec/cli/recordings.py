@@ -13,7 +13,7 @@ from lidarspec.cli.inputs import no_scan_error, refuse_overwriting
 from lidarspec.cli.options import DURATION, SPEED, count_option, selecting, sensor_option
 from lidarspec.cli.output import Progress, emit_json, size
 from lidarspec.cli.terminal import note, say
-from lidarspec.detect.identification import find_declared_sensor
+from lidarspec.detect.identification import find_declared_sensor, verb_to_show
 from lidarspec.device.named_devices import find_device
 from lidarspec.device.source_recording import SourceRecording, make_recorder
 from lidarspec.errors import (
@@ -211,7 +211,8 @@ def _describe_damage(stats: Counters) -> str:
 def _view_command(recorder: BackgroundWriter, sensor: Sensor | None) -> str:
     """Return the command that shows a recording."""
     if isinstance(recorder, Recorder) and recorder.header.sensor:
-        return f"lidarspec view {shlex.quote(recorder.path)}"
+        verb = "view" if sensor is None else verb_to_show(sensor)
+        return f"lidarspec {verb} {shlex.quote(recorder.path)}"
     return f"lidarspec {_view_words(sensor, recorder.path)}"
 
 
@@ -357,7 +358,7 @@ def _view_words(sensor: Sensor | None, place: str) -> str:
     """Return the words after `lidarspec` that show the data at a place."""
     if sensor is None:
         return f"detect {shlex.quote(place)}"
-    return f"view {shlex.quote(place)} -s {sensor.id}"
+    return f"{verb_to_show(sensor)} {shlex.quote(place)} -s {sensor.id}"
 
 
 def _describe_progress(played: Replay) -> str:

@@ -141,13 +141,12 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         return
     from lidarspec.explaining.formatting import describe_losses
 
-    low, high = sensor.range_limits
     losses = describe_losses(sensor).replace("`", "")
     links = _links(summarize_links(sensor))
     parts = [
         f"{sensor.id}: {sensor.vendor} {sensor.model}"
         + (f", also {', '.join(sensor.aliases)}" if sensor.aliases else ""),
-        f"  link    {links}\n  range   {low:g} .. {high:g} m\n  losses  {losses}"
+        f"  link    {links}\n{_range_line(sensor)}  losses  {losses}"
         f"\n  status  {sensor.status}\n  source  {sensor.source}",
     ]
     units = {role: _unit(sensor, path) for role, path in sensor.info.items()}
@@ -174,6 +173,13 @@ def show(sensor_id: str, as_plan: bool, as_json: bool, output: str | None) -> No
         headers = ["offset", "size", "type", "field", "unit", "meaning"]
         parts.append(f"\n{name}{kind}: {frame_size(frame)} bytes\n{table(headers, rows, output)}")
     emit("\n".join(parts), output)
+
+
+def _range_line(sensor: Sensor) -> str:
+    if sensor.range_limits is None:
+        return ""
+    low, high = sensor.range_limits
+    return f"  range   {low:g} .. {high:g} m\n"
 
 
 def _unit(sensor: Sensor, path: str) -> str:

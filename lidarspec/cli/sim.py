@@ -16,7 +16,7 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.options import DURATION, SHARE, configuring, count_option, sensor_option
 from lidarspec.cli.output import Progress, emit_json, render, size
 from lidarspec.cli.terminal import handle_sigterm, note, say
-from lidarspec.detect.identification import format_sensor_options
+from lidarspec.detect.identification import format_sensor_options, verb_to_show
 from lidarspec.device.demo import Demonstration, demonstrate
 from lidarspec.errors import UsageError, suggest
 from lidarspec.known_sensors import no_sensors_text
@@ -192,7 +192,8 @@ def _announce(
     sensor: Sensor, where: str, source: str, controls: Mapping[str, str], *, as_json: bool
 ) -> None:
     """Print the place of the sensor, its other links, and the next command."""
-    following = f"lidarspec view {shlex.quote(source)} {format_sensor_options(sensor)}"
+    verb = verb_to_show(sensor)
+    following = f"lidarspec {verb} {shlex.quote(source)} {format_sensor_options(sensor)}"
     if as_json:
         emit_json(
             {
@@ -260,6 +261,9 @@ def demo(sensor_id: str | Sensor | None, count: int, errors: float, as_json: boo
     sensor = named_sensor(sensor_id) if sensor_id else next(simulated, None)
     if sensor is None:
         raise UsageError(no_sensors_text())
+    if not sensor.has_points:
+        error = UsageError(f"{sensor.id} has no points, and demo draws a scan")
+        raise suggest(error, f"lidarspec stats sim:{sensor.id} -t 5s")
     result = demonstrate(sensor, turns=count, errors=errors)
     whole = [scan for scan in result.scans if scan.whole]
     if as_json:

@@ -12,7 +12,13 @@ from pathlib import Path
 
 import click
 
-from lidarspec.cli.inputs import PATIENCE, conclude, no_scan_error, refuse_overwriting
+from lidarspec.cli.inputs import (
+    PATIENCE,
+    conclude,
+    no_scan_error,
+    refuse_overwriting,
+    require_points,
+)
 from lidarspec.cli.options import DURATION, colour_option, selecting, sensor_option
 from lidarspec.cli.output import render
 from lidarspec.cli.terminal import handle_sigterm, note, say
@@ -122,6 +128,7 @@ def view(
         return
     if once or not is_interactive():
         with open_device(source, sensor_id) as device:
+            require_points(device, source)
             say(_draw_once(device, source, ramp, duration or PATIENCE, selection), colour=True)
             conclude(device)
         return
@@ -132,6 +139,7 @@ def view(
     with open_device(
         source, sensor_id, record=switch.attach if switch else None, period=LOOK_S
     ) as device:
+        require_points(device, source)
         if switch is not None:
             switch.sensor_id = device.sensor.id
         _show(
@@ -230,6 +238,7 @@ def _in_rerun(
             raise UsageError(f"{target}: a recording for Rerun requires the suffix {RERUN.suffix}")
         refuse_overwriting([target], source, sensor_id)
     with open_device(source, sensor_id, period=LOOK_S) as device:
+        require_points(device, source)
         feed = LiveScans(device, select=selection)
         show(feed, target, ramp=ramp, until=time.monotonic() + (duration or math.inf))
         if feed.scan is None:

@@ -18,6 +18,7 @@ from lidarspec.detect.identification import (
     identify_sample,
     identify_senders,
     read_info,
+    verb_to_show,
 )
 from lidarspec.detect.listen import (
     LISTEN,
@@ -314,13 +315,13 @@ def _verdict(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
         return Diagnosis(
             False,
             f"received frames of {ids[0]}{at}, not of {sensor.id}",
-            f"lidarspec view {quoted} -s {ids[0]}",
+            f"lidarspec {verb_to_show(verdict.scores[0].sensor)} {quoted} -s {ids[0]}",
         )
     name = sensor.id if sensor is not None else ids[0]
     if name not in may_be:
         other, why = next(iter(may_be.items()))
         if verdict.candidates:
-            command = f"lidarspec view {quoted} -s {other}"
+            command = f"lidarspec {verb_to_show(verdict.candidates[0].sensor)} {quoted} -s {other}"
         else:
             command = f"lidarspec detect {quoted}"
         return Diagnosis(False, f"received frames of {other} ({why}){at}, not of {name}", command)
@@ -331,7 +332,7 @@ def _verdict(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
         return Diagnosis(
             False,
             f"{name} sends{at}, but {link.baud} is declared",
-            f"lidarspec view {again} -s {name}",
+            f"lidarspec {verb_to_show(score.sensor)} {again} -s {name}",
         )
     cut_off = (
         2 * max(frame.max_length for frame in score.sensor.incoming.values()) / sample.size

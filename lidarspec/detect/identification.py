@@ -150,7 +150,7 @@ def _excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, s
         for name, relative in sensor.relatives.items()
         if isinstance(relative, Relative)
     }
-    if single:
+    if single and sensor.has_points:
         data = [item.data for item in frames if item.frame == sensor.data_frame]
     else:
         data = []
@@ -190,6 +190,8 @@ def _keep_matching(
 
 def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
     """Return a reason if the clock in the frames has the pace of this sensor, else ""."""
+    if not sensor.has_points:
+        return ""
     data = [item for item in frames if item.frame == sensor.data_frame]
     if sensor.clock is None or len(data) < 3:
         return ""
@@ -491,7 +493,7 @@ def _score(
     else:
         items = decoder.feed(b"".join(chunks))
     items += decoder.finish()
-    number = sum(decoder.stats.frames.get(name, 0) for name in sensor.data_frames)
+    number = sum(decoder.stats.frames.get(name, 0) for name in sensor.main_frames)
     if number:
         return Score(
             sensor, 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in, number, tuple(items)
@@ -637,6 +639,13 @@ def format_sensor_options(sensor: Sensor) -> str:
             *(f"-O {quote(f'{name}={value}')}" for name, value in sensor.options.items()),
         ]
     )
+
+
+def verb_to_show(sensor: Sensor) -> str:
+    """Return the verb of the command line that shows a sensor's data."""
+    if sensor.has_points:
+        return "view"
+    return "stats"
 
 
 def list_candidates(verdict: Verdict) -> list[str]:

@@ -34,9 +34,9 @@ MAX_LISTED = 6
 
 
 def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
-    """Return the signatures of the data frames of a sensor that have enough constant bytes."""
+    """Return the signatures of the main frames of a sensor that have enough constant bytes."""
     signatures = []
-    for name in sensor.data_frames:
+    for name in sensor.main_frames:
         engine = get_codec(sensor.frames[name])
         constant = {
             offset: value

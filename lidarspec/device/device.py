@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 import weakref
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -192,8 +192,11 @@ class Device(ClosingContext):
             wait: if no packet arrives for this number of seconds, yield an empty batch.
 
         Raises:
+            UsageError: if no `frame` is named for a sensor without points.
             SourceError: if a file has already been read to its end.
         """
+        if frame is None:
+            self.sensor.require_points()
         reader = self._get_reader(frame)
         ahead = self._take_ahead()
         yield_timer = _YieldTimer(wait)
@@ -209,6 +212,37 @@ class Device(ClosingContext):
             has_data = (packets is not None and len(packets)) or len(self.imu_samples)
             if has_data or batch is None or yield_timer.is_due():
                 yield reader.make_empty_batch() if packets is None else packets
+                yield_timer.restart()
+
+    def packets_by_frame(
+        self, frames: Sequence[str], *, wait: float | None = None
+    ) -> Iterator[dict[str, Packets]]:
+        """Yield packets of several frame types in batches, until the input ends.
+
+        A file is read once, by all iterators together.
+
+        Args:
+            frames: the names of the frame types.
+            wait: yield an empty batch if none arrives for this number of seconds.
+
+        Returns:
+            The packets of each type that has arrived, by name.
+
+        Raises:
+            UnknownFrame: for a frame type that the sensor does not have.
+            SourceError: if a file has already been read to its end.
+        """
+        readers = {frame: self._get_reader(frame) for frame in frames}
+        yield_timer = _YieldTimer(wait)
+        for batch in self._iter_batches(wait, self._take_ahead()):
+            packets_by_frame = dict[str, Packets]()
+            if batch is not None:
+                for frame, reader in readers.items():
+                    packets = reader.add(batch)
+                    if packets is not None and len(packets):
+                        packets_by_frame[frame] = packets
+            if packets_by_frame or batch is None or yield_timer.is_due():
+                yield packets_by_frame
                 yield_timer.restart()
 
     @overload
@@ -234,8 +268,9 @@ class Device(ClosingContext):
 
         Raises:
             SourceError: if a file has already been read to its end.
-            UsageError: if the selection contains no scan.
+            UsageError: for a sensor without points, or if the selection contains no scan.
         """
+        self.sensor.require_points()
         scans = self._iter_scans(wait)
         if select is None:
             return scans
@@ -280,7 +315,9 @@ class Device(ClosingContext):
         Raises:
             SourceTimeout: if no whole scan arrives in time.
             SourceError: if the input has ended or the device was closed.
+            UsageError: for a sensor without points.
         """
+        self.sensor.require_points()
         if timeout is None:
             deadline = None
         else:

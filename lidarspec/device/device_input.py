@@ -302,10 +302,11 @@ class FileInput(DeviceInput):
         if (
             self.state == "ended"
             and stats.bytes_in
-            and not any(name in stats.frames for name in self.sensor.data_frames)
+            and not any(name in stats.frames for name in self.sensor.main_frames)
         ):
+            kind = "data frame" if self.sensor.has_points else "frame"
             text = (
-                f"{self._source}: {stats.bytes_in} bytes, and no data frame of {self.sensor.id}"
+                f"{self._source}: {stats.bytes_in} bytes, and no {kind} of {self.sensor.id}"
                 " among them"
             )
             warnings.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")

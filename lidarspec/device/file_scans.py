@@ -52,11 +52,12 @@ class FileScans(ClosingContext):
             start of the file.
 
     Raises:
-        UsageError: for a source that is not a file.
+        UsageError: for a source that is not a file, or a sensor without points.
         SourceError: if it cannot be read.
     """
 
     def __init__(self, source: str | Path, sensor: Sensor, bookmark: bytes | None = None) -> None:
+        sensor.require_points()
         opened = open_transport(source, sensor)
         if isinstance(opened, LiveTransport):
             opened.close()

@@ -68,7 +68,7 @@ class LinkState:
             self._framed_bytes = stats.bytes_in
             self._frameless_since = None
             if not self.has_data:
-                self.has_data = any(name in stats.frames for name in self._sensor.data_frames)
+                self.has_data = any(name in stats.frames for name in self._sensor.main_frames)
         elif self._frameless_since is None and stats.bytes_in > self._framed_bytes:
             self._frameless_since = time.monotonic()
 

@@ -184,7 +184,7 @@ class LiveInput(DeviceInput):
             except CommandError as error:
                 if (
                     name in self._learning_commands
-                    and self.sensor.data_frames
+                    and self.sensor.main_frames
                     and not self.sensor.commands[name].starts
                 ):
                     self._reported_warnings.append(

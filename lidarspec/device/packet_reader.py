@@ -80,6 +80,8 @@ class PacketReader:
         if self._stream is None:
             name = choose_data_frame(self._sensor, frames)
             if name is None:
+                if not self._sensor.has_points:
+                    self._undecided.clear()
                 return None
             self._stream = self._make_stream(name)
         self._undecided.clear()

@@ -19,6 +19,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidarspec.device.capture_thread import BoundedQueue, CaptureThread, LinkEvent
 from lidarspec.device.device import Device
@@ -239,12 +240,12 @@ class SourceRecording:
         Returns:
             Whether the file may contain more packets.
         """
-        packets = next(device.packets(wait=CHECK_PERIOD_S), None)
-        if packets is None or len(packets) == 0:
+        arrived = _next_arrival_times(device)
+        if len(arrived) == 0:
             return False
-        count = int(np.count_nonzero(packets.host_ns <= (log.last or 0)))
+        count = int(np.count_nonzero(arrived <= (log.last or 0)))
         self.packets += count
-        return count == len(packets)
+        return count == len(arrived)
 
     def _end(self, log: TimedLog) -> None:
         """Ignore further arrivals, and set `elapsed` to the duration of the file."""
@@ -355,3 +356,14 @@ class SourceRecording:
             and (log.is_over or self.elapsed >= self._seconds)
         )
         return is_late or (self._count is not None and self.packets >= self._count)
+
+
+def _next_arrival_times(device: Device) -> NDArray[np.int64]:
+    """Return the arrival times of the next packets, ns; of all frames if none has points."""
+    if device.sensor.has_points:
+        packets = next(device.packets(wait=CHECK_PERIOD_S), None)
+        batches = [] if packets is None else [packets]
+    else:
+        every = device.packets_by_frame(device.sensor.main_frames, wait=CHECK_PERIOD_S)
+        batches = list(next(every, {}).values())
+    return np.concatenate([np.zeros(0, np.int64), *(batch.host_ns for batch in batches)])

@@ -20,6 +20,7 @@ from lidarspec.detect.identification import (
     format_sensor_options,
     identify_senders,
     list_candidates,
+    verb_to_show,
 )
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, suggest
@@ -35,7 +36,7 @@ from lidarspec.transports.files import (
 from lidarspec.transports.open_url import is_live, open_transport
 from lidarspec.transports.protocol import Chunk, Sender, Transport, endpoint
 from lidarspec.transports.robotics_logs import BagTransport
-from lidarspec.view.live_scans import LiveScans
+from lidarspec.view.live_frames import open_live
 from lidarspec.view.rate_meter import MeterReading
 
 #: Maximum number of bytes and of packets to read from the beginning of a file, and of bytes of a
@@ -81,6 +82,7 @@ class SensorContent:
             sensor.
         options: command-line options to read it, "" if the file names the sensor.
         reading: statistics of the part that was decoded.
+        verb: the verb of the command line that shows it.
     """
 
     source: str
@@ -88,11 +90,12 @@ class SensorContent:
     share: float | None = None
     options: str = ""
     reading: MeterReading | None = None
+    verb: str = "view"
 
     @property
     def command(self) -> str:
         """The command that shows it."""
-        return f"lidarspec view {quote(self.source)} {self.options}".rstrip()
+        return f"lidarspec {self.verb} {quote(self.source)} {self.options}".rstrip()
 
 
 @dataclass
@@ -181,7 +184,7 @@ class FileContents:
             ],
             "contents": [
                 {
-                    **vars(content),
+                    **{name: value for name, value in vars(content).items() if name != "verb"},
                     "command": content.command,
                     "reading": content.reading and content.reading.to_dict(),
                 }
@@ -278,11 +281,9 @@ def _find_sensors(contents: FileContents) -> list[SensorContent]:
     """Return the data of each sensor."""
     try:
         if (declared := find_declared_sensor(contents.path)) is not None:
-            return [
-                SensorContent(
-                    contents.path, (declared.id,), None, "", _reading(contents.path, declared)
-                )
-            ]
+            reading = _reading(contents.path, declared)
+            verb = verb_to_show(declared)
+            return [SensorContent(contents.path, (declared.id,), None, "", reading, verb)]
     except LidarSpecError as error:
         contents.warnings.append(str(error))
     judged = identify_senders(contents.path)
@@ -305,6 +306,7 @@ def _content(path: str, one: Verdict) -> SensorContent:
         best.share,
         format_sensor_options(best.sensor),
         _reading(source, best.sensor),
+        verb_to_show(best.sensor),
     )
 
 
@@ -315,7 +317,7 @@ def _reading(source: str, sensor: Sensor) -> MeterReading | None:
     """
     try:
         with Device(source, sensor) as device:
-            feed = LiveScans(device)
+            feed = open_live(device)
             while not feed.ended and device.stats.bytes_in < DECODED:
                 feed.read(0.0)
             return feed.meter.summary(device.stats)

@@ -17,6 +17,7 @@ from lidarspec.frames.wire_table import frame_size
 from lidarspec.spec import Command, Frame, Sensor, tree
 from lidarspec.spec.arguments import Address, Count
 from lidarspec.spec.links import Link, Udp
+from lidarspec.spec.timing import Split
 
 #: Increased whenever the meaning of a key changes or a key is removed.
 VERSION = 1
@@ -52,7 +53,7 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
             "vendor_axes",
         ),
         "links": {name: link_data(link) for name, link in sensor.links.items()},
-        "scan": {"rule": type(sensor.scan).__name__, **dataclasses.asdict(sensor.scan)},
+        "scan": _scan(sensor.scan),
         "clock": _clock(sensor),
         "sequence": (
             sequence
@@ -64,6 +65,13 @@ def to_data(sensor: Sensor) -> dict[str, Any]:
         "commands": {name: _command(command) for name, command in sensor.commands.items()},
         **facts(sensor, "on_open", "on_close"),
     }
+
+
+def _scan(rule: Split | None) -> dict[str, Any] | None:
+    """Return the rule by which scans end; None for a sensor without points."""
+    if rule is None:
+        return None
+    return {"rule": type(rule).__name__, **dataclasses.asdict(rule)}
 
 
 def facts(value: object, *names: str) -> dict[str, Any]:

@@ -64,10 +64,10 @@ def make_page(sensor: Sensor, pictures: Mapping[str, str] | None = None) -> str:
 def _facts(sensor: Sensor) -> Iterator[str]:
     rows = [("id", ", ".join(f"`{name}`" for name in (sensor.id, *sensor.aliases)))]
     rows += [(f"link `{name}`", _link(link)) for name, link in sensor.links.items()]
-    rows += [
-        ("range", "{:g} m to {:g} m".format(*sensor.range_limits)),
-        ("scan", f"ends {_rule(sensor.scan)}"),
-    ]
+    if sensor.range_limits is not None:
+        rows.append(("range", "{:g} m to {:g} m".format(*sensor.range_limits)))
+    if sensor.scan is not None:
+        rows.append(("scan", f"ends {_rule(sensor.scan)}"))
     rows += [("clock", _clock(sensor.clock))] if sensor.clock else []
     rows += [("losses", describe_losses(sensor))]
     rows += [("fillers", f"`{sensor.fillers.hex(' ')}` between frames")] if sensor.fillers else []

@@ -15,6 +15,7 @@ for callers. `formats` includes the formats of plugins. Modules in reading order
 * `messages`: ROS messages of scans, packets and IMU samples.
 * `bags`: .mcap, .bag, .rosbag2 and .db3, one message per scan.
 * `foxglove`: .foxglove.mcap, with Foxglove messages.
+* `frame_tables`: frames of any type, one row each, to .csv, .parquet, .arrow, .feather or .mcap.
 * `rerun`: .rrd, for the Rerun viewer.
 """
 

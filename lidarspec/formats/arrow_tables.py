@@ -134,7 +134,7 @@ def _array(arrow: Any, values: Any, kind: Any) -> Any:
     return arrow.Array.from_buffers(kind, len(values), [None, arrow.py_buffer(data)])
 
 
-def _parquet(path: Path, schema: Any) -> Any:
+def open_parquet(path: Path, schema: Any) -> Any:
     """Return a Parquet writer, without compression.
 
     Compression would take longer than everything else. Columns with few values use a dictionary.
@@ -147,22 +147,22 @@ def _parquet(path: Path, schema: Any) -> Any:
     )
 
 
-def _batches(path: Path, schema: Any, compression: str | None) -> Any:
+def open_batches(path: Path, schema: Any, compression: str | None) -> Any:
     """Return a writer of Arrow's file format."""
     ipc = import_library("pyarrow.ipc", "arrow")
     return ipc.new_file(str(path), schema, options=ipc.IpcWriteOptions(compression=compression))
 
 
 PARQUET = Format(
-    ".parquet", "Parquet, one row per point (pyarrow)", partial(_write, open_writer=_parquet)
+    ".parquet", "Parquet, one row per point (pyarrow)", partial(_write, open_writer=open_parquet)
 )
 ARROW = Format(
     ".arrow",
     "Arrow, one row per point, for memory mapping (pyarrow)",
-    partial(_write, open_writer=partial(_batches, compression=None)),
+    partial(_write, open_writer=partial(open_batches, compression=None)),
 )
 FEATHER = Format(
     ".feather",
     "Arrow, compressed with LZ4 (pyarrow)",
-    partial(_write, open_writer=partial(_batches, compression="lz4")),
+    partial(_write, open_writer=partial(open_batches, compression="lz4")),
 )

@@ -63,13 +63,13 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
     own_codec = get_codec(sensor.frames[frame])
-    is_data = sensor.frames[frame].data
+    is_main = frame in sensor.main_frames
     clock = find_clock(sensor, frame)
     timed_sensor = sensor
     if clock is not None and clock is not sensor.clock:
         timed_sensor = replace(sensor, clock=clock)
     counter_clock = None
-    if is_data and clock is not None:
+    if is_main and clock is not None:
         counter_clock = sensor.clock
     loss_clock = counter_clock
     step_ns = 0.0
@@ -81,7 +81,7 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
             terms = clock_terms(fields, own_codec.schema, sensor.id)
             step_ns = float(min((step for _, step, _, _ in terms), default=0))
     counter = sensor.sequence
-    is_counted = is_data and counter is not None and _has_field(sensor, frame, counter.field)
+    is_counted = is_main and counter is not None and _has_field(sensor, frame, counter.field)
     return PacketType(
         sensor,
         frame,
@@ -100,7 +100,8 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
 def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
     """Return the clock of the frames of a type, if any.
 
-    Data frames use the clock of the sensor, as do frames of an IMU that have its fields.
+    Data frames use the clock of the sensor. So do frames of an IMU, and all frames of a sensor
+    without points, that have its fields.
     """
     declared = sensor.frames[frame]
     shared = sensor.clock
@@ -110,7 +111,7 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
         if all(_has_field(sensor, frame, path) for path in paths(shared)):
             return shared
         return None
-    if declared.imu is None or not paths(shared):
+    if not paths(shared) or (declared.imu is None and sensor.has_points):
         return None
     schema = get_codec(declared).schema
     if all(path in schema.fields for path in paths(shared)):
@@ -120,7 +121,7 @@ def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
 
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
     """Return whether packets of this type have a field, or should, since no data frame has it."""
-    schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.data_frames}
+    schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.main_frames}
     having = [
         name
         for name, schema in schemas.items()

@@ -432,9 +432,12 @@ def choose_data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> s
     """Return the default data frame type of an input.
 
     It is the configured type, or else the type of the first data frame that arrived. None if the
-    sensor has several types, none is configured, and no data frame has arrived yet.
+    sensor has several types, none is configured, and no data frame has arrived yet, and for a
+    sensor without points.
     """
     names = sensor.data_frames
+    if not sensor.has_points:
+        return None
     if len(names) < 2 or sensor.options.get("answer") in names:
         return sensor.data_frame
     for frames in batches:

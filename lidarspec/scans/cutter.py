@@ -46,6 +46,7 @@ class ScanCutter:
 
     def __init__(self, sensor: SensorDescription) -> None:
         rule = sensor.scan
+        assert rule is not None  # as of every sensor with points
         self._ends = EndFinder(sensor)
         self._limits = ScanLimits(sensor)
         self._warning = f"{_describe_missing_end(rule)} within {self._limits.seconds:.3g} s"

@@ -159,6 +159,7 @@ class Scan:
             period = 1 / self.rate_hz
         else:
             period = abs(slope) * FULL_TURN
+        assert self.sensor.range_limits is not None  # as of every sensor with points
         range_min, range_max = self.sensor.range_limits
         return LaserScan(
             angle_min=first,

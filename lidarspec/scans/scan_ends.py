@@ -58,6 +58,7 @@ class EndFinder:
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
+        assert sensor.scan is not None  # as of every sensor with points
         self._rule = sensor.scan
         self._reader = AngleReader(sensor)
         self._wraps = WrapDetector()

@@ -24,9 +24,8 @@ from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import get_codec
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.faults import Faults, FaultyLink
-from lidarspec.simulation.frame_maker import FrameMaker
 from lidarspec.simulation.scenes import Scene, make_room
-from lidarspec.simulation.simulator import FrameSimulation, RestingImu, frame_simulation
+from lidarspec.simulation.simulator import FrameSimulation, FramesWithoutPoints, frame_simulation
 from lidarspec.spec.description import Answer, Command, Frame
 from lidarspec.spec.links import is_datagram
 from lidarspec.spec.sensor import with_frames
@@ -37,9 +36,6 @@ SECOND = 1_000_000_000
 #: packets.
 AHEAD = SECOND // 4
 MOST = 128
-#: Number of frames that are made together, of a type that the sensor sends unasked, such as IMU
-#: data.
-UNASKED_BATCH = 50
 #: Number of fillers that are sent in a pause.
 FILLERS = 14
 #: Maximum delay of a device in ns; if it is polled less often, its time stands still.
@@ -79,15 +75,10 @@ class ReplyMaker:
 
     def __init__(self, sensor: Sensor, shake: float = 0.0) -> None:
         self._sensor = sensor
-        self._shake = shake
-        self._rests: dict[str, RestingImu] = {}
+        self._frames = FramesWithoutPoints(sensor, shake)
         self._received: dict[str, int] = {}
         links = {command.link for command in sensor.commands.values() if command.frame}
         self._decoders = {link: _command_decoder(sensor, link) for link in links}
-        self._makers: dict[str, FrameMaker] = {}
-        self._unasked: dict[
-            str, tuple[int, list[bytes]]
-        ] = {}  # frame type: number of the first frame of a batch, and the batch
 
     def find_requests(self, data: bytes, now: int, link: str) -> list[ReceivedCommand]:
         """Return the commands that these bytes complete; other bytes are ignored."""
@@ -111,36 +102,9 @@ class ReplyMaker:
                 chosen = declared
         return [self._make_reply(answer, request) for answer in chosen]
 
-    def frame(self, name: str, values: Mapping[str, Any]) -> bytes:
-        """Return a frame of a type other than data.
-
-        It has the defaults of the spec, the values of its `sweep`, and these physical values.
-        """
-        return self._make(name, range(1), values)[0]
-
     def unasked_frame(self, name: str, number: int) -> bytes:
-        """Return the frame of this number of a type that the sensor sends unasked.
-
-        Frames are made in batches, since a batch takes hardly longer than one frame.
-        """
-        start = number - number % UNASKED_BATCH
-        if self._unasked.get(name, (-1, []))[0] != start:
-            self._unasked[name] = start, self._make(name, range(start, start + UNASKED_BATCH), {})
-        return self._unasked[name][1][number - start]
-
-    def _make(self, name: str, numbers: range, values: Mapping[str, Any]) -> list[bytes]:
-        """Return the frames of these numbers of a type other than data."""
-        if name not in self._makers:
-            self._makers[name] = FrameMaker(self._sensor, name)
-        declared = self._sensor.frames[name]
-        state = self._sensor.state.get(name, {})
-        sweep = declared.simulation.sweep
-        given = [{**state, **(sweep(number) if sweep else {}), **values} for number in numbers]
-        table = self._makers[name].table(given)
-        if declared.imu is not None:
-            rest = self._rests.setdefault(name, RestingImu(self._sensor, name, given[0]))
-            rest.fill(table, self._shake, [numbers.start])
-        return self._makers[name].seal(table)
+        """Return the frame of this number of a type that the sensor sends unasked."""
+        return self._frames.numbered(name, number)
 
     def _make_reply(self, answer: Answer, request: ReceivedCommand) -> ReplyPart:
         if isinstance(answer, bytes):
@@ -148,7 +112,8 @@ class ReplyMaker:
         if isinstance(answer, int | float):
             return ReplyPart(pause=float(answer))
         name, values = (answer, {}) if isinstance(answer, str) else answer
-        return ReplyPart(name, self.frame(name, {**self._matching_values(name, request), **values}))
+        given = {**self._matching_values(name, request), **values}
+        return ReplyPart(name, self._frames.make(name, given))
 
     def _matching_values(self, name: str, request: ReceivedCommand) -> dict[str, Any]:
         """Return the physical values that match a reply to its request."""
@@ -329,7 +294,8 @@ class SimulatedDevice:
         self._powered = 0
         self._time = 0.0
         self._plug: int | None = None
-        self._simulation(sensor.data_frame)
+        if sensor.has_points:
+            self._simulation(sensor.data_frame)
 
     def _line(self, name: str, seed: int) -> FaultyLink:
         """Return the faulty line of a link.
@@ -352,10 +318,10 @@ class SimulatedDevice:
             self._plug = now + int(self.faults.unplug * SECOND)
         else:
             self._plug = None
-        for name, frame in self.sensor.incoming.items():
-            if frame.simulation.rate and not frame.data:
-                self._put(0.0, "data", name, self._replies.unasked_frame(name, 0))
-        if not self._waits_for_a_command():
+        is_started = not self._waits_for_a_command()
+        if is_started or self.sensor.has_points:
+            self._begin_unasked(0.0)
+        if is_started and self.sensor.has_points:
             self._begin(0.0, self.sensor.data_frame)
 
     def _waits_for_a_command(self) -> bool:
@@ -476,7 +442,9 @@ class SimulatedDevice:
             self._plan = [
                 due
                 for due in self._plan
-                if due.frame and self.sensor.frames[due.frame].simulation.rate
+                if due.frame
+                and self.sensor.frames[due.frame].simulation.rate
+                and self.sensor.has_points
             ]
             heapq.heapify(self._plan)
         announcing = {frame.after for frame in self.sensor.frames.values() if frame.after}
@@ -486,7 +454,9 @@ class SimulatedDevice:
             else:
                 self._put(time_ns, command.link, answer.frame, answer.data)
                 mode = answer.frame if answer.frame in announcing else mode
-        if command.starts:
+        if command.starts and not self.sensor.has_points:
+            self._begin_unasked(time_ns)
+        elif command.starts:
             kinds = [
                 name
                 for name, frame in self.sensor.frames.items()
@@ -499,6 +469,12 @@ class SimulatedDevice:
             )
             if chosen is not None:
                 self._begin(time_ns, chosen)
+
+    def _begin_unasked(self, at: float) -> None:
+        """Plan the first frames of the types that are sent periodically, besides the data."""
+        for name, frame in self.sensor.incoming.items():
+            if frame.simulation.rate and not frame.data:
+                self._put(at, "data", name, self._replies.unasked_frame(name, 0))
 
     def _settle(self, at: float, seconds: float, link: str) -> float:
         """Send fillers during a pause, and return the time of its end."""

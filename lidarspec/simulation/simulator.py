@@ -20,7 +20,9 @@ the coordinates, which are linear in the raw values, are solved for the point th
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+import heapq
+import itertools
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,6 +67,8 @@ _MEASURED = ("range", "azimuth", "elevation", "ox", "oy", "oz", "x", "y", "z", "
 PROBE = 100
 #: Relative tolerance between a range and its field, for rounding errors.
 EXACT = 1e-9
+#: Number of frames without points that are made together.
+UNASKED_BATCH = 50
 #: Standard gravity, m/s2.
 GRAVITY = 9.80665
 
@@ -234,6 +238,7 @@ class Measurement:
         metres = scene.measure(
             np.nan_to_num(beams.azimuth), np.nan_to_num(beams.elevation), beams.origin, seconds
         )
+        assert self._sensor.range_limits is not None  # as of every sensor with points
         near, far = self._sensor.range_limits
         metres = np.where(has_direction & (metres >= near) & (metres <= far), metres, 0)
         return np.asarray(
@@ -894,12 +899,74 @@ class FrameSimulation:
         """Return the values of a frame that change because the rotor turns."""
         fields = get_codec(self._sensor.frames[self._frame]).schema.fields
         rule = self._sensor.scan
+        assert rule is not None  # as of every sensor with points
         cut_by = "" if isinstance(rule, Every) else rule.name
         return {
             path: value
             for path, value in values.items()
             if path == cut_by or fields[path].unit in ("deg", "rad")
         }
+
+
+class FramesWithoutPoints:
+    """Makes frames of the types without points: replies, and those sent unasked.
+
+    Each has the defaults of the spec, the values of its `sweep`, and the readings of an IMU at
+    rest.
+
+    Args:
+        shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
+    """
+
+    def __init__(self, sensor: Sensor, shake: float = 0.0) -> None:
+        self._sensor = sensor
+        self._shake = shake
+        self._makers = dict[str, FrameMaker]()
+        self._rests = dict[str, RestingImu]()
+        #: Frame type -> the number of the first frame of a batch, and the batch.
+        self._batches = dict[str, tuple[int, list[bytes]]]()
+
+    def make(self, name: str, values: Mapping[str, Any]) -> bytes:
+        """Return a frame with these physical values."""
+        return self._make(name, range(1), values)[0]
+
+    def numbered(self, name: str, number: int) -> bytes:
+        """Return the frame of this number.
+
+        Frames are made in batches, since a batch takes hardly longer than one frame.
+        """
+        start = number - number % UNASKED_BATCH
+        if self._batches.get(name, (-1, []))[0] != start:
+            self._batches[name] = start, self._make(name, range(start, start + UNASKED_BATCH), {})
+        return self._batches[name][1][number - start]
+
+    def iter_unasked(self) -> Iterator[bytes]:
+        """Yield the frames that are sent periodically, in the order of their times."""
+        rates = {
+            name: frame.simulation.rate
+            for name, frame in self._sensor.incoming.items()
+            if frame.simulation.rate and not frame.data
+        }
+        due = heapq.merge(*(_iter_due(name, rate) for name, rate in rates.items()))
+        return (self.numbered(name, number) for _, name, number in due)
+
+    def _make(self, name: str, numbers: range, values: Mapping[str, Any]) -> list[bytes]:
+        if name not in self._makers:
+            self._makers[name] = FrameMaker(self._sensor, name)
+        declared = self._sensor.frames[name]
+        state = self._sensor.state.get(name, {})
+        sweep = declared.simulation.sweep
+        given = [{**state, **(sweep(number) if sweep else {}), **values} for number in numbers]
+        table = self._makers[name].table(given)
+        if declared.imu is not None:
+            rest = self._rests.setdefault(name, RestingImu(self._sensor, name, given[0]))
+            rest.fill(table, self._shake, [numbers.start])
+        return self._makers[name].seal(table)
+
+
+def _iter_due(name: str, rate: float) -> Iterator[tuple[float, str, int]]:
+    """Yield the times of frames in seconds, with their type and number, without an end."""
+    return ((number / rate, name, number) for number in itertools.count())
 
 
 @functools.lru_cache(maxsize=64)
@@ -913,15 +980,23 @@ def simulate(
 ) -> list[bytes]:
     """Return the data frames that a sensor in a scene sends, in order.
 
+    A sensor without points sends its periodic frames, those with a `rate`.
+
     Args:
         packets: number of frames.
         start: the number of the first one since the sensor was switched on.
         scene: the surroundings, such as `read_scene` reads from a file; by default a room.
 
     Raises:
-        UsageError: if the sensor declares no `sweep`.
+        UsageError: if the sensor declares no `sweep`, or no `rate` if it has no points.
         SpecError: if its ranges cannot be traced back to fields.
     """
+    if not sensor.has_points:
+        unasked = FramesWithoutPoints(sensor).iter_unasked()
+        frames = list(itertools.islice(unasked, start, start + packets))
+        if not frames and packets:
+            raise UsageError(f"{sensor.id}: it sends no frames unasked: none declares a `rate`")
+        return frames
     stream = frame_simulation(sensor, sensor.data_frame)
     return stream.block(start, packets, scene or Room(), start * stream.interval / 1e9).frames
 

@@ -77,8 +77,8 @@ class SensorDescription:
     vendor: str = field(kw_only=True)
     model: str = field(kw_only=True)
     frames: Mapping[str, Frame] = field(kw_only=True)
-    points: Callable[[Any], Points] | None = field(kw_only=True)
-    scan: Split = field(kw_only=True)
+    points: Callable[[Any], Points] | None = field(default=None, kw_only=True)
+    scan: Split | None = field(default=None, kw_only=True)
     links: Mapping[str, Link] = field(kw_only=True)
     commands: Mapping[str, Command] = field(default_factory=dict, kw_only=True)
     clock: Clock | None = field(default=None, kw_only=True)
@@ -92,7 +92,7 @@ class SensorDescription:
     )
     on_open: tuple[str, ...] = field(default=(), kw_only=True)
     on_close: tuple[str, ...] = field(default=(), kw_only=True)
-    range_limits: tuple[float, float] = field(kw_only=True)
+    range_limits: tuple[float, float] | None = field(default=None, kw_only=True)
     vendor_axes: tuple[str, str, str] | None = field(default=None, kw_only=True)
     beams: int | None = field(default=None, kw_only=True)
     turn: tuple[float, float] | None = field(default=None, kw_only=True)
@@ -124,9 +124,11 @@ class SensorDescription:
         """The name of the frame type with the points; with several, the chosen one.
 
         Raises:
+            UsageError: for a sensor without points; the message lists its frame types.
             UnknownFrame: if there is none yet, for a sensor that needs a file first.
         """
         names = self.data_frames
+        self.require_points()
         if not names:
             raise UnknownFrame(
                 "data", self.frames, place=self.id, hint="; configure the sensor first"
@@ -143,6 +145,25 @@ class SensorDescription:
     def data_frames(self) -> tuple[str, ...]:
         """The names of the frame types with points."""
         return tuple(name for name, frame in self.frames.items() if frame.data)
+
+    @property
+    def has_points(self) -> bool:
+        """Whether a frame type has points; True for a sensor that has no frames yet."""
+        return bool(self.data_frames) or not self.frames
+
+    def require_points(self) -> None:
+        """Raise UsageError for a sensor without points; the message lists its frame types."""
+        if not self.has_points:
+            example = next(iter(self.incoming), "")
+            raise UsageError(
+                f"{self.id} has no points: name a frame type, such as frame={example!r}; there are"
+                f" {', '.join(self.incoming) or 'none'}"
+            )
+
+    @cached_property
+    def main_frames(self) -> tuple[str, ...]:
+        """The names of the data frames; of a sensor without points, all incoming frames."""
+        return self.data_frames or tuple(self.incoming)
 
     @cached_property
     def imu_frames(self) -> tuple[str, ...]:
@@ -275,10 +296,21 @@ def _check_sensor(sensor: SensorDescription) -> None:
     _check_names(sensor, "info", sensor.info_frames, sensor.frames)
     _check_names(sensor, "on_open, on_close", sensor.on_open, sensor.commands)
     _check_names(sensor, "on_open, on_close", sensor.on_close, sensor.commands)
+    if sensor.data_frames:
+        _check_points(sensor)
+
+
+def _check_points(sensor: SensorDescription) -> None:
+    """Raise SpecError if a sensor with data frames lacks a fact about its points or scans."""
     if sensor.points is None and any(
         frame.data and frame.points is None for frame in sensor.frames.values()
     ):
         raise SpecError("a data frame without a points function", path="points", sensor=sensor.id)
+    for name in ("scan", "range_limits"):
+        if getattr(sensor, name) is None:
+            raise SpecError(
+                "missing: needed for a sensor with a data frame", path=name, sensor=sensor.id
+            )
 
 
 def _check_facts(sensor: SensorDescription) -> None:

@@ -107,18 +107,19 @@ def _sensor(sensor: Sensor) -> Findings:
             yield "LS211", f"{name} is empty", ""
     if "data" not in sensor.links:
         yield "LS211", "link 'data' is missing", "links"
-    if sensor.frames and not any(frame.data for frame in sensor.frames.values()):
-        yield "LS211", "no frame is declared with data=True", "frames"
-    low, high = sensor.range_limits
-    if not 0 <= low < high:
-        yield "LS210", f"range_limits are {low:g} .. {high:g}", "range_limits"
+    if sensor.points is not None and not sensor.has_points:
+        yield "LS211", "no frame is declared with data=True, but points is given", "frames"
+    if sensor.range_limits is not None:
+        low, high = sensor.range_limits
+        if not 0 <= low < high:
+            yield "LS210", f"range_limits are {low:g} .. {high:g}", "range_limits"
 
 
 def _check_required_fields(sensor: Sensor) -> Findings:
     """Yield the missing fields of scans, clock and counter."""
     known = {
         path
-        for name in sensor.data_frames
+        for name in sensor.main_frames
         for path in get_codec(sensor.frames[name]).schema.scan_names
     }
     if isinstance(sensor.scan, OnWrap):
@@ -153,7 +154,7 @@ def _clock(sensor: Sensor) -> Findings:
         not isinstance(clock, Clock)
         or callable(clock.source)
         or clock.wraps_at is not None
-        or not sensor.frames
+        or not sensor.data_frames
     ):
         return
     named = get_codec(sensor.frames[sensor.data_frame]).schema.scan_names
@@ -530,6 +531,9 @@ def _intensity(subject: SensorUnderTest, name: str, result: Any) -> Findings:
 
 def _reach(subject: SensorUnderTest) -> Findings:
     """Yield a finding if a range limit exceeds the largest value of the range field."""
+    limits = subject.sensor.range_limits
+    if limits is None:
+        return
     reach: list[tuple[float, str]] = []
     for name in subject.sensor.data_frames:
         try:
@@ -547,17 +551,17 @@ def _reach(subject: SensorUnderTest) -> Findings:
             metres = None
         if info is None or metres is None:
             return
-        declared = "{:g} .. {:g}".format(*subject.sensor.range_limits)
+        declared = "{:g} .. {:g}".format(*limits)
         held = [info.physical(raw) * float(metres) for raw in (1, info.limits[1])]
         subject.picture[f"{name}: range"] = (
             f"{held[0]:.4g} .. {held[1]:.6g} m can be represented, {declared} m is declared"
         )
         reach.append((held[1], f"{name}.{info.path}"))
     furthest, path = max(reach, default=(np.inf, ""))
-    if subject.sensor.range_limits[1] > furthest * 1.001:
+    if limits[1] > furthest * 1.001:
         yield (
             "LS210",
-            f"it ends at {furthest:g} m, but range_limits at {subject.sensor.range_limits[1]:g} m",
+            f"it ends at {furthest:g} m, but range_limits at {limits[1]:g} m",
             path,
         )
 

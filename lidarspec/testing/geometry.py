@@ -670,6 +670,7 @@ def a_simulated_scene_comes_back(subject: SensorUnderTest, name: str) -> None:
         f"a point is {worst:.4f} m from the nearest surface of the scene",
         f"{name}.points",
     )
+    assert subject.sensor.range_limits is not None  # as of every sensor with points
     near, far = subject.sensor.range_limits
     ranges = cloud.range[:count][valid]
     inside = not len(ranges) or (ranges.min() >= near - UNTOLD and ranges.max() <= far + UNTOLD)

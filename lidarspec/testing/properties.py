@@ -21,6 +21,12 @@ from lidarspec.testing.findings import Finding, ViolationError
 from lidarspec.testing.sensor_under_test import SensorUnderTest
 
 
+def _no_points(subject: SensorUnderTest) -> str:
+    if subject.sensor.has_points:
+        return ""
+    return "it has no points"
+
+
 def _no_sweep(subject: SensorUnderTest) -> str:
     names = subject.sensor.data_frames
     if not any(subject.sensor.simulation_of(name).sweep for name in names):
@@ -39,9 +45,11 @@ def _no_commands(subject: SensorUnderTest) -> str:
 
 def _no_device(subject: SensorUnderTest) -> str:
     has_replies = any(command.replies for command in subject.sensor.commands.values())
-    if has_replies:
+    if not has_replies:
+        return "it has no commands with a documented reply"
+    if subject.sensor.has_points:
         return _no_sweep(subject)
-    return "it has no commands with a documented reply"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -134,7 +142,17 @@ class Property:
 FAILS = ("LS213", "LS214", "LS215", "LS414")
 
 #: Attributes that decide the result of decoding a stream.
-READING = ("frames", "datagrams", "data_frame", "points", "clock", "sequence", "scan", "state")
+READING = (
+    "frames",
+    "datagrams",
+    "main_frames",
+    "options",
+    "points",
+    "clock",
+    "sequence",
+    "scan",
+    "state",
+)
 
 PROPERTIES = (
     Property(frames.examples_are_valid_and_repeat, "frame", "LS301"),
@@ -220,6 +238,7 @@ PROPERTIES = (
         streams.the_same_bytes_give_the_same_points,
         "sensor",
         "LS415",
+        lacks=_no_points,
         unless=FAILS,
         depends_on=READING,
     ),
@@ -228,6 +247,7 @@ PROPERTIES = (
         streams.scans_do_not_depend_on_batches,
         "sensor",
         "LS404",
+        lacks=_no_points,
         unless=(*FAILS, "LS415"),
         depends_on=READING,
     ),

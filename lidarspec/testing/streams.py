@@ -33,7 +33,7 @@ def a_clean_input_loses_nothing(subject: SensorUnderTest) -> None:
     received = [(item.frame, item.data) for item in subject.sensor.split(data)]
     if received != sent:
         raise _loss(sent, received)
-    stats = subject.sensor.decode(data).stats
+    stats = subject.sensor.decode(data, subject.sensor.main_frames[0]).stats
     require(not stats.plugin_errors, "LS414", str(stats.failure("")))
     require(
         (stats.bytes_skipped, stats.pending) == (0, 0),

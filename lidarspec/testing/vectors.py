@@ -224,6 +224,7 @@ def points_stand_in_two_quadrants(subject: SensorUnderTest, name: str) -> None:
     subject.picture[f"{name}: vectors"] = (
         f"{seen} in {len(vectors)} vectors, with x and y in {number}"
     )
+    assert subject.sensor.range_limits is not None  # as of every sensor with points
     far = subject.sensor.range_limits[1]
     require(
         not len(ranges) or ranges.max() <= far * (1 + NEAR),

@@ -105,7 +105,7 @@ def _commands_on_open(sensor: Sensor) -> list[str]:
 def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
     """Return the error with the reason why a device has sent no data."""
     sensor = device.sensor
-    sent = {name: device.sent[name] for name in sensor.data_frames if device.sent[name]}
+    sent = {name: device.sent[name] for name in sensor.main_frames if device.sent[name]}
     if sent:
         frames = ", ".join(f"{number} {name}" for name, number in sent.items())
         return UsageError(

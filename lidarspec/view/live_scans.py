@@ -10,6 +10,9 @@ from __future__ import annotations
 import time
 from collections import deque
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lidarspec.device.device import Device
 from lidarspec.device.device_input import BATCH_BYTES
 from lidarspec.packets.packets import Packets
@@ -29,9 +32,14 @@ READ_AHEAD_S = 0.1
 #: bytes of the first read of a played file.
 MIN_PORTION_BYTES = 1 << 12
 
+Times = NDArray[np.int64]
+
 
 class LiveScans:
     """Takes the scans of an open device.
+
+    Raises:
+        UsageError: for a sensor without points.
 
     Args:
         device: open; it is not closed.
@@ -59,6 +67,7 @@ class LiveScans:
         select: Selection | None = None,
         ahead: float | None = READ_AHEAD_S,
     ) -> None:
+        device.sensor.require_points()
         self.device = device
         self.speed = speed
         self.packets: Packets | None = None
@@ -87,6 +96,15 @@ class LiveScans:
     def ended(self) -> bool:
         """Whether the input has ended and every scan was shown."""
         return self._is_read_out and not self._waiting
+
+    @property
+    def times_ns(self) -> Times:
+        """The times of the packets that were read last, ns: of arrival, or else their own."""
+        if self.packets is None:
+            return np.zeros(0, np.int64)
+        if self.packets.host_ns.any():
+            return self.packets.host_ns
+        return self.packets.time_ns
 
     def read(self, until: float) -> None:
         """Read until a time of `time.monotonic`, or the end; at least once.

@@ -186,14 +186,27 @@ class RateMeter:
     def packets(self, packets: Packets) -> None:
         """Count a batch."""
         arrivals = packets.host_ns[packets.host_ns > 0]
-        by_host = len(arrivals) > 0
-        times = arrivals if by_host else packets.time_ns
+        if len(arrivals):
+            self._add(len(packets), arrivals, by_host=True)
+        else:
+            self._add(len(packets), packets.time_ns, by_host=False)
+
+    def frames(self, count: int, arrivals: NDArray[np.int64]) -> None:
+        """Count frames of several types.
+
+        Args:
+            arrivals: ascending times, ns.
+        """
+        self._add(count, arrivals, by_host=True)
+
+    def _add(self, count: int, times: NDArray[np.int64], *, by_host: bool) -> None:
+        """Count packets, and the intervals between their ascending times in ns."""
         previous = np.array([] if self._last_ns is None else [self._last_ns], np.int64)
         gaps = np.diff(np.concatenate([previous, times])) * 1e-9
         if len(times):
             self._last_ns = int(times[-1])
         for tally in (self._recent, self._all):
-            tally.add_packets(len(packets), gaps, by_host=by_host)
+            tally.add_packets(count, gaps, by_host=by_host)
 
     def scan(self, scan: Scan) -> None:
         """Count a whole scan; pieces of a scan say nothing about speed and points."""

@@ -1,0 +1,216 @@
+"""Write frames of any type, one row each, with their fields in units.
+
+A row has `time_ns`, the time of the frame, and each field that is not constant: numbers in their
+unit, other integers as they are, bytes as hexadecimal text, or as text if the frame is text. An
+element of an array of numbers has a column of its own, such as `gains[2]`; nan where a frame lacks
+it. Tables hold one frame type. An MCAP file has a topic for each type, with JSON messages, which
+Foxglove and PlotJuggler read; its log times are those of arrival, if they are known.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import UsageError
+from lidarspec.formats.arrow_tables import ARROW, FEATHER, PARQUET, open_batches, open_parquet
+from lidarspec.formats.bags import CHUNK, MCAP
+from lidarspec.formats.common import replace_file, write_in_thread
+from lidarspec.formats.text import CSV, CSV_GZ, open_text_file
+from lidarspec.optional_libraries import import_library
+from lidarspec.packets.packets import Packets
+from lidarspec.spec.tree import FieldInfo
+
+#: Columns by name: numbers, or lists of texts.
+Columns = dict[str, Any]
+#: The packets that arrived together, by frame type.
+Batch = Mapping[str, Packets]
+
+
+def frame_columns(packets: Packets) -> Columns:
+    """Return the columns of packets: `time_ns`, and the fields that are not constant."""
+    columns: Columns = {"time_ns": packets.time_ns}
+    for path, info in packets.table.schema.fields.items():
+        if info.const is not None:
+            continue
+        if info.kind == "bytes":
+            is_text = getattr(packets.sensor.frames[packets.frame].wire, "is_text", False)
+            columns[path] = _texts(packets.table.raw(path), is_text=is_text)
+        else:
+            columns |= _elements(path, _numbers(packets, path, info))
+    return columns
+
+
+def _numbers(packets: Packets, path: str, info: FieldInfo) -> NDArray[Any]:
+    """Return a field in its unit; an integer without one stays an integer if no frame lacks it."""
+    values = packets[path]
+    if info.kind == "int" and not info.scaled and values.ndim == 1 and not np.isnan(values).any():
+        return packets.table.raw(path)
+    return values
+
+
+def _elements(path: str, values: NDArray[Any]) -> Columns:
+    """Return a column for each element of an array field, or the column of another field."""
+    if values.ndim == 1:
+        return {path: values}
+    columns: Columns = {}
+    for index in np.ndindex(values.shape[1:]):
+        name = path + "".join(f"[{number}]" for number in index)
+        columns[name] = values[(slice(None), *index)]
+    return columns
+
+
+def _texts(values: NDArray[Any], *, is_text: bool) -> list[str]:
+    """Return a field of bytes as texts, (n, bytes) or (n, elements, bytes) to n texts."""
+    rows = [row.tobytes() for row in values]
+    if is_text:
+        return [row.rstrip(b"\x00").decode("ascii", "backslashreplace") for row in rows]
+    return [row.hex(" ") for row in rows]
+
+
+def write_frames(path: str | Path, batches: Iterable[Batch]) -> int:
+    """Write frames to a file in the format of its suffix; return their number.
+
+    Args:
+        path: .csv, .csv.gz, .parquet, .arrow or .feather for one frame type; .mcap for several.
+
+    Raises:
+        UsageError: for another suffix.
+        SourceError: if the file cannot be written.
+    """
+    path = Path(path)
+    name = path.name.lower()
+    known = [suffix for suffix in WRITERS if name.endswith(suffix)]
+    if not known:
+        raise UsageError(f"{path}: frames are written to {', '.join(WRITERS)}")
+    with replace_file(path) as part:
+        return WRITERS[max(known, key=len)](part, batches)
+
+
+def holds_several_types(path: str | Path) -> bool:
+    """Return whether a file of this name can hold several frame types."""
+    return str(path).lower().endswith(MCAP.suffix)
+
+
+def _tables(batches: Iterable[Batch]) -> Iterator[Columns]:
+    """Yield the columns of each batch of one frame type; later ones as the first one."""
+    names: list[str] = []
+    for packets in itertools.chain.from_iterable(batch.values() for batch in batches):
+        columns = frame_columns(packets)
+        names = names or list(columns)
+        missing = np.full(len(packets), np.nan)
+        yield {name: columns.get(name, missing) for name in names}
+
+
+def _write_csv(path: Path, batches: Iterable[Batch], *, is_zipped: bool = False) -> int:
+    count = 0
+    with open_text_file(path, is_zipped=is_zipped) as put:
+        for columns in _tables(batches):
+            if not count:
+                put(",".join(columns) + "\n")
+            cells = [_cells(values) for values in columns.values()]
+            for row in zip(*cells, strict=True):
+                put(",".join(row) + "\n")
+                count += 1
+    return count
+
+
+def _cells(values: Any) -> list[str]:
+    """Return a column as CSV; texts that need it are quoted."""
+    if isinstance(values, list):
+        return [_quote(text) for text in values]
+    if values.dtype.kind == "f":
+        return [f"{value:.15g}" for value in values.tolist()]
+    return [str(int(value)) for value in values.tolist()]
+
+
+def _quote(text: str) -> str:
+    if any(character in text for character in ',"\r\n'):
+        return '"' + text.replace('"', '""') + '"'
+    return text
+
+
+def _write_table(
+    path: Path, batches: Iterable[Batch], *, open_writer: Callable[[Path, Any], Any]
+) -> int:
+    arrow = import_library("pyarrow", "arrow")
+    count = 0
+    tables = (arrow.table(_with_float_integers(columns)) for columns in _tables(batches))
+    first = next(tables, None)
+    if first is None:
+        return 0
+    with open_writer(path, first.schema) as writer, write_in_thread(writer.write_table) as write:
+        for table in itertools.chain([first], tables):
+            write(table.cast(first.schema))
+            count += len(table)
+    return count
+
+
+def _with_float_integers(columns: Columns) -> Columns:
+    """Return columns whose types do not depend on the batch: integers but times as float64."""
+    return {
+        name: values.astype(np.float64)
+        if name != "time_ns" and not isinstance(values, list)
+        else values
+        for name, values in columns.items()
+    }
+
+
+def _write_mcap(path: Path, batches: Iterable[Batch]) -> int:
+    mcap = import_library("mcap.writer", "ros")
+    channels = dict[str, int]()
+    count = 0
+    with path.open("wb") as file:
+        log = mcap.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
+        log.start(profile="", library="lidarspec")
+        for packets in itertools.chain.from_iterable(batch.values() for batch in batches):
+            columns = frame_columns(packets)
+            frame = packets.frame
+            if frame not in channels:
+                name = f"{packets.sensor.id}.{frame}"
+                schema = log.register_schema(name, "jsonschema", _json_schema(columns).encode())
+                channels[frame] = log.register_channel(f"/{frame}", "json", schema)
+            times = np.where(packets.host_ns > 0, packets.host_ns, packets.time_ns)
+            for row, time_ns in enumerate(np.maximum(times, 0).tolist()):
+                data = json.dumps({name: _plain(values[row]) for name, values in columns.items()})
+                log.add_message(
+                    channels[frame], log_time=time_ns, publish_time=time_ns, data=data.encode()
+                )
+                count += 1
+        log.finish()
+    return count
+
+
+def _json_schema(columns: Columns) -> str:
+    types = {
+        name: "string" if isinstance(values, list) else "number" for name, values in columns.items()
+    }
+    properties = {name: {"type": kind} for name, kind in types.items()}
+    return json.dumps({"type": "object", "properties": properties})
+
+
+def _plain(value: Any) -> Any:
+    """Return a value for JSON, null for nan and infinity."""
+    if isinstance(value, str):
+        return value
+    number = value.item()
+    if isinstance(number, float) and not np.isfinite(number):
+        return None
+    return number
+
+
+WRITERS: Mapping[str, Callable[[Path, Iterable[Batch]], int]] = {
+    CSV.suffix: _write_csv,
+    CSV_GZ.suffix: partial(_write_csv, is_zipped=True),
+    PARQUET.suffix: partial(_write_table, open_writer=open_parquet),
+    ARROW.suffix: partial(_write_table, open_writer=partial(open_batches, compression=None)),
+    FEATHER.suffix: partial(_write_table, open_writer=partial(open_batches, compression="lz4")),
+    MCAP.suffix: _write_mcap,
+}

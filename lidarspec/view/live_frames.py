@@ -1,0 +1,71 @@
+"""The frames of an open device without points, between two lines of figures.
+
+`open_live` chooses between these frames and the scans of a device with points (`live_scans`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+
+import numpy as np
+
+from lidarspec.device.device import Device
+from lidarspec.errors import UsageError
+from lidarspec.packets.packets import Packets
+from lidarspec.scans.selection import EVERYTHING, Selection
+from lidarspec.view.live_scans import LOOK_S, LiveScans, Times
+from lidarspec.view.rate_meter import RateMeter
+
+
+def open_live(device: Device, select: Selection = EVERYTHING) -> LiveScans | LiveFrames:
+    """Return the scans of an open device, or the frames of one without points.
+
+    Raises:
+        UsageError: if scans are selected, and the sensor has no points.
+    """
+    if device.sensor.has_points:
+        return LiveScans(device, select=select)
+    if select != EVERYTHING:
+        raise UsageError(f"{device.sensor.id} has no points: omit the options that select scans")
+    return LiveFrames(device)
+
+
+class LiveFrames:
+    """Takes the frames of every type of an open device, and counts them.
+
+    Args:
+        device: open; it is not closed.
+
+    Attributes:
+        packets: the batches that were read last, one for each type that arrived.
+        ended: whether the input has ended.
+        meter: counts the frames.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.packets: Collection[Packets] = ()
+        self.ended = False
+        self.meter = RateMeter(device.stats, counts_losses=device.sensor.counts_losses)
+        self._batches = device.packets_by_frame(device.sensor.main_frames, wait=LOOK_S)
+
+    @property
+    def times_ns(self) -> Times:
+        """The times of arrival of the frames that were read last, ns, ascending."""
+        arrivals = np.concatenate([np.zeros(0, np.int64), *(one.host_ns for one in self.packets)])
+        return np.sort(arrivals[arrivals > 0])
+
+    def read(self, until: float) -> None:
+        """Read until a time of `time.monotonic`, or the end; at least once.
+
+        Raises:
+            LidarSpecError: if the source fails.
+        """
+        while not self.ended:
+            batch = next(self._batches, None)
+            self.ended = batch is None
+            self.packets = [] if batch is None else batch.values()
+            self.meter.frames(sum(map(len, self.packets)), self.times_ns)
+            if time.monotonic() >= until:
+                return

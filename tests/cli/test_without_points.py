@@ -1,0 +1,198 @@
+"""A device without points: each verb works, or says what is missing and what to do instead."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec import simulate
+from lidarspec.recording.recorders import Recorder
+from lidarspec.transports.protocol import Chunk
+from tests.cli.running import ran
+from tests.libraries import Library, needs
+from tests.shapes import SHAPES
+from tests.shapes.receiver import SENSOR
+
+parquet = Library("pyarrow.parquet")
+mcap = Library("mcap.reader")
+
+RECEIVER = Path(__file__).parents[1] / "shapes" / "receiver.py"
+START_NS = 1_700_000_000 * 10**9
+STEP_NS = 100_000_000
+FRAMES = simulate(SENSOR, 60)  # five `fix` to one `warmth`
+FIX_COUNT = 50
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of five seconds, whose frames arrive one by one."""
+    path = tmp_path_factory.mktemp("receiver") / "receiver.lsr"
+    with Recorder(path, SENSOR, "made") as recorder:
+        for number, frame in enumerate(FRAMES):
+            recorder.write(Chunk(frame, START_NS + number * STEP_NS))
+    return path
+
+
+def test_decoding_needs_the_name_of_a_frame_type() -> None:
+    data = b"".join(FRAMES)
+    there_are = "frame='fix'; there are fix, warmth, rate_reply"
+    for read in (SENSOR.decode, SENSOR.scans):
+        with pytest.raises(ls.UsageError, match=there_are):
+            read(data)
+    packets = SENSOR.decode(data, frame="fix")
+    assert packets["latitude"].tolist() == pytest.approx([47 + i * 1e-5 for i in range(FIX_COUNT)])
+    assert packets.time_ns.tolist() == [i * STEP_NS for i in range(FIX_COUNT)]
+    assert SENSOR.decode(data, frame="warmth")["temperature"][:2].tolist() == [20, 21]
+
+
+def test_losses_are_counted() -> None:
+    packets = SENSOR.decode(b"".join([*FRAMES[:10], *FRAMES[20:]]), frame="fix")
+    assert packets.stats.lost == FIX_COUNT - len(packets) > 0
+
+
+def test_only_sensors_without_points_may_lack_a_scan_and_limits() -> None:
+    for name in ("scan", "range_limits", "points"):
+        with pytest.raises(ls.SpecError, match=name):
+            replace(SHAPES["shape-count"], **{name: None})
+
+
+def test_a_device_yields_the_packets_of_several_types(recording: Path) -> None:
+    counts = {"fix": 0, "warmth": 0}
+    with ls.open(recording, SENSOR) as device:
+        for batch in device.packets_by_frame(["fix", "warmth"]):
+            for name, packets in batch.items():
+                counts[name] += len(packets)
+    assert counts == {"fix": FIX_COUNT, "warmth": 10}
+    with ls.open(recording, SENSOR) as device:
+        with pytest.raises(ls.UsageError, match="there are fix"):
+            next(device.packets())
+        with pytest.raises(ls.UsageError, match="there are fix"):
+            device.latest(0)
+
+
+@pytest.mark.parametrize("verb", ["view", "plot", "read"])
+def test_verbs_that_need_points_suggest_another(verb: str, recording: Path, tmp_path: Path) -> None:
+    more = ["-o", tmp_path / "plot.svg"] if verb == "plot" else []
+    error = ran(verb, recording, "-s", RECEIVER, *more, code=2).stderr
+    assert "has no points; its frames are fix, warmth, rate_reply" in error
+    assert f"next: lidarspec read {recording} -s shape-receiver -f fix" in error
+
+
+def test_demo_suggests_the_statistics() -> None:
+    assert "next: lidarspec stats sim:" in ran("demo", "-s", RECEIVER, code=2).stderr
+
+
+def test_the_suggested_verb_prints_the_fields(recording: Path) -> None:
+    lines = ran("read", recording, "-s", RECEIVER, "-f", "fix", "-n", "2", "--json").stdout
+    rows = [json.loads(line) for line in lines.splitlines()]
+    assert [row["latitude"] for row in rows] == [47, 47.00001]
+
+
+def test_stats_count_all_frames(recording: Path) -> None:
+    lines = ran("stats", recording, "-s", RECEIVER, "--json").stdout.splitlines()
+    summary = json.loads(lines[-1])
+    assert (summary["packets"], summary["stats"]["frames"]["warmth"]) == (60, 10)
+    assert summary["packet_rate_hz"] == pytest.approx(10)
+    assert len(lines) > 1
+    text = ran("stats", f"sim:{RECEIVER}?rate=20", "-t", "500ms").stdout
+    assert "frames in 0.5 s" in text
+
+
+def test_check_is_clean() -> None:
+    assert "clean" in ran("check", RECEIVER).stdout
+
+
+def test_a_simulation_follows_its_commands(tmp_path: Path) -> None:
+    path = tmp_path / "simulated.lsr"
+    assert "next: lidarspec stats" in ran("sim", RECEIVER, "-t", "2s", "--to", path).stderr
+    assert "rate   7 Hz" in ran("send", f"sim:{RECEIVER}", "rate", "rate=7").stdout
+    target = tmp_path / "recorded.lsr"
+    summary = ran("record", f"sim:{RECEIVER}?rate=max", "-n", "20", "-o", target).stderr
+    assert "packets" in summary
+    assert "decoding fails" not in summary
+
+
+@pytest.mark.parametrize("form", ["wireshark", "c", "ksy", "md", "svg", "json", "pyi"])
+def test_exports(form: str) -> None:
+    text = ran("export", form, RECEIVER).stdout
+    assert "latitude" in text
+    if form == "json":
+        assert json.loads(text)["scan"] is None
+
+
+def test_show_has_no_range() -> None:
+    assert "range " not in ran("show", RECEIVER).stdout.partition("fix:")[0]
+
+
+def convert(recording: Path, target: Path, *words: str) -> None:
+    ran("convert", recording, target, "-s", RECEIVER, *words)
+
+
+def test_fields_become_csv(recording: Path, tmp_path: Path) -> None:
+    convert(recording, tmp_path / "fix.csv", "-f", "fix", "-n", "3")
+    expected = [
+        "time_ns,number,time,latitude,longitude,quality,sum",
+        "0,0,0,47,8.5,3,93",
+        "100000000,1,0.1,47.00001,8.5,3,195",
+        "200000000,2,0.2,47.00002,8.5,3,42",
+    ]
+    assert (tmp_path / "fix.csv").read_text().splitlines() == expected
+    convert(recording, tmp_path / "fix.csv.gz", "-f", "fix", "-n", "3")
+    with gzip.open(tmp_path / "fix.csv.gz", "rt") as file:
+        assert file.read().splitlines() == expected
+
+
+def test_a_table_holds_one_type(recording: Path, tmp_path: Path) -> None:
+    target = tmp_path / "all.csv"
+    error = ran("convert", recording, target, "-s", RECEIVER, code=2).stderr
+    assert "choose one of fix, warmth, rate_reply" in error
+    assert "next: repeat with -f fix" in error
+    assert not target.exists()
+
+
+@pytest.mark.slow
+@needs("pyarrow")
+def test_fields_become_parquet(recording: Path, tmp_path: Path) -> None:
+    convert(recording, tmp_path / "fix.parquet", "-f", "fix")
+    table = parquet.read_table(tmp_path / "fix.parquet")
+    packets = SENSOR.decode(b"".join(FRAMES), frame="fix")
+    assert table["time_ns"].to_pylist() == packets.time_ns.tolist()
+    for name in ("number", "latitude", "quality"):
+        np.testing.assert_array_equal(table[name].to_numpy(), packets[name])
+
+
+@pytest.mark.slow
+@needs("mcap")
+def test_fields_of_all_types_become_mcap(recording: Path, tmp_path: Path) -> None:
+    convert(recording, tmp_path / "all.mcap")
+    with (tmp_path / "all.mcap").open("rb") as file:
+        messages = list(mcap.make_reader(file).iter_messages())
+    assert [message.log_time for _, _, message in messages] == [
+        START_NS + number * STEP_NS for number in range(60)
+    ]
+    assert {channel.topic for _, channel, _ in messages} == {"/fix", "/warmth"}
+    schema, channel, message = messages[1]
+    assert (schema.name, channel.message_encoding) == ("shape-receiver.warmth", "json")
+    assert json.loads(message.data)["temperature"] == 20
+
+
+def test_a_part_is_converted(recording: Path, tmp_path: Path) -> None:
+    convert(recording, tmp_path / "part.csv", "-f", "fix", "--slice", "1s:2s")
+    rows = (tmp_path / "part.csv").read_text().splitlines()[1:]
+    assert [row.split(",")[1] for row in rows] == [str(i) for i in range(10, 20)]
+
+
+def test_fields_of_a_sensor_with_points_are_converted(tmp_path: Path) -> None:
+    sensor = ls.sensor("ldrobot-stl27l")
+    path = tmp_path / "lidar.bin"
+    path.write_bytes(b"".join(simulate(sensor, 3)))
+    ran("convert", path, tmp_path / "lidar.csv", "-s", sensor.id, "-f", "data")
+    header, *rows = (tmp_path / "lidar.csv").read_text().splitlines()
+    assert header.startswith("time_ns,speed,start_angle,points.distance[0],points.distance[1]")
+    assert len(rows) == 3
