@@ -233,7 +233,7 @@ class HeaderWalk:
             case tree.Never():
                 raise TooLongError(path)
             case tree.Derived():
-                self._derived(node, path, shape, strides)
+                self._add_derived(node, path, shape, strides)
             case tree.Opaque():
                 raise NotCompilableError(node.info.path, node.reason)
         if self.cursor > self.limit:
@@ -276,7 +276,7 @@ class HeaderWalk:
             self.constants.update({offset + size * index: byte for index in range(count)})
         self.cursor = start + size * count
 
-    def _derived(
+    def _add_derived(
         self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
         """Add a value without bytes of its own."""

@@ -26,7 +26,7 @@ from lidarspec.errors import SourceError, SpecError, UnknownSensor
 from lidarspec.plugins import Registry, import_file, registry, split_file_and_id
 from lidarspec.sensor_operations import Sensor
 from lidarspec.testing.declaration import check_declaration
-from lidarspec.testing.findings import Finding, unacknowledged
+from lidarspec.testing.findings import Finding, list_unacknowledged
 from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.sensor_under_test import EXAMPLES, SensorUnderTest
 from lidarspec.testing.vectors import lacking
@@ -677,7 +677,7 @@ def _report(
     report.findings += check_declaration(subject)
     for done, one in enumerate(PROPERTIES):
         known = sorted(
-            {finding.code for finding in unacknowledged(report.findings, sensor, whole=False)}
+            {finding.code for finding in list_unacknowledged(report.findings, sensor, whole=False)}
             & set(one.unless)
         )
         reason = one.lacks(subject) or (f"{', '.join(known)} was found" if known else "")
@@ -693,7 +693,9 @@ def _report(
     distinct = list(
         {(finding.code, finding.path): finding for finding in reversed(report.findings)}.values()
     )[::-1]
-    left = unacknowledged(distinct, sensor, whole=ELSE not in report.skipped and not subject.tested)
+    left = list_unacknowledged(
+        distinct, sensor, whole=ELSE not in report.skipped and not subject.tested
+    )
     report.findings = [places.locate(finding, sensor) for finding in left]
     report.measured = subject.measured
     report.picture = subject.picture and {

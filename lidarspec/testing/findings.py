@@ -2,7 +2,7 @@
 
 The rules are a table, which a test compares with the reference page. A property raises `ViolationError`
 (through `require`) if it does not hold, which becomes a `Finding`; findings that a declaration
-acknowledges with a reason are removed at the end, by `unacknowledged`.
+acknowledges with a reason are removed at the end, by `list_unacknowledged`.
 """
 
 from __future__ import annotations
@@ -226,7 +226,7 @@ def require(holds: object, code: str, what: str, path: str = "") -> None:
         raise ViolationError(code, what, path)
 
 
-def unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[Finding]:
+def list_unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool) -> list[Finding]:
     """Return the findings that a declaration does not acknowledge with a reason.
 
     Args:

@@ -57,7 +57,7 @@ from lidarspec.testing import frames
 from lidarspec.testing.check import CheckTarget, reports
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declaration import check_declaration
-from lidarspec.testing.findings import ViolationError, unacknowledged
+from lidarspec.testing.findings import ViolationError, list_unacknowledged
 from lidarspec.testing.frames import (
     values_in_units_build_the_same_bytes,
     values_survive_building_and_parsing,
@@ -327,7 +327,7 @@ def left(sensor: Sensor) -> set[str]:
     """What its declaration leaves over."""
     return {
         finding.code
-        for finding in unacknowledged(
+        for finding in list_unacknowledged(
             check_declaration(SensorUnderTest(sensor)), sensor, whole=True
         )
     }

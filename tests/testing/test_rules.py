@@ -21,7 +21,7 @@ from lidarspec.spec import (
 )
 from lidarspec.testing.commands import the_simulated_sensor_answers
 from lidarspec.testing.declaration import check_declaration
-from lidarspec.testing.findings import unacknowledged
+from lidarspec.testing.findings import list_unacknowledged
 from lidarspec.testing.geometry import the_points_turn_as_the_axes_do
 from lidarspec.testing.properties import PROPERTIES
 from lidarspec.testing.sensor_under_test import SensorUnderTest
@@ -33,7 +33,7 @@ def declared_codes(sensor: Sensor) -> set[str]:
     """Return the rules that a declaration alone breaks."""
     return {
         finding.code
-        for finding in unacknowledged(
+        for finding in list_unacknowledged(
             check_declaration(SensorUnderTest(sensor)), sensor, whole=True
         )
     }

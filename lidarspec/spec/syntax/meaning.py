@@ -244,17 +244,17 @@ class _Builder:
         if inner is construct.Pass:
             return tree.Empty(name)
         if name and not place.in_bits:
-            derived = self._derived(inner, place)
+            derived = self._make_derived(inner, place)
             if derived is not None:
                 return derived
         return self._leaf(inner, place)
 
-    def _derived(self, con: Construct, place: _Context) -> tree.Node | None:
+    def _make_derived(self, con: Construct, place: _Context) -> tree.Node | None:
         """Return the node of a value that is not on the wire; None for another construct, or if
         only construct can compute it.
         """
         if isinstance(con, construct.Computed):
-            return self._computed(con, place)
+            return self._make_computed(con, place)
         if con is construct.Tell and place.offset is not None:
             info = _integer(place.info)
             offset = place.offset()
@@ -269,7 +269,7 @@ class _Builder:
                 return tree.Derived(place.info, "peeked", node=node)
         return None
 
-    def _computed(self, con: construct.Computed, place: _Context) -> tree.Node | None:
+    def _make_computed(self, con: construct.Computed, place: _Context) -> tree.Node | None:
         if not callable(con.func):
             self._add_value(place, con.func)
             return tree.Derived(place.info, "computed", constant=con.func)
