@@ -1,10 +1,10 @@
-"""Datagrams, each one frame, whole, or none: of which type each is, judged together.
+"""Find the frame type of each datagram; a datagram is one whole frame or none.
 
-The rule of streams, without the search: at the first byte of a datagram the order of the types
-decides, a type with `after` only counts while it is announced, and a frame has to be as long as its
-datagram. Datagrams that are all alike are judged as rows (`lidarspec.framing.regular_rows`). Of the
-others, each type judges the datagrams that no earlier type has taken. Only a datagram that makes a
-plugin fail is judged alone, so that it does not cost the others.
+The rule of streams applies, without the search: at the first byte of a datagram the order of the
+types decides, a type with `after` counts only while it is active, and a frame must be as long as
+its datagram. Datagrams of one size and type are judged as rows (`lidarspec.framing.regular_rows`).
+Otherwise each type judges the datagrams that no earlier type has accepted. Only a datagram that
+makes a plugin fail is judged alone, so that it does not cost the others.
 
 A message in several datagrams is joined before this (`lidarspec.framing.datagram_assembly`).
 """
@@ -40,12 +40,12 @@ def sort_datagrams(
     """Return the type of each datagram.
 
     Args:
-        buffer: what the datagrams stand in.
-        starts, sizes: of each, in the order of their arrival.
-        mode: remembered between batches, changed here.
+        buffer: the bytes that contain the datagrams.
+        starts, sizes: of each datagram, in the order of their arrival.
+        mode: state between batches; changed here.
 
     Returns:
-        All datagrams as frames, those that are none with the kind -1.
+        All datagrams as frames; datagrams that are not frames have the kind -1.
     """
     steady = find_regular_datagrams(framing, buffer, starts, sizes, mode)
     if steady is not None and steady.is_sound:
@@ -54,10 +54,10 @@ def sort_datagrams(
 
 
 class _DatagramBatch:
-    """Some datagrams, judged once for each of the frames that may have been announced.
+    """Some datagrams, judged once for each set of active types.
 
     Args:
-        steady: what they are as frames of one type and layout, where that was tried.
+        steady: the verdict on them as frames of one type and layout, if that was tried.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class _DatagramBatch:
         self._piece = PieceResult(Frames.make_empty(buffer), len(buffer))
 
     def sort(self, mode: SearchState) -> PieceResult:
-        """Return all of them."""
+        """Return the type of each datagram."""
         position = 0
         parts = list[Frames]()
         while position < len(self._starts):
@@ -89,7 +89,7 @@ class _DatagramBatch:
         return self._piece
 
     def _sort_from(self, position: int, mode: SearchState) -> Frames:
-        """Return the types from here up to the datagram that changes what is looked for."""
+        """Return the types from `position` to the datagram that changes the active types."""
         if mode.after not in self._known:
             frames, reasons = self._judge(self._starts[position:], self._sizes[position:], mode)
             if self._framing.named:
@@ -118,11 +118,10 @@ class _DatagramBatch:
         return frames
 
     def _judge(self, starts: Indices, sizes: Indices, mode: SearchState) -> tuple[Frames, Status]:
-        """Return the type and layout of each datagram while nothing changes what is looked for.
+        """Return the type and layout of each datagram, and why others are invalid.
 
-        Returns:
-            They, and why those that are no frames are none, 0 where they resemble none; `PLUGIN`
-            where each is to be judged alone.
+        The active types are those of `mode` throughout. The reason is 0 for datagrams without the
+        constants of any type, and `PLUGIN` for datagrams that must be judged alone.
         """
         number = len(starts)
         common_size = broadcast_value(sizes)
@@ -145,7 +144,7 @@ class _DatagramBatch:
         ]
         others = [
             kind for kind, size in fixed if size is not None and not least <= size <= most
-        ]  # they can only say why not
+        ]  # no datagram fits them, so they can only give a reason
         for kind in (*(kind for kind, _ in fixed if kind not in others), *others):
             if not len(left):
                 break
@@ -191,9 +190,9 @@ class _DatagramBatch:
     def _count_rejected(
         self, frames: Frames, lost: Indices, reasons: Status, mode: SearchState
     ) -> Frames:
-        """Count datagrams that are no frames; judge again those with a plugin failure.
+        """Count invalid datagrams; judge again the datagrams at which the plugin failed.
 
-        Returns the datagrams up to a frame that changes which types are searched.
+        Return the datagrams up to a frame that changes the active types.
         """
         parts = list[Frames]()
         begun = 0
@@ -213,7 +212,7 @@ class _DatagramBatch:
         return frames
 
     def _judge_alone(self, datagram: Frames, mode: SearchState) -> Frames | None:
-        """One datagram as a frame, None where it is none; counts why."""
+        """Return one datagram as a frame; if it is invalid, count the reason and return None."""
         rejected = 0
         start = datagram.starts
         size = datagram.sizes
@@ -236,7 +235,8 @@ class _DatagramBatch:
     def _count(self, reasons: NDArray[np.uint8], sizes: Indices, mode: SearchState) -> None:
         """Count datagrams as rejected.
 
-        Without the constants of a frame they count as such, or as too short to have them.
+        A datagram without the constants of a frame counts as `bad_constant`, or as `bad_length` if
+        it is too short to have them.
         """
         least = min(self._framing.ends[kind] for kind in self._framing.active_types(mode))
         unknown = np.isin(reasons, (VALID, CONSTANT))

@@ -1,10 +1,11 @@
-"""Frames at equal distances, judged as the rows of an array instead of by a search.
+"""Judge frames at equal distances as the rows of an array, without a search.
 
 In an undisturbed stream frames follow one another without a byte between; datagrams of one size
-stand at equal distances in a capture, and back to back in an array. If all of them are frames of
-one layout, and no earlier type begins at their first bytes, the search would take the same. So
-they are judged as rows, which takes a few calls: of a stream up to the first invalid row, where the
-search goes on; of datagrams all or none. Rows of a weak type go on with a run that is under way.
+are at equal distances in a capture, and back to back in an array. If all of them are frames of one
+layout, and no earlier type matches at their first bytes, the search would accept the same frames.
+So they are judged as rows, which takes a few calls. In a stream the rows end at the first invalid
+row, where the search continues; datagrams are judged as rows all or none. Rows of a weak type
+continue a run.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from lidarspec.frames.layout import Bytes2D, Layout, Marks, are_contradictory, m
 from lidarspec.framing.candidates import Framing, PieceResult, SearchState
 from lidarspec.framing.results import Frames, Indices, Numbers
 
-#: rows whose constants are compared before those of all rows.
+#: number of rows whose constants are compared first, before those of all rows.
 FIRST_ROWS = 64
 #: bytes of a piece that is judged as rows even after a piece with damaged frames.
 SMALL_PIECE_BYTES = 1 << 16
@@ -28,11 +29,11 @@ DISTINCTIVE_CONSTANTS = 4
 def find_regular_frames(
     framing: Framing, buffer: NDArray[np.uint8], mode: SearchState, base: int
 ) -> PieceResult | None:
-    """Return the frames of a piece from its first byte on; None if it has to be searched.
+    """Return the frames of a piece from its first byte on; None if it must be searched.
 
     Args:
-        buffer: the bytes not yet decided and those after them.
-        mode: as after the piece before; whether rows were worth their time is noted in it.
+        buffer: the undecided bytes and the bytes after them.
+        mode: state between pieces; records whether rows were faster.
         base: offset of the buffer in the stream.
     """
     if not mode.size or not (mode.steady or len(buffer) <= SMALL_PIECE_BYTES):
@@ -69,11 +70,10 @@ def find_regular_frames(
 def find_regular_datagrams(
     framing: Framing, buffer: NDArray[np.uint8], starts: Numbers, sizes: Indices, mode: SearchState
 ) -> Frames | None:
-    """Return datagrams of one size at equal distances, judged as frames of one type and layout.
+    """Return datagrams at equal distances as frames of one type and layout, or None.
 
-    Returns:
-        None if they may be anything else: if some lack the constants of that type or have those of
-        an earlier one, or if they change which types are looked for.
+    None means that they must be judged otherwise: they differ in size, some lack the constants of
+    the type or have the constants of an earlier type, or they change the active types.
     """
     rows = _rows(buffer, starts, sizes)
     if rows is None:

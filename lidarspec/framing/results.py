@@ -1,11 +1,9 @@
 """The results of framing: frames as one struct of arrays, single frames, and counters.
 
-`Frames` is what every part of the framing passes on to the next: a frame type's engine says which
-candidates are frames and of which layout, the search takes some of them, the decoder adds where in
-the input they stand and when they came, and packets
-become columns by the layouts that are known by then. Frames of one size at one distance are
-described by a few numbers: arrays that follow from these cost more than finding such frames does,
-and are made only when they are read.
+`Frames` is passed from step to step: the engine of a frame type judges candidates and finds their
+layouts, the search accepts some of them, and the decoder adds their offsets in the input and their
+arrival times. Frames of one size at equal distances are described by a few numbers; the arrays that
+follow from these cost more than finding the frames, so they are made when they are first read.
 """
 
 from __future__ import annotations
@@ -31,21 +29,21 @@ from lidarspec.frames.layout import Bytes2D, Layout
 
 Indices = NDArray[np.intp]
 Status = NDArray[np.integer[Any]]
-#: places, or the numbers of a range, which become an array when they are read.
+#: offsets as an array, or as a range that becomes an array when it is first read.
 Numbers = NDArray[np.int64] | range
 
-#: what a candidate is: a frame, one that is short of bytes, or why it is none.
+#: status of a candidate: valid, incomplete, or the reason why it is invalid.
 VALID, SHORT, LENGTH, CONSTANT, CHECKSUM, IMPLAUSIBLE, PLUGIN = range(7)
 
-#: layouts whose frames are found one layout after another sooner than by sorting, and sooner than
-#: by counting first.
-FEW = 16
-FEWER = 4
+#: up to this number of layouts, frames are found faster layout by layout than by sorting.
+MAX_UNSORTED_LAYOUTS = 16
+#: up to this number of layouts, no count of each layout is needed first.
+MAX_UNCOUNTED_LAYOUTS = 4
 
-#: bytes that the repr of a frame shows.
-SHOWN = 8
+#: number of bytes in the repr of a frame.
+REPR_BYTES = 8
 
-#: which counter a rejected candidate raises.
+#: status of a rejected candidate -> its counter.
 COUNTED = {
     SHORT: "bad_length",
     LENGTH: "bad_length",
@@ -66,19 +64,20 @@ class Counters:
         bytes_filler: declared fillers among the skipped bytes.
         pending: bytes held because a candidate needs more.
         bad_checksum, bad_length, implausible: rejected candidates.
-        bad_constant: datagrams without the constants of any frame; in a stream such bytes are
-            skipped, and are no candidate.
+        bad_constant: datagrams without the constants of any frame. In a stream such bytes are
+            skipped and are not candidates.
         lost, duplicates, late: packets, by the sensor's counter and clock.
-        fragments_lost, fragments_late: datagrams of messages that were given up without them; those
-            that came when their message was joined or given up already, or for the second time.
+        fragments_lost: datagrams that were missing when their message was abandoned.
+        fragments_late: datagrams that arrived twice, or after their message was joined or
+            abandoned.
         kernel_drops, queue_dropped, foreign, disconnects: counted by the transports.
         unread: bytes of a damaged file that could not be read.
-        plugin_errors: packets, or candidates, at which a function of the plugin raised; `failures`
-            keeps the first ones.
-        nominal: whether a default calibration stood in for the sensor's own in any scan.
-        unended: what to say of scans that were handed out without an end; "" where there were none.
-        undated: what to say of times that no frame has completed; "" where they are complete.
-        masked: what to say of a masked sector; "" if there is none.
+        plugin_errors: packets or candidates at which a function of the plugin raised; `failures`
+            has the first exceptions.
+        nominal: whether a default calibration was used in any scan.
+        unended: the warning about scans without a detected end; "" if there is none.
+        undated: the warning about times without a date; "" if there is none.
+        masked: the remark on a masked sector; "" if there is none.
     """
 
     bytes_in: int = 0
@@ -182,26 +181,25 @@ class Found:
     gap: int = 0
 
     def __repr__(self) -> str:
-        begin = f"{self.data[:SHOWN].hex(' ')}{' ...' * (len(self.data) > SHOWN)}"
+        begin = f"{self.data[:REPR_BYTES].hex(' ')}{' ...' * (len(self.data) > REPR_BYTES)}"
         return f"Found({self.frame} at byte {self.offset}, {len(self.data)} bytes: {begin})"
 
 
 class Frames:
-    """Frames, or candidates for frames, in a piece of input, in its order: n of each array.
+    """Frames or candidates in a piece of input, in order, as arrays of length n.
 
     Attributes:
-        buffer: the bytes that they stand in, at `starts`, `sizes` long; of a candidate that is
-            short of bytes the size is how many tell more (0: any).
-        names, kinds: the incoming frame types of a sensor, and which of them each is, as an index;
-            -1 where none.
-        layouts, forms: the layouts of compiled frames, and which of them each has, as an index; -1
-            where nobody knows.
-        status: `VALID`, or why a candidate is no frame.
-        offsets: where each begins in everything fed so far (for datagram links in the payloads,
-            joined).
-        places: these offsets, as a range where the frames have one size and follow one another.
-        rows: the bytes of each, one a row, where all have one layout and somebody gathered them; of
-            candidates, of as many from the first one on as are whole.
+        buffer: the bytes that contain them, from `starts`, `sizes` long. The size of an incomplete
+            candidate is the number of bytes required to decide about it (0: unknown).
+        names, kinds: the incoming frame types of a sensor, and the type of each frame as an index;
+            -1 for datagrams that are not frames.
+        layouts, forms: the layouts of compiled frames, and the layout of each frame as an index; -1
+            if unknown.
+        status: `VALID`, or why a candidate is not a frame.
+        offsets: the offset of each in the whole input; datagrams count as if they were joined.
+        places: these offsets, as a range if the frames have one size and follow one another.
+        rows: the bytes of each as one row, if all have one layout and the rows were gathered; for
+            candidates, of the first complete ones.
         errors: failures of the plugin.
     """
 
@@ -235,12 +233,12 @@ class Frames:
 
     @classmethod
     def make_empty(cls, buffer: NDArray[np.uint8]) -> Frames:
-        """Return no frames."""
+        """Return an object without frames."""
         return cls(buffer, repeat(-1, 0), range(0), repeat(0, 0))
 
     @classmethod
     def join(cls, parts: Sequence[Frames]) -> Frames:
-        """Candidates in one buffer, one part after another, without their rows and tracebacks."""
+        """Return candidates of several parts of one buffer, without their rows and errors."""
         if len(parts) == 1:
             return parts[0]
         layouts = list[Layout]()
@@ -282,12 +280,12 @@ class Frames:
 
     @cached_property
     def at(self) -> NDArray[np.int64]:
-        """The arrival time of each frame, (n,) ns, -1 where nobody knows it."""
+        """The arrival time of each frame, (n,) ns, -1 if unknown."""
         return repeat(-1, len(self))
 
     @property
     def layout(self) -> Layout | None:
-        """The layout that all frames have; None where they differ, or nobody knows."""
+        """The layout of all frames; None if layouts differ or are unknown."""
         form = broadcast_value(self.forms)
         if form is None or form < 0:
             return None
@@ -335,7 +333,7 @@ class Frames:
             if form >= 0:
                 return [(self.layouts[form], count_up(len(self)))]
             return []
-        if len(self.layouts) <= FEWER:
+        if len(self.layouts) <= MAX_UNCOUNTED_LAYOUTS:
             groups = [
                 (layout, np.flatnonzero(self.forms == form))
                 for form, layout in enumerate(self.layouts)
@@ -343,7 +341,7 @@ class Frames:
             return [(layout, which) for layout, which in groups if len(which)]
         return [
             (self.layouts[form], which)
-            for form, which in group_by_value(self.forms, FEW)
+            for form, which in group_by_value(self.forms, MAX_UNSORTED_LAYOUTS)
             if form >= 0
         ]
 
@@ -387,7 +385,7 @@ class Frames:
         return self.buffer[self.starts[index] : self.starts[index] + self.sizes[index]].tobytes()
 
     def found(self) -> list[Found]:
-        """Return the frames one by one."""
+        """Return the frames as a list of `Found`."""
         rows = zip(
             self.kinds.tolist(),
             self.offsets.tolist(),
@@ -402,7 +400,7 @@ class Frames:
 
 
 def pack_found(frames: Sequence[Found]) -> Frames:
-    """Frames given one by one as arrays."""
+    """Return a list of `Found` as `Frames`."""
     names = tuple(dict.fromkeys(item.frame for item in frames))
     sizes = np.array([len(item.data) for item in frames], np.intp)
     columns = [
@@ -425,7 +423,7 @@ def to_array(numbers: Numbers) -> NDArray[np.int64]:
 
 
 def _shift(forms: Indices, first: int) -> Indices:
-    """Indices of layouts that stand behind others."""
+    """Return indices of layouts, increased by the number of layouts before them."""
     form = broadcast_value(forms)
     if form is None:
         return np.where(forms < 0, -1, forms + first)
