@@ -189,7 +189,7 @@ def livox_packet(sensor: ls.Sensor, frame: bytes) -> Sensor:
     )
     return make_sensor(
         sealed,
-        lambda f: livox.cartesian(f, sdk2.after(f)),
+        lambda f: livox.cartesian(f, sdk2.point_times(f)),
         len(frame),
         scan="frame_cnt",
         clock="timestamp",

@@ -1,11 +1,12 @@
-"""3iRobotix Delta-2A, 2B, 2D and 2G, and the LDS08RR that sends their packets: lidars of vacuum
-cleaners, which send by themselves.
+"""3iRobotix Delta-2A, 2B, 2D and 2G, and the LDS08RR with the same packets.
 
-Source: the drivers kaiaai/LDS (LDS_DELTA_2A and its kin, LDS_LDS08RR) and lds2d; two packets of a
-Delta-2A out of another driver's tests. There is no public manual. A packet has the angle of its
-first sample alone; its span follows from the packets of a turn, 16, or 15 of a 2G. Known errors of
-drivers: one takes the sum modulo FFFF, and it is modulo 10000. The field of the zero's offset is
-told and not applied, as the drivers do. The motor is driven by the host, by PWM.
+Lidars of vacuum cleaners, which send without a request. The host drives the motor with PWM.
+
+Source: the drivers kaiaai/LDS (LDS_DELTA_2A and related classes, LDS_LDS08RR) and lds2d; two
+packets of a Delta-2A from another driver's tests. There is no public manual. A packet has only the
+angle of its first sample; its span follows from the packets per revolution, 16, or 15 for a 2G.
+Known errors of drivers: one takes the sum modulo FFFF instead of 10000. The zero offset is
+reported, but not applied, as in the drivers.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ from lidarspec.spec import (
     wrap,
 )
 
-TURN = 6.0  # turns a second (kaiaai/LDS, getTargetScanFreqHz)
-MOST = 70  # samples of a packet: more than any driver has room for
+SCAN_RATE_HZ = 6.0  # kaiaai/LDS, getTargetScanFreqHz
+MAX_SAMPLES_PER_PACKET = 70  # more than the buffer of any driver
 SPEED = Scaled(Int8ub, 0.05, "Hz")
 
 DATA = Checksummed(
@@ -60,7 +61,7 @@ DATA = Checksummed(
     field="sum",
     algorithm=Sum(16),
 )
-SPEED_ALONE = Checksummed(
+SPEED_STRUCT = Checksummed(
     Struct(
         "header" / Const(b"\xaa\x00\x09"),
         "version" / Int8ub * "of the protocol: 0 or 1",
@@ -76,7 +77,7 @@ SPEED_ALONE = Checksummed(
 
 
 def plausible(f: Fields) -> Any:
-    """Both lengths agree, on a sample at least, and the angle is one of the circle."""
+    """Return whether both lengths agree, there are samples, and angle and version fit."""
     return (
         (f.length == f.size + 8)
         & (f.size > 5)
@@ -87,7 +88,10 @@ def plausible(f: Fields) -> Any:
 
 
 def points(f: Fields, packets: int) -> Polar:
-    """Even steps, clockwise, through the span of one of so many packets a turn."""
+    """Return points at even steps, clockwise, through the span of a packet.
+
+    `packets` is the number of packets per revolution.
+    """
     count = (f.size - 5) / 3
     span = 360 / packets
     angles = spread(f.start_angle, f.start_angle + span - span / count, count, full=360.0)
@@ -101,35 +105,39 @@ def points(f: Fields, packets: int) -> Polar:
     )
 
 
-def starts_as(f: Fields, packets: int) -> Any:
-    """Whether a packet starts, not at 0, where one of so many packets a turn does: 22.5 and 24
-    degrees have no other multiple in common.
+def starts_on_grid(f: Fields, packets: int) -> Any:
+    """Return whether the start angle is a multiple of a packet's span, but not 0.
+
+    `packets` is the number of packets per revolution, and the span 360 degrees / `packets`. An
+    angle of 0 does not identify a model, since it is a multiple of all spans.
     """
     return (f.start_angle > 0) & (f.start_angle % (360 / packets) == 0)
 
 
 def sweep(i: int, packets: int, count: int) -> dict[str, float]:
-    """Packet i of turns with so many packets of so many samples."""
+    """Return the simulated values of packet i.
+
+    Args:
+        i: the number of the packet.
+        packets: packets per revolution.
+        count: samples per packet.
+    """
     return {
         "size": 5 + 3 * count,
-        "speed": TURN,
+        "speed": SCAN_RATE_HZ,
         "version": 1,
         "start_angle": i % packets * 360 / packets,
     }
 
 
 FRAMES = {
-    "data": Frame(DATA, data=True, max_length=15 + 3 * MOST, plausible=plausible),
-    "speed": Frame(SPEED_ALONE),
+    "data": Frame(DATA, data=True, max_length=15 + 3 * MAX_SAMPLES_PER_PACKET, plausible=plausible),
+    "speed": Frame(SPEED_STRUCT),
 }
-#: id -> model, packets a turn, samples of a simulated packet, bauds.
+#: Id -> model, packets per revolution, samples of a simulated packet, baud rates.
 MODELS: dict[str, tuple[str, int, int, tuple[int, ...]]] = {
-    "3irobotix-delta2a": (
-        "Delta-2A",
-        16,
-        47,
-        (230_400, 115_200),
-    ),  # its captured packet has more samples than 115 200 baud carry
+    # the samples of the captured Delta-2A packet need more than 115 200 baud
+    "3irobotix-delta2a": ("Delta-2A", 16, 47, (230_400, 115_200)),
     "3irobotix-delta2b": ("Delta-2B", 16, 47, (230_400,)),
     "3irobotix-delta2d": ("Delta-2D", 16, 24, (115_200,)),
     "3irobotix-delta2g": ("Delta-2G", 15, 24, (115_200,)),
@@ -137,17 +145,17 @@ MODELS: dict[str, tuple[str, int, int, tuple[int, ...]]] = {
 }
 
 
-def relative(own: int, other: int) -> str | Relative:
-    """What tells a model with so many packets a turn apart."""
+def describe_difference(own: int, other: int) -> str | Relative:
+    """Return how to distinguish two models by their packets per revolution."""
     if own == other:
         return "nothing in the packets: the baud rate, or the label on the housing"
     return Relative(
-        f"packets start every {360 / other:g} degrees", partial(starts_as, packets=other)
+        f"packets start every {360 / other:g} degrees", partial(starts_on_grid, packets=other)
     )
 
 
-def lidar(name: str) -> Sensor:
-    """One row of the table as a sensor."""
+def make_lidar(name: str) -> Sensor:
+    """Return the sensor of one row of `MODELS`."""
     model, packets, count, bauds = MODELS[name]
     return Sensor(
         name,
@@ -160,7 +168,9 @@ def lidar(name: str) -> Sensor:
         simulation=Simulation(partial(sweep, packets=packets, count=count)),
         range_limits=(0.1, 8.0),
         relatives={
-            other: relative(packets, row[1]) for other, row in MODELS.items() if other != name
+            other: describe_difference(packets, row[1])
+            for other, row in MODELS.items()
+            if other != name
         },
         status="vectors" if model == "Delta-2A" else "manual",
         source="kaiaai/LDS and lds2d"
@@ -169,10 +179,10 @@ def lidar(name: str) -> Sensor:
     )
 
 
-DELTA_2A, DELTA_2B, DELTA_2D, DELTA_2G, LDS08RR = SENSORS = [lidar(name) for name in MODELS]
+DELTA_2A, DELTA_2B, DELTA_2D, DELTA_2G, LDS08RR = SENSORS = [make_lidar(name) for name in MODELS]
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Delta models."""
+    """Return the Delta models."""
     return SENSORS
