@@ -1,14 +1,13 @@
-"""Benewake TFmini-S, TFmini Plus and TF-Luna: rangefinders with one beam over a UART, which send by
-themselves.
+"""Benewake TFmini-S, TFmini Plus and TF-Luna: single-beam rangefinders, which stream over a UART.
 
 Source: TFmini-S manual A01, sections 5 and 7, table 12; TFmini Plus manual A04, the same sections,
 and its data sheet A00; TF-Luna manual A05, section 5, appendices I and II. The first TFmini sends
-the same frames with other numbers in place of the temperature, and has other commands. Frames do
-not say whether their distances are centimetres, as they come, or millimetres:
-``configure(unit="mm")`` reads what `set_unit_mm` asks for. The formats of text and those with a
-time are not here. A TF-Luna's manual has commands with a sum of 00, which it does not look at; the
-others do. The answers that the TFmini-S manual prints to a reset, factory settings and a save have
-the sums of their commands; here they are those of their own bytes.
+the same frames with other data in place of the temperature, and has other commands. Frames do not
+contain their unit, centimetres (the default) or millimetres: use ``configure(unit="mm")`` after
+`set_unit_mm`. Text formats and formats with a time are not supported. A TF-Luna ignores the sum of
+commands, and its manual prints commands with the sum 00; the other models check it. The replies to
+reset, factory settings and save printed in the TFmini-S manual have the sums of their commands;
+here each reply has the sum of its own bytes.
 """
 
 from __future__ import annotations
@@ -35,10 +34,12 @@ from lidarspec.spec import (
     hookimpl,
 )
 
-# signals below and at which the distance is not to be relied on (TFmini-S 5.3, TF-Luna 5.4)
-WEAK = 100
-BLINDED = 0xFFFF
-UNITS = {"cm": 0.01, "mm": 0.001}
+# A distance is unreliable if the strength is below the first or equal to the second value
+# (TFmini-S 5.3, TF-Luna 5.4).
+MIN_STRENGTH = 100
+SATURATED_STRENGTH = 0xFFFF
+METRES_PER_UNIT = {"cm": 0.01, "mm": 0.001}
+# message ids
 VERSION = 1
 RESET = 2
 RATE = 3
@@ -52,9 +53,9 @@ HEAD = "header" / Const(b"\x5a") * "then the length of the frame"
 
 
 @cache
-def data(unit: str) -> Frame:
-    """Return the frame with a distance in this unit."""
-    step = UNITS[unit]
+def make_data_frame(unit: str) -> Frame:
+    """Return the data frame with distances in this unit, "cm" or "mm"."""
+    step = METRES_PER_UNIT[unit]
     struct = Struct(
         "header" / Const(b"\x59\x59"),
         "distance" / Scaled(Int16ul, step, "m") * "FFFC and above: none can be told",
@@ -71,13 +72,18 @@ def data(unit: str) -> Frame:
 
 
 def points(f: Fields) -> Polar:
-    """One point straight ahead; one that the manual calls unreliable is invalid."""
-    unreliable = (f.strength < WEAK) | (f.strength == BLINDED) | (f.distance > 20)
+    """Return one point straight ahead.
+
+    It is invalid if its strength or distance is unreliable according to the manual.
+    """
+    unreliable = (
+        (f.strength < MIN_STRENGTH) | (f.strength == SATURATED_STRENGTH) | (f.distance > 20)
+    )
     return Polar(range=f.distance, azimuth=f.distance * 0, intensity=f.strength, invalid=unreliable)
 
 
 def make_message(size: int, *fields: Any, out: bool = False) -> Frame:
-    """Return a message of so many bytes, its length and sum among them."""
+    """Return the frame of a message of `size` bytes, including its length and sum."""
     struct = Struct(HEAD, "length" / Const(size, Int8ul), *fields, "checksum" / Int8ul)
     return Frame(
         Checksummed(struct, field="checksum", algorithm=Sum(8)),
@@ -87,16 +93,17 @@ def make_message(size: int, *fields: Any, out: bool = False) -> Frame:
 
 
 def is_known_reply(f: Fields) -> Any:
-    """What is answered with one byte: a reset, the format, the output, factory settings, and that
-    settings are saved.
+    """Return whether the id belongs to a reply of one byte.
+
+    These are the replies to reset, format, output, factory settings and save.
     """
     return (
         (f.id == RESET) | (f.id == FORMAT) | (f.id == OUTPUT) | (f.id == FACTORY) | (f.id == SAVE)
     )
 
 
-def of(number: int) -> Any:
-    """Return the field that says what a message is about."""
+def make_id(number: int) -> Any:
+    """Return the field that identifies the kind of a message."""
     return "id" / Const(number, Int8ul)
 
 
@@ -104,27 +111,27 @@ RATE_FIELD = "rate" / Scaled(Int16ul, 1, "Hz") * "of frames; 0: one for each tri
 BAUD_FIELD = "baud" / Int32ul
 FRAMES = {
     "version": make_message(
-        7, of(VERSION), "revision" / Int8ul, "minor" / Int8ul, "major" / Int8ul
+        7, make_id(VERSION), "revision" / Int8ul, "minor" / Int8ul, "major" / Int8ul
     ),
-    "rate": make_message(6, of(RATE), RATE_FIELD),
-    "baud": make_message(8, of(BAUD), BAUD_FIELD),
+    "rate": make_message(6, make_id(RATE), RATE_FIELD),
+    "baud": make_message(8, make_id(BAUD), BAUD_FIELD),
     "setting": make_message(
         5, "id" / Int8ul, "value" / Int8ul * "what is set; of an action, 0: it succeeded"
     ),
     "request": make_message(4, "id" / Int8ul, out=True),
-    "set_rate": make_message(6, of(RATE), RATE_FIELD, out=True),
-    "set_baud": make_message(8, of(BAUD), BAUD_FIELD, out=True),
+    "set_rate": make_message(6, make_id(RATE), RATE_FIELD, out=True),
+    "set_baud": make_message(8, make_id(BAUD), BAUD_FIELD, out=True),
     "set": make_message(5, "id" / Int8ul, "value" / Int8ul, out=True),
 }
 
 
-def action(number: int) -> Command:
-    """What is done once, and answered with 0 where it succeeded."""
+def make_action(number: int) -> Command:
+    """Return the command for an action; the reply 0 means success."""
     return Command("request", {"id": number}, reply="setting", matches={"id": number})
 
 
-def setting(number: int, value: int, **more: Any) -> Command:
-    """What is set to a value, and answered with the same."""
+def make_setting(number: int, value: int, **more: Any) -> Command:
+    """Return the command that sets a value, which the reply repeats."""
     return Command(
         "set",
         {"id": number, "value": value},
@@ -135,14 +142,18 @@ def setting(number: int, value: int, **more: Any) -> Command:
     )
 
 
-def commands(fastest: int) -> dict[str, Command]:
-    """The commands of a model that sends so many frames a second at most; what is set is lost with
-    the power unless it is saved.
+def make_commands(fastest: int) -> dict[str, Command]:
+    """Return the commands of a model.
+
+    Settings are lost at power-off unless they are saved.
+
+    Args:
+        fastest: the highest frame rate in Hz.
     """
     return {
         "get_version": Command("request", {"id": VERSION}, reply="version", retries=1),
-        "output_on": setting(OUTPUT, 1, starts=True),
-        "output_off": setting(OUTPUT, 0, stops=True),
+        "output_on": make_setting(OUTPUT, 1, starts=True),
+        "output_off": make_setting(OUTPUT, 0, stops=True),
         "set_rate": Command(
             "set_rate",
             args={"rate": ("rate", 0, fastest)},
@@ -151,32 +162,38 @@ def commands(fastest: int) -> dict[str, Command]:
             retries=1,
         ),
         "trigger": Command("request", {"id": TRIGGER}, reply="data"),
-        "set_unit_cm": setting(FORMAT, 1),
-        "set_unit_mm": setting(FORMAT, 6),
+        "set_unit_cm": make_setting(FORMAT, 1),
+        "set_unit_mm": make_setting(FORMAT, 6),
         "set_baud": Command(
             "set_baud", args={"baud": ("baud", 9600, 921_600)}, reply="baud", echoes=("baud",)
         ),
-        "save": action(SAVE),
-        "factory_settings": action(FACTORY),
-        "reset": action(RESET),
+        "save": make_action(SAVE),
+        "factory_settings": make_action(FACTORY),
+        "reset": make_action(RESET),
     }
 
 
-def answers() -> dict[str, Any]:
-    """What a simulated one answers, where that is more than the reply as it stands."""
-    done = {
+def make_answers() -> dict[str, Any]:
+    """Return the simulated replies that are not derived from the request."""
+    action_replies = {
         name: (("setting", {"id": number, "value": 0}),)
         for name, number in (("save", SAVE), ("factory_settings", FACTORY), ("reset", RESET))
     }
-    return {"get_version": (("version", {"revision": 1, "minor": 2, "major": 3}),), **done}
+    return {
+        "get_version": (("version", {"revision": 1, "minor": 2, "major": 3}),),
+        **action_replies,
+    }
 
 
 def configure(sensor: Sensor, *, unit: Literal["cm", "mm"] = "cm") -> Sensor:
-    """Return the sensor for distances in centimetres, the factory setting, or millimetres."""
-    return dataclasses.replace(sensor, frames={**sensor.frames, "data": data(unit)})
+    """Return the sensor for distances in centimetres or millimetres.
+
+    Centimetres are the factory setting.
+    """
+    return dataclasses.replace(sensor, frames={**sensor.frames, "data": make_data_frame(unit)})
 
 
-#: id -> model, shortest and longest range, most frames a second, source.
+#: Id -> model, range limits in m, highest frame rate in Hz, source.
 MODELS: dict[str, tuple[str, tuple[float, float], int, str]] = {
     "benewake-tfmini": (
         "TFmini-S",
@@ -199,20 +216,20 @@ MODELS: dict[str, tuple[str, tuple[float, float], int, str]] = {
 }
 
 
-def rangefinder(name: str) -> Sensor:
-    """One row of the table as a sensor."""
+def make_rangefinder(name: str) -> Sensor:
+    """Return the sensor of one row of `MODELS`."""
     model, limits, fastest, source = MODELS[name]
     return Sensor(
         name,
         vendor="Benewake",
         model=model,
-        frames={"data": data("cm"), **FRAMES},
+        frames={"data": make_data_frame("cm"), **FRAMES},
         points=points,
         scan=Every(0.1),
         links={"data": Serial(115_200)},
-        commands=commands(fastest),
+        commands=make_commands(fastest),
         simulation=Simulation(
-            lambda i: {"strength": 1000, "temperature": 21.0}, rate=100, answers=answers()
+            lambda i: {"strength": 1000, "temperature": 21.0}, rate=100, answers=make_answers()
         ),
         configure=configure,
         on_open=("output_on",),
@@ -228,10 +245,10 @@ def rangefinder(name: str) -> Sensor:
     )
 
 
-TFMINI, TFMINI_PLUS, TF_LUNA = SENSORS = [rangefinder(name) for name in MODELS]
+TFMINI, TFMINI_PLUS, TF_LUNA = SENSORS = [make_rangefinder(name) for name in MODELS]
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Benewake rangefinders."""
+    """Return the Benewake rangefinders."""
     return SENSORS
