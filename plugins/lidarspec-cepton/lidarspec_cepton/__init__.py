@@ -1,11 +1,11 @@
-"""Cepton Vista: lidars that look ahead, over UDP, with points by their coordinates.
+"""Cepton Vista: forward-looking lidars, which send Cartesian points over UDP.
 
-Source: the opening of Cepton's Sensor Communication Specifications
-(developer.cepton.com/doc/data_format), and a public reader of the packets in Rust. Neither says
-whether STDV stands in this order on the wire, or as a number with the low byte first: both are
-taken. That the time of a point counts from the one before it is assumed, since 144 points take
-longer than its byte can say; so are the reach, and the pattern of a simulated one. Information and
-fault packets are not public, and are skipped. No packet of a sensor was seen.
+Source: the first part of Cepton's Sensor Communication Specifications
+(developer.cepton.com/doc/data_format), and a public reader of the packets in Rust. Neither states
+whether the wire has the letters STDV in this order, or a number with the low byte first: both are
+accepted. Assumed are the maximum range, the simulated pattern, and that the time of a point counts
+from the point before it (144 points take longer than its byte can hold). Information and fault
+packets are not public and are skipped. No captured packet was available.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ from lidarspec.spec import (
     running,
 )
 
-MOST = 144  # points of a packet
-HEADER = 24
-POINT = 10  # bytes
-STEP = 2e-6  # seconds from point to point of a simulated one
-PACKETS = 64  # of a simulated picture
-SIGNATURES = (0x56445453, 0x53544456)  # STDV in the order of the bytes, and as a number
+MAX_POINTS_PER_PACKET = 144
+HEADER_BYTES = 24
+POINT_BYTES = 10
+SIMULATED_STEP_S = 2e-6  # from point to point
+SIMULATED_PACKETS = 64  # of a scan
+SIGNATURES = (0x56445453, 0x53544456)  # the letters STDV, and STDV as a number, low byte first
 
 DATA = Struct(
     "signature" / Int32ul * "STDV",
     "header_version" / Int8ul,
-    "header_size" / Const(HEADER, Int8ul),
+    "header_size" / Const(HEADER_BYTES, Int8ul),
     "flags" / Int16ul,
     "time" / Scaled(Int64ul, 1e-6, "s") * "since 1970",
     "point_version" / Int8ul,
-    "point_size" / Const(POINT, Int8ul),
+    "point_size" / Const(POINT_BYTES, Int8ul),
     "count" / Int16ul,
     "sequence" / Int32ul,
     "points"
@@ -87,51 +87,63 @@ DATA = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Return a known signature, and no more points than a packet takes."""
+    """Return whether signature and point count are valid."""
     return (
         ((f.signature == SIGNATURES[0]) | (f.signature == SIGNATURES[1]))
         & (f.count >= 1)
-        & (f.count <= MOST)
+        & (f.count <= MAX_POINTS_PER_PACKET)
     )
 
 
 def points(f: Fields) -> Cartesian:
-    """Return the sensor's right, ahead and up, turned to ahead, left and up."""
-    each = f.points
+    """Return the points, with axes converted from right, ahead, up to ahead, left, up."""
+    members = f.points
     return Cartesian(
-        each.y,
-        -each.x,
-        each.z,
-        intensity=each.reflectivity,
-        time=running(each.after),
-        ring=each.channel,
-        return_index=each.flags.second,
-        invalid=(each.flags.no_return == 1) | (each.flags.noise == 1),
+        members.y,
+        -members.x,
+        members.z,
+        intensity=members.reflectivity,
+        time=running(members.after),
+        ring=members.channel,
+        return_index=members.flags.second,
+        invalid=(members.flags.no_return == 1) | (members.flags.noise == 1),
     )
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i, 64 to a picture."""
+    """Return the simulated values of packet i, 64 packets a scan."""
     return {
         "signature": SIGNATURES[0],
-        "time": i * MOST * STEP,
-        "count": MOST,
+        "time": i * MAX_POINTS_PER_PACKET * SIMULATED_STEP_S,
+        "count": MAX_POINTS_PER_PACKET,
         "sequence": i,
-        "points.after": STEP,
-        "points.flags.parity": i // PACKETS % 2,
+        "points.after": SIMULATED_STEP_S,
+        "points.flags.parity": i // SIMULATED_PACKETS % 2,
     }
 
 
 def directions(i: int) -> tuple[Any, Any]:
-    """Lines from the right to the left, 60 degrees wide and 22 high."""
-    return np.linspace(-np.pi / 6, np.pi / 6, MOST), np.deg2rad(i % PACKETS * 22 / PACKETS - 11)
+    """Return the simulated beams of packet i, as azimuth and elevation in radians.
+
+    A packet is a line from right to left, 60 degrees wide; a scan is 22 degrees high.
+    """
+    return np.linspace(-np.pi / 6, np.pi / 6, MAX_POINTS_PER_PACKET), np.deg2rad(
+        i % SIMULATED_PACKETS * 22 / SIMULATED_PACKETS - 11
+    )
 
 
 VISTA = Sensor(
     "cepton-vista",
     vendor="Cepton",
     model="Vista",
-    frames={"data": Frame(DATA, data=True, max_length=HEADER + MOST * POINT, plausible=plausible)},
+    frames={
+        "data": Frame(
+            DATA,
+            data=True,
+            max_length=HEADER_BYTES + MAX_POINTS_PER_PACKET * POINT_BYTES,
+            plausible=plausible,
+        )
+    },
     points=points,
     scan=OnChange("points.flags.parity"),
     links={"data": Udp(8808)},
@@ -149,5 +161,5 @@ VISTA = Sensor(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Cepton sensor."""
+    """Return the Cepton sensor."""
     return [VISTA]
