@@ -1,22 +1,24 @@
-"""CSPC M1C1_Mini, old and new, COIN-D4, COIN-D4A and COIN-D6: 360 degree triangulation and
-time-of-flight lidars, started over a UART.
+"""CSPC M1C1_Mini (two versions), COIN-D4, COIN-D4A and COIN-D6: 360 degree lidars.
 
-Source: CSPC M1C1_Mini development manual, sections 1 and 2. What it does not say comes from the
+The host starts them over a UART. They measure by triangulation or by time of flight.
+
+Source: CSPC M1C1_Mini development manual, sections 1 and 2. Facts missing there come from the
 vendor's SDK (ros_cspc_lidar_coin_d4a, sdk/lidar_information.h), the manual's edition v1.1
 (2020-01-22), or captures of a COIN-D4 and a COIN-D6.
 
 Known errors and gaps of the manual: the printed sum of the device information, 0x0402, is 0x0403
 (v1.1 has it right); the corrections of the angle example, 10.9442 and 11.8653 degrees, are 10.9445
 and 11.8674 at 1000 and 8000 mm, and 71.1718 is 71.171875; the figure with the order of the checksum
-is lost (the grouping here fits every captured packet); no baud rate, no rule for packets that cross
-360 degrees or have one sample (the formula divides by LSN - 1), no command for the announced switch
-between 5.5 and 7 Hz. Besides the fillers FE and FF, a COIN-D4 sends FA FA once, in no manual.
+is missing (the grouping here fits every captured packet); no baud rate, no rule for packets that
+cross 360 degrees or have one sample (the formula divides by LSN - 1), no command for the announced
+switch between 5.5 and 7 Hz. A COIN-D4 sends the fillers FE and FF, and FA FA once, which no manual
+mentions.
 
-Of a COIN-D4A only the vendor's driver is public, of a COIN-D6 what others saw of one: 10 turns a
-second, 400 points each, and every three seconds a frame that nobody explains. That both name
-themselves by their model is assumed. The M1C1_Mini of the manual's edition v1.1 is a sensor of its
-own: samples of two bytes, answers that begin with AA 55, no exposure, and packets that do not tell
-how fast it turns. The M1CT_Coin_Plus, which sends Camsense's packets, is left out.
+Of a COIN-D4A only the vendor's driver is public. Facts about the COIN-D6 come from other people's
+captures: 10 revolutions a second, 400 points each, and an unexplained frame every three seconds.
+Both are assumed to report their model name. The M1C1_Mini of the manual's edition v1.1 is a
+separate sensor: samples of two bytes, replies that begin with AA 55, no exposure, and packets
+without the rotation speed. The M1CT_Coin_Plus, which sends Camsense's packets, is left out.
 """
 
 from __future__ import annotations
@@ -61,11 +63,12 @@ from lidarspec.spec import (
     spread,
 )
 
-STEPS = 380  # points a turn: 360 degrees by the step of the manual's angle example, 0.9473 degrees
-SAMPLES = 25  # samples of a full packet (the manual's angle example)
-SETTLING = 1.0  # seconds; the manual has "less than 3" (1b)
-LOW_EXPOSURE = 2
-LOW_SPEED = 5.5  # Exp_M and Hz of the slower of the two speeds (manual 1c and 2.2.3, Exp_M)
+#: 360 degrees divided by 0.9473 degrees, the step of the manual's angle example.
+POINTS_PER_TURN = 380
+SAMPLES_PER_PACKET = 25  # of a full packet (the manual's angle example)
+SPEED_SETTLING_S = 1.0  # the manual has "less than 3" (1b)
+LOW_EXPOSURE = 2  # value of `exposure` (manual 2.2.3, Exp_M)
+LOW_SPEED_HZ = 5.5  # the slower of the two speeds (manual 1c)
 
 COMMAND = Checksummed(
     Struct(
@@ -78,8 +81,8 @@ COMMAND = Checksummed(
 )
 
 
-def ack(header: bytes) -> Checksummed:
-    """Return the acknowledgement of a command, behind this header."""
+def make_ack(header: bytes) -> Checksummed:
+    """Return the struct of the reply that acknowledges a command."""
     return Checksummed(
         Struct(
             "header" / Const(header),
@@ -138,8 +141,11 @@ AUXILIARY = Checksummed(
 )
 
 
-def angle() -> Construct:
-    """FSA and LSA: 1/64 degree above a check bit that is always 1 (manual 2.2.3)."""
+def make_angle() -> Construct:
+    """Return the struct of FSA or LSA: 1/64 degree above a check bit of 1.
+
+    Source: manual 2.2.3.
+    """
     return ByteSwapped(
         BitStruct(
             "angle" / Scaled(BitsInteger(15), 1 / 64, "deg"), "check" / Const(1, BitsInteger(1))
@@ -147,21 +153,21 @@ def angle() -> Construct:
     )
 
 
-def data(first: Construct, sample: Construct, groups: tuple[int, ...]) -> Checksummed:
-    """Return the point packet.
+def make_data(first: Construct, sample: Construct, groups: tuple[int, ...]) -> Checksummed:
+    """Return the struct of a point packet.
 
     Args:
-        first: what stands above the bit that says that a turn begins, 7 bits.
-        sample: one of them.
-        groups: sizes of the words that the checksum takes of it.
+        first: the 7 bits above the start flag of the first byte.
+        sample: the struct of one sample.
+        groups: sizes in bytes of the words of a sample that enter the checksum.
     """
     return Checksummed(
         Struct(
             "header" / Const(b"\xaa\x55"),
             "mt" / BitStruct(first, "start" / BitsInteger(1) * "1: start packet, a turn begins"),
             "lsn" / Int8ul * "number of samples",
-            "fsa" / angle() * "angle of the first sample",
-            "lsa" / angle() * "angle of the last sample",
+            "fsa" / make_angle() * "angle of the first sample",
+            "lsa" / make_angle() * "angle of the last sample",
             "cs" / Int16ul,
             "samples" / Array(this.lsn, sample),
         ),
@@ -171,7 +177,7 @@ def data(first: Construct, sample: Construct, groups: tuple[int, ...]) -> Checks
 
 
 DISTANCE = "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return"
-DATA = data(
+DATA = make_data(
     "frequency"
     / Scaled(BitsInteger(7), 0.1, "Hz")
     * "of scans, in a start packet; firmware number in the next packet; else 0",
@@ -182,23 +188,25 @@ DATA = data(
     ),
     (1, 2),
 )
-OLDER_DATA = data(
+OLDER_DATA = make_data(
     "reserved" / BitsInteger(7),
     ByteSwapped(BitStruct(DISTANCE, "flags" / BitsInteger(2) * "not explained")),
     (2,),
 )
 
 
-def ack_plausible(f: Fields) -> Any:
-    """Modes of commands are F0 to FF, and the answer's is that with A0 taken off (manual 2.1.3,
-    SDK).
+def is_ack_plausible(f: Fields) -> Any:
+    """Return whether the mode is that of a reply: 50 to 5F.
+
+    Commands have the modes F0 to FF, their replies the command's mode ^ A0 (manual 2.1.3, SDK).
     """
     return (f.mode >= 0x50) & (f.mode <= 0x5F)
 
 
 def plausible(f: Fields) -> Any:
-    """Angles below 360 degrees, a sample at least, and in a start packet one alone (manual 2.2.3,
-    M&T).
+    """Return whether angles are below 360 degrees and the sample count fits.
+
+    A packet has at least one sample, a start packet exactly one (manual 2.2.3, M&T).
     """
     return (
         (f.fsa.angle < 360)
@@ -218,8 +226,11 @@ def correction(distance: Any) -> Any:
 
 
 def directions(f: Fields, zero: str) -> tuple[Any, Any]:
-    """Even steps from FSA to LSA, and those corrected (manual 2.2.3), from the zero of the data or
-    from the one marked on the housing.
+    """Return the angles of the samples in degrees, uncorrected and corrected.
+
+    Uncorrected angles are evenly spaced from FSA to LSA and count from the zero of the data.
+    Corrected angles (manual 2.2.3) count clockwise from the zero of the data, or from the mark on
+    the housing if `zero` is "housing".
     """
     raw = spread(f.fsa.angle, f.lsa.angle, f.lsn, full=360.0)  # degrees, (n, LSN)
     clockwise = raw - np.where(f.state.info.correction == 1, correction(f.samples.distance), 0)
@@ -227,7 +238,7 @@ def directions(f: Fields, zero: str) -> tuple[Any, Any]:
 
 
 def points(f: Fields, zero: str = "data") -> Polar:
-    """The points of a packet, and their times by the speed that the last start packet told."""
+    """Return the points of a packet, with times from the latest reported speed."""
     raw, clockwise = directions(f, zero)
     rate = (
         last(f.mt.frequency, where=(f.mt.start == 1) & (f.mt.frequency > 0)) * 360
@@ -241,7 +252,7 @@ def points(f: Fields, zero: str = "data") -> Polar:
 
 
 def older_points(f: Fields, zero: str = "data") -> Polar:
-    """Return the points of a packet of the older kind, which all have the time of their packet."""
+    """Return the points of a packet of the older kind, all at the packet's time."""
     return Polar(range=f.samples.distance, azimuth=-np.deg2rad(directions(f, zero)[1]))
 
 
@@ -259,13 +270,19 @@ def configure(
     return dataclasses.replace(sensor, points=partial(points, zero=zero))
 
 
-def sweep(i: int, steps: int = STEPS, hertz: float = LOW_SPEED) -> dict[str, float]:
-    """Packet i of turns of so many points, 5.5 Hz is the slower speed: a start packet, then packets
-    of 25 samples and a shorter one.
+def sweep(i: int, steps: int = POINTS_PER_TURN, hertz: float = LOW_SPEED_HZ) -> dict[str, float]:
+    """Return the simulated values of packet i.
+
+    A revolution is a start packet, then packets of 25 samples and a shorter one.
+
+    Args:
+        i: the number of the packet.
+        steps: points per revolution.
+        hertz: revolutions per second.
     """
-    packet = i % (1 + -(-(steps - 1) // SAMPLES))
-    first = 0 if packet == 0 else 1 + (packet - 1) * SAMPLES
-    samples = 1 if packet == 0 else min(SAMPLES, steps - first)
+    packet = i % (1 + -(-(steps - 1) // SAMPLES_PER_PACKET))
+    first = 0 if packet == 0 else 1 + (packet - 1) * SAMPLES_PER_PACKET
+    samples = 1 if packet == 0 else min(SAMPLES_PER_PACKET, steps - first)
     return {
         "mt.frequency": hertz if packet == 0 else 0.0,
         "mt.start": int(packet == 0),
@@ -277,7 +294,7 @@ def sweep(i: int, steps: int = STEPS, hertz: float = LOW_SPEED) -> dict[str, flo
 
 
 def older_sweep(i: int) -> dict[str, float]:
-    """Packet i of the older kind, in turns like those of the newer one."""
+    """Return the simulated values of packet i of the older kind."""
     return {
         name: value
         for name, value in sweep(i).items()
@@ -285,9 +302,10 @@ def older_sweep(i: int) -> dict[str, float]:
     }
 
 
-def asking(mode: int, **more: Any) -> Command:
-    """The command of this mode that is answered with an acknowledgement of the same mode; sent
-    twice, it does the same once.
+def make_request(mode: int, **more: Any) -> Command:
+    """Return the command that is acknowledged with the same mode.
+
+    A repeated command has no further effect, so it is sent again if no reply arrives.
     """
     return Command(
         "command", {"mode": mode}, reply="ack", matches={"mode": mode ^ 0xA0}, retries=1, **more
@@ -297,33 +315,36 @@ def asking(mode: int, **more: Any) -> Command:
 def make_start_packets(
     firmware: int, model: bytes, revision: int, *noise: bytes
 ) -> tuple[Any, ...]:
-    """What a sensor sends when it is started: fillers while the speed settles, noise, and what it
-    is (manual 1b, 2.1.3 and 2.2).
+    """Return the simulated replies to the start command.
+
+    A sensor acknowledges, sends fillers until its speed has settled, then noise and its device
+    information (manual 1b, 2.1.3 and 2.2).
     """
     return (
         ("ack", {"firmware": firmware}),
-        SETTLING,
+        SPEED_SETTLING_S,
         *noise,
         ("info", {"model": model, "revision": revision}),
         "scan_start",
     )
 
 
-def tells_state(f: Fields) -> Any:
-    """Whether a packet that begins no turn says what a CSPC says at most in the first one after a
-    start (manual 2.2.3, M&T).
+def has_state_bits(f: Fields) -> Any:
+    """Return whether the upper bits of M&T are set in a packet without start flag.
+
+    A CSPC sets them at most in the first packet after a start (manual 2.2.3, M&T).
     """
     return (f.mt.start == 0) & (f.mt.frequency > 0)
 
 
-# the packet is the same, and the bits of a sample mean something else (YDLIDAR SDK, communication
+# YDLIDAR sends the same packet with other meanings of the sample bits (YDLIDAR SDK, communication
 # protocol)
-TMINI = Relative(
-    "bits are set beside the lowest of the third byte in packets that begin no turn", tells_state
+TMINI_RELATIVE = Relative(
+    "bits are set beside the lowest of the third byte in packets that begin no turn", has_state_bits
 )
-OTHERS: dict[str, str | Relative] = {
+YDLIDAR_RELATIVES: dict[str, str | Relative] = {
     **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "the answers to its requests"),
-    **dict.fromkeys(("ydlidar-tmini", "ydlidar-tmini-pro", "ydlidar-tmini-plus"), TMINI),
+    **dict.fromkeys(("ydlidar-tmini", "ydlidar-tmini-pro", "ydlidar-tmini-plus"), TMINI_RELATIVE),
 }
 
 COINS = ("cspc-coin-d4", "cspc-coin-d4a", "cspc-coin-d6")
@@ -334,7 +355,7 @@ M1C1_MINI = Sensor(
     vendor="CSPC",
     model="M1C1_Mini",
     frames={
-        "ack": Frame(ack(b"\xa5\x5a"), plausible=ack_plausible),
+        "ack": Frame(make_ack(b"\xa5\x5a"), plausible=is_ack_plausible),
         "info": Frame(INFO),
         "scan_start": Frame(SCAN_START),
         "data": Frame(DATA, data=True, max_length=10 + 3 * 255, plausible=plausible),
@@ -342,34 +363,30 @@ M1C1_MINI = Sensor(
     },
     points=points,
     scan=OnFlag("mt.start"),
-    # 150 000 for this 3-byte format and DTR low: the SDK; 115 200: v1.1, for the older 2-byte
-    # format.
+    # 150 000 for this 3-byte format and DTR low: the SDK; 115 200: v1.1, for the 2-byte format
     links={"data": Serial(150_000, 115_200, dtr=False)},
     commands={
-        "start": asking(0xF0, starts=True),
-        "stop": asking(0xF5, stops=True),
+        "start": make_request(0xF0, starts=True),
+        "stop": make_request(0xF5, stops=True),
         "low_exposure": Command("command", {"mode": 0xF1}),
         "high_exposure": Command("command", {"mode": 0xF2}),
-        "get_version": asking(0xFC),
+        "get_version": make_request(0xFC),
     },
     fillers=b"\xfe\xff",
-    state={
-        "info": {"correction": 1, "zero_angle": 12}
-    },  # the device information printed in the manual, 2.2.2
+    # the device information printed in the manual, 2.2.2
+    state={"info": {"correction": 1, "zero_angle": 12}},
     simulation=Simulation(
         sweep, answers={"start": make_start_packets(3, b"M1C1_Mini", 4), "get_version": VERSION}
     ),
     configure=partial(configure, points),
     on_open=("start",),
     on_close=("stop",),
-    range_limits=(0.001, 16.383),  # what the field can hold; the manual gives none
+    range_limits=(0.001, 16.383),  # the limits of the field; the manual gives none
     vendor_axes=("forward", "right", "up"),
-    turn=(LOW_SPEED, 7.0),  # manual 1c
-    relatives={**dict.fromkeys(COINS, "info.model"), **OTHERS},
-    info={
-        "model": "info.model",
-        "firmware": "info.revision",
-    },  # ack.firmware is 0 but in the answer to start (manual 2.1.3)
+    turn=(LOW_SPEED_HZ, 7.0),  # manual 1c
+    relatives={**dict.fromkeys(COINS, "info.model"), **YDLIDAR_RELATIVES},
+    # not ack.firmware, which is 0 except in the reply to start (manual 2.1.3)
+    info={"model": "info.model", "firmware": "info.revision"},
     status="vectors",
     source=(
         "CSPC M1C1_Mini development manual (3-byte samples), sections 1 and 2; baud rate and FC"
@@ -378,10 +395,12 @@ M1C1_MINI = Sensor(
 )
 
 
-# two bytes a sample, like these; an M1C1_Mini says what it is when it is started, and never how
-# fast it turns
-MODELS_2 = "f4 g1 g2a g2c g4 g4-pro g4c g5 g6 g7 s2 s4 tg15 tg30 tg50 tx20 tx8 x2 x3 x4 x4-pro"
-TELLS_SPEED = Relative(
+# YDLIDAR models with two bytes a sample, as in v1.1. An M1C1_Mini sends its model after the start
+# command, and never sends its speed.
+TWO_BYTE_MODELS = (
+    "f4 g1 g2a g2c g4 g4-pro g4c g5 g6 g7 s2 s4 tg15 tg30 tg50 tx20 tx8 x2 x3 x4 x4-pro"
+)
+SPEED_RELATIVE = Relative(
     "start packets tell how fast it turns",
     lambda f: np.asarray((f.mt.start == 1) & (f.mt.reserved > 0)).any(),
 )
@@ -390,7 +409,7 @@ M1C1_MINI_V11 = Sensor(
     vendor="CSPC",
     model="M1C1_Mini",
     frames={
-        "ack": Frame(ack(b"\xaa\x55"), plausible=ack_plausible),
+        "ack": Frame(make_ack(b"\xaa\x55"), plausible=is_ack_plausible),
         "info": M1C1_MINI.frames["info"],
         "scan_start": M1C1_MINI.frames["scan_start"],
         "data": Frame(OLDER_DATA, data=True, max_length=10 + 2 * 255, plausible=plausible),
@@ -408,7 +427,7 @@ M1C1_MINI_V11 = Sensor(
     on_close=("stop",),
     range_limits=M1C1_MINI.range_limits,
     vendor_axes=M1C1_MINI.vendor_axes,
-    relatives={f"ydlidar-{name}": TELLS_SPEED for name in MODELS_2.split()},
+    relatives={f"ydlidar-{name}": SPEED_RELATIVE for name in TWO_BYTE_MODELS.split()},
     info=M1C1_MINI.info,
     status="vectors",
     source=(
@@ -418,9 +437,10 @@ M1C1_MINI_V11 = Sensor(
 )
 
 
-def coin(model: str, **facts: Any) -> Sensor:
-    """A time-of-flight lidar of the COIN series: an M1C1_Mini but for these facts, whose angles
-    need no correction.
+def make_coin(model: str, **facts: Any) -> Sensor:
+    """Return a sensor of the COIN series, which measures by time of flight.
+
+    It is an M1C1_Mini whose angles need no correction, changed by `facts`, arguments of `Sensor`.
     """
     name = f"cspc-{model.lower()}"
     return dataclasses.replace(
@@ -428,20 +448,22 @@ def coin(model: str, **facts: Any) -> Sensor:
         id=name,
         model=model,
         links={"data": Serial(230_400, dtr=False)},
-        state={
-            "info": {"correction": 0, "zero_angle": 0}
-        },  # the device information of a live COIN-D4
-        relatives={**dict.fromkeys({"cspc-m1c1-mini", *COINS} - {name}, "info.model"), **OTHERS},
-        **{
-            "turn": None,
-            "simulation": coin_simulation(model),
-            **facts,
-        },  # the manual's two speeds are the M1C1_Mini's
+        # the device information of a live COIN-D4
+        state={"info": {"correction": 0, "zero_angle": 0}},
+        relatives={
+            **dict.fromkeys({"cspc-m1c1-mini", *COINS} - {name}, "info.model"),
+            **YDLIDAR_RELATIVES,
+        },
+        # turn: the manual's two speeds apply to the M1C1_Mini only
+        **{"turn": None, "simulation": make_coin_simulation(model), **facts},
     )
 
 
-def coin_simulation(model: str, **turns: Any) -> Simulation:
-    """Return a simulated one, which says what it is when it is started."""
+def make_coin_simulation(model: str, **turns: Any) -> Simulation:
+    """Return a simulated COIN, which sends its model after the start command.
+
+    `turns` are arguments of `sweep`.
+    """
     answers = {
         "start": make_start_packets(1, model.encode(), 1, b"\xfa\xfa"),
         "get_version": VERSION,
@@ -449,20 +471,20 @@ def coin_simulation(model: str, **turns: Any) -> Simulation:
     return Simulation(partial(sweep, **turns), answers=answers)
 
 
-COIN_D4 = coin(
+COIN_D4 = make_coin(
     "COIN-D4",
     status="capture",
     source=(
         "the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4"
     ),
 )
-COIN_D4A = coin(
+COIN_D4A = make_coin(
     "COIN-D4A",
     range_limits=(0.001, 12.0),
     status="manual",
     source="the vendor's driver, ros_cspc_lidar_coin_d4a: baud rate, 12 m",
 )
-COIN_D6 = coin(
+COIN_D6 = make_coin(
     "COIN-D6",
     frames={
         **M1C1_MINI.frames,
@@ -470,7 +492,7 @@ COIN_D6 = coin(
             AUXILIARY, simulation=Simulation(lambda i: {"value": 0x38 + i % 8}, rate=1 / 3)
         ),
     },
-    simulation=coin_simulation("COIN-D6", steps=400, hertz=10.0),
+    simulation=make_coin_simulation("COIN-D6", steps=400, hertz=10.0),
     status="manual",
     source=(
         "the vendor's SDK (baud rate); what others saw of a COIN-D6: turns, points, the auxiliary"
@@ -481,5 +503,5 @@ COIN_D6 = coin(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The CSPC sensors."""
+    """Return the CSPC sensors."""
     return [M1C1_MINI, M1C1_MINI_V11, COIN_D4, COIN_D4A, COIN_D6]
