@@ -1,16 +1,16 @@
-"""Hokuyo scanners that speak SCIP 2.0: URG-04LX, UST-10LX, UST-20LX, UTM-30LX and UTM-30LX-EW.
+"""Hokuyo scanners with SCIP 2.0: URG-04LX, UST-10LX, UST-20LX, UTM-30LX and UTM-30LX-EW.
 
-An answer is a whole turn. It says which steps it has, but not of how many a turn is, nor of which
-model it is. What MD asks for goes on with distances, ME with intensities as well, MS with distances
-of two characters, ND and NE with all echoes; GD, GE, GS, HD and HE ask for one scan, and need
-`laser_on` before. Scans of any steps are read; which ones are asked for says ``configure(content=,
-first=, last=, cluster=)``.
+A reply is one revolution. It contains its steps, but neither the steps of a full revolution nor the
+model. MD requests continuous scans with distances, ME with intensities as well, MS with distances
+of two characters, ND and NE with all echoes; GD, GE, GS, HD and HE request one scan and need
+`laser_on` before. Scans of any steps are read; ``configure(content=, first=, last=, cluster=)``
+selects the requested steps.
 
-Source: SCIP 2.0, C-42-03320B (table 2: steps; 8: commands, and the answer of a URG-04LX to PP);
-UST-10LX/20LX, C-42-04076 (port); what a UST-10LX and a UTM-30LX-EW answer to PP, as users print it,
-for their ranges and speed. Assumed: that a UST-20LX and a UTM-30LX answer as a UTM-30LX-EW does,
-but for the shortest range of the UST-20LX; and that a URG-04LX alone takes SS, CR and HS, and no ME
-and GE. Only of a UTM-30LX-EW is it said that it sends several echoes.
+Source: SCIP 2.0, C-42-03320B (table 2: steps; 8: commands, and the reply of a URG-04LX to PP);
+UST-10LX/20LX, C-42-04076 (port); replies of a UST-10LX and a UTM-30LX-EW to PP, as printed by
+users, for their ranges and speed. Assumed: a UST-20LX and a UTM-30LX reply as a UTM-30LX-EW does,
+except for the shortest range of the UST-20LX; only a URG-04LX accepts SS, CR and HS, and it accepts
+neither ME nor GE. Several echoes are documented for the UTM-30LX-EW only.
 """
 
 from __future__ import annotations
@@ -33,15 +33,24 @@ from lidarspec.spec import (
     Tcp,
     hookimpl,
 )
-from lidarspec_hokuyo.commands import TOLD_BY, commands, messages, telling
-from lidarspec_hokuyo.scans import KINDS, WRAP, Asked, Geometry, number, pace, scan, sweep
+from lidarspec_hokuyo.commands import VALUE_REPLIES, make_commands, make_messages, make_value_lines
+from lidarspec_hokuyo.scans import (
+    CLOCK_WRAP_S,
+    SCAN_COMMANDS,
+    Geometry,
+    RequestedSteps,
+    decimal_value,
+    make_scan_frame,
+    pace,
+    sweep,
+)
 
 URG = Geometry(1024, 44, 725, 384, end=768, rate=10.0, kinds=("distances", "short"))
 UST = Geometry(1440, 0, 1080, 540, end=1080, rate=40.0, kinds=("distances", "intensities", "short"))
-UTM = dataclasses.replace(UST, kinds=tuple(KINDS))
-FARTHEST_SHORT = 4.095  # metres in two characters
+UTM = dataclasses.replace(UST, kinds=tuple(SCAN_COMMANDS))
+MAX_SHORT_RANGE_M = 4.095  # the highest distance of two characters
 ETHERNET = Tcp(10_940)
-#: id -> model, where it looks, limits of range, link, status.
+#: Id -> model, geometry, range limits in m, link, status.
 MODELS: dict[str, tuple[str, Geometry, tuple[float, float], Link, str]] = {
     "hokuyo-urg04lx": ("URG-04LX", URG, (0.02, 5.6), Serial(19_200, 115_200), "manual"),
     "hokuyo-ust10lx": ("UST-10LX", UST, (0.02, 30.0), ETHERNET, "manual"),
@@ -51,86 +60,91 @@ MODELS: dict[str, tuple[str, Geometry, tuple[float, float], Link, str]] = {
 }
 
 
-def relative(own: Geometry, other: Geometry) -> str | Relative:
-    """What tells a scanner that looks elsewhere; of those that do not, one says so itself."""
+def describe_difference(own: Geometry, other: Geometry) -> str | Relative:
+    """Return how to distinguish a scanner from another one."""
     if own.last == other.last:
         return "nothing in its scans: the model in its answer to get_parameters"
     if other.last > own.last:
-        return Relative(f"steps beyond {own.last}", lambda f: number(f.last) > own.last)
+        return Relative(f"steps beyond {own.last}", lambda f: decimal_value(f.last) > own.last)
     return "its pace, or the model in its answer to get_parameters"
 
 
 @cache
-def frames(kind: str, geometry: Geometry) -> dict[str, Frame]:
-    """Return all frames of a scanner, first the scans of a kind."""
+def make_frames(kind: str, geometry: Geometry) -> dict[str, Frame]:
+    """Return all frames of a scanner, first the scans of this kind."""
     kinds = sorted(geometry.kinds, key=lambda other: other != kind)
     scans = {
-        f"{prefix}{one}": scan(command, geometry)
-        for one in kinds
-        for prefix, command in zip(("", "one_"), KINDS[one], strict=True)
+        f"{prefix}{content}": make_scan_frame(command, geometry)
+        for content in kinds
+        for prefix, command in zip(("", "one_"), SCAN_COMMANDS[content], strict=True)
     }
-    return scans | messages(kind, is_urg=geometry is URG)
+    return scans | make_messages(kind, is_urg=geometry is URG)
 
 
 def configure(
     sensor: Sensor, *, content: str = "distances", first: int = -1, last: int = -1, cluster: int = 1
 ) -> Sensor:
-    """The scanner that is asked for these scans: "distances", "intensities" as well, or "short"
-    distances; of a UTM-30LX-EW also "echoes", up to three of each step, and "echo_intensities".
+    """Return the scanner with a request for other scans.
 
     Args:
-        first, last: the steps that are asked for; -1 for the first and the last ones that it
-            measures.
-        cluster: steps that come as one distance, 1 to 99.
+        content: "distances", "intensities" (with distances), or "short" distances; for a
+            UTM-30LX-EW also "echoes", up to three per step, and "echo_intensities".
+        first, last: the requested steps; -1 for the first and last that the scanner measures.
+        cluster: steps that are merged to one distance, 1 to 99.
 
     Raises:
-        UsageError: for what the scanner does not take.
+        UsageError: if the scanner does not support these values.
     """
     geometry = MODELS[sensor.id][1]
-    asked = Asked(
+    steps = RequestedSteps(
         geometry.first if first < 0 else first, geometry.last if last < 0 else last, cluster
     )
     if content not in geometry.kinds:
         raise UsageError(
             f"{sensor.id}: content is one of {', '.join(geometry.kinds)}, not {content!r}"
         )
-    if not (asked.first <= asked.last <= geometry.end and 1 <= cluster <= 99):
+    if not (steps.first <= steps.last <= geometry.end and 1 <= cluster <= 99):
         raise UsageError(
             f"{sensor.id}: steps go from 0 up to {geometry.end}, and 1 to 99 make a cluster; not"
-            f" {asked.text.decode()}"
+            f" {steps.text.decode()}"
         )
-    return dataclasses.replace(sensor, **conversation(sensor.id, content, asked))
+    return dataclasses.replace(sensor, **make_scan_parts(sensor.id, content, steps))
 
 
-def conversation(name: str, kind: str, asked: Asked) -> dict[str, Any]:
-    """What depends on the scans that a scanner is asked for."""
+def make_scan_parts(name: str, kind: str, steps: RequestedSteps) -> dict[str, Any]:
+    """Return the arguments of `Sensor` that depend on the requested scans."""
     model, geometry, limits, _, _ = MODELS[name]
-    in_mm = {"shortest": f"{limits[0] * 1000:g}", "longest": f"{limits[1] * 1000:g}"}
-    looks = {line: str(getattr(geometry, line)) for line in ("division", "first", "last", "ahead")}
-    told = {
+    limits_mm = {"shortest": f"{limits[0] * 1000:g}", "longest": f"{limits[1] * 1000:g}"}
+    geometry_values = {
+        line: str(getattr(geometry, line)) for line in ("division", "first", "last", "ahead")
+    }
+    values = {
         "model": model,
         "product": model,
         "protocol": "SCIP 2.0",
         "speed": f"{geometry.rate * 60:g}",
-        **in_mm,
-        **looks,
+        **limits_mm,
+        **geometry_values,
     }
     answers: dict[str, Any] = {
-        command: (telling(frame, told),) for command, frame in TOLD_BY.items()
+        command: (make_value_lines(frame, values),) for command, frame in VALUE_REPLIES.items()
     }
-    shown = partial(sweep, geometry=geometry, asked=asked)
+    if kind == "short":
+        limits = (limits[0], min(limits[1], MAX_SHORT_RANGE_M))
+    make_scan_values = partial(sweep, geometry=geometry, requested=steps)
     return {
-        "range_limits": (limits[0], min(limits[1], FARTHEST_SHORT)) if kind == "short" else limits,
-        "frames": frames(kind, geometry),
-        "commands": commands(kind, asked.text, is_urg=geometry is URG),
+        "range_limits": limits,
+        "frames": make_frames(kind, geometry),
+        "commands": make_commands(kind, steps.text, is_urg=geometry is URG),
         "simulation": Simulation(
-            shown, answers={**answers, "get_scan": ((f"one_{kind}", shown(0)),)}
+            make_scan_values,
+            answers={**answers, "get_scan": ((f"one_{kind}", make_scan_values(0)),)},
         ),
     }
 
 
-def scanner(name: str) -> Sensor:
-    """One row of the table as a sensor."""
+def make_scanner(name: str) -> Sensor:
+    """Return the sensor of one row of `MODELS`."""
     model, geometry, _, link, status = MODELS[name]
     return Sensor(
         name,
@@ -138,14 +152,16 @@ def scanner(name: str) -> Sensor:
         model=model,
         points=None,
         scan=OnChange("time"),
-        clock=Clock("time", wraps_at=WRAP, pace=partial(pace, rate=geometry.rate)),
+        clock=Clock("time", wraps_at=CLOCK_WRAP_S, pace=partial(pace, rate=geometry.rate)),
         links={"data": link},
-        **conversation(name, "distances", Asked(geometry.first, geometry.last, 1)),
+        **make_scan_parts(name, "distances", RequestedSteps(geometry.first, geometry.last, 1)),
         on_open=("stop", "start"),
         on_close=("stop",),
         configure=configure,
         relatives={
-            other: relative(geometry, row[1]) for other, row in MODELS.items() if other != name
+            other: describe_difference(geometry, row[1])
+            for other, row in MODELS.items()
+            if other != name
         },
         info={
             "serial": "version.serial.text",
@@ -164,10 +180,10 @@ def scanner(name: str) -> Sensor:
     )
 
 
-URG04LX, UST10LX, UST20LX, UTM30LX, UTM30LXEW = SCANNERS = [scanner(name) for name in MODELS]
+URG04LX, UST10LX, UST20LX, UTM30LX, UTM30LXEW = SCANNERS = [make_scanner(name) for name in MODELS]
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Hokuyo scanners."""
+    """Return the Hokuyo scanners."""
     return SCANNERS

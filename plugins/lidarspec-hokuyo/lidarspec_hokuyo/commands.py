@@ -1,9 +1,8 @@
-"""What can be asked of a scanner, and what it answers: an echo, a status and, where it tells
-something, lines with a name and a value each.
+"""Commands and replies: an echo, a status and optional lines with a name and a value.
 
-Source: SCIP 2.0, C-42-03320B, section 8: BM, QT, RS, TM, SS, CR, HS, VV, PP, II; the lines of VV,
-PP and II have their check character over what stands before the semicolon. Commands end with a line
-feed. No text is sent behind a command, though a scanner would repeat it.
+Source: SCIP 2.0, C-42-03320B, section 8: BM, QT, RS, TM, SS, CR, HS, VV, PP, II. In the lines of
+VV, PP and II the check character covers the text before the semicolon. Commands end with a line
+feed. Commands are sent without the optional text that a scanner would repeat.
 """
 
 from __future__ import annotations
@@ -16,12 +15,11 @@ from typing import Any, Literal
 from construct import Bytes, Const, Construct, GreedyBytes, Int8ub, Int32ub, NullTerminated, Struct
 
 from lidarspec.spec import Checksum, Checksummed, Command, Frame, Lines, Scaled, Scip, SixBits, Text
-from lidarspec_hokuyo.scans import KINDS
+from lidarspec_hokuyo.scans import SCAN_COMMANDS
 
 STATUS = "status" / Bytes(2) * "00 done; of BM 02: the laser is on already; else what is wrong"
-#: what a scanner tells of itself: reply -> command, its lines by name, the first four letters of
-#: each.
-TOLD: dict[str, tuple[bytes, dict[str, str]]] = {
+#: Values that a scanner reports: reply -> command, and the first four letters of each line by name.
+REPORTED_VALUES: dict[str, tuple[bytes, dict[str, str]]] = {
     "version": (
         b"VV",
         {
@@ -58,13 +56,16 @@ TOLD: dict[str, tuple[bytes, dict[str, str]]] = {
         },
     ),
 }
-#: command -> the frame that answers it with such lines.
-TOLD_BY = {f"get_{name}": name for name in TOLD}
+#: Command -> the reply with its lines.
+VALUE_REPLIES = {f"get_{name}": name for name in REPORTED_VALUES}
 
 
 @dataclass(frozen=True)
 class LineCheck(Checksum):
-    """Six bits of the sum of a line's characters without the semicolon at its end, from "0" on."""
+    """Six bits of the sum of a line's characters, plus 30 (hexadecimal).
+
+    The semicolon at the end of the line is not part of the sum.
+    """
 
     width: int = 8
     order: Literal["little", "big"] = "little"
@@ -76,31 +77,32 @@ class LineCheck(Checksum):
         return "six bits of the sum before the semicolon"
 
 
-def line(name: str, begin: str) -> Construct:
-    """A line of a value behind a name: its text ends with a semicolon, behind which the check
-    character stands.
-    """
+def make_line(name: str, letters: str) -> Construct:
+    """Return the struct of a line: name, colon, text, semicolon, check character."""
     text = "text" / NullTerminated(GreedyBytes, term=b";")
     struct = Struct(
-        "name" / Const(f"{begin}:".encode()), text, "check" / Int8ub, "end" / Const(b"\n")
+        "name" / Const(f"{letters}:".encode()), text, "check" / Int8ub, "end" / Const(b"\n")
     )
     return name / Checksummed(struct, field="check", algorithm=LineCheck(), over=("name", "text"))
 
 
 def make_reply(command: bytes, lines: Mapping[str, str]) -> Frame:
-    """Return an answer in such lines."""
+    """Return the frame of a reply with these lines.
+
+    `lines` has the first four letters of each line by name.
+    """
     struct = Struct(
         "head" / Const(command + b"\n00P\n"),
-        *(line(*one) for one in lines.items()),
+        *(make_line(*item) for item in lines.items()),
         "end" / Const(b"\n"),
     )
     return Frame(struct, max_length=1000)
 
 
-def telling(name: str, values: Mapping[str, str]) -> bytes:
-    """Such an answer, of a simulated scanner; what is not given is empty."""
-    command, lines = TOLD[name]
-    texts = [f"{begin}:{values.get(line, '')};".encode() for line, begin in lines.items()]
+def make_value_lines(name: str, values: Mapping[str, str]) -> bytes:
+    """Return the bytes of a simulated reply; missing values are empty."""
+    command, lines = REPORTED_VALUES[name]
+    texts = [f"{letters}:{values.get(line, '')};".encode() for line, letters in lines.items()]
     return (
         command
         + b"\n00P\n"
@@ -109,24 +111,31 @@ def telling(name: str, values: Mapping[str, str]) -> bytes:
     )
 
 
-def answer(command: bytes, *more: Construct, size: int = 0, told: tuple[int, ...] = ()) -> Frame:
-    """The echo of a command with an argument of so many characters, and a status; what else is told
-    stands in a line of its own.
+def make_status_reply(
+    command: bytes, *fields: Construct, size: int = 0, line_sizes: tuple[int, ...] = ()
+) -> Frame:
+    """Return the frame of a reply with the echo of a command and a status.
+
+    Args:
+        command: the letters of the command.
+        fields: the fields of further lines.
+        size: characters of the command's argument.
+        line_sizes: characters of each further line.
     """
     value = ("value" / Bytes(size),) if size else ()
-    wire = Lines(64, head=(len(command) + size, 2, *told), bare=1, check=Scip()) | SixBits()
+    wire = Lines(64, head=(len(command) + size, 2, *line_sizes), bare=1, check=Scip()) | SixBits()
     return Frame(
-        Struct("command" / Const(command), *value, STATUS, *more), max_length=40, wire=wire
+        Struct("command" / Const(command), *value, STATUS, *fields), max_length=40, wire=wire
     )
 
 
-def order(command: bytes, size: int) -> Frame:
-    """Return a command with an argument of so many characters."""
+def make_command_frame(command: bytes, size: int) -> Frame:
+    """Return the frame of a command with an argument of `size` characters."""
     value = ("value" / Bytes(size),) if size else ()
     return Frame(Struct("command" / Const(command), *value, "end" / Const(b"\n")), direction="out")
 
 
-#: name -> what is sent, the characters of its argument, and what the command does besides.
+#: Name -> the sent letters, the characters of its argument, and further arguments of `Command`.
 ORDERS: dict[str, tuple[bytes, int, dict[str, Any]]] = {
     "stop": (b"QT", 0, {"stops": True}),
     "laser_on": (b"BM", 0, {}),
@@ -134,9 +143,9 @@ ORDERS: dict[str, tuple[bytes, int, dict[str, Any]]] = {
     "timing_on": (b"TM0", 0, {"stops": True}),
     "get_time": (b"TM1", 0, {}),
     "timing_off": (b"TM2", 0, {}),
-    **{f"get_{name}": (command, 0, {}) for name, (command, _) in TOLD.items()},
+    **{f"get_{name}": (command, 0, {}) for name, (command, _) in REPORTED_VALUES.items()},
 }
-OF_URG: dict[str, tuple[bytes, int, dict[str, Any]]] = {
+URG_ORDERS: dict[str, tuple[bytes, int, dict[str, Any]]] = {
     "set_baud": (b"SS", 6, {}),
     "set_speed": (b"CR", 2, {}),
     "more_sensitive": (b"HS1", 0, {}),
@@ -144,49 +153,55 @@ OF_URG: dict[str, tuple[bytes, int, dict[str, Any]]] = {
 }
 
 
-def orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
-    """Return all that a scanner takes whose scans are of this kind."""
+def list_orders(kind: str, *, is_urg: bool) -> dict[str, tuple[bytes, int, dict[str, Any]]]:
+    """Return all commands of a scanner whose scans are of this kind."""
     scans = {
-        "start": (KINDS[kind][0].encode(), 13, {"starts": True}),
-        "get_scan": (KINDS[kind][1].encode(), 10, {}),
+        "start": (SCAN_COMMANDS[kind][0].encode(), 13, {"starts": True}),
+        "get_scan": (SCAN_COMMANDS[kind][1].encode(), 10, {}),
     }
-    return scans | ORDERS | (OF_URG if is_urg else {})
+    return scans | ORDERS | (URG_ORDERS if is_urg else {})
 
 
 @cache
-def messages(kind: str, *, is_urg: bool) -> dict[str, Frame]:
-    """Return all commands and answers, but for scans."""
-    rows = orders(kind, is_urg=is_urg)
-    found = dict[str, Frame]()
+def make_messages(kind: str, *, is_urg: bool) -> dict[str, Frame]:
+    """Return the frames of all commands and replies except scans."""
+    rows = list_orders(kind, is_urg=is_urg)
+    frames = dict[str, Frame]()
     for name, (command, size, _) in rows.items():
-        found[f"{name}_order"] = order(command, size)
-        if name not in TOLD_BY:
+        frames[f"{name}_order"] = make_command_frame(command, size)
+        if name not in VALUE_REPLIES:
             clock: tuple[Any, ...] = ()
             if name == "get_time":
                 clock = ("time" / Scaled(Int32ub, 0.001, "s") * "24 bits",)
-            found[f"{name}_answer"] = answer(command, *clock, size=size, told=(4,) if clock else ())
-    return found | {name: make_reply(*row) for name, row in TOLD.items()}
+            frames[f"{name}_answer"] = make_status_reply(
+                command, *clock, size=size, line_sizes=(4,) if clock else ()
+            )
+    return frames | {name: make_reply(*row) for name, row in REPORTED_VALUES.items()}
 
 
-def commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command]:
-    """The commands of a scanner that is asked for these steps: the first, the last and how many
-    come as one distance.
+def make_commands(kind: str, steps: bytes, *, is_urg: bool) -> dict[str, Command]:
+    """Return the commands of a scanner.
+
+    Args:
+        kind: a key of `SCAN_COMMANDS`.
+        steps: the requested steps: first, last and cluster size.
+        is_urg: whether it is a URG-04LX.
     """
-    given = {"start": {"value": steps + b"000"}, "get_scan": {"value": steps}}
-    found = dict[str, Command]()
-    for name, (_, size, more) in orders(kind, is_urg=is_urg).items():
-        reply = TOLD_BY.get(name, f"{name}_answer")
-        own: dict[str, Any] = {"reply": reply, "retries": 1, **more}
-        if name not in TOLD_BY and name != "laser_on":
-            own["matches"] = {"status": b"00"}
+    values = {"start": {"value": steps + b"000"}, "get_scan": {"value": steps}}
+    commands = dict[str, Command]()
+    for name, (_, size, more) in list_orders(kind, is_urg=is_urg).items():
+        reply = VALUE_REPLIES.get(name, f"{name}_answer")
+        arguments: dict[str, Any] = {"reply": reply, "retries": 1, **more}
+        if name not in VALUE_REPLIES and name != "laser_on":
+            arguments["matches"] = {"status": b"00"}
         if size:
-            own["echoes"] = ("value",)
-            own |= (
-                {"values": given[name]}
-                if name in given
+            arguments["echoes"] = ("value",)
+            arguments |= (
+                {"values": values[name]}
+                if name in values
                 else {"args": {"value": ("value", Text(size))}}
             )
         if name == "get_scan":
-            own |= {"reply": f"one_{kind}", "matches": {}, "echoes": ()}
-        found[name] = Command(f"{name}_order", **own)
-    return found
+            arguments |= {"reply": f"one_{kind}", "matches": {}, "echoes": ()}
+        commands[name] = Command(f"{name}_order", **arguments)
+    return commands

@@ -1,12 +1,11 @@
-"""The scans that a scanner sends: distances of two or three characters, or distances with
-intensities; of one echo, or of up to three.
+"""Scans: distances of two or three characters, or distances with intensities; 1 or 3 echoes.
 
 Source: SCIP 2.0, C-42-03320B: characters (6), steps (5), MD and MS with the time and the errors
 (8.1), GD and GS (8.2). ME and GE send a distance and an intensity of three characters each
 (UTM-30LX-EW, C-42-03886). ND, NE, HD and HE send the same for each echo of a step, with "&" between
-them (C-42-03886). A cluster of steps comes as one distance, its shortest; that a last cluster of
-fewer steps comes too, that a cluster is seen in its middle, and that a step has three echoes at
-most (Hokuyo's urg_library makes room for three), is assumed.
+them (C-42-03886). A cluster of steps is sent as one distance, its shortest. Assumed: a last cluster
+of fewer steps is sent too, the direction of a cluster is that of its middle, and a step has at most
+three echoes (Hokuyo's urg_library has room for three).
 """
 
 from __future__ import annotations
@@ -20,16 +19,15 @@ from construct import Array, Const, Int8ub, Int16ub, Int24ub, Int32ub, OneOf, St
 
 from lidarspec.spec import Echoes, Fields, Frame, Lines, Polar, Scaled, Scip, SixBits
 
-WIDTH = 64  # characters of a line of data
-LONGEST = {
-    1: 7000,
-    3: 23_000,
-}  # characters by echoes: 1081 distances with intensities take 6727, with three echoes each 22,327
-ECHOES = 3  # of a step, at most
-WRAP = 2**24 * 1e-3  # seconds after which the clock starts again
-LEAST = 0.02  # metres: what is below is the number of an error (tables 3 and 4)
-#: kind -> the commands for scan after scan, and for one.
-KINDS = {
+LINE_CHARACTERS = 64  # of data
+#: Echoes per step -> maximum characters of a scan. 1081 distances with intensities need 6727, with
+#: three echoes each 22,327.
+MAX_SCAN_CHARACTERS = {1: 7000, 3: 23_000}
+MAX_ECHOES = 3  # per step
+CLOCK_WRAP_S = 2**24 * 1e-3
+MIN_RANGE_M = 0.02  # lower values are error codes (tables 3 and 4)
+#: Kind -> the commands for continuous scans and for one scan.
+SCAN_COMMANDS = {
     "distances": ("MD", "GD"),
     "intensities": ("ME", "GE"),
     "short": ("MS", "GS"),
@@ -46,15 +44,15 @@ FIELDS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where a scanner looks, and how.
+    """The steps and the rotation of a scanner.
 
     Attributes:
-        division: steps of a whole turn.
-        first, last, ahead: the first and the last step that it measures, and the one straight
-            ahead.
-        end: the highest step that can be asked for.
-        rate: turns a second.
-        kinds: of scans that it sends.
+        division: steps of a full revolution.
+        first, last: the first and the last step that it measures.
+        ahead: the step straight ahead.
+        end: the highest step of a request.
+        rate: revolutions per second.
+        kinds: the kinds of scans that it sends.
     """
 
     division: int
@@ -67,8 +65,8 @@ class Geometry:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Which steps are asked for, and how many of them come as one distance."""
+class RequestedSteps:
+    """The requested steps, and the number of steps that are merged to one distance."""
 
     first: int
     last: int
@@ -76,13 +74,14 @@ class Asked:
 
     @property
     def text(self) -> bytes:
-        """The same as in a command."""
+        """The steps as in a command."""
         return f"{self.first:04}{self.last:04}{self.cluster:02}".encode()
 
 
-def decimal(name: str, places: int, most: int = 9999) -> Any:
-    """A number of so many decimal digits, the first of them no larger than that of the largest
-    number.
+def make_decimal(name: str, places: int, most: int = 9999) -> Any:
+    """Return the struct of a decimal number with `places` digits, each a field.
+
+    The first digit is at most that of `most`, the largest number.
     """
     first = most // 10 ** (places - 1) if places == 4 else 9
     largest = (first, *[9] * (places - 1))
@@ -92,107 +91,116 @@ def decimal(name: str, places: int, most: int = 9999) -> Any:
     )
 
 
-def number(digits: Any) -> Any:
-    """What digits of a `decimal` say."""
-    return digits.thousands * 1000 + digits.hundreds * 100 + two(digits)
+def decimal_value(digits: Any) -> Any:
+    """Return the value of a `make_decimal` struct with four digits."""
+    return digits.thousands * 1000 + digits.hundreds * 100 + two_digit_value(digits)
 
 
-def two(digits: Any) -> Any:
-    """What two digits say."""
+def two_digit_value(digits: Any) -> Any:
+    """Return the value of the last two digits."""
     return digits.tens * 10 + digits.ones
 
 
-def digits(name: str, value: int, places: int) -> dict[str, int]:
-    """Return the digits of a number, by their paths."""
+def split_digits(name: str, value: int, places: int) -> dict[str, int]:
+    """Return the digits of a number by their field path."""
     return {
         f"{name}.{place}": int(digit)
         for place, digit in zip(DIGITS[places], f"{value:0{places}}", strict=True)
     }
 
 
-def width(f: Any) -> Any:
-    """Return the steps of a cluster, of which 00 means one too."""
-    return two(f.cluster) + (two(f.cluster) == 0)
+def cluster_size(f: Any) -> Any:
+    """Return the steps of a cluster; 00 means one."""
+    return two_digit_value(f.cluster) + (two_digit_value(f.cluster) == 0)
 
 
-def count(f: Any) -> Any:
-    """How many distances there are."""
-    return (number(f.last) - number(f.first)) // width(f) + 1
+def distance_count(f: Any) -> Any:
+    """Return the number of distances in a scan."""
+    return (decimal_value(f.last) - decimal_value(f.first)) // cluster_size(f) + 1
 
 
 def plausible(f: Fields, end: int) -> Any:
-    """Return the steps are those of the scanner."""
-    return (number(f.last) <= end) & (number(f.first) <= number(f.last))
+    """Return whether the steps are in order and at most `end`."""
+    return (decimal_value(f.last) <= end) & (decimal_value(f.first) <= decimal_value(f.last))
 
 
 def points(f: Fields, geometry: Geometry, echoes: int) -> Polar:
-    """Points from the first step on, counter-clockwise; a distance below the shortest is the number
-    of an error, or no echo.
+    """Return points from the first step on, counter-clockwise.
+
+    A distance below the shortest is an error code or a missing echo, and invalid.
     """
-    step = number(f.first) + f.points.index * width(f) + (width(f) - 1) / 2
-    seen = f.points if echoes == 1 else f.points.echoes
+    step = decimal_value(f.first) + f.points.index * cluster_size(f) + (cluster_size(f) - 1) / 2
+    returns = f.points if echoes == 1 else f.points.echoes
     return Polar(
-        range=seen.distance,
+        range=returns.distance,
         azimuth=(step - geometry.ahead) * (2 * np.pi / geometry.division),
-        intensity=getattr(seen, "intensity", None),
+        intensity=getattr(returns, "intensity", None),
         time=step / (geometry.division * geometry.rate),
         return_index=None if echoes == 1 else np.arange(echoes),
-        invalid=seen.distance < LEAST,
+        invalid=returns.distance < MIN_RANGE_M,
     )
 
 
 @cache
-def scan(command: str, geometry: Geometry) -> Frame:
-    """Return the answer to a command for scans."""
-    goes_on = command[0] in "MN"
-    echoes = ECHOES if command[0] in "NH" else 1
+def make_scan_frame(command: str, geometry: Geometry) -> Frame:
+    """Return the frame of a scan, the reply to this command."""
+    is_continuous = command[0] in "MN"
+    echoes = MAX_ECHOES if command[0] in "NH" else 1
     fields = FIELDS[command[1]]
     rest: tuple[Any, ...] = ()
-    if goes_on:
+    if is_continuous:
         rest = (
             "skip" / Int8ub * "turns left out between scans",
-            decimal("left", 2) * "scans to come; 0: on and on",
+            make_decimal("left", 2) * "scans to come; 0: on and on",
         )
     struct = Struct(
         "command" / Const(command.encode()),
-        decimal("first", 4, geometry.end) * "step",
-        decimal("last", 4, geometry.end) * "step",
-        decimal("cluster", 2) * "steps that come as one distance",
+        make_decimal("first", 4, geometry.end) * "step",
+        make_decimal("last", 4, geometry.end) * "step",
+        make_decimal("cluster", 2) * "steps that come as one distance",
         *rest,
-        "status" / Const(b"99" if goes_on else b"00"),
+        "status" / Const(b"99" if is_continuous else b"00"),
         "time" / Scaled(Int32ub, 0.001, "s") * "when the turn was at step 0; 24 bits",
         "points"
-        / Array(count(this), fields if echoes == 1 else Struct("echoes" / Array(echoes, fields))),
+        / Array(
+            distance_count(this),
+            fields if echoes == 1 else Struct("echoes" / Array(echoes, fields)),
+        ),
     )
     return Frame(
         struct,
         data=True,
-        max_length=LONGEST[echoes],
+        max_length=MAX_SCAN_CHARACTERS[echoes],
         plausible=partial(plausible, end=geometry.end),
         points=partial(points, geometry=geometry, echoes=echoes),
         acknowledged={"LS711": "it has no step of four digits"} if geometry.end < 1000 else {},
-        wire=Lines(WIDTH, head=(15 if goes_on else 12, 2, 4), bare=1, check=Scip())
+        wire=Lines(LINE_CHARACTERS, head=(15 if is_continuous else 12, 2, 4), bare=1, check=Scip())
         | SixBits(echoes=None if echoes == 1 else Echoes(fields.sizeof(), echoes)),
     )
 
 
 def pace(f: Fields, rate: float) -> Any:
-    """Return the seconds from a scan to the next, nan if scans are asked for one by one.
+    """Return the seconds from a scan to the next, nan for single scans.
 
-    Turns are left out between scans as the command asks for (SCIP 2.0, 8.1).
+    A command may leave out revolutions between scans (SCIP 2.0, 8.1).
 
     Args:
-        rate: turns a second.
+        rate: revolutions per second.
     """
     skipped = getattr(f, "skip", None)
     return np.nan if skipped is None else (1 + skipped) / rate
 
 
-def sweep(i: int, geometry: Geometry, asked: Asked) -> dict[str, Any]:
-    """Scan i of those that were asked for."""
+def sweep(i: int, geometry: Geometry, requested: RequestedSteps) -> dict[str, Any]:
+    """Return the values of simulated scan i."""
     steps = (
-        digits("first", asked.first, 4)
-        | digits("last", asked.last, 4)
-        | digits("cluster", asked.cluster, 2)
+        split_digits("first", requested.first, 4)
+        | split_digits("last", requested.last, 4)
+        | split_digits("cluster", requested.cluster, 2)
     )
-    return {**steps, "skip": 0, **digits("left", 0, 2), "time": i / geometry.rate % WRAP}
+    return {
+        **steps,
+        "skip": 0,
+        **split_digits("left", 0, 2),
+        "time": i / geometry.rate % CLOCK_WRAP_S,
+    }
