@@ -1,19 +1,20 @@
-"""LDROBOT STL-27L and relatives: 360 degree time-of-flight and triangulating lidars over a UART,
-which send by themselves.
+"""LDROBOT STL-27L and related 360 degree lidars, which stream over a UART.
 
-Source: STL-27L development manual, section 3; rates, bauds and the frames beside the data from the
-vendor's SDKs (ldlidar_sdk, ldlidar_stl_ros2). LD06, LD19 and STL-19P are one sensor on the line:
-same frame, baud and rate. An LD14 triangulates, and its angles are turned into those seen from the
-axis as the SDK does (sl_transform.cpp). There is an older LD14P of 2300 points a second.
+The models measure by time of flight or by triangulation and send data without a request.
 
-What an LD14P answers to commands is nowhere said: they are sent without waiting. Bauds of LD20,
-STL-06P and STL-26 are assumed to be the LD19's; no frame of the last two was seen. An STL-50 is
-left out: nothing about its protocol is public.
+Source: STL-27L development manual, section 3. Rates, baud rates and the other frames come from the
+vendor's SDKs (ldlidar_sdk, ldlidar_stl_ros2). LD06, LD19 and STL-19P share frame, baud rate and
+point rate, so they are one sensor here. An LD14 triangulates; its angles are converted to angles
+around the axis of rotation as in the SDK (sl_transform.cpp). An older LD14P measures 2300 points a
+second.
 
-Known errors of the manual: the CRC table lacks entries 175 to 186 (it
-is generated here); the decode table of the example prints point 2 as 200 mm (0x00dc is 220) and
-point 12 as B0 00 EA (the dump, whose CRC is right, has C0 00 E5); no rule for frames that cross 360
-degrees.
+The replies of an LD14P to commands are not documented, so commands do not wait for a reply. The
+baud rates of LD20, STL-06P and STL-26 are assumed to be the LD19's; no captured frame of the last
+two was available. The STL-50 is left out, because its protocol is not public.
+
+Known errors of the manual: the CRC table lacks entries 175 to 186 (it is generated here); the
+decode table of the example prints point 2 as 200 mm (0x00dc is 220) and point 12 as B0 00 EA (the
+dump, with a valid CRC, has C0 00 E5); no rule for frames that cross 360 degrees.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ from lidarspec.spec import (
 )
 
 POINTS = 12
-#: points per second: STL-27L manual, section 1; LD06 data sheet (450 points a turn at 10 Hz); SDKs;
-#: LD20: from a captured frame.
-RATES = {
+#: Points per second by model. Sources: STL-27L manual, section 1; LD06 data sheet (450 points a
+#: revolution at 10 Hz); SDKs; a captured frame of the LD20.
+POINT_RATES_HZ = {
     "STL-27L": 21_600,
     "LD06": 4_500,
     "STL-06P": 5_000,
@@ -100,26 +101,36 @@ COMMAND = with_crc(
 
 
 def plausible(f: Fields) -> Any:
-    """Angles below 360 degrees and a time of at most 30 s (manual 3.1)."""
+    """Return whether angles are below 360 degrees and the time is at most 30 s.
+
+    Source: manual 3.1.
+    """
     return (f.start_angle < 360) & (f.end_angle < 360) & (f.timestamp <= 30)
 
 
-def seen_aside(distance: Any) -> Any:
-    """Degrees by which what an LD14 sees lies before the angle of its laser, by the distance in
-    metres (SDK, sl_transform.cpp).
+def parallax_angle(distance: Any) -> Any:
+    """Return the angle in degrees from a point to its laser beam.
+
+    The receiver of an LD14 sits beside the axis of rotation. `distance` is in metres. Source: SDK,
+    sl_transform.cpp.
     """
     mm = distance * 1000
     return np.where(mm > 0, np.rad2deg(np.arctan((0.11923 * mm - 18.975571) / (mm + 5.9))), 0)
 
 
-def points(f: Fields, rate: int, *, aside: bool = False) -> Polar:
+def points(f: Fields, rate: int, *, correct_parallax: bool = False) -> Polar:
     """Return points at even steps from the start angle to the end angle.
 
-    `rate` is in points per second. Source: manual 3.2.
+    Args:
+        f: the fields of n frames.
+        rate: points per second.
+        correct_parallax: convert the angles of a triangulating model.
+
+    Source: manual 3.2.
     """
     clockwise = spread(f.start_angle, f.end_angle, POINTS, full=360.0)  # degrees, (n, 12)
-    if aside:
-        clockwise = clockwise - seen_aside(f.points.distance)
+    if correct_parallax:
+        clockwise = clockwise - parallax_angle(f.points.distance)
     return Polar(
         range=f.points.distance,
         azimuth=-np.deg2rad(clockwise),  # left-handed, clockwise (manual, section 4)
@@ -129,7 +140,13 @@ def points(f: Fields, rate: int, *, aside: bool = False) -> Polar:
 
 
 def sweep(i: int, rate: int, turns: int) -> dict[str, float]:
-    """Frame i at so many turns and points per second."""
+    """Return the simulated values of frame i.
+
+    Args:
+        i: the number of the frame.
+        rate: points per second.
+        turns: revolutions per second.
+    """
     step = 360.0 * turns / rate
     start = i * POINTS * step % 360
     return dict(
@@ -140,47 +157,48 @@ def sweep(i: int, rate: int, turns: int) -> dict[str, float]:
     )
 
 
-def slug(name: str) -> str:
+def make_id(name: str) -> str:
     """Return the id of a model."""
     return "ldrobot-" + name.lower().replace("-", "")
 
 
-def keeps_pace(f: Fields, rate: int) -> Any:
-    """Whether the angles of a frame are as far apart as those of a lidar with so many points a
-    second, more than with any other rate.
+def matches_rate(f: Fields, rate: int) -> Any:
+    """Return whether speed and angles of a frame fit `rate` best of all rates.
+
+    `rate` is in points per second.
     """
-    found = (
+    measured_rate = (
         (POINTS - 1)
         * np.maximum(f.speed, 1)
         / np.maximum(wrap(f.end_angle - f.start_angle, 360.0), 0.01)
     )
-    off = [np.abs(np.log(found / known)) for known in (rate, *RATES.values())]
-    return np.min(off, axis=0) == off[0]
+    rates = (rate, *POINT_RATES_HZ.values())
+    deviations = [np.abs(np.log(measured_rate / candidate)) for candidate in rates]
+    return np.min(deviations, axis=0) == deviations[0]
 
 
 def pace(f: Fields, rate: int, older_rate: int | None = None) -> Any:
-    """Return the seconds from a frame to the next, at so many points a second.
+    """Return the seconds from a frame to the next.
 
     Args:
-        older_rate: of older units, which are told apart by the angles of their frames.
+        rate: points per second.
+        older_rate: points per second of older units, recognized by the angles of their frames.
     """
     seconds = POINTS / rate
     if older_rate is None:
         return seconds
-    return np.where(keeps_pace(f, older_rate), POINTS / older_rate, seconds)
+    return np.where(matches_rate(f, older_rate), POINTS / older_rate, seconds)
 
 
 def relatives(own: str) -> dict[str, str | Relative]:
-    """What tells the others apart: how far they turn from point to point at the speed that they
-    tell.
-    """
-    others = {slug(name): rate for name, rate in RATES.items() if name != own}
+    """Return how to recognize each other model: by its point rate."""
+    others = {make_id(name): rate for name, rate in POINT_RATES_HZ.items() if name != own}
     return {
         name: (
             "nothing in the data: it has as many points a second"
-            if rate == RATES[own]
+            if rate == POINT_RATES_HZ[own]
             else Relative(
-                f"{rate} points a second, by its speed and angles", partial(keeps_pace, rate=rate)
+                f"{rate} points a second, by its speed and angles", partial(matches_rate, rate=rate)
             )
         )
         for name, rate in others.items()
@@ -188,32 +206,38 @@ def relatives(own: str) -> dict[str, str | Relative]:
 
 
 DATA_FRAME = Frame(DATA, data=True, plausible=plausible)
-TOLD = {
+STATUS_FRAMES = {
     "info": Frame(INFO, plausible=lambda f: f.speed <= 3600),
     "health": Frame(HEALTH, plausible=lambda f: (f.error >= 1) & (f.error <= 3)),
 }
 
 
-def lidar(
+def make_lidar(
     name: str,
     *,
     turns: int = 10,
-    aside: bool = False,
+    correct_parallax: bool = False,
     older_rate: int | None = None,
     frames: Mapping[str, Frame] | None = None,
     **more: Any,
 ) -> Sensor:
-    """One model, simulated at so many turns a second, with the frames that it has beside the data.
+    """Return the sensor of one model.
 
-    `older_rate`: points a second of older units.
+    Args:
+        name: a key of `POINT_RATES_HZ`.
+        turns: simulated revolutions per second.
+        correct_parallax: convert the angles of a triangulating model.
+        older_rate: points per second of older units.
+        frames: the frames other than the data.
+        more: further arguments of `Sensor`.
     """
-    rate = RATES[name]
+    rate = POINT_RATES_HZ[name]
     return Sensor(
-        slug(name),
+        make_id(name),
         vendor="LDROBOT",
         model=more.pop("model", name),
         frames={"data": DATA_FRAME, **(frames or {})},
-        points=partial(points, rate=rate, aside=True) if aside else partial(points, rate=rate),
+        points=partial(points, rate=rate, correct_parallax=correct_parallax),
         scan=OnWrap("azimuth"),
         clock=Clock(
             "timestamp",
@@ -227,30 +251,28 @@ def lidar(
     )
 
 
-STL27L = lidar(
+STL27L = make_lidar(
     "STL-27L",
     links={"data": Serial(921_600)},
     range_limits=(0.03, 25.0),
-    turn=(
-        9.9,
-        10.1,
-    ),  # by its own control (manual, section 1); no limits are given for control by PWM
+    # the limits of the internal speed control (manual, section 1); none are given for PWM control
+    turn=(9.9, 10.1),
     status="vectors",
     source="STL-27L development manual, sections 1 to 4",
 )
-LD06 = lidar(
+LD06 = make_lidar(
     "LD06",
     model="LD06, LD19, STL-19P",
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
-    turn=(5.0, 13.0),  # inno-maker's page of the LD06; by PWM, as for the LD19
+    turn=(5.0, 13.0),  # with PWM control, as for the LD19 (inno-maker's page of the LD06)
     status="capture",
     source=(
         "LD06 and LD19 development manual v2.5 (the STL-27L's frame); three consecutive captured"
         " frames"
     ),
 )
-LD20 = lidar(
+LD20 = make_lidar(
     "LD20",
     turns=6,
     links={"data": Serial(230_400)},
@@ -258,7 +280,7 @@ LD20 = lidar(
     status="vectors",
     source="one captured frame; baud and range are assumed to be the LD19's",
 )
-STL06P = lidar(
+STL06P = make_lidar(
     "STL-06P",
     model="STL-06P, STL-26",
     links={"data": Serial(230_400)},
@@ -266,11 +288,11 @@ STL06P = lidar(
     status="manual",
     source="ldlidar_stl_ros2, lipkg.cpp (the rate); baud and range are assumed to be the LD19's",
 )
-LD14 = lidar(
+LD14 = make_lidar(
     "LD14",
     turns=6,
-    aside=True,
-    frames=TOLD,
+    correct_parallax=True,
+    frames=STATUS_FRAMES,
     links={"data": Serial(115_200)},
     range_limits=(0.1, 8.0),
     status="vectors",
@@ -279,12 +301,12 @@ LD14 = lidar(
         " example; its range is assumed"
     ),
 )
-LD14P = lidar(
+LD14P = make_lidar(
     "LD14P",
     turns=6,
-    aside=True,
-    older_rate=RATES["LD14"],
-    frames={**TOLD, "command": Frame(COMMAND, direction="out")},
+    correct_parallax=True,
+    older_rate=POINT_RATES_HZ["LD14"],
+    frames={**STATUS_FRAMES, "command": Frame(COMMAND, direction="out")},
     links={"data": Serial(230_400)},
     commands={
         "start": Command("command", {"command": 0xA0, "speed": 0}, starts=True),
@@ -292,9 +314,8 @@ LD14P = lidar(
         "set_speed": Command("command", {"command": 0xA2}, args={"speed": ("speed", 720, 2880)}),
         "get_firmware": Command("command", {"command": 0xA8, "speed": 0}),
     },
-    on_open=(
-        "start",
-    ),  # it turns by itself when it is plugged in, and not where it was stopped before
+    # it rotates after power-up, but not if it was stopped before
+    on_open=("start",),
     range_limits=(0.1, 8.0),
     turn=(2.0, 8.0),
     status="vectors",
@@ -307,5 +328,5 @@ LD14P = lidar(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The LDROBOT sensors."""
+    """Return the LDROBOT sensors."""
     return [STL27L, LD06, LD20, STL06P, LD14, LD14P]

@@ -16,7 +16,7 @@ from construct import Array, Const, Int8ul, Int16ul, Struct
 import lidarspec as ls
 from lidarspec.packets.stream import PacketStream
 from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, Polar, Scaled, Serial, spread
-from lidarspec_ldrobot import RATES, keeps_pace
+from lidarspec_ldrobot import POINT_RATES_HZ, matches_rate
 from tests.evidence import assert_points, capture, clockwise, decode, vector_bytes, vectors
 
 FILE = "vectors_serial2d.json"
@@ -158,8 +158,10 @@ def test_an_ld14_looks_from_aside() -> None:
 def test_one_frame_shows_the_pace_of_its_lidar(name: str, owner: str) -> None:
     fields = Fields(SENSOR.decode(vector_bytes(FILE, name)).batch())
     assert [
-        rate for rate in sorted({*RATES.values()}) if np.all(np.asarray(keeps_pace(fields, rate)))
-    ] == [RATES[owner]]
+        rate
+        for rate in sorted({*POINT_RATES_HZ.values()})
+        if np.all(np.asarray(matches_rate(fields, rate)))
+    ] == [POINT_RATES_HZ[owner]]
 
 
 def test_the_crc_has_all_256_entries() -> None:
