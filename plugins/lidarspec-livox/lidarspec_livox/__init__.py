@@ -14,5 +14,5 @@ __all__ = ["AVIA", "HAP", "HORIZON", "MID40", "MID70", "MID360", "TELE15"]
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Livox Lidars."""
+    """Return the Livox Lidars."""
     return [*sdk2.SENSORS, *sdk1.SENSORS]

@@ -1,5 +1,4 @@
-"""What both generations have in common: what a point is, what an IMU feels, and where a simulated
-one looks.
+"""Points, IMU samples and simulated beam directions of both protocol generations.
 
 Source: Livox-SDK 9306596 (livox_def.h) and Livox-SDK2 08f523c (livox_lidar_def.h), which have the
 same points.
@@ -14,7 +13,7 @@ from construct import Array, Const, Float32l, Int8ul, Int16sl, Int16ul, Int32sl,
 
 from lidarspec.spec import Cartesian, Fields, Imu, Polar, Scaled
 
-#: degrees to the right, to the left, below and above that a Lidar sees.
+#: The field of view: azimuth of its right and left edge, elevation of its lower and upper, degrees.
 View = tuple[float, float, float, float]
 SOF = "sof" / Const(b"\xaa")
 GRAVITY = 9.80665  # m/s2
@@ -37,44 +36,65 @@ INERTIAL = (
 )
 
 
-def echoes(number: int, *members: Any) -> Any:
-    """Return the returns of one shot."""
-    return "returns" / Array(number, Struct(*members, REFLECTIVITY, TAG))
+def make_returns(count: int, *members: Any) -> Any:
+    """Return the array field that holds the `count` returns of one shot."""
+    return "returns" / Array(count, Struct(*members, REFLECTIVITY, TAG))
 
 
 def cartesian(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Cartesian:
-    """Points as they stand on the wire, in REP-103 axes already; three zeros are no return."""
-    place = f.points if returns == 1 else f.points.returns
-    return Cartesian(place.x, place.y, place.z, **_common(place, time, returns, tagged))
+    """Return points from x, y and z on the wire, whose axes are those of REP-103.
+
+    Three zeros mean no return.
+
+    Args:
+        f: the fields of n packets.
+        time: seconds of each shot after the packet's clock.
+        returns: returns per shot.
+        tagged: whether points have a tag.
+    """
+    members = f.points if returns == 1 else f.points.returns
+    return Cartesian(
+        members.x, members.y, members.z, **common_columns(members, time, returns, tagged)
+    )
 
 
 def spherical(f: Fields, time: Any, *, returns: int = 1, tagged: bool = True) -> Polar:
-    """Points by depth and direction, whose zenith angle is counted from the z axis."""
-    place = f.points if returns == 1 else f.points.returns
+    """Return points from depth, azimuth and zenith angle (from the z axis).
+
+    The arguments are those of `cartesian`.
+    """
+    members = f.points if returns == 1 else f.points.returns
     azimuth = np.deg2rad(f.points.azimuth)
     elevation = np.deg2rad(90 - f.points.zenith)
-    return Polar(place.depth, azimuth, elevation, **_common(place, time, returns, tagged))
+    return Polar(
+        members.depth, azimuth, elevation, **common_columns(members, time, returns, tagged)
+    )
 
 
-def _common(place: Fields, time: Any, returns: int, tagged: bool) -> dict[str, Any]:
+def common_columns(members: Fields, time: Any, returns: int, tagged: bool) -> dict[str, Any]:
     return {
-        "intensity": place.reflectivity,
+        "intensity": members.reflectivity,
         "time": time,
         "return_index": np.arange(returns) if returns > 1 else None,
-        "extra": {"tag": place.tag} if tagged else {},
+        "extra": {"tag": members.tag} if tagged else {},
     }
 
 
 def imu(f: Fields) -> Imu:
-    """Rates and forces, in the axes of the points."""
+    """Return angular rates and accelerations, in the axes of the points."""
     return Imu((f.gyro_x, f.gyro_y, f.gyro_z), (f.acc_x, f.acc_y, f.acc_z))
 
 
-def looking(shots: Any, rate: float, view: View) -> tuple[Any, Any]:
-    """Azimuth and elevation, degrees, of shots with these numbers, at so many a second.
+def simulated_angles(shots: Any, rate: float, view: View) -> tuple[Any, Any]:
+    """Return azimuth and elevation in degrees of simulated shots.
 
     The real pattern never repeats and is not published: here a wave goes up and down 610 times a
     second, and across 7.3 times.
+
+    Args:
+        shots: numbers of the shots since the start.
+        rate: shots per second.
+        view: the field of view.
     """
     right, left, low, high = view
     across = np.sin(2 * np.pi * 7.3 * shots / rate)

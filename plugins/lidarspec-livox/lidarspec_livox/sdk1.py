@@ -1,16 +1,15 @@
-"""Livox Mid-40, Mid-70, Horizon, Tele-15 and Avia: the first generation of the protocol, which
-Livox-SDK speaks.
+"""Livox Mid-40, Mid-70, Horizon, Tele-15 and Avia: generation 1 of the protocol (Livox-SDK).
 
-A Lidar says once a second who it is (`broadcast`, to port 55000 of everybody). It is told where its
-data go (`handshake`), and goes on as long as it hears a `heartbeat` each second. Packets of points
-have no checksum and no counter, so that their length and header have to prove them; they do not say
-either how far apart their points are in time, which is the model's.
+A Lidar broadcasts its identity once a second (`broadcast`, to port 55000). The host sends it the
+address for its data (`handshake`), and a `heartbeat` each second to keep the data coming. Point
+packets have neither checksum nor counter, so their length and header have to identify them. They do
+not contain the time from point to point either, which depends on the model.
 
 Source: Livox-SDK communication protocol 1.3.0, Livox-SDK 9306596 (livox_def.h, device_discovery.h)
 and livox_ros_driver (lds.h: packet sizes, points a second; it prints 9 bytes for a point of type 3,
-which has 10). Ranges and fields of view are as remembered from the user manuals: assumed. Which
-model sends which type of data is not said: all are read of each. That the version of a packet is 5
-is assumed, since vectors have it and drivers do not look at it. Hubs are not here, nor are the
+which has 10). Ranges and fields of view are assumed from memory of the user manuals. The documents
+do not state which model sends which type of data: each model accepts all types. Packet version 5 is
+assumed, because test vectors have it and drivers ignore it. Hubs are not supported, nor are the
 parameters of commands 0B to 0D.
 """
 
@@ -52,24 +51,24 @@ from lidarspec_livox.points import (
     TAG,
     View,
     cartesian,
-    echoes,
     imu,
-    looking,
+    make_returns,
+    simulated_angles,
     spherical,
 )
 
 CRC16 = Crc(16, 0x1021, init=0x9232, refin=True, refout=True)
 CRC32 = Crc(32, 0x04C11DB7, init=0xAFE50D95, refin=True, refout=True, xorout=0xFFFFFFFF)
-FARTHEST = 1000.0  # metres; twice what the Tele-15 sees
-GPS = 3  # the type of timestamps that are a date
-IMU_RATE = 200  # samples a second
+MAX_POSITION_M = 1000.0  # of the extrinsics: twice the range of the Tele-15
+GPS = 3  # the timestamp type of dates
+IMU_RATE_HZ = 200
 MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon LiDAR, 6 Mid-70, 7 Avia"
 STATES = "0 starts, 1 normal, 2 saves power, 3 stands by, 4 error"
 COMMAND_PORT = 55_501
 DATA_PORT = 56_001
-IMU_PORT = 56_002  # of this computer
+IMU_PORT = 56_002  # of the host
 
-#: in pieces that keep 64 bits of nanoseconds exact, and hold a date as well.
+#: Parts that keep 64 bits of nanoseconds exact in float64, and can hold a date.
 TIMESTAMP = Struct(
     "low"
     / Int32ul
@@ -79,8 +78,8 @@ TIMESTAMP = Struct(
 )
 
 
-def packet(kind: int, *members: Any) -> Struct:
-    """Return a packet with data of one type behind the header."""
+def make_packet(kind: int, *members: Any) -> Struct:
+    """Return the struct of a packet with one type of data."""
     return Struct(
         "version" / Const(5, Int8ul),
         "slot" / Int8ul,
@@ -98,70 +97,82 @@ def packet(kind: int, *members: Any) -> Struct:
 
 
 def clock(f: Fields) -> tuple[Any, ...]:
-    """Return the terms of the time in seconds: of a date, or of a number of nanoseconds.
+    """Return the time in seconds as four terms, from a date or from nanoseconds.
 
     Each term is exact.
     """
     low = f.timestamp.low
     middle = f.timestamp.middle
     high = f.timestamp.high
-    dated = f.timestamp_type == GPS
-    year, month, day, hour = (np.mod(np.floor(low / 256**place), 256) for place in range(4))
+    is_date = f.timestamp_type == GPS
+    year, month, day, hour = (np.mod(np.floor(low / 256**index), 256) for index in range(4))
     date = unix_time(year + 2000, month, day, hour)
     return (
-        np.where(dated, date, 281_474 * high),
-        np.where(dated, (65_536 * high + middle) * 1e-6, low * 1e-9),
-        np.where(dated, 0, middle * 4.294967296),
-        np.where(dated, 0, high * 0.976710656),
+        np.where(is_date, date, 281_474 * high),
+        np.where(is_date, (65_536 * high + middle) * 1e-6, low * 1e-9),
+        np.where(is_date, 0, middle * 4.294967296),
+        np.where(is_date, 0, high * 0.976710656),
     )
 
 
-def is_known(f: Fields) -> Any:
-    """A type of timestamp that there is, and a slot and a number as a hub counts them; a Lidar by
-    itself has such numbers too.
+def has_known_header(f: Fields) -> Any:
+    """Return whether timestamp type, slot and Lidar number are in their ranges.
+
+    Slot and number count the Lidars of a hub; a Lidar without a hub sends them too.
     """
     return (f.timestamp_type <= 4) & (f.timestamp_type != 2) & (f.slot <= 15) & (f.lidar_id <= 15)
 
 
-#: name -> type, shots of a packet, returns of each, fields of a shot.
-TYPES: dict[str, tuple[int, int, int, tuple[Any, ...]]] = {
+#: Name -> type, shots per packet, returns per shot, fields of a shot.
+DATA_TYPES: dict[str, tuple[int, int, int, tuple[Any, ...]]] = {
     "cartesian": (0, 100, 1, (*MILLIMETRES, REFLECTIVITY)),
     "spherical": (1, 100, 1, (*DEPTH, *DIRECTION, REFLECTIVITY)),
     "tagged": (2, 96, 1, (*MILLIMETRES, REFLECTIVITY, TAG)),
     "tagged_spherical": (3, 96, 1, (*DEPTH, *DIRECTION, REFLECTIVITY, TAG)),
-    "dual": (4, 48, 2, (echoes(2, *MILLIMETRES),)),
-    "dual_spherical": (5, 48, 2, (*DIRECTION, echoes(2, *DEPTH))),
-    "triple": (7, 30, 3, (echoes(3, *MILLIMETRES),)),
-    "triple_spherical": (8, 30, 3, (*DIRECTION, echoes(3, *DEPTH))),
+    "dual": (4, 48, 2, (make_returns(2, *MILLIMETRES),)),
+    "dual_spherical": (5, 48, 2, (*DIRECTION, make_returns(2, *DEPTH))),
+    "triple": (7, 30, 3, (make_returns(3, *MILLIMETRES),)),
+    "triple_spherical": (8, 30, 3, (*DIRECTION, make_returns(3, *DEPTH))),
 }
 
 
 def pace(f: Fields, rate: float) -> Any:
-    """Return the seconds that the shots of a packet take, of so many shots a second."""
-    shots = np.zeros(max(kind for kind, *_ in TYPES.values()) + 1)
-    for kind, count, _, _ in TYPES.values():
+    """Return the seconds from a packet to the next.
+
+    `rate` is in shots per second.
+    """
+    shots = np.zeros(max(kind for kind, *_ in DATA_TYPES.values()) + 1)
+    for kind, count, _, _ in DATA_TYPES.values():
         shots[kind] = count
     return take(shots, f.data_type) / rate
 
 
-def data_frame(name: str, rate: float, **more: Any) -> Frame:
-    """Points of one type, so many shots a second."""
-    kind, shots, returns, members = TYPES[name]
-    by_angles = name.endswith("spherical")
+def make_data_frame(name: str, rate: float, **more: Any) -> Frame:
+    """Return the frame of one data type.
+
+    Args:
+        name: a key of `DATA_TYPES`.
+        rate: shots per second.
+        more: further arguments of `Frame`.
+    """
+    kind, shots, returns, members = DATA_TYPES[name]
+    is_spherical = name.endswith("spherical")
     tagged = kind > 1
 
     def points(f: Fields) -> Any:
-        made = spherical if by_angles else cartesian
-        return made(f, along("points", np.arange(shots) / rate), returns=returns, tagged=tagged)
+        make_points = spherical if is_spherical else cartesian
+        return make_points(
+            f, along("points", np.arange(shots) / rate), returns=returns, tagged=tagged
+        )
 
     def plausible(f: Fields) -> Any:
-        if by_angles:
-            return is_known(f) & (f.points[0].zenith <= 180) & (f.points[0].azimuth <= 360)
-        return is_known(f)
+        if is_spherical:
+            return has_known_header(f) & (f.points[0].zenith <= 180) & (f.points[0].azimuth <= 360)
+        return has_known_header(f)
 
     shot = Struct(*members)
     return Frame(
-        packet(kind, "points" / Array(shots, shot)),
+        make_packet(kind, "points" / Array(shots, shot)),
         data=True,
         points=points,
         plausible=plausible,
@@ -169,13 +180,20 @@ def data_frame(name: str, rate: float, **more: Any) -> Frame:
     )
 
 
-def simulation(name: str, rate: float, view: View, **more: Any) -> Simulation:
-    """What a simulated Lidar needs to send points of one type."""
-    _, count, returns, _ = TYPES[name]
+def make_simulation(name: str, rate: float, view: View, **more: Any) -> Simulation:
+    """Return a simulated Lidar that sends points of one data type.
+
+    Args:
+        name: a key of `DATA_TYPES`.
+        rate: shots per second.
+        view: the field of view.
+        more: further arguments of `Simulation`.
+    """
+    _, count, returns, _ = DATA_TYPES[name]
     shots = np.arange(count)[:, None] if returns > 1 else np.arange(count)
 
     def look(i: int) -> tuple[Any, Any]:
-        return looking(i * count + shots, rate, view)
+        return simulated_angles(i * count + shots, rate, view)
 
     def sweep(i: int) -> dict[str, Any]:
         azimuth, elevation = look(i)
@@ -191,15 +209,21 @@ def simulation(name: str, rate: float, view: View, **more: Any) -> Simulation:
 
 
 def make_header(ns: int) -> dict[str, Any]:
-    """Return the header of a packet of this time since power-up."""
-    pieces = {"low": ns % 2**32, "middle": (ns >> 32) % 2**16, "high": ns >> 48}
+    """Return the header values of a packet `ns` nanoseconds after power-up."""
+    parts = {"low": ns % 2**32, "middle": (ns >> 32) % 2**16, "high": ns >> 48}
     header = {"slot": 1, "lidar_id": 1, "reserved": 0, "status_code": 0, "timestamp_type": 0}
-    return header | {f"timestamp.{name}": piece for name, piece in pieces.items()}
+    return header | {f"timestamp.{name}": part for name, part in parts.items()}
 
 
-def message(packet_type: int, number: tuple[int, int] | None, *members: Any) -> Checksummed:
-    """A control frame: a header with a CRC of its own, the number of the command, and its data."""
-    head = Struct(
+def make_message(packet_type: int, number: tuple[int, int] | None, *members: Any) -> Checksummed:
+    """Return the struct of a control frame.
+
+    Args:
+        packet_type: `REQUEST`, `REPLY` or `NOTIFICATION`.
+        number: command set and id; None for frames of several commands.
+        members: the data.
+    """
+    header = Struct(
         SOF,
         "version" / Const(1, Int8ul),
         "length" / SizeOf(Int16ul, "_"),
@@ -208,13 +232,15 @@ def message(packet_type: int, number: tuple[int, int] | None, *members: Any) -> 
         "crc16" / Int16ul,
     )
     names = ("cmd_set", "cmd_id")
-    numbers = (
-        name / (Int8ul if number is None else Const(number[at], Int8ul))
-        for at, name in enumerate(names)
+    command_id = (
+        name / (Int8ul if number is None else Const(number[index], Int8ul))
+        for index, name in enumerate(names)
     )
-    sealed = "head" / Checksummed(head, field="crc16", algorithm=CRC16)
+    checked_header = "head" / Checksummed(header, field="crc16", algorithm=CRC16)
     return Checksummed(
-        Struct(sealed, *numbers, *members, "crc32" / Int32ul), field="crc32", algorithm=CRC32
+        Struct(checked_header, *command_id, *members, "crc32" / Int32ul),
+        field="crc32",
+        algorithm=CRC32,
     )
 
 
@@ -228,11 +254,11 @@ POSE = (
     *(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz"),
 )
 STATUS = "status_code" / Int32ul * "as in packets of points; while it starts, per cent"
-ASK = 0
-ANSWER = 1
-TELL = 2
-#: (set, number) of what is asked without more, of what is set to a number, and of what is answered
-#: with one.
+REQUEST = 0
+REPLY = 1
+NOTIFICATION = 2
+#: Command set and id of commands without arguments, of commands that set a number, and of commands
+#: that return a number.
 INFORMATION = (0, 2)
 DISCONNECT = (0, 6)
 ADDRESS = (0, 9)
@@ -258,34 +284,34 @@ DATE = (
 )
 
 
-def out(number: tuple[int, int] | None, *members: Any) -> Frame:
-    """Return a command."""
-    return Frame(message(ASK, number, *members), direction="out")
+def make_command_frame(number: tuple[int, int] | None, *members: Any) -> Frame:
+    """Return the frame of a command."""
+    return Frame(make_message(REQUEST, number, *members), direction="out")
 
 
 CONTROL: dict[str, Frame] = {
     "imu": Frame(
-        packet(6, *INERTIAL),
+        make_packet(6, *INERTIAL),
         imu=imu,
-        plausible=is_known,
-        simulation=Simulation(lambda i: make_header(i * 10**9 // IMU_RATE), rate=IMU_RATE),
+        plausible=has_known_header,
+        simulation=Simulation(lambda i: make_header(i * 10**9 // IMU_RATE_HZ), rate=IMU_RATE_HZ),
     ),
     "broadcast": Frame(
-        message(
-            TELL,
+        make_message(
+            NOTIFICATION,
             (0, 0),
             "broadcast_code" / Bytes(16),
             "device_type" / Int8ul * MODEL_TYPES,
             "data_reserved" / Int16ul,
         )
     ),
-    "abnormal": Frame(message(TELL, (0, 7), STATUS)),
-    "ack": Frame(message(ANSWER, None, RESULT)),
-    "number": Frame(message(ANSWER, None, RESULT, "number" / Int8ul)),
-    "firmware": Frame(message(ANSWER, INFORMATION, RESULT, "firmware" / Array(4, Int8ul))),
+    "abnormal": Frame(make_message(NOTIFICATION, (0, 7), STATUS)),
+    "ack": Frame(make_message(REPLY, None, RESULT)),
+    "number": Frame(make_message(REPLY, None, RESULT, "number" / Int8ul)),
+    "firmware": Frame(make_message(REPLY, INFORMATION, RESULT, "firmware" / Array(4, Int8ul))),
     "heartbeat_ack": Frame(
-        message(
-            ANSWER,
+        make_message(
+            REPLY,
             (0, 3),
             RESULT,
             "work_state" / Int8ul * STATES,
@@ -293,53 +319,54 @@ CONTROL: dict[str, Frame] = {
             STATUS,
         )
     ),
-    "address": Frame(message(ANSWER, ADDRESS, RESULT, *NET)),
-    "extrinsics": Frame(message(ANSWER, EXTRINSICS, RESULT, *POSE)),
-    "ask": out(None),
-    "set": out(None, "number" / Int8ul),
-    "handshake": out(
+    "address": Frame(make_message(REPLY, ADDRESS, RESULT, *NET)),
+    "extrinsics": Frame(make_message(REPLY, EXTRINSICS, RESULT, *POSE)),
+    "ask": make_command_frame(None),
+    "set": make_command_frame(None, "number" / Int8ul),
+    "handshake": make_command_frame(
         (0, 1),
         "host" / Bytes(4),
         "data_port" / Int16ul,
         "command_port" / Int16ul,
         "imu_port" / Int16ul,
     ),
-    "set_address": out((0, 8), *NET),
-    "reboot": out((0, 0x0A), "delay" / Scaled(Int16ul, 0.001, "s")),
-    "set_extrinsics": out((1, 1), *POSE),
-    "set_time": out((1, 0x0A), *DATE),
+    "set_address": make_command_frame((0, 8), *NET),
+    "reboot": make_command_frame((0, 0x0A), "delay" / Scaled(Int16ul, 0.001, "s")),
+    "set_extrinsics": make_command_frame((1, 1), *POSE),
+    "set_time": make_command_frame((1, 0x0A), *DATE),
 }
 
 
-def command(
+def make_command(
     frame: str, reply: str | None = "ack", number: tuple[int, int] | None = None, **more: Any
 ) -> Command:
-    """A command with a running number, which the answer repeats, and its number where the frame is
-    for several.
+    """Return a command with a running number, which the reply repeats.
+
+    `number` is the command set and id, if the frame serves several commands.
     """
     values = {} if number is None else dict(zip(("cmd_set", "cmd_id"), number, strict=True))
-    own = {
+    defaults = {
         "values": {"head.seq": Count(16), **values, **more.pop("values", {})},
         "echoes": ("head.seq",),
         "link": "control",
         "retries": 1,
     }
-    return Command(frame, reply=reply, **{**own, **more})
+    return Command(frame, reply=reply, **{**defaults, **more})
 
 
-def setter(number: tuple[int, int], low: int, high: int) -> Command:
+def make_setter(number: tuple[int, int], low: int, high: int) -> Command:
     """Return a command that sets something to a number."""
-    return command("set", number=number, args={"number": ("number", low, high)})
+    return make_command("set", number=number, args={"number": ("number", low, high)})
 
 
-def getter(number: tuple[int, int]) -> Command:
-    """Return a command that asks for a number."""
-    return command("ask", "number", number)
+def make_getter(number: tuple[int, int]) -> Command:
+    """Return a command that requests a number."""
+    return make_command("ask", "number", number)
 
 
 DONE = {"result": 0}
 COMMANDS: dict[str, Command] = {
-    "handshake": command(
+    "handshake": make_command(
         "handshake",
         values={
             "host": Address(),
@@ -349,13 +376,13 @@ COMMANDS: dict[str, Command] = {
         },
         matches=DONE,
     ),
-    "heartbeat": command("ask", "heartbeat_ack", (0, 3), every=1.0, retries=0),
-    "start": command("set", number=SAMPLING, values={"number": 1}, matches=DONE, starts=True),
-    "stop": command("set", number=SAMPLING, values={"number": 0}, matches=DONE, stops=True),
-    "disconnect": command("ask", number=DISCONNECT, retries=0),
-    "get_information": command("ask", "firmware", INFORMATION),
-    "get_address": command("ask", "address", ADDRESS),
-    "set_address": command(
+    "heartbeat": make_command("ask", "heartbeat_ack", (0, 3), every=1.0, retries=0),
+    "start": make_command("set", number=SAMPLING, values={"number": 1}, matches=DONE, starts=True),
+    "stop": make_command("set", number=SAMPLING, values={"number": 0}, matches=DONE, stops=True),
+    "disconnect": make_command("ask", number=DISCONNECT, retries=0),
+    "get_information": make_command("ask", "firmware", INFORMATION),
+    "get_address": make_command("ask", "address", ADDRESS),
+    "set_address": make_command(
         "set_address",
         args={
             "mode": ("mode", 0, 1),
@@ -363,26 +390,26 @@ COMMANDS: dict[str, Command] = {
         },
         matches=DONE,
     ),
-    "reboot": command("reboot", args={"delay": ("delay", 0, 65.535)}, retries=0),
-    "set_coordinates": setter(COORDINATES, 0, 1),
-    "set_mode": setter(MODE, 1, 3),
-    "set_rain_mode": setter(RAIN, 0, 1),
-    "set_fan": setter(FAN, 0, 1),
-    "get_fan": getter(GET_FAN),
-    "set_returns": setter(RETURNS, 0, 3),
-    "get_returns": getter(GET_RETURNS),
-    "set_imu": setter(IMU, 0, 1),
-    "get_imu": getter(GET_IMU),
-    "get_extrinsics": command("ask", "extrinsics", EXTRINSICS),
-    "set_extrinsics": command(
+    "reboot": make_command("reboot", args={"delay": ("delay", 0, 65.535)}, retries=0),
+    "set_coordinates": make_setter(COORDINATES, 0, 1),
+    "set_mode": make_setter(MODE, 1, 3),
+    "set_rain_mode": make_setter(RAIN, 0, 1),
+    "set_fan": make_setter(FAN, 0, 1),
+    "get_fan": make_getter(GET_FAN),
+    "set_returns": make_setter(RETURNS, 0, 3),
+    "get_returns": make_getter(GET_RETURNS),
+    "set_imu": make_setter(IMU, 0, 1),
+    "get_imu": make_getter(GET_IMU),
+    "get_extrinsics": make_command("ask", "extrinsics", EXTRINSICS),
+    "set_extrinsics": make_command(
         "set_extrinsics",
         args={
             **{name: (name, -360, 360) for name in ("roll", "pitch", "yaw")},
-            **{axis: (axis, -FARTHEST, FARTHEST) for axis in "xyz"},
+            **{axis: (axis, -MAX_POSITION_M, MAX_POSITION_M) for axis in "xyz"},
         },
         matches=DONE,
     ),
-    "set_time": command(
+    "set_time": make_command(
         "set_time",
         args={
             "year": ("year", 0, 99),
@@ -397,36 +424,42 @@ COMMANDS: dict[str, Command] = {
 
 
 @cache
-def frames(rate: int, first: str) -> Mapping[str, Frame]:
-    """All frames of the models with so many shots a second, of which the first type of data is what
-    they usually send.
+def make_frames(rate: int, first: str) -> Mapping[str, Frame]:
+    """Return all frames of the models with one shot rate.
+
+    Args:
+        rate: shots per second.
+        first: the data type that the models usually send.
     """
-    own = {first: data_frame(first, rate)}
+    usual = {first: make_data_frame(first, rate)}
     return (
-        own
+        usual
         | {
-            name: data_frame(name, rate, simulation=simulation(name, rate, WIDEST[rate]))
-            for name in TYPES
+            name: make_data_frame(
+                name, rate, simulation=make_simulation(name, rate, DEFAULT_VIEWS[rate])
+            )
+            for name in DATA_TYPES
             if name != first
         }
         | CONTROL
     )
 
 
-ANSWERS = {
-    "get_information": (("firmware", {**DONE, "firmware": [4, 11, 0, 6]}),)
-}  # of a simulated one
-#: shots a second -> what a simulated one of these sees with types of data that it does not usually
-#: send: a Mid-40's view, an Avia's.
-WIDEST: dict[int, View] = {100_000: (-19.2, 19.2, -19.2, 19.2), 240_000: (-35.2, 35.2, -38.6, 38.6)}
-#: id -> model, device type, shots a second, usual type of data, view, ranges, other ids.
+SIMULATED_ANSWERS = {"get_information": (("firmware", {**DONE, "firmware": [4, 11, 0, 6]}),)}
+#: Shots per second -> simulated field of view for data types that a model does not usually send:
+#: that of a Mid-40, that of an Avia.
+DEFAULT_VIEWS: dict[int, View] = {
+    100_000: (-19.2, 19.2, -19.2, 19.2),
+    240_000: (-35.2, 35.2, -38.6, 38.6),
+}
+#: Id -> model, device type, shots per second, usual data type, field of view, range limits in m.
 MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float]]] = {
     "livox-mid40": (
         "Mid-40",
         1,
         100_000,
         "cartesian",
-        WIDEST[100_000],
+        DEFAULT_VIEWS[100_000],
         (1.0, 260.0),
     ),
     "livox-mid70": (
@@ -453,14 +486,14 @@ MODELS: dict[str, tuple[str, int, int, str, View, tuple[float, float]]] = {
         (-7.25, 7.25, -8.1, 8.1),
         (3.0, 500.0),
     ),
-    "livox-avia": ("Avia", 7, 240_000, "tagged", WIDEST[240_000], (1.0, 450.0)),
+    "livox-avia": ("Avia", 7, 240_000, "tagged", DEFAULT_VIEWS[240_000], (1.0, 450.0)),
 }
 
 
-def lidar(name: str) -> Sensor:
-    """One row of the table as a sensor."""
+def make_lidar(name: str) -> Sensor:
+    """Return the sensor of one row of `MODELS`."""
     model, device_type, rate, first, view, limits = MODELS[name]
-    who = {
+    identity = {
         "head.seq": 0,
         "broadcast_code": b"0TFSIMULATED001",
         "device_type": device_type,
@@ -470,7 +503,7 @@ def lidar(name: str) -> Sensor:
         name,
         vendor="Livox",
         model=model,
-        frames=frames(rate, first),
+        frames=make_frames(rate, first),
         points=None,
         scan=Every(0.1),
         links={
@@ -479,8 +512,11 @@ def lidar(name: str) -> Sensor:
         },
         commands=COMMANDS,
         clock=Clock(clock, pace=partial(pace, rate=rate)),
-        simulation=simulation(
-            first, rate, view, answers={"handshake": (("ack", DONE), ("broadcast", who)), **ANSWERS}
+        simulation=make_simulation(
+            first,
+            rate,
+            view,
+            answers={"handshake": (("ack", DONE), ("broadcast", identity)), **SIMULATED_ANSWERS},
         ),
         on_open=("handshake", "heartbeat", "get_information", "start"),
         on_close=("stop", "disconnect"),
@@ -509,4 +545,4 @@ def lidar(name: str) -> Sensor:
     )
 
 
-MID40, MID70, HORIZON, TELE15, AVIA = SENSORS = [lidar(name) for name in MODELS]
+MID40, MID70, HORIZON, TELE15, AVIA = SENSORS = [make_lidar(name) for name in MODELS]

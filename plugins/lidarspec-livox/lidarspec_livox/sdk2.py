@@ -1,17 +1,17 @@
-"""Livox Mid-360 and HAP: the second generation of the protocol, which Livox-SDK2 speaks.
+"""Livox Mid-360 and HAP: generation 2 of the protocol (Livox-SDK2).
 
-Points, IMU and parameters come over UDP, each from and to a port of its own. A Lidar sends points
-to the host that it was told of (`set_point_host`) once it is sampling (`start`), and its parameters
-once a second by itself. Firmware of the Mid-360 is reported that leaves the CRC of point packets 0:
-these are taken as they are.
+Points, IMU samples and parameters come over UDP, each from and to its own port. A Lidar that is
+sampling (`start`) sends points to the host set with `set_point_host`. It sends its parameters once
+a second without a request. Some firmware of the Mid-360 is reported to leave the CRC of point
+packets 0: such packets are accepted without a check.
 
 Source: Livox Mid-360 protocol document 1.4.10 and Livox-SDK2 08f523c (livox_lidar_def.h), HAP
-protocol document 1.4.8 where they differ; HAP user manual, table 1.2.1, for its rate, ranges and
-view; those of a Mid-360 are assumed. livox_ros_driver2 divides `time_interval` by the number of
-points, the document by one less: the driver's rule is taken, which differs by 1 %. That a HAP takes
-the commands of a Mid-360 is assumed from the SDK, which sends it the same; where its state goes is
-not known, and not asked for. Commands for logs and firmware are not here. Keys whose values are not
-known are passed on as bytes.
+protocol document 1.4.8 where they differ. Rate, ranges and view of the HAP are from its user
+manual, table 1.2.1; those of the Mid-360 are assumed. livox_ros_driver2 divides `time_interval` by
+the number of points, the document by one less: this module follows the driver, a difference of 1 %.
+The HAP is assumed to accept the commands of a Mid-360, because the SDK sends it the same. The port
+for its state is unknown, so its state is not requested. Commands for logs and firmware are not
+supported. Parameters with unknown keys are passed on as bytes.
 """
 
 from __future__ import annotations
@@ -67,27 +67,27 @@ from lidarspec_livox.points import (
     TAG,
     View,
     cartesian,
-    echoes,
     imu,
-    looking,
+    make_returns,
+    simulated_angles,
     spherical,
 )
 
-DISCOVERY = 56_000  # the port that is asked by a broadcast
+DISCOVERY_PORT = 56_000  # receives broadcast requests
 REBOOT = 0x0200
 FACTORY_SETTINGS = 0x0201
 SET_GPS_TIME = 0x0202
 CRC32 = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF)
 CRC16 = Crc(16, 0x1021, init=0xFFFF)
-LONGEST = 1472  # bytes of a datagram that is not cut into fragments
-ANY_NUMBER = {"LS203": "a datagram holds any number of parameters"}
-SHOTS = np.arange(96)
-IMU_RATE = 200  # of a simulated packet; IMU samples a second
-TYPES = "9 MID-360, 10 HAP, 15 HAP, 35 MID-360S"
+MAX_DATAGRAM_BYTES = 1472  # without fragmentation
+VARIABLE_COUNT = {"LS203": "a datagram holds any number of parameters"}
+SHOTS = np.arange(96)  # shot numbers of a simulated packet
+IMU_RATE_HZ = 200
+DEVICE_TYPES = "9 MID-360, 10 HAP, 15 HAP, 35 MID-360S"
 
 
-def packet(kind: int, *members: Any) -> Checksummed:
-    """Return a packet with data of one type behind the header."""
+def make_packet(kind: int, *members: Any) -> Checksummed:
+    """Return the struct of a packet with one type of data."""
     header = Struct(
         "version" / Const(0, Int8ul),
         "length" / SizeOf(Int16ul),
@@ -107,39 +107,53 @@ def packet(kind: int, *members: Any) -> Checksummed:
     return Checksummed(header, field="crc32", algorithm=CRC32, over=covered, absent=(0,))
 
 
-def after(f: Fields) -> Any:
-    """Seconds from the first point of a packet to each."""
+def point_times(f: Fields) -> Any:
+    """Return the seconds from the first point of a packet to each point."""
     return steps(f.dot_num) * (f.time_interval / f.dot_num)
 
 
 def has_points(f: Fields) -> Any:
-    """Return a packet has points."""
+    """Return whether a packet has points."""
     return f.dot_num >= 1
 
 
-def twice(f: Fields) -> Any:
-    """Both returns of each shot, at its time."""
-    return cartesian(f, after(f).on("points"), returns=2)
+def dual_points(f: Fields) -> Any:
+    """Return the points of both returns of each shot, at the time of the shot."""
+    return cartesian(f, point_times(f).on("points"), returns=2)
 
 
-def points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Frame:
-    """Point packets of one type."""
-    struct = packet(kind, "points" / Array(this.dot_num, Struct(*members)))
+def make_points_frame(kind: int, points: Any, *members: Any, **more: Any) -> Frame:
+    """Return the frame of one type of points.
+
+    Args:
+        kind: the data type.
+        points: the points function.
+        members: the fields of a shot.
+        more: further arguments of `Frame`.
+    """
+    struct = make_packet(kind, "points" / Array(this.dot_num, Struct(*members)))
     return Frame(
         struct,
         data=True,
-        max_length=LONGEST,
+        max_length=MAX_DATAGRAM_BYTES,
         plausible=has_points,
         points=points,
         **more,
     )
 
 
-def message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: bool = True) -> Any:
-    """A control frame: a header with a CRC-16, and data with a CRC-32, which is 0 where there are
-    none.
+def make_message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: bool = True) -> Any:
+    """Return the struct of a control frame: a header with CRC-16, data with CRC-32.
+
+    The CRC-32 of a frame without data is 0.
+
+    Args:
+        cmd_id: the command; None for frames of several commands.
+        members: the data.
+        ack: whether it is a reply.
+        lidar: whether the Lidar sends it.
     """
-    head = Struct(
+    header = Struct(
         SOF,
         "version" / Const(0, Int8ul),
         "length" / SizeOf(Int16ul, "_"),
@@ -150,14 +164,14 @@ def message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: bool = T
         "reserved" / Default(Bytes(6), bytes(6)),
         "crc16" / Int16ul,
     )
-    sealed = "head" / Checksummed(head, field="crc16", algorithm=CRC16)
+    checked_header = "head" / Checksummed(header, field="crc16", algorithm=CRC16)
     if not members:
-        return Struct(sealed, "crc32" / Const(0, Int32ul))
+        return Struct(checked_header, "crc32" / Const(0, Int32ul))
     return Checksummed(
-        Struct(sealed, "crc32" / Int32ul, *members),
+        Struct(checked_header, "crc32" / Int32ul, *members),
         field="crc32",
         algorithm=CRC32,
-        over=[one.name for one in members],
+        over=[member.name for member in members],
     )
 
 
@@ -172,7 +186,7 @@ FOV = Struct(
     *(name / Int32sl for name in ("yaw_start", "yaw_stop", "pitch_start", "pitch_stop")),
     "reserved" / Default(Bytes(4), bytes(4)),
 )
-#: name -> key and value of a parameter (Mid-360 protocol document; livox_lidar_def.h).
+#: Name -> key and value type of a parameter (Mid-360 protocol document; livox_lidar_def.h).
 PARAMETERS: dict[str, tuple[int, Any]] = {
     "point_type": (0x0000, NUMBER * "1 millimetres, 2 centimetres, 3 spherical"),
     "scan_pattern": (
@@ -212,19 +226,19 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
 }
 
 
-def parameter(name: str) -> Struct:
-    """One parameter with its key and its length."""
+def make_parameter(name: str) -> Struct:
+    """Return the struct of a parameter with its key and length."""
     key, value = PARAMETERS[name]
     return Struct(
         "key" / Const(key, Int16ul), "length" / Const(value.sizeof(), Int16ul), name / value
     )
 
 
-LIST = (
+PARAMETER_LIST = (
     "parameters"
     / Parts(
         {
-            **{name: parameter(name) for name in PARAMETERS},
+            **{name: make_parameter(name) for name in PARAMETERS},
             "other": Struct("key" / Int16ul, "length" / Int16ul, "value" / Bytes(this.length)),
         },
         count=this.count,
@@ -239,11 +253,11 @@ RESULT = (
 )
 
 
-def setting(*values: Any) -> Frame:
-    """Return a request to set one parameter."""
+def make_set_frame(*values: Any) -> Frame:
+    """Return the frame of a request to set one parameter."""
     value = Struct("key" / Int16ul, "size" / SizeOf(Int16ul, "value"), "value" / Struct(*values))
     return Frame(
-        message(
+        make_message(
             0x0100,
             "key_count" / Const(1, Int16ul),
             RESERVED,
@@ -255,14 +269,19 @@ def setting(*values: Any) -> Frame:
     )
 
 
-def simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) -> Simulation:
-    """What a simulated Lidar needs that shoots so many times a second; `shots` are those of a
-    packet.
+def make_simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) -> Simulation:
+    """Return a simulated Lidar.
+
+    Args:
+        rate: shots per second.
+        view: the field of view.
+        shots: the shot numbers of a packet.
+        more: further arguments of `Simulation`.
     """
     points = len(shots)
 
     def look(i: int) -> tuple[Any, Any]:
-        return looking(i * points + shots, rate, view)
+        return simulated_angles(i * points + shots, rate, view)
 
     def sweep(i: int) -> dict[str, Any]:
         azimuth, elevation = look(i)
@@ -282,19 +301,19 @@ def simulation(rate: float, view: View, shots: Any = SHOTS, **more: Any) -> Simu
     )
 
 
-def inertia(i: int) -> dict[str, Any]:
-    """IMU packet i."""
+def imu_values(i: int) -> dict[str, Any]:
+    """Return the simulated values of IMU packet i."""
     return {
         "time_interval": 0,
         "dot_num": 1,
         "udp_cnt": i % 65_536,
         "frame_cnt": 0,
-        "timestamp": i * 10**9 // IMU_RATE,
+        "timestamp": i * 10**9 // IMU_RATE_HZ,
     }
 
 
-def state(i: int) -> dict[str, Any]:
-    """What a simulated Lidar says of itself once a second."""
+def state_values(i: int) -> dict[str, Any]:
+    """Return the simulated parameters that a Lidar sends once a second."""
     values = {
         "serial": b"SIMULATED",
         "app_version": [13, 18, 2, 40],
@@ -309,55 +328,57 @@ def state(i: int) -> dict[str, Any]:
 
 
 FRAMES: dict[str, Frame] = {
-    "data": points_frame(1, lambda f: cartesian(f, after(f)), *MILLIMETRES, REFLECTIVITY, TAG),
-    "centimetres": points_frame(
-        2, lambda f: cartesian(f, after(f)), *CENTIMETRES, REFLECTIVITY, TAG
+    "data": make_points_frame(
+        1, lambda f: cartesian(f, point_times(f)), *MILLIMETRES, REFLECTIVITY, TAG
     ),
-    "spherical": points_frame(
-        3, lambda f: spherical(f, after(f)), *DEPTH, *DIRECTION, REFLECTIVITY, TAG
+    "centimetres": make_points_frame(
+        2, lambda f: cartesian(f, point_times(f)), *CENTIMETRES, REFLECTIVITY, TAG
     ),
-    "dual": points_frame(
+    "spherical": make_points_frame(
+        3, lambda f: spherical(f, point_times(f)), *DEPTH, *DIRECTION, REFLECTIVITY, TAG
+    ),
+    "dual": make_points_frame(
         0x11,
-        twice,
-        echoes(2, *MILLIMETRES),
-        simulation=simulation(226_000, (-60, 60, -12.5, 12.5), SHOTS[:48, None]),
+        dual_points,
+        make_returns(2, *MILLIMETRES),
+        simulation=make_simulation(226_000, (-60, 60, -12.5, 12.5), SHOTS[:48, None]),
     ),
     "imu": Frame(
-        packet(0, *INERTIAL),
+        make_packet(0, *INERTIAL),
         imu=imu,
         plausible=lambda f: f.dot_num == 1,
-        simulation=Simulation(inertia, rate=IMU_RATE),
+        simulation=Simulation(imu_values, rate=IMU_RATE_HZ),
     ),
     "state": Frame(
-        message(0x0102, "count" / Int16ul, RESERVED, *LIST, ack=False),
-        max_length=LONGEST,
-        simulation=Simulation(state, rate=1),
-        acknowledged=ANY_NUMBER,
+        make_message(0x0102, "count" / Int16ul, RESERVED, *PARAMETER_LIST, ack=False),
+        max_length=MAX_DATAGRAM_BYTES,
+        simulation=Simulation(state_values, rate=1),
+        acknowledged=VARIABLE_COUNT,
     ),
     "discovery": Frame(
-        message(
+        make_message(
             0x0000,
             RESULT,
-            "device_type" / Int8ul * TYPES,
+            "device_type" / Int8ul * DEVICE_TYPES,
             "serial" / Bytes(16),
             "address" / Bytes(4),
             "command_port" / Int16ul,
         )
     ),
-    "set_ack": Frame(message(0x0100, RESULT, "wrong_key" / Int16ul)),
+    "set_ack": Frame(make_message(0x0100, RESULT, "wrong_key" / Int16ul)),
     "parameters": Frame(
-        message(0x0101, RESULT, "count" / Int16ul, *LIST),
-        max_length=LONGEST,
-        acknowledged=ANY_NUMBER,
+        make_message(0x0101, RESULT, "count" / Int16ul, *PARAMETER_LIST),
+        max_length=MAX_DATAGRAM_BYTES,
+        acknowledged=VARIABLE_COUNT,
     ),
     "ack": Frame(
-        message(None, RESULT),
+        make_message(None, RESULT),
         plausible=lambda f: (f.head.cmd_id >= REBOOT) & (f.head.cmd_id <= SET_GPS_TIME),
         simulation=Simulation(lambda i: {"head.seq": i, "head.cmd_id": REBOOT, "result": 0}),
     ),
-    "discover": Frame(message(0x0000, ack=False, lidar=False), direction="out"),
+    "discover": Frame(make_message(0x0000, ack=False, lidar=False), direction="out"),
     "get": Frame(
-        message(
+        make_message(
             0x0101,
             "count" / Int16ul,
             RESERVED,
@@ -366,23 +387,25 @@ FRAMES: dict[str, Frame] = {
             lidar=False,
         ),
         direction="out",
-        max_length=LONGEST,
+        max_length=MAX_DATAGRAM_BYTES,
     ),
-    "set_number": setting("number" / Int8ul),
-    "set_host": setting(*HOST.subcons),
-    "set_net": setting(*NET.subcons),
-    "set_attitude": setting(*ATTITUDE.subcons),
-    "set_fov": setting(*FOV.subcons),
+    "set_number": make_set_frame("number" / Int8ul),
+    "set_host": make_set_frame(*HOST.subcons),
+    "set_net": make_set_frame(*NET.subcons),
+    "set_attitude": make_set_frame(*ATTITUDE.subcons),
+    "set_fov": make_set_frame(*FOV.subcons),
     "reboot": Frame(
-        message(REBOOT, "delay" / Scaled(Int16ul, 0.001, "s"), ack=False, lidar=False),
+        make_message(REBOOT, "delay" / Scaled(Int16ul, 0.001, "s"), ack=False, lidar=False),
         direction="out",
     ),
     "factory_settings": Frame(
-        message(FACTORY_SETTINGS, "data" / Default(Bytes(16), bytes(16)), ack=False, lidar=False),
+        make_message(
+            FACTORY_SETTINGS, "data" / Default(Bytes(16), bytes(16)), ack=False, lidar=False
+        ),
         direction="out",
     ),
     "set_gps_time": Frame(
-        message(
+        make_message(
             SET_GPS_TIME,
             "type" / Const(2, Int8ul),
             "time" / Scaled(Int64ul, 1, "ns"),
@@ -394,73 +417,83 @@ FRAMES: dict[str, Frame] = {
 }
 
 
-def asking(frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any) -> Command:
-    """Return a request with a running number, which the answer repeats."""
-    own = {
+def make_request(
+    frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any
+) -> Command:
+    """Return a request with a running number, which the reply repeats."""
+    defaults = {
         "values": {"head.seq": Count(16), **(values or {})},
         "reply": reply,
         "echoes": ("head.seq",),
         "link": "control",
         "retries": 1,
     }
-    return Command(frame, **{**own, **more})
+    return Command(frame, **{**defaults, **more})
 
 
-def setter(
+def make_setter(
     frame: str,
     name: str,
     values: Mapping[str, Any] | None = None,
     args: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> Command:
-    """Return a command that sets one parameter; values and arguments by their names in it."""
-    given = {
+    """Return a command that sets one parameter.
+
+    Args:
+        frame: the frame of the request.
+        name: a key of `PARAMETERS`.
+        values: fixed values by their field in the parameter.
+        args: ranges of arguments by their field in the parameter.
+        more: further arguments of `Command`.
+    """
+    all_values = {
         "parameter.key": PARAMETERS[name][0],
         **{f"parameter.value.{path}": value for path, value in (values or {}).items()},
     }
-    taken = {path: (f"parameter.value.{path}", *limits) for path, limits in (args or {}).items()}
-    return asking(frame, "set_ack", given, args=taken, matches={"result": 0}, **more)
+    ranges = {path: (f"parameter.value.{path}", *limits) for path, limits in (args or {}).items()}
+    return make_request(frame, "set_ack", all_values, args=ranges, matches={"result": 0}, **more)
 
 
-def one_of(name: str, low: int, high: int) -> Command:
+def make_number_setter(name: str, low: int, high: int) -> Command:
     """Return a command that sets a parameter to a number."""
-    return setter("set_number", name, args={"number": (low, high)})
+    return make_setter("set_number", name, args={"number": (low, high)})
 
 
-def host(name: str, port: int, lidar_port: int) -> Command:
-    """Return a command that has something sent to this computer."""
-    return setter("set_host", name, {"ip": Address(), "host_port": port, "lidar_port": lidar_port})
+def make_host_setter(name: str, port: int, lidar_port: int) -> Command:
+    """Return a command that makes the Lidar send one kind of data to this computer."""
+    return make_setter(
+        "set_host", name, {"ip": Address(), "host_port": port, "lidar_port": lidar_port}
+    )
 
 
-def work(mode: int, **more: Any) -> Command:
-    """Return a command that puts the Lidar to work, or to rest."""
-    return setter("set_number", "work_mode", {"number": mode}, **more)
+def make_mode_setter(mode: int, **more: Any) -> Command:
+    """Return a command that sets the work mode."""
+    return make_setter("set_number", "work_mode", {"number": mode}, **more)
 
 
-# metres that it can be mounted away from where its points are counted from, and degrees that angles
-# go
-FAR = 1000.0
+MAX_POSITION_M = 1000.0  # of the attitude
 COMMANDS: dict[str, Command] = {
-    "start": work(1, starts=True),
-    "stop": work(2, stops=True),
-    "set_point_type": one_of("point_type", 1, 3),
-    "set_scan_pattern": one_of("scan_pattern", 0, 2),
-    "set_detect_mode": one_of("detect_mode", 0, 1),
-    "set_imu": one_of("imu_enabled", 0, 1),
-    "enable_fov": one_of("fov_enabled", 0, 3),
-    "set_address": setter(
+    "start": make_mode_setter(1, starts=True),
+    "stop": make_mode_setter(2, stops=True),
+    "set_point_type": make_number_setter("point_type", 1, 3),
+    "set_scan_pattern": make_number_setter("scan_pattern", 0, 2),
+    "set_detect_mode": make_number_setter("detect_mode", 0, 1),
+    "set_imu": make_number_setter("imu_enabled", 0, 1),
+    "enable_fov": make_number_setter("fov_enabled", 0, 3),
+    "set_address": make_setter(
         "set_net", "lidar_address", args={name: (Address(),) for name in ("ip", "mask", "gateway")}
     ),
-    "set_attitude": setter(
+    "set_attitude": make_setter(
         "set_attitude",
         "attitude",
         args={
             **dict.fromkeys(("roll", "pitch", "yaw"), (-360, 360)),
-            **dict.fromkeys("xyz", (-FAR, FAR)),
+            **dict.fromkeys("xyz", (-MAX_POSITION_M, MAX_POSITION_M)),
         },
     ),
     **{
-        f"set_{name}": setter(
+        f"set_{name}": make_setter(
             "set_fov",
             name,
             args={
@@ -470,26 +503,26 @@ COMMANDS: dict[str, Command] = {
         )
         for name in ("fov_0", "fov_1")
     },
-    "get": asking(
+    "get": make_request(
         "get", "parameters", {"count": 1, "wanted": [0]}, args={"key": ("wanted[0]", 0, 0xFFFF)}
     ),
-    "get_state": asking(
+    "get_state": make_request(
         "get", "parameters", {"count": 5, "wanted": [0x8000, 0x8002, 0x8006, 0x8007, 0x800C]}
     ),
-    "reboot": asking(
+    "reboot": make_request(
         "reboot", "ack", args={"delay": ("delay", 0.1, 2.0)}, matches={"result": 0}, retries=0
     ),
-    "factory_settings": asking("factory_settings", "ack", matches={"result": 0}, retries=0),
-    "set_gps_time": asking(
+    "factory_settings": make_request("factory_settings", "ack", matches={"result": 0}, retries=0),
+    "set_gps_time": make_request(
         "set_gps_time", "ack", args={"time": ("time", 0, 2**63)}, matches={"result": 0}
     ),
 }
 
 
-#: what is sent to the host -> the port of the Lidar, and that of the host.
+#: Kind of data -> port of the Lidar, port of the host.
 Ports = dict[str, tuple[int, int]]
-#: id -> model, device type, port of the Lidar for commands and of the host, ports of the rest,
-#: points a second, view, ranges, other ids.
+#: Id -> model, device type, command ports of Lidar and host, data ports, points per second,
+#: field of view, range limits in m.
 MODELS: dict[str, tuple[str, int, int, int, Ports, int, View, tuple[float, float]]] = {
     "livox-mid360": (
         "Mid-360",
@@ -504,7 +537,7 @@ MODELS: dict[str, tuple[str, int, int, int, Ports, int, View, tuple[float, float
     "livox-hap": (
         "HAP",
         15,
-        DISCOVERY,
+        DISCOVERY_PORT,
         0,
         {"point": (57_000, 57_000), "imu": (58_000, 58_000)},
         452_000,
@@ -515,15 +548,15 @@ MODELS: dict[str, tuple[str, int, int, int, Ports, int, View, tuple[float, float
 
 
 def answer_state(request: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What a simulated one answers where it is asked for its state."""
-    return (("parameters", {"result": 0, **state(request["head.seq"])}),)
+    """Return the simulated reply to a request for the state."""
+    return (("parameters", {"result": 0, **state_values(request["head.seq"])}),)
 
 
-def lidar(name: str) -> Sensor:
-    """One row of the table as a sensor."""
+def make_lidar(name: str) -> Sensor:
+    """Return the sensor of one row of `MODELS`."""
     model, device_type, control, local, ports, rate, view, limits = MODELS[name]
-    discovery = "control" if control == DISCOVERY else "discovery"
-    found = {
+    discovery = "control" if control == DISCOVERY_PORT else "discovery"
+    discovery_reply = {
         "result": 0,
         "device_type": device_type,
         "serial": b"SIMULATED",
@@ -540,23 +573,25 @@ def lidar(name: str) -> Sensor:
         links={
             "data": Udp(*(port for _, port in ports.values())),
             "control": Udp(control, local=local),
-            discovery: Udp(DISCOVERY, broadcast=DISCOVERY),
+            discovery: Udp(DISCOVERY_PORT, broadcast=DISCOVERY_PORT),
         },
         commands={
-            "discover": asking("discover", "discovery", link=discovery),
+            "discover": make_request("discover", "discovery", link=discovery),
             **COMMANDS,
             **{
-                f"set_{what}_host": host(f"{what}_host", port, source)
-                for what, (source, port) in ports.items()
+                f"set_{kind}_host": make_host_setter(f"{kind}_host", port, source)
+                for kind, (source, port) in ports.items()
             },
         },
-        # the counter restarts with each frame, of which nothing says how many packets it has
+        # the counter restarts with each frame, and frames have no fixed number of packets
         clock=Clock("timestamp", pace=lambda f: f.time_interval),
         sequence=Sequence("udp_cnt"),
-        simulation=simulation(
-            rate, view, answers={"discover": (("discovery", found),), "get_state": answer_state}
+        simulation=make_simulation(
+            rate,
+            view,
+            answers={"discover": (("discovery", discovery_reply),), "get_state": answer_state},
         ),
-        on_open=("discover", "get_state", *(f"set_{what}_host" for what in ports), "start"),
+        on_open=("discover", "get_state", *(f"set_{kind}_host" for kind in ports), "start"),
         on_close=("stop",),
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
@@ -576,7 +611,10 @@ def lidar(name: str) -> Sensor:
 
 
 def is_fast(f: Fields) -> Any:
-    """452 000 points a second, 2.2 us each, and not 200 000."""
+    """Return whether points follow each other in 2.2 us, as with a HAP.
+
+    A HAP measures 452 000 points a second, a Mid-360 200 000.
+    """
     return f.time_interval < 3.3e-6 * f.dot_num
 
 
@@ -587,4 +625,4 @@ RELATIVES: dict[str, str | Relative] = {
     "livox-hap": Relative("2.2 us from a point to the next", is_fast),
     "livox-mid360s": "the device type in its answer to a discovery, 35",
 }
-MID360, HAP = SENSORS = [lidar(name) for name in MODELS]
+MID360, HAP = SENSORS = [make_lidar(name) for name in MODELS]
