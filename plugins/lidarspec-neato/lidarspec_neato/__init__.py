@@ -1,15 +1,14 @@
-"""Neato XV-11 and its kin: lidars of vacuum cleaners and of the TurtleBot3, with a point to the
-degree.
+"""Neato XV-11 and related lidars of vacuum cleaners and the TurtleBot3, with a point per degree.
 
 Source: the drivers xv_11_laser_driver, kaiaai/LDS (LDS_NEATO_XV11, LDS_LDS02RR, LDS_HLS_LFCD2) and
 hls_lfcd_lds_driver of ROBOTIS; there are no public manuals. The XV-11 and Xiaomi's LDS01RR count
-counter-clockwise, the LDS02RR clockwise; nothing in their packets says which it is. The host drives
-their motors by PWM, at 5 turns a second; without it they send nothing.
+counter-clockwise, the LDS02RR clockwise; the packets do not contain the direction. The host drives
+their motors with PWM, at 5 revolutions a second; they send nothing while the motor is off.
 
-Known contradictions on the HLS-LFCD2: its speed is in tenths of a turn a minute (ROBOTIS,
-thijses/HLS_LFCD) or in whole ones (kaiaai); its last two bytes are both FF less the sum of the
-others (thijses), the folded sum of an XV-11 (kaiaai), and ROBOTIS passes over them, as it is done
-here: two packets in a row are asked for instead.
+Known contradictions on the HLS-LFCD2: its speed is in tenths of a revolution per minute (ROBOTIS,
+thijses/HLS_LFCD) or in whole ones (kaiaai). Its last two bytes are both FF minus the sum of the
+other bytes (thijses), or the folded sum of an XV-11 (kaiaai). ROBOTIS ignores them, and so does
+this module: it requires two consecutive packets instead.
 """
 
 from __future__ import annotations
@@ -47,13 +46,13 @@ from lidarspec.spec import (
     hookimpl,
 )
 
-FIRST = 0xA0  # index of the first packet of a turn
+FIRST_INDEX = 0xA0  # of the packets of a revolution
 
 DATA = Checksummed(
     Struct(
         "header" / Const(b"\xfa"),
         "start_angle"
-        / Scaled(Int8ul, 4, "deg", -4 * FIRST)
+        / Scaled(Int8ul, 4, "deg", -4 * FIRST_INDEX)
         * "index A0 to F9: angle of the first sample",
         "speed" / Scaled(Int16ul, 1 / 64, "rpm"),
         "samples"
@@ -79,7 +78,7 @@ DATA = Checksummed(
 LFCD = Struct(
     "header" / Const(b"\xfa"),
     "start_angle"
-    / Scaled(Int8ul, 6, "deg", -6 * FIRST)
+    / Scaled(Int8ul, 6, "deg", -6 * FIRST_INDEX)
     * "index A0 to DB: angle of the first sample",
     "speed" / Scaled(Int16ul, 0.1, "rpm"),
     "samples"
@@ -96,66 +95,67 @@ LFCD = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Return an angle of the circle."""
+    """Return whether the start angle is between 0 and 360 degrees."""
     return (f.start_angle >= 0) & (f.start_angle < 360)
 
 
-def lfcd_plausible(f: Fields) -> Any:
-    """Return an angle of the circle, and no more than twice the speed that it has."""
+def is_lfcd_plausible(f: Fields) -> Any:
+    """Return whether the start angle fits, and the speed is at most twice the usual."""
     return (f.start_angle >= 0) & (f.start_angle < 360) & (f.speed <= 600)
 
 
-def after_first(f: Fields, count: int) -> Any:
+def sample_times(f: Fields, count: int) -> Any:
     """Return the seconds from the first sample of a packet to each sample.
 
-    Samples are one degree apart. The result is 0 if the motor stands still.
+    Samples are one degree apart. The result is 0 if the motor stops.
     """
     return np.where(f.speed > 0, np.arange(count) / (np.maximum(f.speed, 1 / 64) * 6), 0)
 
 
-def points(f: Fields, turns: int) -> Polar:
-    """A degree from sample to sample, counter-clockwise (1) or clockwise (-1); a weak one is a
-    point all the same.
+def points(f: Fields, direction: int) -> Polar:
+    """Return points one degree apart, including weak ones.
+
+    `direction` is 1 for counter-clockwise, -1 for clockwise.
     """
     return Polar(
         range=np.where(f.samples.range.invalid, 0, f.samples.range.distance),
-        azimuth=np.deg2rad(turns * (f.start_angle + np.arange(4))),
+        azimuth=np.deg2rad(direction * (f.start_angle + np.arange(4))),
         intensity=f.samples.signal,
-        time=after_first(f, 4),
+        time=sample_times(f, 4),
     )
 
 
 def lfcd_points(f: Fields) -> Polar:
-    """A degree from sample to sample, clockwise; the first one is at 359 degrees (ROBOTIS)."""
+    """Return points one degree apart, clockwise, the first at 359 degrees (ROBOTIS)."""
     azimuth = np.deg2rad(359 - f.start_angle - np.arange(6))
     return Polar(
         range=f.samples.distance,
         azimuth=azimuth,
         intensity=f.samples.intensity,
-        time=after_first(f, 6),
+        time=sample_times(f, 6),
     )
 
 
 def sweep(i: int, count: int) -> dict[str, float]:
-    """Packet i of turns at 5 Hz, with so many samples."""
+    """Return the simulated values of packet i with `count` samples, at 5 Hz."""
     return {"start_angle": i * count % 360, "speed": 300}
 
 
-TOLD_BY = "nothing in their packets: it counts the other way, or has another label"
-KIN = ("neato-xv11", "xiaomi-lds01rr", "xiaomi-lds02rr")
+NO_DIFFERENCE = "nothing in their packets: it counts the other way, or has another label"
+XV11_MODELS = ("neato-xv11", "xiaomi-lds01rr", "xiaomi-lds02rr")
 
 XV11 = Sensor(
     "neato-xv11",
     vendor="Neato",
     model="XV-11",
     frames={"data": Frame(DATA, data=True, plausible=plausible)},
-    points=partial(points, turns=1),
+    points=partial(points, direction=1),
     scan=OnWrap("azimuth"),
     links={"data": Serial(115_200)},
     simulation=Simulation(partial(sweep, count=4)),
     range_limits=(0.15, 6.0),
     beams=360,
-    relatives={name: TOLD_BY for name in KIN if name != "neato-xv11"},
+    relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "neato-xv11"},
     status="vectors",
     source="xv_11_laser_driver; kaiaai/LDS, LDS_NEATO_XV11. Limits of range are assumed",
 )
@@ -164,7 +164,7 @@ LDS01RR = dataclasses.replace(
     id="xiaomi-lds01rr",
     vendor="Xiaomi",
     model="LDS01RR",
-    relatives={name: TOLD_BY for name in KIN if name != "xiaomi-lds01rr"},
+    relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "xiaomi-lds01rr"},
     source="kaiaai/LDS, LDS_LDS01RR. Limits of range are assumed",
 )
 LDS02RR = dataclasses.replace(
@@ -172,8 +172,8 @@ LDS02RR = dataclasses.replace(
     id="xiaomi-lds02rr",
     vendor="Xiaomi",
     model="LDS02RR",
-    points=partial(points, turns=-1),
-    relatives={name: TOLD_BY for name in KIN if name != "xiaomi-lds02rr"},
+    points=partial(points, direction=-1),
+    relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "xiaomi-lds02rr"},
     source="kaiaai/LDS, LDS_LDS02RR. Limits of range are assumed",
 )
 HLS_LFCD2 = Sensor(
@@ -184,7 +184,7 @@ HLS_LFCD2 = Sensor(
         "data": Frame(
             LFCD,
             data=True,
-            plausible=lfcd_plausible,
+            plausible=is_lfcd_plausible,
             confirm=2,
             acknowledged={"LS212": "its sources contradict each other on the trailer"},
         ),
@@ -202,7 +202,7 @@ HLS_LFCD2 = Sensor(
     on_close=("stop",),
     range_limits=(0.12, 3.5),
     beams=360,
-    turn=(4.83, 5.17),  # 300 turns a minute, give or take 10 (ROBOTIS, LDS-01)
+    turn=(4.83, 5.17),  # 300 +- 10 revolutions per minute (ROBOTIS, LDS-01)
     status="vectors",
     source=(
         "hls_lfcd_lds_driver and the LDS-01's page of ROBOTIS; thijses/HLS_LFCD. What its trailer"
@@ -213,5 +213,5 @@ HLS_LFCD2 = Sensor(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The XV-11 and its kin."""
+    """Return the XV-11 and the related models."""
     return [XV11, LDS01RR, LDS02RR, HLS_LFCD2]
