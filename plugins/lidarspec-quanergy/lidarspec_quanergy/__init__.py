@@ -1,13 +1,12 @@
-"""Quanergy M8 and MQ8: rotating lidars of eight lasers over TCP, which send by themselves, high
-byte first.
+"""Quanergy M8 and MQ8: rotating lidars with eight lasers, which stream over TCP, high byte first.
 
 Source: the vendor's quanergy_client (packet_header.h, m_series_data_packet.h,
-data_packet_parser_00.cpp, data_packet_parser_04.cpp, data_packet_parser_m_series.h). The client
-takes the time of a packet for that of its last firing. Assumed are what it does not say: that
-firings are evenly apart, at 420 000 points a second, the limits of range, and turns a second. Which
-way a unit turns its positions tell: they may fall as well as grow. The nanoseconds of packets
-before version 4 count tens of them, which is not corrected here. Packets of other kinds (1 and 6)
-and settings over HTTP are left out. No packet of a sensor was seen.
+data_packet_parser_00.cpp, data_packet_parser_04.cpp, data_packet_parser_m_series.h). In the client,
+the time of a packet is the time of its last firing. Assumed: evenly spaced firings at 420 000
+points a second, the range limits, and the revolutions per second. The positions show the direction
+of rotation: they may decrease as well as increase. The nanoseconds of packets before version 4
+count tens of nanoseconds, which is not corrected here. Packets of other kinds (1 and 6) and
+settings over HTTP are not supported. No captured packet was available.
 """
 
 from __future__ import annotations
@@ -36,14 +35,15 @@ from lidarspec.spec import (
 
 FIRINGS = 50
 LASERS = 8
-TICKS = 10_400  # positions of a turn
-FINE = 5  # the first version of packets with steps of 10 um; before it they are of 10 mm
-PERIOD = LASERS / 420_000  # seconds from firing to firing
-TIME = (
-    np.arange(FIRINGS) - (FIRINGS - 1)
-) * PERIOD  # of the firings of a packet, after the packet's own
+POSITIONS_PER_TURN = 10_400  # positions of a turn
+FINE_STEP_VERSION = (
+    5  # the first version of packets with steps of 10 um; before it they are of 10 mm
+)
+FIRING_PERIOD_S = LASERS / 420_000
+#: Seconds from the time of the packet to each firing.
+FIRING_TIMES_S = (np.arange(FIRINGS) - (FIRINGS - 1)) * FIRING_PERIOD_S
 
-#: radians above the level, from the lowest laser to the highest.
+#: Elevation in radians, from the lowest laser to the highest.
 M8_ELEVATION = np.array(
     [-0.318505, -0.2692, -0.218009, -0.165195, -0.111003, -0.0557982, 0.0, 0.0557982]
 )
@@ -51,15 +51,15 @@ MQ8_ELEVATION = np.array(
     [-0.24435, -0.18326, -0.14137, -0.10297, -0.07854, -0.055327, -0.041364, -0.027402]
 )
 
-POSITION: Construct = Scaled(Int16ub, 360 / TICKS, "deg") * "counter-clockwise"
+POSITION: Construct = Scaled(Int16ub, 360 / POSITIONS_PER_TURN, "deg") * "counter-clockwise"
 DISTANCES: Construct = Array(
     LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; before version 5 a step is 10 mm"
 )
 INTENSITIES: Construct = Array(LASERS, Int8ub * "255: saturated")
 
 
-def header(kind: int, size: int) -> tuple[Construct, ...]:
-    """Return the header of a packet of this kind and so many bytes in all."""
+def make_header(kind: int, size: int) -> tuple[Construct, ...]:
+    """Return the header fields of a packet with this kind and total size in bytes."""
     return (
         "signature" / Const(b"\x75\xbd\x7e\x97"),
         "size" / Const(size, Int32ub) * "of the whole packet",
@@ -70,8 +70,8 @@ def header(kind: int, size: int) -> tuple[Construct, ...]:
     )
 
 
-THREE = Struct(
-    *header(0, 6632),
+THREE_RETURNS = Struct(
+    *make_header(0, 6632),
     "firings"
     / Array(
         FIRINGS,
@@ -92,8 +92,8 @@ THREE = Struct(
     "api" / Int16ub * "version of the packet",
     "status" / Int16ub * "0 good, 1 software and firmware do not match, 2 watchdog",
 )
-ONE = Struct(
-    *header(4, 2224),
+ONE_RETURN = Struct(
+    *make_header(4, 2224),
     "status" / Int16ub * "0 good, 1 software and firmware do not match, 2 watchdog",
     "return_id" / Int8ub * "which of the three returns",
     "reserved" / Bytes(1),
@@ -111,48 +111,59 @@ ONE = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Positions of the circle, and a time of day."""
+    """Return whether the positions are at most 360 degrees and nanoseconds below 1 s."""
     return (f.firings.position <= 360) & (f.nanoseconds < 1)
 
 
-def three_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
-    """Three returns of each laser; where there are fewer, the third repeats the first or the
-    second, which then are no points.
+def three_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
+    """Return three returns of each laser.
+
+    If a laser has fewer, the packet repeats the first or second distance as the third. The first or
+    second return is then not a point.
+
+    `elevation` is in radians, one per laser.
     """
-    fields = f.firings
+    firings = f.firings
     first, second, third = (
-        each.on("firings", "firings.third") for each in (fields.first, fields.second, fields.third)
+        each.on("firings", "firings.third")
+        for each in (firings.first, firings.second, firings.third)
     )
-    intensities = (fields.first_intensity, fields.second_intensity, fields.third_intensity)
+    intensities = (firings.first_intensity, firings.second_intensity, firings.third_intensity)
     return Polar(
         range=stack(np.where(first == third, 0, first), np.where(second == third, 0, second), third)
-        * np.where(f.api < FINE, 1000, 1),
-        azimuth=np.deg2rad(fields.position),
+        * np.where(f.api < FINE_STEP_VERSION, 1000, 1),
+        azimuth=np.deg2rad(firings.position),
         elevation=elevation[:, None],
         intensity=stack(*(each.on("firings", "firings.third") for each in intensities)),
-        time=TIME[:, None, None],
+        time=FIRING_TIMES_S[:, None, None],
         ring=np.arange(LASERS)[:, None],
         return_index=np.arange(3),
     )
 
 
-def one_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
-    """One return of each laser."""
+def one_return_points(f: Fields, elevation: NDArray[np.float64]) -> Polar:
+    """Return one return of each laser.
+
+    `elevation` is in radians, one per laser.
+    """
     return Polar(
         range=f.firings.distance,
         azimuth=np.deg2rad(f.firings.position),
         elevation=elevation,
         intensity=f.firings.intensity.on("firings", "firings.distance"),
-        time=TIME[:, None],
+        time=FIRING_TIMES_S[:, None],
         ring=np.arange(LASERS),
         return_index=f.return_id,
     )
 
 
 def sweep(i: int, more: Mapping[str, Any]) -> dict[str, Any]:
-    """Packet i of 10 turns a second."""
-    seconds, nanoseconds = divmod(round(i * FIRINGS * PERIOD * 1e9), 1_000_000_000)
-    position = (i * FIRINGS + np.arange(FIRINGS)) * PERIOD * 3600 % 360
+    """Return the simulated values of packet i, at 10 revolutions a second.
+
+    `more` has the values of fields that only one packet kind has.
+    """
+    seconds, nanoseconds = divmod(round(i * FIRINGS * FIRING_PERIOD_S * 1e9), 1_000_000_000)
+    position = (i * FIRINGS + np.arange(FIRINGS)) * FIRING_PERIOD_S * 3600 % 360
     return {
         "firings.position": position,
         "seconds": seconds,
@@ -161,9 +172,19 @@ def sweep(i: int, more: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) -> Sensor:
-    """One model, which differs from the other one by the angles of its lasers alone."""
-    kinds = {"data": (THREE, three_points, {"api": FINE}), "data_single": (ONE, one_points, {})}
+def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) -> Sensor:
+    """Return the sensor of one model; the models differ only in their laser angles.
+
+    Args:
+        model: the name of the model.
+        elevation: elevation in radians, one per laser.
+        other: the last part of the other model's id.
+        facts: further arguments of `Sensor`.
+    """
+    kinds = {
+        "data": (THREE_RETURNS, three_return_points, {"api": FINE_STEP_VERSION}),
+        "data_single": (ONE_RETURN, one_return_points, {}),
+    }
     return Sensor(
         f"quanergy-{model.lower()}",
         vendor="Quanergy",
@@ -198,11 +219,11 @@ def lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: Any) 
     )
 
 
-M8 = lidar("M8", M8_ELEVATION, "mq8", range_limits=(1.0, 150.0))
-MQ8 = lidar("MQ8", MQ8_ELEVATION, "m8", range_limits=(1.0, 150.0))
+M8 = make_lidar("M8", M8_ELEVATION, "mq8", range_limits=(1.0, 150.0))
+MQ8 = make_lidar("MQ8", MQ8_ELEVATION, "m8", range_limits=(1.0, 150.0))
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Quanergy sensors."""
+    """Return the Quanergy sensors."""
     return [M8, MQ8]
