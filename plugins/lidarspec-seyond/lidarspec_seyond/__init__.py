@@ -1,18 +1,19 @@
-"""Seyond (once Innovusion) Falcon: a lidar that looks ahead, over UDP, with blocks of four channels
-in spherical coordinates.
+"""Seyond (formerly Innovusion) Falcon: a forward-looking lidar over UDP.
+
+A packet contains blocks of four channels, in spherical coordinates:
 
     6A 17 major minor, sequence(2) | checksum(4) size(4) source type | start of the frame(8) mode
     status frame(8) part(2) packet(2) | item type, count(3) item size(2) topic(4) flags(2) region(4)
     [reserved(16), from version 2] count x [angles and their differences, 17 bytes, 4 points of 4
     bytes, or 8 with two returns]
 
-What the checksum covers is public, which CRC it is is not: it is not held. The vendor's SDK moves
-points by some centimetres beside the axis, by a table of its own, which is left out. How many
-blocks a packet holds, and the pattern of a simulated one, are assumed.
+The checksum is not verified: the bytes that it covers are public, its CRC is not. The vendor's SDK
+moves points by some centimetres away from the axis, with a table of its own, which is left out. The
+number of blocks per packet and the simulated pattern are assumed.
 
 Source: Innovusion SDK 3.102, inno_lidar_packet.h (fields, units, bits) and
 inno_lidar_packet_utils.h (angles of the channels); its ROS driver (port 8010); data sheet of the
-Falcon K (120 by 25 degrees, 500 m). No packet of a sensor was seen.
+Falcon K (120 by 25 degrees, 500 m). No captured packet was available.
 """
 
 from __future__ import annotations
@@ -54,31 +55,35 @@ from lidarspec.spec import (
     hookimpl,
 )
 
-UNIT = np.pi / 32768  # of angles
+ANGLE_UNIT_RAD = np.pi / 32768
 CHANNELS = 4
-APART = 196  # units from channel to channel, to which their own differences are added
-DATAGRAM = 1472
-SHORT = 54
-HEADER = 70
-BLOCK = 17
-POINT = 4  # bytes: header of version 1 and from 2 on, head of a block, point
-SIZE = {1: BLOCK + CHANNELS * POINT, 2: BLOCK + 2 * CHANNELS * POINT}  # of a block, by the returns
-PACKETS = 60
-LINES = 12  # of a simulated frame
-RATE = 10
-START = 1.7e9  # seconds since 1970 of a simulated frame
+CHANNEL_STEP_UNITS = 196  # elevation from channel to channel, before the differences are added
+MAX_DATAGRAM_BYTES = 1472
+HEADER_1_BYTES = 54  # header of version 1
+HEADER_2_BYTES = 70  # header from version 2 on
+BLOCK_HEADER_BYTES = 17
+POINT_BYTES = 4
+#: Returns -> bytes of a block.
+BLOCK_BYTES = {
+    1: BLOCK_HEADER_BYTES + CHANNELS * POINT_BYTES,
+    2: BLOCK_HEADER_BYTES + 2 * CHANNELS * POINT_BYTES,
+}
+SIMULATED_PACKETS = 60  # of a scan
+SIMULATED_LINES = 12  # of a scan
+SIMULATED_RATE_HZ = 10  # scans per second
+SIMULATED_START_S = 1.7e9  # time of the first scan since 1970
 
 
-def difference(name: str, bits: int) -> Any:
-    """What the angle of a channel adds to that of the first."""
-    return name / Scaled(BitsInteger(bits, signed=True), UNIT, "rad")
+def make_difference(name: str, bits: int) -> Any:
+    """Return the field of the angle from the first channel to another channel."""
+    return name / Scaled(BitsInteger(bits, signed=True), ANGLE_UNIT_RAD, "rad")
 
 
-HEAD = (
+BLOCK_HEADER = (
     "angle"
-    / Scaled(Int16sl, UNIT, "rad")
+    / Scaled(Int16sl, ANGLE_UNIT_RAD, "rad")
     * "horizontal, of the first channel: 0 ahead, to the right positive",
-    "tilt" / Scaled(Int16sl, UNIT, "rad") * "vertical: up positive",
+    "tilt" / Scaled(Int16sl, ANGLE_UNIT_RAD, "rad") * "vertical: up positive",
     "after" / Scaled(Int16ul, 1e-5, "s") * "the start of the frame",
     "line_index" / Int16ul,
     "more"
@@ -87,8 +92,14 @@ HEAD = (
             "reserved" / BitsInteger(2),
             "facet" / BitsInteger(3),
             "region" / BitsInteger(2) * "0 sparse, 1 slow, 3 the centre",
-            *(difference(f"tilt_{channel}", bits) for channel, bits in ((3, 9), (2, 9), (1, 8))),
-            *(difference(f"angle_{channel}", bits) for channel, bits in ((3, 11), (2, 10), (1, 9))),
+            *(
+                make_difference(f"tilt_{channel}", bits)
+                for channel, bits in ((3, 9), (2, 9), (1, 8))
+            ),
+            *(
+                make_difference(f"angle_{channel}", bits)
+                for channel, bits in ((3, 11), (2, 10), (1, 9))
+            ),
             "line" / BitsInteger(9),
         )
     ),
@@ -106,8 +117,8 @@ PIXEL = ByteSwapped(
 )
 
 
-def packet(returns: int) -> Struct:
-    """Return the packet with so many returns."""
+def make_packet(returns: int) -> Struct:
+    """Return the struct of a packet with this number of returns per channel."""
     return Struct(
         "magic" / Const(b"\x6a\x17"),
         "major" / Int8ul,
@@ -125,7 +136,7 @@ def packet(returns: int) -> Struct:
         "packet" / Int16ul,
         "item_type" / Const(1, Int8ul) * "spherical points",
         "count" / Int24ul,
-        "item_size" / Const(SIZE[returns], Int16ul),
+        "item_size" / Const(BLOCK_BYTES[returns], Int16ul),
         "topic" / Int32ul,
         "flags"
         / ByteSwapped(
@@ -146,36 +157,39 @@ def packet(returns: int) -> Struct:
                 "upwards" / BitsInteger(1),
             )
         ),
-        "region_angle" / Scaled(Int16sl, UNIT, "rad"),
-        "region_tilt" / Scaled(Int16sl, UNIT, "rad"),
-        "extended" / If(this.major >= 2, Bytes(HEADER - SHORT)),
-        "blocks" / Array(this.count, Struct(*HEAD, "pixels" / Array(returns * CHANNELS, PIXEL))),
+        "region_angle" / Scaled(Int16sl, ANGLE_UNIT_RAD, "rad"),
+        "region_tilt" / Scaled(Int16sl, ANGLE_UNIT_RAD, "rad"),
+        "extended" / If(this.major >= 2, Bytes(HEADER_2_BYTES - HEADER_1_BYTES)),
+        "blocks"
+        / Array(this.count, Struct(*BLOCK_HEADER, "pixels" / Array(returns * CHANNELS, PIXEL))),
     )
 
 
 def plausible(f: Fields) -> Any:
-    """As long as it says, with as many returns, and no more blocks than a datagram takes."""
-    header = np.where(f.major >= 2, HEADER, SHORT)
-    return (f.count >= 1) & (f.count * f.item_size + header == f.size) & (f.size <= DATAGRAM)
+    """Return whether the size fits the block count, header and maximum datagram."""
+    header = np.where(f.major >= 2, HEADER_2_BYTES, HEADER_1_BYTES)
+    return (
+        (f.count >= 1) & (f.count * f.item_size + header == f.size) & (f.size <= MAX_DATAGRAM_BYTES)
+    )
 
 
 def points(f: Fields) -> Polar:
-    """Blocks of four channels, of which the second return stands behind the first."""
+    """Return the points of blocks of four channels; second returns follow the first."""
     block = f.blocks
     pixels = f.blocks.pixels
-    more = f.blocks.more
+    differences = f.blocks.more
     channel = pixels.index % CHANNELS
     angle, tilt = (
         np.where(channel == 0, 0, np.where(channel == 1, one, np.where(channel == 2, two, three)))
         for one, two, three in (
-            (more.angle_1, more.angle_2, more.angle_3),
-            (more.tilt_1, more.tilt_2, more.tilt_3),
+            (differences.angle_1, differences.angle_2, differences.angle_3),
+            (differences.tilt_1, differences.tilt_2, differences.tilt_3),
         )
     )
     return Polar(
         range=pixels.radius * np.where(f.flags.long == 1, 2, 1),
         azimuth=-(block.angle + angle),
-        elevation=block.tilt + tilt + channel * APART * UNIT,
+        elevation=block.tilt + tilt + channel * CHANNEL_STEP_UNITS * ANGLE_UNIT_RAD,
         intensity=pixels.strength,
         time=block.after - f.blocks[0].after,
         ring=channel,
@@ -184,36 +198,36 @@ def points(f: Fields) -> Polar:
 
 
 def sweep(i: int, returns: int = 1) -> dict[str, Any]:
-    """Return the values of packet i.
+    """Return the simulated values of packet i.
 
     Lines of 120 degrees, with four channels each, run from the top to the bottom of 25 degrees.
     """
-    count = (DATAGRAM - HEADER) // SIZE[returns]
-    spot = i % PACKETS * count + np.arange(count)
-    per_line = PACKETS * count // LINES
+    count = (MAX_DATAGRAM_BYTES - HEADER_2_BYTES) // BLOCK_BYTES[returns]
+    block_index = i % SIMULATED_PACKETS * count + np.arange(count)
+    per_line = SIMULATED_PACKETS * count // SIMULATED_LINES
     return {
         "major": 2,
-        "size": HEADER + count * SIZE[returns],
-        "start": START + i // PACKETS / RATE,
-        "frame": i // PACKETS,
-        "packet": i % PACKETS,
+        "size": HEADER_2_BYTES + count * BLOCK_BYTES[returns],
+        "start": SIMULATED_START_S + i // SIMULATED_PACKETS / SIMULATED_RATE_HZ,
+        "frame": i // SIMULATED_PACKETS,
+        "packet": i % SIMULATED_PACKETS,
         "count": count,
         "flags.returns": returns,
         "flags.locked": 1,
-        "blocks.angle": np.deg2rad(spot % per_line * 120 / per_line - 60),
-        "blocks.tilt": np.deg2rad(12.5 - (spot // per_line + 1) * 25 / LINES),
-        "blocks.after": np.round(spot / (PACKETS * count * RATE), 5),
-        "blocks.more.line": spot // per_line,
+        "blocks.angle": np.deg2rad(block_index % per_line * 120 / per_line - 60),
+        "blocks.tilt": np.deg2rad(12.5 - (block_index // per_line + 1) * 25 / SIMULATED_LINES),
+        "blocks.after": np.round(block_index / (SIMULATED_PACKETS * count * SIMULATED_RATE_HZ), 5),
+        "blocks.more.line": block_index // per_line,
         "blocks.pixels.second": np.tile(np.repeat(np.arange(returns), CHANNELS), (count, 1)),
     }
 
 
-def frame(returns: int) -> Frame:
-    """Return the data frame with so many returns."""
+def make_frame(returns: int) -> Frame:
+    """Return the data frame with this number of returns per channel."""
     return Frame(
-        packet(returns),
+        make_packet(returns),
         data=True,
-        max_length=DATAGRAM,
+        max_length=MAX_DATAGRAM_BYTES,
         plausible=plausible,
         simulation=Simulation(partial(sweep, returns=returns)),
         acknowledged={
@@ -226,7 +240,7 @@ FALCON = Sensor(
     "seyond-falcon",
     vendor="Seyond",
     model="Falcon",
-    frames={"data": frame(1), "data_dual": frame(2)},
+    frames={"data": make_frame(1), "data_dual": make_frame(2)},
     points=points,
     scan=OnChange("frame"),
     links={"data": Udp(8010)},
@@ -244,5 +258,5 @@ FALCON = Sensor(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Seyond sensor."""
+    """Return the Seyond sensor."""
     return [FALCON]
