@@ -1,16 +1,15 @@
-"""Texas Instruments IWR6843: a millimetre-wave radar with the out-of-box demo of the mmWave SDK 3,
-over its data UART.
+"""Texas Instruments IWR6843: a millimetre-wave radar with the out-of-box demo of the mmWave SDK 3.
 
-A frame is a header and parts with a type and a length, as many as `guiMonitor` asks for, filled up
-to a multiple of 32 bytes with anything. Each point has a velocity. Its SNR stands in a part of its
-own, in the order of the points: ``packets.parts("tlvs.side_info")``.
+A frame on its data UART is a header and parts with a type and a length, selected by `guiMonitor`,
+padded with arbitrary bytes to a multiple of 32. Each point has a velocity. Its SNR is in a separate
+part, in the order of the points: ``packets.parts("tlvs.side_info")``.
 
 Source: TI, "Understanding the Out of Box Demo Data Output" (mmWave industrial toolbox 4.10), whose
 44 bytes of header are 40 by its own table; mmWave SDK 3.5 (mmw_output.h) for the types of parts,
-dpif_pointcloud.h for points and SNR. That the cycles are those of the 200 MHz R4F is assumed, as
-the longest range is. Heat maps, and parts of other demos of the toolbox, are kept as bytes. The
-radar is set up and started by the lines of a .cfg file over its other UART, at 115 200 baud: that
-is not here, so send it one first.
+dpif_pointcloud.h for points and SNR. Assumed: the cycles are those of the 200 MHz R4F, and the
+longest range. Heat maps, and parts of other demos of the toolbox, are kept as bytes. To configure
+and start the radar, send it the lines of a .cfg file over its other UART at 115 200 baud; this
+plugin does not.
 """
 
 from __future__ import annotations
@@ -48,17 +47,23 @@ from lidarspec.spec import (
     hookimpl,
 )
 
-CYCLE = 5  # ns, of 200 MHz
-TURN = 2**32 * CYCLE * 1e-9  # seconds after which the cycles start again
+CYCLE_NS = 5  # at 200 MHz
+CLOCK_WRAP_S = 2**32 * CYCLE_NS * 1e-9
 PLATFORM = 0xA6843
-POINTS = 24
-RATE = 10  # of a simulated frame; frames a second
-POINT = 16
-SIDE = 4  # bytes
+SIMULATED_POINTS = 24  # of a frame
+SIMULATED_RATE_HZ = 10  # frames per second
+POINT_BYTES = 16
+SIDE_INFO_BYTES = 4  # per point
 
 
-def part(kind: int, size: int, *members: Any) -> Struct:
-    """A part whose `members` are arrays of so many bytes an element; what is left over is kept."""
+def make_part(kind: int, size: int, *members: Any) -> Struct:
+    """Return the struct of a part with arrays of elements.
+
+    Args:
+        kind: the type of the part.
+        size: bytes per element; remaining bytes are kept as `rest`.
+        members: the arrays.
+    """
     return Struct(
         "type" / Const(kind, Int32ul),
         "length" / Int32ul,
@@ -67,12 +72,12 @@ def part(kind: int, size: int, *members: Any) -> Struct:
     )
 
 
-POINTS_PART = part(
+POINTS_PART = make_part(
     1,
-    POINT,
+    POINT_BYTES,
     "points"
     / Array(
-        this.length // POINT,
+        this.length // POINT_BYTES,
         Struct(
             "x" / Scaled(Float32l, 1, "m") * "to the right",
             "y" / Scaled(Float32l, 1, "m") * "ahead",
@@ -81,12 +86,12 @@ POINTS_PART = part(
         ),
     ),
 )
-SIDE_PART = part(
+SIDE_INFO_PART = make_part(
     7,
-    SIDE,
+    SIDE_INFO_BYTES,
     "points"
     / Array(
-        this.length // SIDE,
+        this.length // SIDE_INFO_BYTES,
         Struct("snr" / Scaled(Int16sl, 0.1, "dB"), "noise" / Scaled(Int16sl, 0.1, "dB")),
     ),
 )
@@ -129,7 +134,7 @@ DATA = Struct(
     "length" / SizeOf(Int32ul),
     "platform" / Const(PLATFORM, Int32ul),
     "frame_number" / Int32ul,
-    "time" / Scaled(Int32ul, CYCLE, "ns") * "cycles; starts again at 21.5 s",
+    "time" / Scaled(Int32ul, CYCLE_NS, "ns") * "cycles; starts again at 21.5 s",
     "detected" / Int32ul * "points of the frame",
     "tlv_count" / Int32ul,
     "subframe" / Int32ul,
@@ -137,14 +142,14 @@ DATA = Struct(
     / Parts(
         {
             "points": POINTS_PART,
-            "range_profile": part(
+            "range_profile": make_part(
                 2, 2, "magnitudes" / Array(this.length // 2, Int16ul) * "log2, Q9"
             ),
-            "noise_profile": part(
+            "noise_profile": make_part(
                 3, 2, "magnitudes" / Array(this.length // 2, Int16ul) * "log2, Q9"
             ),
             "statistics": STATISTICS,
-            "side_info": SIDE_PART,
+            "side_info": SIDE_INFO_PART,
             "temperature": TEMPERATURE,
             "other": Struct("type" / Int32ul, "length" / Int32ul, "content" / Bytes(this.length)),
         },
@@ -155,33 +160,43 @@ DATA = Struct(
 
 
 def points(f: Fields) -> Cartesian:
-    """Return the points of a frame; the radar's x is to the right, and its y ahead."""
-    place = f.points
-    return Cartesian(x=place.y, y=-place.x, z=place.z, extra={"velocity": place.velocity})
+    """Return the points of a frame, in axes ahead, left and up.
+
+    The radar's x is to the right and its y ahead.
+    """
+    members = f.points
+    return Cartesian(x=members.y, y=-members.x, z=members.z, extra={"velocity": members.velocity})
 
 
 def directions(i: int) -> tuple[Any, Any]:
-    """Return a fan of 120 degrees, that nods by 15."""
-    return np.deg2rad(np.linspace(-60, 60, POINTS)), np.deg2rad(
-        15 * np.sin(i / 7 + np.arange(POINTS))
+    """Return azimuth and elevation in radians of the simulated points of frame i.
+
+    The points form a fan of 120 degrees that moves up and down by 15 degrees.
+    """
+    return np.deg2rad(np.linspace(-60, 60, SIMULATED_POINTS)), np.deg2rad(
+        15 * np.sin(i / 7 + np.arange(SIMULATED_POINTS))
     )
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Frame i: points that stand still, their SNR, and statistics."""
+    """Return the simulated values of frame i: static points, SNR and statistics."""
     return {
         "version": 0x03050004,
         "frame_number": i + 1,
-        "time": round(i * 1e9 / RATE) % (2**32 * CYCLE),
-        "detected": POINTS,
+        "time": round(i * 1e9 / SIMULATED_RATE_HZ) % (2**32 * CYCLE_NS),
+        "detected": SIMULATED_POINTS,
         "subframe": 0,
         "tlvs": [
-            {"type": 1, "length": POINTS * POINT, "points.velocity": np.zeros(POINTS)},
+            {
+                "type": 1,
+                "length": SIMULATED_POINTS * POINT_BYTES,
+                "points.velocity": np.zeros(SIMULATED_POINTS),
+            },
             {
                 "type": 7,
-                "length": POINTS * SIDE,
-                "points.snr": np.full(POINTS, 18.0),
-                "points.noise": np.full(POINTS, 60.0),
+                "length": SIMULATED_POINTS * SIDE_INFO_BYTES,
+                "points.snr": np.full(SIMULATED_POINTS, 18.0),
+                "points.noise": np.full(SIMULATED_POINTS, 60.0),
             },
             {
                 "type": 6,
@@ -211,9 +226,9 @@ IWR6843 = Sensor(
     points=None,
     scan=OnChange("frame_number"),
     links={"data": Serial(921_600)},
-    clock=Clock("time", wraps_at=TURN),
+    clock=Clock("time", wraps_at=CLOCK_WRAP_S),
     sequence=Sequence("frame_number"),
-    simulation=Simulation(sweep, rate=RATE, directions=directions),
+    simulation=Simulation(sweep, rate=SIMULATED_RATE_HZ, directions=directions),
     range_limits=(0.05, 100.0),
     vendor_axes=("right", "forward", "up"),
     status="manual",
@@ -226,5 +241,5 @@ IWR6843 = Sensor(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The radar."""
+    """Return the radar."""
     return [IWR6843]
