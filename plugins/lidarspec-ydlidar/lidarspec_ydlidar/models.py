@@ -1,7 +1,7 @@
-"""The models: what differs between them.
+"""The models and their differences.
 
-Source: YDLIDAR SDK, "Dataset" (bauds, rates, ranges and turns), core/common/DriverInterface.h
-(numbers of models); data sheets.
+Source: YDLIDAR SDK, "Dataset" (baud rates, sample rates, ranges and speeds),
+core/common/DriverInterface.h (numbers of models); data sheets.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ class Model:
     """One row of the table of models.
 
     Attributes:
-        form: of its samples.
-        baud: of its line.
-        rate: samples a second.
+        form: the form of its samples.
+        baud: the baud rate.
+        rate: samples per second.
         range_limits: in metres.
-        turn: the slowest and the fastest number of scans a second.
-        number: what it calls itself in its information; 0: no public source says.
+        turn: the lowest and the highest number of scans per second.
+        number: the model number in its information; 0 if it is not public.
         one_channel: whether it only sends.
-        tells_state: whether packets that begin no turn tell the state of the device in the bits of
-            the scan frequency.
-        proof: its status.
+        has_state: whether packets other than zero packets contain the state of the device, in the
+            bits of the scan frequency.
+        status: the status of the sensor.
     """
 
     form: Form
@@ -36,19 +36,19 @@ class Model:
     turn: tuple[float, float]
     number: int = 0
     one_channel: bool = False
-    tells_state: bool = False
-    proof: str = "manual"
+    has_state: bool = False
+    status: str = "manual"
 
 
 MODELS = {
     "F4": Model(samples.TRIANGLE, 115_200, 4000, (0.12, 12), (5, 12), 1),
     "X2": Model(
-        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, status="vectors"
     ),
     "X3": Model(
-        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, status="vectors"
     ),
-    "X4": Model(samples.TRIANGLE, 128_000, 5000, (0.12, 10), (5, 12), 6, proof="vectors"),
+    "X4": Model(samples.TRIANGLE, 128_000, 5000, (0.12, 10), (5, 12), 6, status="vectors"),
     "X4 Pro": Model(
         samples.TRIANGLE_FLAGGED,
         128_000,
@@ -56,19 +56,19 @@ MODELS = {
         (0.12, 10),
         (5, 12),
         one_channel=True,
-        tells_state=True,
+        has_state=True,
     ),
     "S2": Model(
-        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, proof="vectors"
+        samples.TRIANGLE, 115_200, 3000, (0.1, 8), (4, 8), one_channel=True, status="vectors"
     ),
-    "S4": Model(samples.TRIANGLE, 115_200, 4000, (0.1, 8), (5, 12), 4, proof="vectors"),
+    "S4": Model(samples.TRIANGLE, 115_200, 4000, (0.1, 8), (5, 12), 4, status="vectors"),
     "S4B": Model(samples.TRIANGLE_8, 153_600, 4000, (0.1, 8), (5, 12), 11),
-    "G1": Model(samples.TRIANGLE, 230_400, 9000, (0.28, 16), (5, 12), 19, proof="vectors"),
+    "G1": Model(samples.TRIANGLE, 230_400, 9000, (0.28, 16), (5, 12), 19, status="vectors"),
     "G2": Model(samples.TRIANGLE_8, 230_400, 5000, (0.28, 16), (5, 12), 15),
     "G2A": Model(samples.TRIANGLE, 230_400, 5000, (0.12, 12), (5, 12), 14),
     "G2C": Model(samples.TRIANGLE, 115_200, 4000, (0.1, 12), (5, 12), 16),
-    "G4": Model(samples.TRIANGLE, 230_400, 9000, (0.1, 16), (5, 12), 5, proof="vectors"),
-    "G4B": Model(samples.TRIANGLE_10, 512_000, 10_000, (0.12, 16), (5, 12), 17, proof="vectors"),
+    "G4": Model(samples.TRIANGLE, 230_400, 9000, (0.1, 16), (5, 12), 5, status="vectors"),
+    "G4B": Model(samples.TRIANGLE_10, 512_000, 10_000, (0.12, 16), (5, 12), 17, status="vectors"),
     "G4C": Model(samples.TRIANGLE, 115_200, 4000, (0.1, 12), (5, 12), 18),
     "G4 Pro": Model(samples.TRIANGLE, 230_400, 9000, (0.1, 16), (5, 12), 7),
     "G5": Model(samples.TRIANGLE, 230_400, 9000, (0.1, 16), (5, 12), 20),
@@ -76,15 +76,15 @@ MODELS = {
     "G7": Model(samples.HALF, 512_000, 18_000, (0.1, 25), (5, 12), 21),
     "TX8": Model(samples.TOF, 115_200, 4000, (0.1, 8), (4, 8), one_channel=True),
     "TX20": Model(samples.TOF, 115_200, 4000, (0.1, 20), (4, 8), one_channel=True),
-    "TG15": Model(samples.TOF, 512_000, 20_000, (0.05, 30), (3, 15.7), 100, proof="vectors"),
+    "TG15": Model(samples.TOF, 512_000, 20_000, (0.05, 30), (3, 15.7), 100, status="vectors"),
     "TG30": Model(samples.TOF, 512_000, 20_000, (0.05, 30), (3, 15.7), 101),
     "TG50": Model(samples.TOF, 512_000, 20_000, (0.05, 50), (3, 15.7), 102),
-    "T-mini": Model(samples.TOF_8, 230_400, 4000, (0.02, 12), (6, 12), 140, tells_state=True),
+    "T-mini": Model(samples.TOF_8, 230_400, 4000, (0.02, 12), (6, 12), 140, has_state=True),
     "T-mini Pro": Model(
-        samples.TOF_8, 230_400, 4000, (0.02, 12), (6, 12), 150, tells_state=True, proof="capture"
+        samples.TOF_8, 230_400, 4000, (0.02, 12), (6, 12), 150, has_state=True, status="capture"
     ),
-    "T-mini Plus": Model(samples.TOF_8, 230_400, 4000, (0.05, 12), (6, 12), 151, tells_state=True),
+    "T-mini Plus": Model(samples.TOF_8, 230_400, 4000, (0.05, 12), (6, 12), 151, has_state=True),
     "T-mini Plus SH": Model(
-        samples.TOF_16, 230_400, 4000, (0.05, 12), (6, 12), 152, tells_state=True
+        samples.TOF_16, 230_400, 4000, (0.05, 12), (6, 12), 152, has_state=True
     ),
 }

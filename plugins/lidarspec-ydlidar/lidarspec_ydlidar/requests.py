@@ -1,10 +1,10 @@
-"""What the host asks, ``A5 cmd``, and what a YDLIDAR answers.
+"""Requests of the host, ``A5 cmd``, and replies of a YDLIDAR.
 
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (system commands);
-core/common/ydlidar_protocol.h (stamps). Health is asked with 92 in the SDK and with 91 in older
-manuals, a reset with 80 and 40; the order of the two bytes of the firmware differs between manuals
-(a T-mini's 00 01 is 1.0). Commands that only some models know (low power, constant frequency,
-heartbeat, zero offset, pitch) are left out.
+core/common/ydlidar_protocol.h (stamps). The request for the health is 92 in the SDK and 91 in older
+manuals, a reset 80 or 40; the order of the two bytes of the firmware differs between manuals (a
+T-mini's 00 01 is 1.0). Commands of only some models (low power, constant frequency, heartbeat, zero
+offset, pitch) are left out.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from construct import Bytes, Const, Construct, Int8ul, Int16ul, Int32ul, Struct
 from lidarspec.spec import Checksummed, Command, Frame, Scaled, Xor
 from lidarspec_ydlidar.models import MODELS
 
-AFTER_STOP = 0.03  # seconds (SDK, stop)
-AFTER_MOTOR = 0.5  # seconds (SDK, startMotor)
+STOP_DELAY_S = 0.03  # SDK, stop
+MOTOR_START_DELAY_S = 0.5  # SDK, startMotor
 
 
-def answer(kind: int, *fields: Construct, size: int) -> Frame:
-    """Return the answer to a request, with its descriptor in front."""
+def make_reply(kind: int, *fields: Construct, size: int) -> Frame:
+    """Return the frame of a reply, which begins with its descriptor."""
     header = b"\xa5\x5a" + size.to_bytes(4, "little") + bytes([kind])
     return Frame(Struct("descriptor" / Const(header), *fields))
 
@@ -31,7 +31,7 @@ SCAN_START = Frame(
 )
 ANSWERS = {
     "scan_start": SCAN_START,
-    "info": answer(
+    "info": make_reply(
         0x04,
         "model"
         / Int8ul
@@ -41,11 +41,11 @@ ANSWERS = {
         "serial" / Bytes(16) * "a digit a byte",
         size=20,
     ),
-    "health": answer(
+    "health": make_reply(
         0x06, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul, size=3
     ),
-    "speed": answer(0x04, "frequency" / Scaled(Int32ul, 0.01, "Hz") * "of scans", size=4),
-    "setting": answer(
+    "speed": make_reply(0x04, "frequency" / Scaled(Int32ul, 0.01, "Hz") * "of scans", size=4),
+    "setting": make_reply(
         0x04,
         "value" / Int8ul * "number of the sampling rate, or of the direction of rotation",
         size=1,
@@ -66,27 +66,27 @@ ANSWERS = {
 REQUEST = Frame(Struct("start" / Const(b"\xa5"), "cmd" / Int8ul), direction="out")
 
 
-def asking(cmd: int, reply: str | None = None, **more: Any) -> Command:
-    """Return a request without payload."""
+def make_request(cmd: int, reply: str | None = None, **more: Any) -> Command:
+    """Return the command for a request without payload."""
     return Command("request", {"cmd": cmd}, reply=reply, **more)
 
 
 COMMANDS = {
-    "start_motor": Command(lines={"dtr": True}, settle=AFTER_MOTOR),
+    "start_motor": Command(lines={"dtr": True}, settle=MOTOR_START_DELAY_S),
     "stop_motor": Command(lines={"dtr": False}),
-    "scan": asking(0x60, "scan_start", retries=1, starts=True),
-    "force_scan": asking(0x61, "scan_start", retries=1, starts=True),
-    "stop": asking(0x65, stops=True, settle=AFTER_STOP),
-    "get_info": asking(0x90, "info", retries=1, only_stopped=True),
-    "get_health": asking(0x92, "health", retries=1, only_stopped=True),
-    "reset": asking(0x80, stops=True),
-    "faster": asking(0x09, "speed", only_stopped=True),
-    "slower": asking(0x0A, "speed", only_stopped=True),
-    "faster_1hz": asking(0x0B, "speed", only_stopped=True),
-    "slower_1hz": asking(0x0C, "speed", only_stopped=True),
-    "get_speed": asking(0x0D, "speed", retries=1, only_stopped=True),
-    "rotate_forward": asking(0x06, "setting", retries=1, only_stopped=True),
-    "rotate_back": asking(0x07, "setting", retries=1, only_stopped=True),
-    "next_rate": asking(0xD0, "setting", only_stopped=True),
-    "get_rate": asking(0xD1, "setting", retries=1, only_stopped=True),
+    "scan": make_request(0x60, "scan_start", retries=1, starts=True),
+    "force_scan": make_request(0x61, "scan_start", retries=1, starts=True),
+    "stop": make_request(0x65, stops=True, settle=STOP_DELAY_S),
+    "get_info": make_request(0x90, "info", retries=1, only_stopped=True),
+    "get_health": make_request(0x92, "health", retries=1, only_stopped=True),
+    "reset": make_request(0x80, stops=True),
+    "faster": make_request(0x09, "speed", only_stopped=True),
+    "slower": make_request(0x0A, "speed", only_stopped=True),
+    "faster_1hz": make_request(0x0B, "speed", only_stopped=True),
+    "slower_1hz": make_request(0x0C, "speed", only_stopped=True),
+    "get_speed": make_request(0x0D, "speed", retries=1, only_stopped=True),
+    "rotate_forward": make_request(0x06, "setting", retries=1, only_stopped=True),
+    "rotate_back": make_request(0x07, "setting", retries=1, only_stopped=True),
+    "next_rate": make_request(0xD0, "setting", only_stopped=True),
+    "get_rate": make_request(0xD1, "setting", retries=1, only_stopped=True),
 }

@@ -1,4 +1,4 @@
-"""What a YDLIDAR sample holds: two, three or four bytes, in eight forms.
+"""YDLIDAR samples: two, three or four bytes, in eight forms.
 
 Source: YDLIDAR SDK, "YDLidar-SDK Communication Protocol" (scan command response) and
 core/common/ydlidar_protocol.h.
@@ -15,7 +15,7 @@ from construct import BitsInteger, BitStruct, ByteSwapped, Construct, Int16ul, S
 
 from lidarspec.spec import Scaled
 
-NONE = "0: no return"
+NO_RETURN_NOTE = "0: no return"
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +23,12 @@ class Form:
     """One form of samples.
 
     Attributes:
-        struct: one sample.
-        size: its bytes.
-        groups: sizes of the words that the checksum takes of it.
-        correction: degrees to add to the angle of a sample, by its distance in metres.
-        slowest: Hz that the field of the scan frequency counts from.
-        intense: whether it has an intensity.
+        struct: the struct of a sample.
+        size: bytes of a sample.
+        groups: sizes in bytes of the words of a sample that enter the checksum.
+        correction: function from distance in metres to the degrees to add to the angle.
+        slowest: the scan frequency in Hz of the raw value 0.
+        has_intensity: whether it has an intensity.
     """
 
     struct: Construct
@@ -36,7 +36,7 @@ class Form:
     groups: tuple[int, ...] = (2,)
     correction: Callable[[Any], Any] | None = None
     slowest: float = 0.0
-    intense: bool = False
+    has_intensity: bool = False
 
 
 def camera_angle(distance: Any) -> Any:
@@ -48,31 +48,35 @@ def camera_angle(distance: Any) -> Any:
     return np.where(distance > 0, np.rad2deg(np.arctan(21.8 * (155.3 - mm) / (155.3 * mm))), 0)
 
 
-def alone(step: float) -> Construct:
-    """Return a distance and nothing else, in steps of so many metres."""
-    return Struct("distance" / Scaled(Int16ul, step, "m") * NONE)
+def make_plain_distance(step: float) -> Construct:
+    """Return the struct of a sample with only a distance, in steps of `step` metres."""
+    return Struct("distance" / Scaled(Int16ul, step, "m") * NO_RETURN_NOTE)
 
 
-def make_distance(*below: Construct) -> Construct:
-    """Whole millimetres in the upper 14 bits."""
-    return ByteSwapped(BitStruct("distance" / Scaled(BitsInteger(14), 0.001, "m") * NONE, *below))
+def make_packed_sample(*lower_fields: Construct) -> Construct:
+    """Return the struct of a sample with millimetres in the upper 14 bits."""
+    return ByteSwapped(
+        BitStruct("distance" / Scaled(BitsInteger(14), 0.001, "m") * NO_RETURN_NOTE, *lower_fields)
+    )
 
 
 FLAGS = "flags" / BitsInteger(2)
-MARKS = FLAGS * "2: mirror or glass, 3: sunlight"
-EIGHT = make_distance(MARKS, "intensity" / BitsInteger(8))
+REFLECTION_FLAGS = FLAGS * "2: mirror or glass, 3: sunlight"
+SAMPLE_8 = make_packed_sample(REFLECTION_FLAGS, "intensity" / BitsInteger(8))
 
-TRIANGLE = Form(alone(0.00025), correction=camera_angle)
+TRIANGLE = Form(make_plain_distance(0.00025), correction=camera_angle)
 TRIANGLE_FLAGGED = Form(
-    make_distance(FLAGS * "not 0: disturbed by another lidar"), correction=camera_angle
+    make_packed_sample(FLAGS * "not 0: disturbed by another lidar"), correction=camera_angle
 )
-TRIANGLE_8 = Form(EIGHT, 3, (1, 2), camera_angle, intense=True)
+TRIANGLE_8 = Form(SAMPLE_8, 3, (1, 2), camera_angle, has_intensity=True)
 TRIANGLE_10 = Form(
-    make_distance("intensity" / BitsInteger(10)), 3, (1, 2), camera_angle, intense=True
+    make_packed_sample("intensity" / BitsInteger(10)), 3, (1, 2), camera_angle, has_intensity=True
 )
-HALF = Form(alone(0.0005), correction=camera_angle)
-TOF = Form(alone(0.001), slowest=3.0)
-TOF_8 = Form(EIGHT, 3, (1, 2), intense=True)
+HALF = Form(make_plain_distance(0.0005), correction=camera_angle)
+TOF = Form(make_plain_distance(0.001), slowest=3.0)
+TOF_8 = Form(SAMPLE_8, 3, (1, 2), has_intensity=True)
 TOF_16 = Form(
-    Struct("intensity" / Int16ul, "distance" / Scaled(Int16ul, 0.001, "m") * NONE), 4, intense=True
+    Struct("intensity" / Int16ul, "distance" / Scaled(Int16ul, 0.001, "m") * NO_RETURN_NOTE),
+    4,
+    has_intensity=True,
 )
