@@ -71,7 +71,8 @@ from construct import (
 )
 
 from lidarspec import Sensor, SpecError, UsageError, WireError
-from lidarspec.spec import Fields, Polar, Serial
+from lidarspec.explaining.explanation import explain
+from lidarspec.spec import Checksummed, Fields, Polar, Serial, Sum
 from tests.engine.against_construct import at, sensor
 from tests.engine.engines import interpreted_reason, is_compiled
 
@@ -327,6 +328,11 @@ PLAIN: dict[str, Case] = {
         frames="000102 0000",
         reason="Parts(struct, count) reads such in bulk",
     ),
+    "Checksummed in an array": case(
+        "r" / Array(2, Checksummed(TWO, field="y", algorithm=Sum())),
+        frames="01010202",
+        reason="a checksum inside an array",
+    ),
     "RepeatUntil": case(
         "a" / RepeatUntil(obj_ == 0, Int8ub), "b" / Int8ub, frames="01020003 0003", reason="Parts"
     ),
@@ -469,6 +475,40 @@ def test_build_ignores_derived_values_and_takes_edits() -> None:
     found.r.offset1 = found.t = 99
     assert ours.build("data", found) == b"\2\2\3\7"
     assert ours.build("data", r=dict(value=dict(a=1, b=2))) == b"\1\0\2\3"
+
+
+def test_frames_that_construct_reads_take_edits_of_a_raw_copy() -> None:
+    ours = sensor(Struct("r" / RawCopy(BODY), "text" / CString("ascii")))
+    assert not is_compiled(ours.frames["data"])
+    found = ours.parse(b"\1\2\3x\0")
+    found.r.value.a = 9
+    assert ours.build("data", found) == b"\x09\2\3x\0"
+    assert ours.build("data", r=dict(data=b"\7\7\7"), text="x") == b"\7\7\7x\0"
+
+
+def test_branches_with_different_lengths_of_one_name_are_built_as_parsed() -> None:
+    branches = {1: Struct("d" / GreedyBytes), 2: Struct("k" / Int16ub, "d" / GreedyBytes)}
+    content = Struct("kind" / Int8ub, "v" / Switch(this.kind, branches))
+    ours = sensor(Struct("a" / Prefixed(Int8ub, content)))
+    for data in (b"\3\1ab", b"\5\2\0\0ab"):
+        assert ours.build("data", ours.parse(data)) == data
+
+
+def test_a_nested_field_may_have_a_name_that_points_reserves() -> None:
+    part = Struct("state" / Int8ub, "on" / Int8ub)
+    ours = dataclasses.replace(
+        sensor(Struct("a" / Array(2, part))),
+        points=lambda f: Polar(range=f.a.state + f.a.on, azimuth=0),
+    )
+    assert ours.decode([b"\1\2\3\4"]).points().range.tolist() == [3, 7]
+    with pytest.raises(SpecError, match="'state'"):
+        sensor(part)
+
+
+def test_a_recoded_struct_is_explained_as_one_field() -> None:
+    data = MARK + b"\1\2"
+    explained = explain(data, sensor(CASES["Transformed by a function"].struct))
+    assert [field.raw for field in explained.fields.values()][-2:] == [0x54, 0x57]
 
 
 def test_a_wrong_checksum_of_construct_is_counted_as_one() -> None:
