@@ -12,15 +12,15 @@ from lidarspec.cli.failures import FINDINGS
 from lidarspec.cli.output import Progress, emit, emit_json, output_option
 from lidarspec.cli.terminal import note, say
 from lidarspec.detect.sample_bytes import read_beginning
-from lidarspec.drafting.draft import (
+from lidarspec.drafting.distribution import (
     DistributionNames,
     Link,
     add_to_distribution,
-    draft,
     make_draft_files,
     make_example_files,
     write_files,
 )
+from lidarspec.drafting.draft import make_draft
 from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.exports import EXPORTS, ExportError, export as exported, select_frame
 from lidarspec.optional_libraries import import_library
@@ -124,7 +124,7 @@ def _draft_files(names: DistributionNames, link: str | None, capture: str) -> di
     )
     if not any(chunk.data for chunk in chunks):
         raise WireError(no_bytes(capture, opened.warnings))
-    frame_draft = draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
+    frame_draft = make_draft([chunk.data for chunk in chunks], datagrams=opened.datagrams)
     note(
         f"{capture}: {len(frame_draft.frames)} frames,"
         f" {frame_draft.share:.1%} of {frame_draft.bytes_in} bytes"

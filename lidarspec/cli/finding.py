@@ -156,7 +156,9 @@ def crc(
             {"frames": len(frames), "matches": [match_to_dict(match) for match in matches]}, output
         )
     elif matches:
-        shown = [match for match in matches if match.open == matches[0].open][:PRINTED]
+        shown = [match for match in matches if match.is_ambiguous == matches[0].is_ambiguous][
+            :PRINTED
+        ]
         emit("\n\n".join(_text(match, len(frames[0])) for match in shown), output)
     if not matches:
         note(
@@ -165,7 +167,7 @@ def crc(
             " complete and begins at its first byte"
         )
         raise click.exceptions.Exit(FINDINGS)
-    if matches[0].doubt < WEAK:
+    if matches[0].evidence_bits < WEAK:
         note("the match may be chance: give more frames")
 
 
@@ -217,12 +219,12 @@ def match_to_dict(match: ChecksumMatch) -> dict[str, Any]:
     return {
         "checksum": match.algorithm.describe(),
         "name": match.name,
-        "paste": match.paste,
+        "paste": match.source,
         "field": {"offset": match.place.offset, "size": match.place.size, "order": match.order},
         "over": {"part": match.span.part, "head": match.span.head, "tail": match.span.tail},
         "right": match.right,
         "frames": match.total,
-        "evidence_bits": round(match.doubt, 1),
+        "evidence_bits": round(match.evidence_bits, 1),
         "remarks": list(match.remarks),
     }
 
@@ -233,7 +235,7 @@ def _text(match: ChecksumMatch, length: int) -> str:
     else:
         order = ""
     name = f" ({match.name})" if match.name else ""
-    if match.doubt >= WEAK:
+    if match.evidence_bits >= WEAK:
         chance = f"1 in {match.odds} by chance"
     else:
         chance = "may be chance"
@@ -246,10 +248,10 @@ def _text(match: ChecksumMatch, length: int) -> str:
         f"  over:  {match.span.describe(match.place, length)}",
         *(f"  note:  {remark}" for remark in match.remarks),
     ]
-    if "\n" in match.paste:
-        paste = f"\n{indent(match.paste, '    ')}"
+    if "\n" in match.source:
+        paste = f"\n{indent(match.source, '    ')}"
     else:
-        paste = f" {match.paste}"
+        paste = f" {match.source}"
     return "\n".join([*lines, f"  paste:{paste}"])
 
 
@@ -596,8 +598,8 @@ def _structure_text(structure: FrameStructure) -> str:
         f"  length    {length}: {len(structure.frames)} frames, {structure.share:.0%} of the bytes",
     ]
     for match in structure.checksums[:TOLD]:
-        if "\n" not in match.paste:
-            checksum = match.paste
+        if "\n" not in match.source:
+            checksum = match.source
         else:
             checksum = match.algorithm.describe()
         lines.append(

@@ -1,8 +1,8 @@
 """Find the checksum of sample frames: algorithm, place and covered bytes.
 
-The plain checksums are tried one by one, the usual ones first: XOR, sums of bytes and words, their
-complements, words in groups, folded sums, split nibbles. CRCs are found without trial
-(`crc_search`), and only if no plain checksum is certain.
+All plain checksums are tried: XOR, sums of bytes and words, their complements, words in groups,
+folded sums, split nibbles. If no plain checksum is sure, CRCs are calculated from the frames
+(`crc_search`).
 """
 
 from __future__ import annotations
@@ -29,23 +29,25 @@ from lidarspec.frames.row_checksums import compute_checksums
 from lidarspec.spec.checksums import ByteOrder, Bytes, Checksum, Fold15, Sum, Values, WordXor, Xor
 
 #: Maximum number of matches to return.
-TOLD = 8
-#: Number of frames on which a guess is tried before all frames are used.
-SCREENED = 16
-#: Minimum share of frames with a valid checksum, if it has a constant of its own.
-CERTAIN = 0.95
-ANYWHERE = (
+MAX_MATCHES = 8
+#: Number of frames on which a checksum is tried before all frames are used.
+SCREENING_FRAMES = 16
+#: Minimum share of frames with a valid checksum if a constant was fitted.
+MIN_VALID_SHARE = 0.95
+#: Upper limit of the number of places and spans at which split nibbles are tried.
+NIBBLE_TRIALS = 8
+ANYWHERE_NOTE = (
     "an XOR of a whole frame fits at several offsets: this is the one with the most varying bytes"
 )
-#: Heads and groups of words that are tried.
-HEADS = (0, 2, 4, 6, 8, 10, 12)
-GROUPS = ((2,), (1, 2), (2, 1), (1, 1, 2))
+#: Heads and groups of `WordXor` that are tried.
+WORD_XOR_HEADS = (0, 2, 4, 6, 8, 10, 12)
+WORD_XOR_GROUPS = ((2,), (1, 2), (2, 1), (1, 1, 2))
 _PADDED = {"little": "", "big": '.ljust(2, b"\\0")'}
 
 
 @dataclass(frozen=True)
 class WordSum(Checksum):
-    """The sum of two-byte words modulo 2**16; an odd last byte is extended by zeros.
+    """The sum of two-byte words modulo 2**16; an odd last byte is extended by a zero.
 
     Attributes:
         words: byte order of the words.
@@ -80,35 +82,38 @@ class WordSum(Checksum):
 
 
 @dataclass(frozen=True)
-class MaskedChecksum(Checksum):
-    """Another checksum with a constant.
+class OffsetChecksum(Checksum):
+    """Another checksum, combined with a constant.
 
-    It is ``constant - value`` with `negative`, else ``constant + value``; for XORs
-    ``constant ^ value``.
+    It is ``constant ^ value`` for XORs, ``constant - value`` if `negative`, and otherwise
+    ``constant + value``.
     """
 
-    of: Checksum
+    base: Checksum
     constant: int
     negative: bool = False
     width = 8
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "width", self.of.width)
+        object.__setattr__(self, "width", self.base.width)
 
     def __call__(self, data: Bytes) -> int:
-        return int(self._add_constant(np.array([self.of(data)], np.uint64))[0])
+        return int(self._add_constant(np.array([self.base(data)], np.uint64))[0])
 
     def describe(self) -> str:
         digits = self.width // 4
         if self.negative and self.constant in (0, self._mask):
-            return f"{self.of.describe()}, {'negated' if self.constant == 0 else 'complemented'}"
-        return (
-            f"{self.of.describe()}, {'taken from' if self.negative else 'and'}"
-            f" 0x{self.constant:0{digits}x}"
-        )
+            return f"{self.base.describe()}, {'negated' if self.constant == 0 else 'complemented'}"
+        if isinstance(self.base, Xor | WordXor):
+            operation = "xor"
+        elif self.negative:
+            operation = "taken from"
+        else:
+            operation = "plus"
+        return f"{self.base.describe()}, {operation} 0x{self.constant:0{digits}x}"
 
     def batch(self, rows: NDArray[np.uint8]) -> Values:
-        return self._add_constant(compute_checksums(self.of, rows))
+        return self._add_constant(compute_checksums(self.base, rows))
 
     @property
     def _mask(self) -> int:
@@ -116,7 +121,7 @@ class MaskedChecksum(Checksum):
 
     def _add_constant(self, values: Values) -> Values:
         constant = np.uint64(self.constant)
-        if isinstance(self.of, Xor | WordXor):
+        if isinstance(self.base, Xor | WordXor):
             return values ^ constant
         return ((constant - values) if self.negative else (constant + values)) & np.uint64(
             self._mask
@@ -127,34 +132,32 @@ def search(
     frames: Iterable[bytes],
     *,
     quick: bool = False,
-    stands: Callable[[ChecksumPlace], bool] = accept_any_place,
+    is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place,
 ) -> list[ChecksumMatch]:
     """Return the checksums that match the frames, the simplest and surest first.
 
-    Returns an empty list if there is none.
-
     Args:
-        frames: whole frames; more and more different frames give a surer result; some may be
-            damaged, and lengths may differ.
-        quick: end after about a second: search for CRCs at the usual places only, and for CRCs of
-            long frames in the catalogue only.
-        stands: returns whether a checksum may be at a place.
+        frames: whole frames, of any lengths; some may be damaged. The result is surer with more
+            frames, and if their content varies more.
+        quick: whether to stop after about a second. CRCs are then searched only at the usual
+            places, and for long frames only in the catalogue.
+        is_possible_place: returns whether a checksum may be at a place.
     """
     samples = SampleFrames(frames)
     if samples.shortest < 3 or not any(map(any, samples.frames)):
         return []
-    matches = list(plain_matches(samples, stands))
-    if not any(match.sure for match in matches):
-        matches += crc_matches(samples, quick=quick, stands=stands)
+    matches = list(iter_plain_matches(samples, is_possible_place))
+    if not any(match.is_sure for match in matches):
+        matches += crc_matches(samples, quick=quick, is_possible_place=is_possible_place)
     if not matches and not quick:
-        matches += crc_matches(samples, mixed=True, stands=stands)
-    return sort_matches(matches)[:TOLD]
+        matches += crc_matches(samples, mixed=True, is_possible_place=is_possible_place)
+    return sort_matches(matches)[:MAX_MATCHES]
 
 
 def format_algorithm(algorithm: Checksum) -> str:
-    """Return the algorithm as Python source; a class if the package has none."""
-    if isinstance(algorithm, MaskedChecksum | WordSum):
-        return _class(algorithm)
+    """Return the Python source of an algorithm: an expression or a class."""
+    if needs_class(algorithm):
+        return format_class(algorithm)
     if isinstance(algorithm, Sum):
         return f"Sum({algorithm.width})"
     if isinstance(algorithm, WordXor):
@@ -162,17 +165,22 @@ def format_algorithm(algorithm: Checksum) -> str:
     return f"{type(algorithm).__name__}()"
 
 
-def plain_matches(
-    samples: SampleFrames, stands: Callable[[ChecksumPlace], bool] = accept_any_place
+def needs_class(algorithm: Checksum) -> bool:
+    """Return whether a plugin needs a class, because `lidarspec.spec` has none."""
+    return isinstance(algorithm, OffsetChecksum | WordSum)
+
+
+def iter_plain_matches(
+    samples: SampleFrames, is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place
 ) -> Iterator[ChecksumMatch]:
-    """Yield every plain checksum that matches, in no special order."""
-    few = samples.take_spread(SCREENED)
+    """Yield the plain checksums that match, of decreasing size, until one is sure."""
+    few = samples.take_spread(SCREENING_FRAMES)
     tried = 0
-    sure = False
-    certain = False
-    longest = len(few.frames[-1])
+    has_sure = False
+    has_sure_sum = False
+    longest = len(few.frames[-1])  # the frames are sorted by length
     for size, algorithms in ((4, (Sum(32),)), (2, _WIDE), (1, (Xor(), Sum(8)))):
-        for place in filter(stands, few.places(size)):
+        for place in filter(is_possible_place, few.places(size)):
             for span in iter_spans(place, few):
                 if 2 * sum(b - a for a, b in span.ranges(place, longest)) < longest - size:
                     continue
@@ -181,16 +189,17 @@ def plain_matches(
                         continue
                     tried += 1
                     for match in _iter_matches(samples, few, algorithm, place, span, tried):
-                        sure = sure or match.sure
-                        certain = certain or (
-                            match.sure and not isinstance(match.algorithm, Xor | WordXor)
+                        has_sure = has_sure or match.is_sure
+                        has_sure_sum = has_sure_sum or (
+                            match.is_sure and not isinstance(match.algorithm, Xor | WordXor)
                         )
                         yield match
-            if certain:
+            # An XOR may fit at several places, so all of them are searched.
+            if has_sure_sum:
                 return
-        if sure:
+        if has_sure:
             return
-    yield from _nibbles(samples)
+    yield from _iter_nibble_matches(samples)
 
 
 def _iter_matches(
@@ -201,95 +210,104 @@ def _iter_matches(
     span: CoveredSpan,
     tried: int,
 ) -> Iterator[ChecksumMatch]:
-    """Yield an algorithm and its complements if they match.
+    """Yield an algorithm, and its variants with a constant, if they match.
 
-    A constant is fitted only if there are several frames to prove it.
+    A constant is fitted only if there are several frames that can confirm it.
+
+    Args:
+        samples: all frames.
+        few: some of them, on which the algorithm is tried first.
+        tried: number of checksums that were tried so far.
     """
     computed = few.compute_checksums(algorithm, place, span)
     mask = np.uint64((1 << 8 * place.size) - 1)
     orders: tuple[ByteOrder, ...] = ("little", "big") if place.size > 1 else ("little",)
     for order in orders:
-        there = few.fields(place, order)
+        stored = few.fields(place, order)
         algorithms: list[Checksum]
         if isinstance(algorithm, Fold15):
-            if are_enough(int((there == computed).sum()), len(few)):
+            if are_enough(int((stored == computed).sum()), len(few)):
                 algorithms = [algorithm]
             else:
                 algorithms = []
         elif isinstance(algorithm, Xor | WordXor):
-            algorithms = [_change(algorithm, constant) for constant in _constant(there ^ computed)]
+            algorithms = [
+                _add_constant(algorithm, constant) for constant in _find_constant(stored ^ computed)
+            ]
         elif few.is_single:
-            if not there.any():
+            if not stored.any():
                 return
-            algorithms = [algorithm, MaskedChecksum(algorithm, int(mask), negative=True)]
+            algorithms = [algorithm, OffsetChecksum(algorithm, int(mask), negative=True)]
         else:
             algorithms = [
-                _change(algorithm, constant) for constant in _constant((there - computed) & mask)
+                _add_constant(algorithm, constant)
+                for constant in _find_constant((stored - computed) & mask)
             ]
             algorithms += [
-                MaskedChecksum(algorithm, constant, negative=True)
-                for constant in _constant((there + computed) & mask)
+                OffsetChecksum(algorithm, constant, negative=True)
+                for constant in _find_constant((stored + computed) & mask)
             ]
-        for one in algorithms:
-            constant = one.constant if isinstance(one, MaskedChecksum) else 0
-            fitted = int(constant not in (0, int(mask)))
-            right = samples.count_valid(one, place, span, order)
-            doubtful = weigh_evidence(one.width, there, fitted, tried)
-            if not fitted:
-                proven = are_enough(right, len(samples))
+        for variant in algorithms:
+            constant = variant.constant if isinstance(variant, OffsetChecksum) else 0
+            has_constant = constant not in (0, int(mask))
+            right = samples.count_valid(variant, place, span, order)
+            evidence_bits = weigh_evidence(variant.width, stored, int(has_constant), tried)
+            if has_constant:
+                is_proven = right >= MIN_VALID_SHARE * len(samples) and not few.is_single
             else:
-                proven = right >= CERTAIN * len(samples)
-            if proven and doubtful > 0 and not (few.is_single and fitted):
-                remarks: tuple[str, ...] = (
-                    ("it contains a constant: fields outside the covered bytes, or a start value",)
-                    if fitted
-                    else ()
-                )
-                varied = 0.0
-                if isinstance(algorithm, Xor | WordXor) and span == CoveredSpan():
-                    remarks = (*remarks, ANYWHERE)
-                    varied = samples.measure_variation(place)
-                yield ChecksumMatch(
-                    one,
-                    place,
-                    span,
-                    order,
-                    right,
-                    len(samples),
-                    doubtful,
-                    format_algorithm(one),
-                    remarks,
-                    "",
-                    bool(fitted),
-                    varied,
-                )
+                is_proven = are_enough(right, len(samples))
+            if not is_proven or evidence_bits <= 0:
+                continue
+            notes: tuple[str, ...] = ()
+            variation = 0.0
+            if isinstance(algorithm, Xor | WordXor) and span == CoveredSpan():
+                notes = (ANYWHERE_NOTE,)
+                variation = samples.measure_variation(place)
+            yield ChecksumMatch(
+                variant,
+                place,
+                span,
+                order,
+                right,
+                len(samples),
+                evidence_bits,
+                format_algorithm(variant),
+                notes,
+                is_ambiguous=has_constant,
+                has_constant=has_constant,
+                variation=variation,
+            )
 
 
-def _change(algorithm: Checksum, constant: int) -> Checksum:
+def _add_constant(algorithm: Checksum, constant: int) -> Checksum:
     if constant:
-        return MaskedChecksum(algorithm, constant)
+        return OffsetChecksum(algorithm, constant)
     return algorithm
 
 
-def _constant(values: NDArray[np.uint64]) -> list[int]:
-    """Return the value that nearly all elements have, if there is one."""
+def _find_constant(values: NDArray[np.uint64]) -> list[int]:
+    """Return the value that enough elements have, as a list; empty if there is none."""
     distinct, counts = np.unique(values, return_counts=True)
-    most = int(counts.argmax())
-    if are_enough(int(counts[most]), len(values)):
-        return [int(distinct[most])]
+    most_frequent = int(counts.argmax())
+    if are_enough(int(counts[most_frequent]), len(values)):
+        return [int(distinct[most_frequent])]
     return []
 
 
-def _nibbles(samples: SampleFrames) -> Iterator[ChecksumMatch]:
+def _iter_nibble_matches(samples: SampleFrames) -> Iterator[ChecksumMatch]:
     """Yield an XOR that is stored in the low nibbles of two adjacent bytes."""
-    for front in range(min(3, samples.shortest - 4)):
-        place = ChecksumPlace(front, 2)
-        there = samples.fields(place, "little")
-        halves = (there & np.uint64(15)) | (there >> np.uint64(4)) & np.uint64(0xF0)
-        for span in (CoveredSpan("behind"), CoveredSpan("all"))[: 1 + (front > 0)]:
+    for offset in range(min(3, samples.shortest - 4)):
+        place = ChecksumPlace(offset, 2)
+        stored = samples.fields(place, "little")
+        halves = (stored & np.uint64(15)) | (stored >> np.uint64(4)) & np.uint64(0xF0)
+        spans = [CoveredSpan("behind")]
+        if offset > 0:
+            spans.append(CoveredSpan("all"))
+        for span in spans:
             right = int((samples.compute_checksums(Xor(), place, span) == halves).sum())
-            if are_enough(right, len(samples)) and weigh_evidence(8, halves, 0, 8) > 0:
-                remark = (
+            evidence_bits = weigh_evidence(8, halves, 0, NIBBLE_TRIALS)
+            if are_enough(right, len(samples)) and evidence_bits > 0:
+                note = (
                     "its halves are the low nibbles of two bytes, low half first:"
                     " name both in Checksummed(field=(...))"
                 )
@@ -300,27 +318,38 @@ def _nibbles(samples: SampleFrames) -> Iterator[ChecksumMatch]:
                     "little",
                     right,
                     len(samples),
-                    weigh_evidence(8, halves, 0, 8),
+                    evidence_bits,
                     "Xor()",
-                    (remark,),
+                    (note,),
+                    is_in_nibbles=True,
                 )
 
 
+#: Checksums of two bytes that are tried. Without larger groups, a head makes no difference.
 _WIDE: tuple[Checksum, ...] = (
     Sum(16),
     *(WordSum(order, carry) for order in ("little", "big") for carry in (False, True)),
-    *(WordXor(head, groups) for groups in GROUPS for head in (HEADS if groups != (2,) else (0,))),
+    *(
+        WordXor(head, groups)
+        for groups in WORD_XOR_GROUPS
+        for head in (WORD_XOR_HEADS if groups != (2,) else (0,))
+    ),
     Fold15(),
 )
 
 
-def _class(algorithm: Checksum) -> str:
-    """Return the source of a class for a checksum that the package does not have."""
-    if isinstance(algorithm, MaskedChecksum):
+def format_class(algorithm: Checksum, *, is_typed: bool = False) -> str:
+    """Return the Python source of a class `Check` for a checksum.
+
+    Args:
+        algorithm: an `OffsetChecksum` or a `WordSum`.
+        is_typed: whether the methods have annotations.
+    """
+    if isinstance(algorithm, OffsetChecksum):
         changed = algorithm
     else:
-        changed = MaskedChecksum(algorithm, 0)
-    base = changed.of
+        changed = OffsetChecksum(algorithm, 0)
+    base = changed.base
     steps = []
     if isinstance(base, Xor | WordXor):
         value = f"{format_algorithm(base)}(data) ^ 0x{changed.constant:X}"
@@ -341,8 +370,10 @@ def _class(algorithm: Checksum) -> str:
         f"        {line}\n"
         for line in (*steps, f"return ({value}) & 0x{(1 << changed.width) - 1:X}")
     )
+    call = "self, data: Any) -> int" if is_typed else "self, data)"
+    describe = "self) -> str" if is_typed else "self)"
     return (
         f"class Check(Checksum):\n    width = {changed.width}\n\n"
-        f"    def __call__(self, data):\n{body}\n"
-        f'    def describe(self):\n        return "{algorithm.describe()}"'
+        f"    def __call__({call}:\n{body}\n"
+        f'    def describe({describe}:\n        return "{algorithm.describe()}"'
     )

@@ -5,10 +5,10 @@ message modulo its polynomial, so the polynomial divides the message followed by
 frames of one length it divides their XOR, whatever the start value and the final XOR of the CRC
 are. The polynomial is therefore a divisor of the greatest common divisor of such XORs.
 
-Start value and final XOR follow from the polynomial. If the frames have several lengths, the values
-are the solution of linear equations. If all frames have one length, many pairs of values are
+Start value and final XOR follow from the polynomial. If the frames have several lengths, they are
+the solution of linear equations. If all frames have one length, many pairs of values are
 equivalent, and the most usual pair is returned. If too few frames share a length, the usual pairs
-are assumed first, so that each frame alone is a multiple of the polynomial.
+are tried first: with the right pair, the polynomial divides each frame.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ from lidarspec.drafting.samples import (
 )
 from lidarspec.spec.checksums import CRCS, KNOWN, MIRROR, ByteOrder, Crc, name_of, reflect
 
-#: Largest degree of the cofactors that are tried to find a divisor, one by one.
+#: Largest degree of the cofactors that are tried to find a divisor.
 MAX_COFACTOR_DEGREE = 11
-#: Widths of CRCs in bits. The widest comes first, since the polynomial of a narrow CRC may divide
-#: that of a wide one.
+#: Widths of CRCs in bits. The widest comes first, because the polynomial of a narrow CRC may divide
+#: the polynomial of a wide CRC.
 WIDTHS = (32, 16, 8)
-#: In longer frames than this, division is used only for a CRC at the end. At other places only the
-#: CRCs of the catalogue are tried.
+#: If frames are longer than this, division is used only for a CRC at the end. At other places only
+#: the CRCs of the catalogue are tried.
 MAX_DIVIDED_BYTES = 256
 #: Cost of the division of one byte, in bytes of CRC computation.
 DIVISION_WORK = 32
 #: Limit of a quick search, in bytes of CRC computation: about a second.
 QUICK_WORK = 1 << 23
-#: Number of frames of one length that are used to find a polynomial.
+#: Number of frames of one length in a selection that is used to find a polynomial.
 FRAMES_PER_PICK = 4
-#: Number of selections of frames that are tried at the usual place, in case of damaged frames.
-PICKS = 6
+#: Number of selections that are tried at the usual place, in case of damaged frames.
+MAX_PICKS = 6
 #: Largest number of polynomials that are tested with all frames for one place and span.
 MAX_POLYNOMIALS = 64
 #: For each frame: number of covered bytes, and the polynomial of the message and its checksum.
 Codewords = list[tuple[int, int]]
 
 
-def divide_remainder(a: int, b: int) -> int:
-    """Return a modulo b; b must not be 0."""
+def remainder(a: int, b: int) -> int:
+    """Return polynomial a modulo polynomial b; b must not be 0."""
     size = b.bit_length()
     while (shift := a.bit_length() - size) >= 0:
         a ^= b << shift
@@ -65,7 +65,7 @@ def divide_remainder(a: int, b: int) -> int:
 
 
 def quotient(a: int, b: int) -> int:
-    """Return a divided by b, without the remainder; b must not be 0."""
+    """Return polynomial a divided by polynomial b, rounded down; b must not be 0."""
     size = b.bit_length()
     result = 0
     while (shift := a.bit_length() - size) >= 0:
@@ -78,23 +78,23 @@ def common_divisor(polynomials: Iterable[int], *, floor: int = 0) -> int:
     """Return the greatest common divisor of polynomials; 0 if all are 0.
 
     Args:
-        floor: stop early if the degree of the divisor falls below this.
+        floor: stop early if the degree of the divisor falls below this value.
     """
     divisor = 0
     for polynomial in polynomials:
         other = polynomial
         while other:
-            divisor, other = other, divide_remainder(divisor, other) if divisor else 0
+            divisor, other = other, remainder(divisor, other) if divisor else 0
         if divisor and divisor.bit_length() <= floor:
             break
     return divisor
 
 
 def divisors(polynomial: int, degree: int) -> list[int]:
-    """Return the divisors of a degree with constant term 1, as CRC polynomials have.
+    """Return the divisors of a degree with constant term 1, like CRC polynomials.
 
     Returns:
-        An empty list also if there are too many polynomials to try.
+        The divisors. The list is also empty if there are too many polynomials to try.
     """
     if polynomial == 0:
         return []
@@ -106,7 +106,7 @@ def divisors(polynomial: int, degree: int) -> list[int]:
         quotients = (
             quotient(polynomial, small)
             for small in range((1 << spare) | 1, 2 << spare, 2)
-            if divide_remainder(polynomial, small) == 0
+            if remainder(polynomial, small) == 0
         )
         if spare:
             return sorted(quotients)
@@ -117,21 +117,21 @@ def divisors(polynomial: int, degree: int) -> list[int]:
 
 
 def _try_all(polynomial: int, degree: int) -> list[int]:
-    """Return the divisors of a small degree, by division by all polynomials at once."""
+    """Return the divisors of a small degree; divide by all polynomials at once."""
     candidates = np.arange((1 << degree) | 1, 2 << degree, 2, dtype=np.uint32)
     rest = np.zeros(len(candidates), np.uint32)
     top = np.uint32(degree)
     for bit in range(polynomial.bit_length() - 1, -1, -1):
         rest = rest << np.uint32(1) | np.uint32(polynomial >> bit & 1)
         rest ^= candidates * (rest >> top)
-    return [int(one) for one in candidates[rest == 0]]
+    return [int(divisor) for divisor in candidates[rest == 0]]
 
 
 def solve(equations: Sequence[tuple[int, int]], width: int) -> tuple[int, list[int]] | None:
     """Solve linear equations over GF(2).
 
     Args:
-        equations: pairs (mask, bit): the XOR of the bits of the unknown under the mask equals bit.
+        equations: pairs (mask, bit): the XOR of the unknown's bits that are set in the mask is bit.
         width: number of bits of the unknown.
 
     Returns:
@@ -168,7 +168,8 @@ class _BitOrder:
     Attributes:
         width: width of the CRC, in bits.
         order: byte order of the stored CRC.
-        refin, refout: whether bytes and register begin with the lowest bit.
+        refin: whether bytes begin with the lowest bit.
+        refout: whether the register begins with the lowest bit.
     """
 
     width: int
@@ -188,7 +189,7 @@ class _BitOrder:
         """Return the polynomial that a start value adds to a message of `size` bytes."""
         return init << 8 * size
 
-    def iter_catalogue_crcs(self) -> list[Crc]:
+    def catalogue_crcs(self) -> list[Crc]:
         """Return the CRCs of the catalogue with this width and bit order."""
         return [
             crc
@@ -206,15 +207,16 @@ def crc_matches(
     *,
     mixed: bool = False,
     quick: bool = False,
-    stands: Callable[[ChecksumPlace], bool] = accept_any_place,
+    is_possible_place: Callable[[ChecksumPlace], bool] = accept_any_place,
 ) -> Iterator[ChecksumMatch]:
     """Yield the CRCs that match, up to the first place with a sure match.
 
     Args:
-        mixed: search only for CRCs with different `refin` and `refout`; by default, only for CRCs
-            with equal ones.
-        quick: stop after a fixed amount of work; the usual places come first.
-        stands: returns whether a CRC may be at a place.
+        samples: the frames.
+        mixed: whether to search only for CRCs with different `refin` and `refout`, or only for CRCs
+            with equal `refin` and `refout`.
+        quick: whether to stop after a fixed amount of work; the usual places come first.
+        is_possible_place: returns whether a CRC may be at a place.
     """
     if mixed:
         mirrors = [(False, True), (True, False)]
@@ -222,12 +224,12 @@ def crc_matches(
         mirrors = [(False, False), (True, True)]
     picks = [
         samples.take_similar(FRAMES_PER_PICK, pick)
-        for pick in range(PICKS if len(samples) > 2 * FRAMES_PER_PICK else 1)
+        for pick in range(MAX_PICKS if len(samples) > 2 * FRAMES_PER_PICK else 1)
     ]
     by_width = [
         [
             place
-            for place in filter(stands, samples.places(width // 8))
+            for place in filter(is_possible_place, samples.places(width // 8))
             if _varies_like_crc(samples, place)
         ]
         for width in WIDTHS
@@ -247,20 +249,20 @@ def crc_matches(
             by_catalogue = samples.shortest > MAX_DIVIDED_BYTES and (quick or not at_end)
             chosen = picks if at_end and span == CoveredSpan() else picks[:1]
             work_left -= sum(
-                _estimate_cost(some, reading, by_catalogue=by_catalogue) for some in chosen
+                _estimate_cost(pick, reading, by_catalogue=by_catalogue) for pick in chosen
             )
             if work_left < 0:
                 return
             results = (
                 list(
                     _iter_matches(
-                        samples, some, place, span, reading, tried, by_catalogue=by_catalogue
+                        samples, pick, place, span, reading, tried, by_catalogue=by_catalogue
                     )
                 )
-                for some in chosen
+                for pick in chosen
             )
             for match in next((matches for matches in results if matches), []):
-                sure = sure or match.sure
+                sure = sure or match.is_sure
                 yield match
         if sure:
             return
@@ -269,23 +271,23 @@ def crc_matches(
 def _estimate_cost(few: SampleFrames, reading: _BitOrder, *, by_catalogue: bool) -> int:
     """Return the cost of one place, span and reading, in bytes of CRC computation."""
     if by_catalogue:
-        return few.shortest * len(reading.iter_catalogue_crcs())
+        return few.shortest * len(reading.catalogue_crcs())
     return DIVISION_WORK * sum(map(len, few.frames))
 
 
 def _varies_like_crc(samples: SampleFrames, place: ChecksumPlace) -> bool:
-    """Return whether each byte of a place has as many values as the bytes of a CRC."""
+    """Return whether each byte of a place has enough distinct values for a CRC."""
     if len(samples) < 2:
         return True
-    wanted = max(min(len(samples) // 2, 24), 2)
+    min_distinct = max(min(len(samples) // 2, 24), 2)
     columns = (
         samples.fields(ChecksumPlace(place.offset + index, 1), "little")
         for index in range(place.size)
     )
-    return all(len(np.unique(column)) >= wanted for column in columns)
+    return all(len(np.unique(column)) >= min_distinct for column in columns)
 
 
-def _codewords(
+def _make_codewords(
     samples: SampleFrames, place: ChecksumPlace, span: CoveredSpan, reading: _BitOrder
 ) -> Codewords:
     rows = [row.tobytes() for group in samples.cut_span(place, span) for row in group]
@@ -306,26 +308,27 @@ def _iter_matches(
     *,
     by_catalogue: bool,
 ) -> Iterator[ChecksumMatch]:
-    """Yield the CRCs that match for one place, span and reading.
+    """Yield the CRCs that match for one place, span and bit order.
 
     Args:
-        few: the samples that are used to find candidates; all samples are used to test these.
+        samples: all frames, which test the candidates.
+        few: the frames that are used to find candidates.
         tried: number of combinations that were tried so far.
-        by_catalogue: try only the CRCs of the catalogue.
+        by_catalogue: whether to try only the CRCs of the catalogue.
     """
     stored = samples.fields(place, reading.order)
     if by_catalogue:
         candidates = _iter_catalogue(few, place, span, reading)
     else:
-        candidates = _candidates(_codewords(few, place, span, reading), reading)
-    for crc, fitted, remarks in candidates:
+        candidates = _iter_candidates(_make_codewords(few, place, span, reading), reading)
+    for crc, fitted, notes in candidates:
         right = samples.count_valid(crc, place, span, reading.order)
         is_known = crc.poly in KNOWN[crc.width]
-        doubtful = weigh_evidence(
+        # An unknown polynomial is one more fitted parameter; a known one is one of many trials.
+        evidence_bits = weigh_evidence(
             crc.width, stored, fitted + (not is_known), tried * (len(CRCS) if is_known else 1)
         )
-        if are_enough(right, len(samples)) and doubtful > 0:
-            open_ = bool(remarks)
+        if are_enough(right, len(samples)) and evidence_bits > 0:
             yield ChecksumMatch(
                 crc,
                 place,
@@ -333,27 +336,29 @@ def _iter_matches(
                 reading.order,
                 right,
                 len(samples),
-                doubtful,
+                evidence_bits,
                 format_crc(crc),
-                remarks,
+                notes,
                 name_of(crc),
-                open_,
+                is_ambiguous=bool(notes),
             )
 
 
-def _candidates(words: Codewords, reading: _BitOrder) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
+def _iter_candidates(
+    words: Codewords, reading: _BitOrder
+) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield candidate CRCs.
 
     Yields:
-        The CRC, the number of values of the frames that determined its parameters, and remarks
-        about parameters that remain ambiguous.
+        The CRC, the number of frames that were needed to determine init and xorout, and notes
+        about ambiguous parameters.
     """
     ones = (1 << reading.width) - 1
     lengths = {size for size, _ in words}
-    same = _differences(words)
-    if len(same) >= 2:
-        for poly in _polynomials(same, reading.width):
-            yield from _registers(words, poly, reading, open_=len(lengths) == 1)
+    differences = _find_differences(words)
+    if len(differences) >= 2:
+        for poly in _find_polynomials(differences, reading.width):
+            yield from _iter_crcs(words, poly, reading, has_one_length=len(lengths) == 1)
         return
     for init, xorout in product((0, ones), repeat=2):
         absolute = [
@@ -363,10 +368,10 @@ def _candidates(words: Codewords, reading: _BitOrder) -> Iterator[tuple[Crc, int
         ]
         if len(absolute) < 2:
             continue
-        for poly in _polynomials(absolute, reading.width):
+        for poly in _find_polynomials(absolute, reading.width):
             yield reading.crc(poly, init, xorout), 0, ()
     if len(words) == 1:
-        yield from ((crc, 0, ()) for crc in reading.iter_catalogue_crcs())
+        yield from ((crc, 0, ()) for crc in reading.catalogue_crcs())
 
 
 def _iter_catalogue(
@@ -375,17 +380,17 @@ def _iter_catalogue(
     """Yield the CRCs of the catalogue that are valid for the first frame."""
     covered = few.cut_span(place, span)[0][0].tobytes()
     stored = int(few.fields(place, reading.order)[0])
-    yield from ((crc, 0, ()) for crc in reading.iter_catalogue_crcs() if crc(covered) == stored)
+    yield from ((crc, 0, ()) for crc in reading.catalogue_crcs() if crc(covered) == stored)
 
 
-def _differences(words: Codewords) -> list[int]:
-    """Return the XOR of each frame and the first one of the same length, if they differ."""
+def _find_differences(words: Codewords) -> list[int]:
+    """Return the XOR of each frame and the first frame of its length, if they differ."""
     first: dict[int, int] = {}
     return [word ^ first[size] for size, word in words if first.setdefault(size, word) != word]
 
 
-def _polynomials(multiples: Sequence[int], width: int) -> list[int]:
-    """Return the possible CRC polynomials that divide all multiples, known ones first."""
+def _find_polynomials(multiples: Sequence[int], width: int) -> list[int]:
+    """Return the CRC polynomials that divide all multiples, known polynomials first."""
     xor_polynomial = (1 << width) | 1  # its CRC is a plain XOR, which is searched elsewhere
     polynomials = [
         poly
@@ -396,16 +401,16 @@ def _polynomials(multiples: Sequence[int], width: int) -> list[int]:
     return (catalogued + [poly for poly in polynomials if poly not in catalogued])[:MAX_POLYNOMIALS]
 
 
-def _registers(
-    words: Codewords, poly: int, reading: _BitOrder, *, open_: bool
+def _iter_crcs(
+    words: Codewords, poly: int, reading: _BitOrder, *, has_one_length: bool
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
-    """Yield a CRC with start value and final XOR for a polynomial.
+    """Yield a CRC with start value and final XOR for a polynomial, if they exist.
 
     Args:
-        open_: whether all frames have one length, so that the two values are ambiguous.
+        has_one_length: whether all frames have one length, so that the two values are ambiguous.
     """
     first = dict(reversed(words))  # the first frame of each length
-    left = {size: divide_remainder(word, poly) for size, word in first.items()}
+    remainders = {size: remainder(word, poly) for size, word in first.items()}
     ones = (1 << reading.width) - 1
     usual = [
         crc.init
@@ -415,8 +420,8 @@ def _registers(
     consistent = []
     for init in dict.fromkeys((*usual, 0, ones)):
         finals = {
-            rest ^ divide_remainder(reading.init_term(init, size), poly)
-            for size, rest in left.items()
+            rest ^ remainder(reading.init_term(init, size), poly)
+            for size, rest in remainders.items()
         }
         if len(finals) == 1:
             consistent.append(reading.crc(poly, init, finals.pop()))
@@ -425,7 +430,7 @@ def _registers(
     ]
     if plain:
         yield plain[0], 1, ()
-    elif consistent and open_:
+    elif consistent and has_one_length:
         yield (
             consistent[0],
             1,
@@ -438,48 +443,47 @@ def _registers(
         )
     elif consistent:
         yield consistent[0], 2, ()
-    elif len(left) > 1:
-        yield from _solve_registers(left, poly, reading)
+    elif len(remainders) > 1:
+        yield from _solve_registers(remainders, poly, reading)
 
 
 def _solve_registers(
-    left: dict[int, int], poly: int, reading: _BitOrder
+    remainders: dict[int, int], poly: int, reading: _BitOrder
 ) -> Iterator[tuple[Crc, int, tuple[str, ...]]]:
     """Yield a CRC with start value and final XOR from linear equations.
 
     Args:
-        left: frame length -> remainder of a frame of this length.
+        remainders: frame length -> remainder of a frame of this length.
     """
-    (size, rest), *others = left.items()
+    (size, rest), *others = remainders.items()
     equations = []
     bits = range(reading.width)
     for other, other_rest in others:
         columns = [
-            divide_remainder(
-                reading.init_term(1 << bit, size) ^ reading.init_term(1 << bit, other), poly
-            )
+            remainder(reading.init_term(1 << bit, size) ^ reading.init_term(1 << bit, other), poly)
             for bit in bits
         ]
-        wanted = rest ^ other_rest
+        difference = rest ^ other_rest
         equations += [
-            (sum((columns[bit] >> row & 1) << bit for bit in bits), wanted >> row & 1)
+            (sum((columns[bit] >> row & 1) << bit for bit in bits), difference >> row & 1)
             for row in bits
         ]
     solution = solve(equations, reading.width)
     if solution is not None:
         first, free = solution
-        some = (
-            chosen for count in range(1 + len(free[:4])) for chosen in combinations(free[:4], count)
+        basis = free[:4]  # enough solutions to find a usual one among them
+        subsets = (
+            subset for count in range(1 + len(basis)) for subset in combinations(basis, count)
         )
-        inits = [functools.reduce(operator.xor, chosen, first) for chosen in some]
-        pairs = [
-            (init, rest ^ divide_remainder(reading.init_term(init, size), poly)) for init in inits
-        ]
+        inits = [functools.reduce(operator.xor, subset, first) for subset in subsets]
+        pairs = [(init, rest ^ remainder(reading.init_term(init, size), poly)) for init in inits]
         init, xorout = min(
             pairs, key=lambda pair: (pair[1] not in (0, (1 << reading.width) - 1), pair[0])
         )
-        remarks = (f"{2 ** len(free)} pairs of init and xorout fit these frames",) if free else ()
-        yield reading.crc(poly, init, xorout), 2, remarks
+        notes: tuple[str, ...] = ()
+        if free:
+            notes = (f"{2 ** len(free)} pairs of init and xorout fit these frames",)
+        yield reading.crc(poly, init, xorout), 2, notes
 
 
 def format_crc(crc: Crc) -> str:

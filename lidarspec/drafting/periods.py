@@ -1,13 +1,14 @@
 """Find frames and steadily changing fields in unknown bytes.
 
-`find_structure` finds the frames. Frames of one length cause a distance at which many bytes are
-equal. Their sync bytes are then the longest run of constant bytes. Frames of several lengths cause
-a frequent pair of bytes, at distances that a length field after the pair explains.
+`find_structure` finds the frames. If all frames have one length, many bytes are equal at this
+distance, and the sync bytes are the longest run of constant bytes. If frames have several lengths,
+their sync bytes are a frequent pair of bytes, and a length field after the pair gives the distance
+to the next pair.
 
-`find_rising_fields` finds counters, angles that wrap at a full circle, and clocks. Such a field
-rises from frame to frame by about the same step. With the wrong byte order or offset it jumps
-instead. The value at which an angle wraps gives its unit: an angle in hundredths of a degree never
-reaches 36 000.
+`find_rising_fields` finds counters, angles that wrap at a full circle, and clocks. Their values
+rise from frame to frame by about the same step. Read with the wrong byte order or offset, the
+values jump. The value at which an angle wraps gives its unit: an angle in hundredths of a degree
+never reaches 36 000.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from lidarspec.spec.checksums import ByteOrder
 
 Kind = Literal["counter", "angle", "rising"]
 
-#: Full circle in raw units -> one unit in degrees, and in words.
+#: full circle in raw units -> one raw unit in degrees, and in words.
 CIRCLES = {
     360: (1.0, "whole degrees"),
     3_600: (0.1, "tenths of a degree"),
@@ -38,49 +39,52 @@ CIRCLES = {
     360_000: (0.001, "thousandths of a degree"),
     3_600_000: (0.0001, "1/10 000 of a degree"),
 }
-#: With fewer frames than this, only the first and last bytes of a frame are searched for fields.
-FEW = 8
-#: Number of first bytes that are searched then.
-FRONT = 16
-#: Number of offsets at the end that are searched then.
-BACK = 8
+#: With fewer frames than this, only the first and last bytes of a frame are searched for fields,
+#: and constant bytes may be coincidence.
+FEW_FRAMES = 8
+#: Number of first bytes that are searched if there are few frames.
+HEAD_SEARCH_BYTES = 16
+#: Number of last offsets that are searched if there are few frames.
+TAIL_SEARCH_BYTES = 8
 #: Smallest share of regular steps.
 MIN_REGULAR_SHARE = 0.9
-#: Relative difference of two steps that counts as regular.
+#: Largest relative difference between regular steps.
 STEP_TOLERANCE = 0.05
-#: Absolute difference of two steps that always counts as regular, in raw units.
+#: Absolute difference that is always regular, in raw units.
 STEP_SLACK_UNITS = 4
-#: The steps have to be less even by this factor without the lowest byte of a field.
+#: Without the lowest byte of a field, the steps have to vary more by this factor.
 MIN_COARSENING = 1.5
-#: Largest ratio of a step to the usual step, and smallest ratio of the value range to a usual step.
+#: Largest ratio of a step to the usual step. Also the smallest ratio of a field's range of values
+#: to the usual step.
 MAX_STEP_RATIO = 4
-#: Largest share of frames in which the value may stay the same, as in two returns of one firing.
+#: Largest share of frames in which the value may stay the same, as for two returns of one firing.
 MAX_UNCHANGED_SHARE = 0.75
 #: Number of bytes of a stream that are searched.
 MAX_SEARCHED_BYTES = 1 << 15
-#: Shortest and longest frame length that is searched, in bytes.
-SHORTEST = 4
-LONGEST = 4096
-#: Number of distances that are tried as frame length.
+#: Shortest and longest frame length that is searched.
+MIN_FRAME_BYTES = 4
+MAX_FRAME_BYTES = 4096
+#: Maximum number of distances that are tried as frame length.
 MAX_DISTANCES = 48
-#: Smallest share of frames in which a constant byte has its usual value; the others may be damaged.
-STEADY = 0.9
-#: Smallest share of the bytes that has to be in frames.
-MIN_SHARE = 0.5
+#: A byte is constant if it has its usual value in this share of frames; the others may be damaged.
+MIN_CONSTANT_SHARE = 0.9
+#: Smallest share of the bytes that have to be in frames.
+MIN_FRAMED_SHARE = 0.5
 #: Shares that differ by less than this count as equal.
 SHARE_TOLERANCE = 0.03
-#: Number of frames that decides between one length and several: fewer may be coincidence.
-MANY = 12
-#: Smallest ratio of a shorter period's weight to the best weight, for the shorter one to be used.
+#: If there are fewer frames of one length than this, but not fewer frames of several lengths, the
+#: frames of several lengths are preferred.
+MANY_FRAMES = 12
+#: Among the periods with at least this ratio of weight to the best weight, the shortest is used.
 MIN_RELATIVE_WEIGHT = 0.75
-#: Number of byte pairs that are tried as sync bytes.
+#: Maximum number of byte pairs that are tried as sync bytes.
 MAX_SYNC_PAIRS = 32
 #: Smallest number of frames of a structure.
 MIN_FRAMES = 3
-#: A structure is refused if random bytes show one like it with a higher probability.
-CHANCE = 1e-3
+#: If random bytes have the same structure with a higher probability, the structure is rejected.
+MAX_CHANCE = 1e-3
 #: The length field has to begin before this offset.
-HEADER = 8
+MAX_LENGTH_FIELD_OFFSET = 8
 #: Largest size of the elements that a length field counts, in bytes.
 MAX_UNIT_BYTES = 16
 
@@ -90,13 +94,16 @@ class RisingField:
     """A field that changes like a counter, an angle or a clock.
 
     Attributes:
-        offset, size, order: position in the frame or block, in bytes, and byte order.
+        offset: offset in the frame or block, in bytes.
+        size: size in bytes.
+        order: byte order.
         kind: "counter" rises by one each time; "angle" wraps at a full circle; "rising" is any
             other field that rises.
         circle: the value at which the field wraps; 0 if no wrap was seen.
         steps: the smallest, usual and largest step.
-        right, total: the number of regular steps, and of all steps.
-        wraps: the number of wraps.
+        right: number of regular steps.
+        total: number of all steps.
+        wraps: number of wraps.
         first: the value of a counter after a wrap.
     """
 
@@ -121,14 +128,18 @@ class RisingField:
         """The provisional name of the field in a draft."""
         return f"{self.kind}_{self.offset}"
 
-    def why(self, what: str = "frame") -> str:
-        """Describe the evidence; `what` is "frame" or "block"."""
+    def describe_evidence(self, container: str = "frame") -> str:
+        """Return the evidence in words.
+
+        Args:
+            container: "frame" or "block", which contains the field.
+        """
         low, usual, high = self.steps
         if low == high:
-            by = f"{usual}"
+            step = f"{usual}"
         else:
-            by = f"{low} to {high}"
-        text = f"rises by {by} from {what} to {what}, in {self.right} of {self.total}"
+            step = f"{low} to {high}"
+        text = f"rises by {step} from {container} to {container}, in {self.right} of {self.total}"
         if self.kind == "angle":
             return f"{text}, wraps at {self.circle}: {CIRCLES[self.circle][1]}?"
         if not self.wraps:
@@ -139,67 +150,86 @@ class RisingField:
 
 
 def find_rising_fields(rows: NDArray[np.uint8]) -> list[RisingField]:
-    """Return the rising fields of consecutive frames, without overlaps, by offset.
+    """Return the rising fields of consecutive frames, sorted by offset.
+
+    If fields overlap, only the most certain is returned.
 
     Args:
-        rows: the frames, or the first bytes of each, (n, size).
+        rows: the frames, or the first bytes of each frame, (n, size).
     """
     if len(rows) < 3:
         return []
     fields = sorted(
         _iter_rising_fields(rows),
-        key=lambda one: (one.kind == "rising", -one.size, -one.right / one.total, one.offset),
+        key=lambda field: (
+            field.kind == "rising",
+            -field.size,
+            -field.right / field.total,
+            field.offset,
+        ),
     )
     chosen: list[RisingField] = []
-    for one in fields:
-        if all(one.end <= other.offset or one.offset >= other.end for other in chosen):
-            chosen.append(one)
-    return sorted(chosen, key=lambda one: one.offset)
+    for field in fields:
+        if all(field.end <= other.offset or field.offset >= other.end for other in chosen):
+            chosen.append(field)
+    return sorted(chosen, key=lambda field: field.offset)
 
 
 def share_between(first: NDArray[np.int64], last: NDArray[np.int64], circle: int) -> float:
-    """Return the share of frames with `last` between this `first` and the next."""
+    """Return the share of frames with `last` between this and the next `first`.
+
+    Args:
+        first: a field of each frame, (n,).
+        last: another field of each frame, (n,).
+        circle: the value at which both wrap; 0 if unknown.
+    """
     modulus = circle or 1 << 40
     return float((((last - first)[:-1] % modulus) <= (np.diff(first) % modulus)).mean())
 
 
 def _iter_rising_fields(rows: NDArray[np.uint8]) -> Iterator[RisingField]:
     varied = (rows != rows[0]).any(axis=0)
-    for offset in _offsets(rows, 1):
-        if varied[offset] and len(rows) >= FEW:
-            yield from _counter(rows, offset, 1, "little")
+    for offset in _select_offsets(rows, 1):
+        if varied[offset] and len(rows) >= FEW_FRAMES:
+            yield from _iter_counters(rows, offset, 1, "little")
     orders: tuple[ByteOrder, ...] = ("little", "big")
-    for size in (2, 4) if len(rows) >= FEW else (2,):
-        for offset in _offsets(rows, size):
+    for size in (2, 4) if len(rows) >= FEW_FRAMES else (2,):
+        for offset in _select_offsets(rows, size):
             for order in orders:
                 if order == "little":
                     from_low = range(size)
                 else:
                     from_low = range(size - 1, -1, -1)
                 if all(varied[offset + index] for index in list(from_low)[: size // 2 + 1]):
-                    yield from _counter(rows, offset, size, order)
-                    yield from _rising(rows, offset, size, order)
+                    yield from _iter_counters(rows, offset, size, order)
+                    yield from _iter_rising(rows, offset, size, order)
 
 
-def _offsets(rows: NDArray[np.uint8], size: int) -> Iterable[int]:
+def _select_offsets(rows: NDArray[np.uint8], size: int) -> Iterable[int]:
+    """Return the offsets at which a field of this size is searched."""
     last = rows.shape[1] - size
-    if len(rows) >= FEW:
+    if len(rows) >= FEW_FRAMES:
         return range(last + 1)
-    return sorted({*range(min(FRONT, last + 1)), *range(max(last - BACK, 0), last + 1)})
+    return sorted(
+        {
+            *range(min(HEAD_SEARCH_BYTES, last + 1)),
+            *range(max(last - TAIL_SEARCH_BYTES, 0), last + 1),
+        }
+    )
 
 
-def _counter(
+def _iter_counters(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
 ) -> Iterator[RisingField]:
-    """Yield a counter: it rises by one each time, and wraps to its smallest value."""
-    there = values(rows, offset, size, order)
-    steps = np.diff(there)
-    first = int(there.min())
-    last = int(there.max())
-    back = (there[:-1] == last) & (there[1:] == first) & (last > first + 1)
-    right = int((steps == 1).sum() + back.sum())
+    """Yield the field if it rises by one each time, and wraps to its smallest value."""
+    counts = values(rows, offset, size, order)
+    steps = np.diff(counts)
+    first = int(counts.min())
+    last = int(counts.max())
+    is_wrap = (counts[:-1] == last) & (counts[1:] == first) & (last > first + 1)
+    right = int((steps == 1).sum() + is_wrap.sum())
     if right >= MIN_REGULAR_SHARE * len(steps) and (steps == 1).sum() >= 2:
-        wraps = int(back.sum())
+        wraps = int(is_wrap.sum())
         yield RisingField(
             offset,
             size,
@@ -214,12 +244,12 @@ def _counter(
         )
 
 
-def _rising(
+def _iter_rising(
     rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder
 ) -> Iterator[RisingField]:
-    """Yield a field that rises by about the same step each time."""
-    there = values(rows, offset, size, order)
-    steps = np.diff(there)
+    """Yield the field if it rises by about the same step each time."""
+    field_values = values(rows, offset, size, order)
+    steps = np.diff(field_values)
     moved = steps[steps != 0]
     if (
         len(moved) < 2
@@ -233,7 +263,7 @@ def _rising(
     if wraps > (1 - MIN_REGULAR_SHARE) * len(moved):
         return
     if wraps:
-        circle = _circle(int(there.max()), int(np.median(usual - moved[falls])), usual)
+        circle = _find_circle(int(field_values.max()), int(np.median(usual - moved[falls])), usual)
     else:
         circle = 0
     if circle:
@@ -248,7 +278,7 @@ def _rising(
         or usual * MAX_STEP_RATIO > (circle or 1 << 8 * size)
     ):
         return
-    if len(rows) >= FEW and not _low_byte_counts(there):
+    if len(rows) >= FEW_FRAMES and not _includes_low_byte(field_values):
         return
     regular = forward[within]
     kind: Kind = "angle" if circle in CIRCLES else "rising"
@@ -257,20 +287,25 @@ def _rising(
     yield RisingField(offset, size, order, kind, circle, spread, right, len(steps), wraps)
 
 
-def _low_byte_counts(there: NDArray[np.int64]) -> bool:
-    """Return whether the lowest byte belongs to the field: it makes steps more even."""
-    steps = np.diff(there)
-    coarse = 256 * np.diff(there >> 8)
-    fine, rough = (np.abs(np.diff(each[steps != 0])) for each in (steps, coarse))
-    forward = steps[steps != 0] > 0
-    both = forward[1:] & forward[:-1]
-    return bool(both.any()) and bool(rough[both].mean() > MIN_COARSENING * fine[both].mean())
+def _includes_low_byte(field_values: NDArray[np.int64]) -> bool:
+    """Return whether the lowest byte belongs to the field: steps vary less with it."""
+    steps = np.diff(field_values)
+    moved = steps != 0
+    coarse_steps = 256 * np.diff(field_values >> 8)
+    fine_changes = np.abs(np.diff(steps[moved]))
+    coarse_changes = np.abs(np.diff(coarse_steps[moved]))
+    is_forward = steps[moved] > 0
+    both = is_forward[1:] & is_forward[:-1]
+    if not both.any():
+        return False
+    return bool(coarse_changes[both].mean() > MIN_COARSENING * fine_changes[both].mean())
 
 
-def _circle(highest: int, fallen: int, usual: int) -> int:
+def _find_circle(highest: int, fallen: int, usual: int) -> int:
     """Return the value at which a field wraps.
 
-    This is a full circle if the highest value and the fall are close to one, else the fall itself.
+    This is a full circle in a usual unit if the highest value and the decrease fit, else the
+    decrease.
 
     Args:
         highest: the highest value.
@@ -289,10 +324,17 @@ def _circle(highest: int, fallen: int, usual: int) -> int:
 class LengthField:
     """A length field in the header of a frame.
 
-    The frame length is `rest` + `unit` times the number of `size` bytes at `place`.
+    The frame length is `rest` + `unit` * value.
+
+    Attributes:
+        offset: offset of the field, in bytes.
+        size: size of the field, in bytes.
+        order: byte order.
+        unit: size of the counted elements, in bytes; 1 for a length in bytes.
+        rest: number of bytes that the field does not count.
     """
 
-    place: int
+    offset: int
     size: int
     order: ByteOrder
     unit: int
@@ -300,19 +342,19 @@ class LengthField:
 
     @property
     def end(self) -> int:
-        """The offset after the number."""
-        return self.place + self.size
+        """The offset after the field."""
+        return self.offset + self.size
 
     def read(self, frame: bytes) -> int:
-        """Return the frame length from the length field of a frame."""
-        return self.rest + self.unit * int.from_bytes(frame[self.place : self.end], self.order)
+        """Return the length of a frame from its length field."""
+        return self.rest + self.unit * int.from_bytes(frame[self.offset : self.end], self.order)
 
     def __str__(self) -> str:
         if self.size == 1:
             kind = "byte"
         else:
             kind = f"{self.order}-endian word"
-        return f"{self.rest} + {self.unit} x {kind} at {self.place}"
+        return f"{self.rest} + {self.unit} x {kind} at {self.offset}"
 
 
 @dataclass(frozen=True)
@@ -335,7 +377,7 @@ class FrameStructure:
 
     @cached_property
     def checksums(self) -> tuple[ChecksumMatch, ...]:
-        """The checksums that fit, likeliest first, found in about a second of search."""
+        """The checksums that match, likeliest first; the search takes about a second."""
         return tuple(search(self.frames, quick=True))
 
 
@@ -363,12 +405,12 @@ def find_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def split_frames(data: bytes, period: int, start: int = 0) -> list[bytes]:
-    """Split data into frames of one length; an incomplete last one is left out."""
+    """Split data into frames of one length, without an incomplete last frame."""
     return [data[first : first + period] for first in range(start, len(data) - period + 1, period)]
 
 
 def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
-    """Return the structure of the datagrams with the length that most bytes are in."""
+    """Return the structure of datagrams of one length, the one with the most bytes."""
     if len(chunks) < MIN_FRAMES:
         return None
     lengths, counts = np.unique([len(chunk) for chunk in chunks], return_counts=True)
@@ -385,31 +427,31 @@ def _find_in_datagrams(chunks: Sequence[bytes]) -> FrameStructure | None:
 
 
 def _find_in_stream(data: NDArray[np.uint8]) -> FrameStructure | None:
-    """Return the structure that explains more bytes; prefer one length."""
+    """Return the structure with more bytes in frames; prefer frames of one length."""
     periodic = _find_fixed_length(data)
     varying = _find_varying_length(data)
     if periodic is None or varying is None:
         return periodic or varying
-    few = len(periodic.frames) < MANY <= len(varying.frames)
-    if varying.share > periodic.share + SHARE_TOLERANCE or few:
+    has_more_frames = len(periodic.frames) < MANY_FRAMES <= len(varying.frames)
+    if varying.share > periodic.share + SHARE_TOLERANCE or has_more_frames:
         return varying
     return periodic
 
 
 def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
-    """Return frames of one length.
+    """Return the structure of frames of one length; None if none is found.
 
-    Of the distances at which most bytes are equal, select the one with the largest share of
-    constant bytes, or a shorter one that is almost as good.
+    Among the distances at which most bytes are equal, select the distance with the largest share of
+    constant bytes, or a shorter distance that is almost as good.
     """
-    lags = np.arange(SHORTEST, min(LONGEST, len(data) // MIN_FRAMES) + 1)
+    lags = np.arange(MIN_FRAME_BYTES, min(MAX_FRAME_BYTES, len(data) // MIN_FRAMES) + 1)
     equal = np.array([float((data[lag:] == data[:-lag]).mean()) for lag in lags])
     likely = lags[np.argsort(equal)[::-1][:MAX_DISTANCES]].tolist()
     framed = [
         (weight, structure)
         for lag in likely
         for weight, structure in _iter_frames_of_length(data, lag)
-        if structure.share > MIN_SHARE
+        if structure.share > MIN_FRAMED_SHARE
     ]
     best = max((weight for weight, _ in framed), default=0.0)
     shortest = min(
@@ -423,30 +465,32 @@ def _find_fixed_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 
 
 def _split_groups(data: NDArray[np.uint8], whole: FrameStructure) -> FrameStructure:
-    """Split frames that are groups of shorter frames; return others unchanged.
+    """Split frames that are groups of shorter frames; return other frames unchanged.
 
-    A group repeats if, for example, an index runs from 0 to 5, or the data is simulated. A part
-    counts as a frame if its sync bytes have different values, or if it has a counter.
+    A group repeats if, for example, an index runs from 0 to 5, or the data is simulated. The parts
+    of a group are frames if their sync bytes are not all equal, or if they have a counter.
     """
     period = whole.period or 0
-    for part in (part for part in range(SHORTEST, period // 2 + 1) if period % part == 0):
-        for _, structure in _iter_frames_of_length(data, part):
+    for part_size in range(MIN_FRAME_BYTES, period // 2 + 1):
+        if period % part_size:
+            continue
+        for _, structure in _iter_frames_of_length(data, part_size):
             if structure.share > whole.share - SHARE_TOLERANCE and (
-                len(set(structure.sync)) > 1 or _is_counted(structure)
+                len(set(structure.sync)) > 1 or _has_counter(structure)
             ):
                 return structure
     return whole
 
 
-def _is_counted(structure: FrameStructure) -> bool:
+def _has_counter(structure: FrameStructure) -> bool:
     rows = np.frombuffer(b"".join(structure.frames), np.uint8).reshape(len(structure.frames), -1)
-    return any(one.kind == "counter" for one in find_rising_fields(rows))
+    return any(field.kind == "counter" for field in find_rising_fields(rows))
 
 
 def _iter_frames_of_length(
     data: NDArray[np.uint8], period: int
 ) -> Iterator[tuple[float, FrameStructure]]:
-    """Yield frames of this length and their weight; nothing if there are none.
+    """Yield the weight and the structure of frames of a length, if they are found.
 
     The frames begin with the longest run of constant bytes. The weight is the share of constant
     bytes, multiplied by the share of bytes in frames.
@@ -455,7 +499,7 @@ def _iter_frames_of_length(
     rows = data[: count * period].reshape(count, period)
     usual = usual_bytes(rows)
     if count >= 2 * MIN_FRAMES:
-        steady = (rows == usual).mean(axis=0) >= STEADY
+        steady = (rows == usual).mean(axis=0) >= MIN_CONSTANT_SHARE
     else:
         steady = (rows == usual).all(axis=0)
     steady_count = int((steady & (usual != 0)).sum())
@@ -474,47 +518,49 @@ def _iter_frames_of_length(
         )
 
 
-def _is_chance(data: NDArray[np.uint8], steady: int, count: int, period: int) -> bool:
-    """Return whether random bytes are likely to show such a structure.
+def _is_chance(data: NDArray[np.uint8], constant_count: int, count: int, period: int) -> bool:
+    """Return whether random bytes are likely to have the same structure.
 
-    The random bytes have the same shares of values. Chernoff's bound gives the probability of as
-    many steady bytes at one period; all periods that are tried count.
+    The random bytes have the same distribution of values. Chernoff's bound gives the probability
+    that one period has the same number of constant bytes. It is multiplied by the number of periods
+    that are tried.
 
     Args:
-        steady: bytes of a period that are the same in each repetition, and not 0.
-        count: repetitions.
+        data: the data.
+        constant_count: number of nonzero bytes of a period that are equal in each repetition.
+        count: number of repetitions.
+        period: length of the period, in bytes.
     """
     shares = np.bincount(data, minlength=256)[1:] / len(data)
     expected = period * float((shares**count).sum())
-    if steady <= expected:
+    if constant_count <= expected:
         return True
     if expected == 0:  # below the smallest float, after many repetitions
         return False
-    log_of_one = steady - expected - steady * math.log(steady / expected)
-    periods = min(LONGEST, len(data) // MIN_FRAMES)
-    return math.log(periods) + log_of_one > math.log(CHANCE)
+    log_chance = constant_count - expected - constant_count * math.log(constant_count / expected)
+    periods = min(MAX_FRAME_BYTES, len(data) // MIN_FRAMES)
+    return math.log(periods) + log_chance > math.log(MAX_CHANCE)
 
 
 def _longest_run(steady: NDArray[np.bool_], usual: NDArray[np.uint8]) -> tuple[int, int]:
     """Return start and length of the run with the most nonzero constant bytes.
 
-    A run may continue from the end of the period to its start. Zeros at the start of a run are left
-    out, since they are frequent in any data.
+    A run may continue from the end of the period to its start. Zeros at the start of a run are
+    omitted, because they are frequent in any data.
     """
-    turn = int(np.argmin(steady))  # rotate to a byte that is not constant, so that no run is split
+    # Rotate so that the first byte is not constant. No run is then split.
+    rotation = int(np.argmin(steady))
     best = (-1, 0, 0)
-    for start, end in find_runs(np.roll(steady, -turn)):
-        run = np.roll(usual, -turn)[start:end]
+    for start, end in find_runs(np.roll(steady, -rotation)):
+        run = np.roll(usual, -rotation)[start:end]
         zeros = int(np.argmax(run != 0)) if run.any() else 0
-        best = max(
-            best,
-            (int(np.count_nonzero(run)), -((turn + start + zeros) % len(usual)), len(run) - zeros),
-        )
+        offset = (rotation + start + zeros) % len(usual)
+        best = max(best, (int(np.count_nonzero(run)), -offset, len(run) - zeros))
     return -best[1], best[2]
 
 
 def _find_varying_length(data: NDArray[np.uint8]) -> FrameStructure | None:
-    """Return frames of several lengths, with a length field in the header."""
+    """Return the structure of frames with a length field; None if none is found."""
     pairs = data[:-1].astype(np.int64) << 8 | data[1:]
     counts = np.bincount(pairs, minlength=1 << 16)
     best: tuple[float, int, FrameStructure] | None = None
@@ -525,16 +571,16 @@ def _find_varying_length(data: NDArray[np.uint8]) -> FrameStructure | None:
         structure = _find_length_field(data, starts, bytes([pair >> 8, pair & 0xFF]))
         if structure is None:
             continue
-        # Several pairs of a header explain the lengths equally well. Use the one that occurs first,
-        # since captures often begin with a frame.
-        begins = int(starts[0])
+        # Several pairs of bytes in a header explain the lengths equally well. Use the pair that
+        # occurs first, because captures often begin with a frame.
+        first_start = int(starts[0])
         if (
             best is None
             or structure.share > best[0] + SHARE_TOLERANCE
-            or (structure.share > best[0] - SHARE_TOLERANCE and begins < best[1])
+            or (structure.share > best[0] - SHARE_TOLERANCE and first_start < best[1])
         ):
-            best = (structure.share, begins, structure)
-    if best is not None and best[0] > MIN_SHARE:
+            best = (structure.share, first_start, structure)
+    if best is not None and best[0] > MIN_FRAMED_SHARE:
         return best[2]
     return None
 
@@ -542,33 +588,36 @@ def _find_varying_length(data: NDArray[np.uint8]) -> FrameStructure | None:
 def _find_length_field(
     data: NDArray[np.uint8], starts: NDArray[np.intp], sync: bytes
 ) -> FrameStructure | None:
-    """Return the frames between sync bytes that a length field explains.
+    """Return the structure of frames with certain sync bytes; None if none is found.
 
-    The length field is the byte or word after the sync bytes that gives most lengths.
+    The length field is the byte or word after the sync bytes that gives the distance to the next
+    sync bytes most often.
 
     Args:
-        starts: offsets of the sync bytes.
+        data: the data.
+        starts: offsets of the sync bytes, (n,).
+        sync: the sync bytes.
     """
-    starts = starts[starts + HEADER + 2 < len(data)]
+    starts = starts[starts + MAX_LENGTH_FIELD_OFFSET + 2 < len(data)]
     steps = np.diff(starts)
     if len(steps) < MIN_FRAMES:
         return None
     best: tuple[float, LengthField | None, NDArray[np.bool_]] = (0.0, None, np.zeros(0, np.bool_))
     kinds: tuple[tuple[int, ByteOrder], ...] = ((1, "little"), (2, "little"), (2, "big"))
-    for place in range(2, HEADER):
-        low = data[starts[:-1] + place].astype(np.int64)
-        high = data[starts[:-1] + place + 1].astype(np.int64)
-        for (size, order), numbers in zip(
+    for offset in range(2, MAX_LENGTH_FIELD_OFFSET):
+        low = data[starts[:-1] + offset].astype(np.int64)
+        high = data[starts[:-1] + offset + 1].astype(np.int64)
+        for (size, order), lengths in zip(
             kinds, (low, low | high << 8, high | low << 8), strict=True
         ):
             for unit in range(1, MAX_UNIT_BYTES + 1):
-                rest = steps - unit * numbers
-                usual, number = _most_frequent(rest)
+                rest = steps - unit * lengths
+                usual, count = _most_frequent(rest)
                 fits = rest == usual
                 distinct = len(np.unique(steps[fits]))
                 share = float(steps[fits].sum() / len(data))
-                if distinct > 1 and number >= MIN_FRAMES and usual >= 0 and share > best[0]:
-                    best = (share, LengthField(place, size, order, unit, usual), fits)
+                if distinct > 1 and count >= MIN_FRAMES and usual >= 0 and share > best[0]:
+                    best = (share, LengthField(offset, size, order, unit, usual), fits)
     share, length, fits = best
     if length is None:
         return None
@@ -580,6 +629,7 @@ def _find_length_field(
     return FrameStructure(sync, None, length, share, tuple(frames))
 
 
-def _most_frequent(numbers: NDArray[np.int64]) -> tuple[int, int]:
-    distinct, counts = np.unique(numbers, return_counts=True)
+def _most_frequent(integers: NDArray[np.int64]) -> tuple[int, int]:
+    """Return the most frequent value and its number of occurrences."""
+    distinct, counts = np.unique(integers, return_counts=True)
     return int(distinct[counts.argmax()]), int(counts.max())

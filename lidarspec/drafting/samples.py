@@ -1,4 +1,4 @@
-"""Sample frames of an unknown format, with possible places of a checksum."""
+"""Sample frames of an unknown format, and the possible places of a checksum in them."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ from lidarspec.spec.checksums import ByteOrder, Checksum
 
 Part = Literal["all", "before", "behind"]
 
-#: Maximum length of frames that are searched at every offset, and the distance from both ends at
-#: which longer ones are searched.
-SHORT = 64
-NEAR = 12
-#: Maximum number of first bytes that a checksum at the end may omit, and its distance from the end.
-HEAD = 6
-TAIL = 4
-#: Minimum range of the values of each byte of a checksum, and the weight of the usual place.
-APART = 96
-USUAL = 1.1
-#: Minimum share of frames with a valid checksum: some may be damaged.
-ENOUGH = 0.6
+#: Frames up to this length are searched at every offset.
+MAX_FULLY_SEARCHED_BYTES = 64
+#: Longer frames are searched up to this distance from both ends.
+MAX_END_DISTANCE_BYTES = 12
+#: Maximum number of first bytes that a checksum at the end may omit.
+MAX_OMITTED_HEAD_BYTES = 6
+#: A checksum with at most this many bytes after it counts as a checksum at the end.
+MAX_TAIL_BYTES = 4
+#: Range of values from which a byte counts as widely varying.
+MIN_WIDE_RANGE = 96
+#: Weight of the usual place of a checksum, at the end.
+USUAL_PLACE_WEIGHT = 1.1
+#: Minimum share of frames with a valid checksum, because some may be damaged.
+MIN_VALID_SHARE = 0.6
 #: Bits of evidence at which a match ends the search: one in a million wrong guesses reaches it.
-SURE = 20
+SURE_EVIDENCE_BITS = 20
 
 
 @dataclass(frozen=True)
 class ChecksumPlace:
-    """The place of a checksum: `size` bytes from `offset` on.
+    """The place of a checksum in a frame: offset and size, in bytes.
 
     A negative offset counts from the end of the frame.
     """
@@ -42,7 +44,7 @@ class ChecksumPlace:
     size: int
 
     def start(self, length: int) -> int:
-        """Return the offset in a frame of this length."""
+        """Return the offset from the start of a frame of this length."""
         if self.offset < 0:
             return self.offset + length
         return self.offset
@@ -61,7 +63,7 @@ class ChecksumPlace:
 
 @dataclass(frozen=True)
 class CoveredSpan:
-    """The bytes that a checksum covers: before its place, behind it, or both.
+    """The bytes that a checksum covers: before the checksum, after it, or both.
 
     The first `head` and the last `tail` bytes are omitted.
     """
@@ -71,7 +73,7 @@ class CoveredSpan:
     tail: int = 0
 
     def ranges(self, place: ChecksumPlace, length: int) -> list[tuple[int, int]]:
-        """Return the byte ranges in a frame of this length."""
+        """Return the covered (start, end) offsets in a frame of this length."""
         start = place.start(length)
         end = start + place.size
         before = (self.head, start)
@@ -80,7 +82,7 @@ class CoveredSpan:
         return [(first, last) for first, last in chosen if last > first]
 
     def describe(self, place: ChecksumPlace, length: int) -> str:
-        """Describe the bytes in words."""
+        """Return the covered bytes in words."""
         if (self.part, self.head, self.tail) == ("all", 0, 0) or sum(
             b - a for a, b in self.ranges(place, length)
         ) == length - place.size:
@@ -98,18 +100,24 @@ class CoveredSpan:
 
 @dataclass(frozen=True)
 class ChecksumMatch:
-    """A checksum that matches.
+    """A checksum that matches sample frames.
 
     Attributes:
         algorithm: the algorithm.
-        place, span, order: its place, covered bytes, and byte order.
-        right, total: number of frames with a valid checksum, and of all.
-        doubt: bits of evidence: one of 2**doubt wrong checksums would match as well by chance.
-        paste: the Python source of the algorithm.
-        remarks: further remarks.
-        name: its name in the catalogue.
-        open: whether other parameters match these frames as well.
-        varied: the variation of its place, as from `SampleFrames.measure_variation`.
+        place: its place in the frames.
+        span: the covered bytes.
+        order: the byte order of the stored checksum.
+        right: number of frames with a valid checksum.
+        total: number of all frames.
+        evidence_bits: bits of evidence; high values are sure. One of 2**evidence_bits wrong
+            checksums would match as well by chance.
+        source: the Python source of the algorithm.
+        notes: further remarks for the user.
+        name: the name of a CRC in the catalogue; "" if it has none.
+        is_ambiguous: whether other parameters match these frames as well.
+        has_constant: whether a constant was fitted to the frames.
+        is_in_nibbles: whether the checksum is stored in the low nibbles of two bytes.
+        variation: the variation of its place, from `SampleFrames.measure_variation`.
     """
 
     algorithm: Checksum
@@ -118,35 +126,52 @@ class ChecksumMatch:
     order: ByteOrder
     right: int
     total: int
-    doubt: float
-    paste: str
-    remarks: tuple[str, ...] = ()
+    evidence_bits: float
+    source: str
+    notes: tuple[str, ...] = ()
     name: str = ""
-    open: bool = False
-    varied: float = 0.0
+    is_ambiguous: bool = False
+    has_constant: bool = False
+    is_in_nibbles: bool = False
+    variation: float = 0.0
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """All remarks for the user."""
+        if self.has_constant:
+            constant = "it contains a constant: fields outside the covered bytes, or a start value"
+            return (constant, *self.notes)
+        return self.notes
 
     @property
     def odds(self) -> str:
-        """The number of wrong checksums for each accidental match, as a power of ten."""
-        return f"1e+{int(self.doubt * np.log10(2)):02}"
+        """The number of wrong checksums for each match by chance, as a power of ten."""
+        return f"1e+{int(self.evidence_bits * np.log10(2)):02}"
 
     @property
-    def sure(self) -> bool:
-        """Whether the search can end.
+    def is_sure(self) -> bool:
+        """Whether the search can end with this match.
 
-        The match is certain, and the checksum is at an end or covers all other bytes, or all but a
-        header.
+        It has enough evidence, its parameters are unique, and the checksum is at the end, or covers
+        all other bytes except a header.
         """
         at_end = self.place.offset < 0 and self.place.offset + self.place.size == 0
         return (
-            self.doubt >= SURE
-            and not self.open
+            self.evidence_bits >= SURE_EVIDENCE_BITS
+            and not self.is_ambiguous
             and ((self.span.part, self.span.tail) == ("all", 0) or at_end)
         )
 
 
 def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) -> NDArray[np.int64]:
-    """Return the values at a place in each row, (n,); at most 7 bytes."""
+    """Return the unsigned value at an offset in each row, (n,).
+
+    Args:
+        rows: the frames, (n, length).
+        offset: offset of the value, in bytes.
+        size: number of bytes, at most 7.
+        order: the byte order.
+    """
     columns = rows[:, offset : offset + size].astype(np.int64)
     shifts = 8 * np.arange(size, dtype=np.int64)
     total: NDArray[np.int64] = (columns << (shifts if order == "little" else shifts[::-1])).sum(
@@ -156,10 +181,19 @@ def values(rows: NDArray[np.uint8], offset: int, size: int, order: ByteOrder) ->
 
 
 class SampleFrames:
-    """Distinct frames, grouped by length."""
+    """Distinct frames, grouped by length.
 
-    def __init__(self, frames: Iterable[bytes], *, most: int = 256) -> None:
-        distinct = list(dict.fromkeys(frame for frame in frames if frame))[:most]
+    Args:
+        frames: the frames; duplicates and empty frames are dropped.
+        max_frames: maximum number of distinct frames; further frames are dropped.
+
+    Attributes:
+        frames: the distinct frames, shortest first.
+        groups: the frames of each length, (n, length), shortest first.
+    """
+
+    def __init__(self, frames: Iterable[bytes], *, max_frames: int = 256) -> None:
+        distinct = list(dict.fromkeys(frame for frame in frames if frame))[:max_frames]
         self.frames: list[bytes] = sorted(distinct, key=len)
         groups = (list(group) for _, group in itertools.groupby(self.frames, len))
         self.groups: list[NDArray[np.uint8]] = [
@@ -179,7 +213,7 @@ class SampleFrames:
         return 0
 
     def take_spread(self, number: int) -> SampleFrames:
-        """Return `number` frames, spread over all of them."""
+        """Return at most `number` frames, spread over all lengths."""
         step = max(1, len(self.frames) // number)
         return SampleFrames(self.frames[::step][:number])
 
@@ -187,8 +221,8 @@ class SampleFrames:
         """Return `number` frames of the most frequent length, and two of other lengths.
 
         Args:
-            number: also the maximum number of other lengths.
-            pick: selects different frames.
+            number: number of frames, and maximum number of other lengths.
+            pick: index of the selection: other indices return other frames.
         """
         largest = max(self.groups, key=len)
         step = max(1, len(largest) // number)
@@ -202,7 +236,7 @@ class SampleFrames:
         )
 
     def fields(self, place: ChecksumPlace, order: ByteOrder) -> NDArray[np.uint64]:
-        """Return the values at a place in each frame, (n,)."""
+        """Return the value at a place in each frame, (n,)."""
         if (place, order) not in self._fields:
             columns = [
                 values(group, place.start(group.shape[1]), place.size, order)
@@ -238,29 +272,29 @@ class SampleFrames:
         )
 
     def places(self, size: int) -> Iterator[ChecksumPlace]:
-        """Yield the possible places of a checksum: at the end, in front, elsewhere.
+        """Yield the possible places of a checksum, the places next to the ends first.
 
-        Places with constant values are omitted.
+        Places with nearly constant values are omitted.
         """
         last = self.shortest - size
         first = last if self.is_single else 0
         near = (
             range(first, last + 1)
-            if self.is_single or self.shortest <= SHORT
-            else [*range(NEAR), *range(last - NEAR, last + 1)]
+            if self.is_single or self.shortest <= MAX_FULLY_SEARCHED_BYTES
+            else [*range(MAX_END_DISTANCE_BYTES), *range(last - MAX_END_DISTANCE_BYTES, last + 1)]
         )
-        by_front = sorted(
-            (place for place in near if place >= 0),
-            key=lambda place: min(last - place, place + 0.5),
+        by_distance = sorted(
+            (offset for offset in near if offset >= 0),
+            key=lambda offset: min(last - offset, offset + 0.5),
         )
-        for front in dict.fromkeys(by_front):
-            from_end = len(self.groups) > 1 or front > last // 2
+        for offset in dict.fromkeys(by_distance):
+            from_end = len(self.groups) > 1 or offset > last // 2
             if from_end:
-                places = [ChecksumPlace(front - self.shortest, size)]
+                places = [ChecksumPlace(offset - self.shortest, size)]
             else:
                 places = []
-            if not from_end or (len(self.groups) > 1 and front < NEAR):
-                places.append(ChecksumPlace(front, size))
+            if not from_end or (len(self.groups) > 1 and offset < MAX_END_DISTANCE_BYTES):
+                places.append(ChecksumPlace(offset, size))
             yield from (
                 place
                 for place in places
@@ -270,46 +304,50 @@ class SampleFrames:
 
     @property
     def is_single(self) -> bool:
-        """Whether there is only one frame, for which only the usual places are searched."""
+        """Whether there is only one frame. Then only the end is searched."""
         return len(self) == 1
 
     def measure_variation(self, place: ChecksumPlace) -> float:
-        """Return the variation of the byte of a place that varies least.
+        """Return a measure of how much the least varying byte of a place varies.
 
-        It depends on the range and on the number of distinct values. The usual place, at the end,
-        has a larger weight.
+        It depends on the range and on the number of distinct values, and is larger for the usual
+        place, at the end.
         """
         columns = [
             self.fields(ChecksumPlace(place.offset + index, 1), "little")
             for index in range(place.size)
         ]
         distinct = min(len(np.unique(column)) for column in columns) / min(len(self), 256)
-        apart = min(int(np.ptp(column)) for column in columns) >= APART
-        return 2 * apart + min(1.0, distinct * (USUAL if place.offset == -place.size else 1))
+        if place.offset == -place.size:
+            distinct *= USUAL_PLACE_WEIGHT
+        variation = min(1.0, distinct)
+        if min(int(np.ptp(column)) for column in columns) >= MIN_WIDE_RANGE:
+            variation += 2
+        return variation
 
 
 def accept_any_place(_: ChecksumPlace) -> bool:
-    """Return True: a checksum may stand at every place."""
+    """Return True, because a checksum is possible at every place."""
     return True
 
 
 def iter_spans(place: ChecksumPlace, samples: SampleFrames) -> Iterator[CoveredSpan]:
-    """Yield the spans of a checksum at a place, the usual first.
+    """Yield the possible spans of a checksum at a place, the most usual first.
 
-    Spans that cover the same bytes of these frames are omitted.
+    Spans that cover the same bytes of the shortest frame as an earlier span are omitted.
     """
     start = place.start(samples.shortest)
     before = start
     behind = samples.shortest - start - place.size
-    at_end = behind <= TAIL
+    at_end = behind <= MAX_TAIL_BYTES
     seen: set[tuple[tuple[int, int], ...]] = set()
     parts: tuple[tuple[Part, int, int], ...] = (
-        ("all", HEAD if at_end else 2, 1),
-        ("before", HEAD if at_end else 2, 0),
+        ("all", MAX_OMITTED_HEAD_BYTES if at_end else 2, 1),
+        ("before", MAX_OMITTED_HEAD_BYTES if at_end else 2, 0),
         ("behind", 0, 1),
     )
     parts = (("all", 2, 0),) if samples.is_single else parts
-    for head in range(HEAD + 1):
+    for head in range(MAX_OMITTED_HEAD_BYTES + 1):
         for part, heads, tails in parts:
             for tail in range(tails + 1) if head <= heads else ():
                 span = CoveredSpan(part, head, tail)
@@ -329,37 +367,37 @@ def weigh_evidence(width: int, values: NDArray[np.uint64], fitted: int, tried: i
 
     Args:
         width: width of the checksum, in bits.
-        values: the values of the frames in its place, (n,).
-        fitted: number of distinct values that determined the parameters.
-        tried: number of checksums that were tried.
+        values: the values of the frames at the place of the checksum, (n,).
+        fitted: number of distinct values that were used to determine parameters.
+        tried: number of checksums that were tried so far.
     """
     return width * (len(np.unique(values)) - fitted) - float(np.log2(max(tried, 1)))
 
 
 def are_enough(right: int, total: int) -> bool:
-    """Return whether enough frames are valid for the others to be damaged ones."""
-    return right >= max(1, ENOUGH * total)
+    """Return whether enough frames are valid, so that the others may be damaged."""
+    return right >= max(1, MIN_VALID_SHARE * total)
 
 
 def sort_matches(matches: Sequence[ChecksumMatch]) -> list[ChecksumMatch]:
-    """Return the matches, the simplest and surest first."""
+    """Return the matches, the simplest and surest first, without duplicates."""
 
     def key(match: ChecksumMatch) -> tuple[object, ...]:
         span = match.span
         return (
             -round(match.right / match.total, 2),
-            match.doubt < match.algorithm.width,
+            match.evidence_bits < match.algorithm.width,
             -match.place.size,  # a divisor of a wide CRC's polynomial fits at its end
-            match.open,
-            -match.varied,
-            not match.sure,
+            match.is_ambiguous,
+            -match.variation,
+            not match.is_sure,
             not match.name,
             span.part != "all",
             span.head + span.tail,
-            len(match.paste),
+            len(match.source),
         )
 
     unique = dict[object, ChecksumMatch]()
     for match in sorted(matches, key=key):
-        unique.setdefault((match.paste, match.place, match.order), match)
+        unique.setdefault((match.source, match.place, match.order), match)
     return list(unique.values())

@@ -26,7 +26,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from lidarspec.drafting.checksum_search import search
+from lidarspec.drafting.checksum_search import needs_class, search
 from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace
 from lidarspec.errors import LidarSpecError, WireError
 from lidarspec.frames.layout import Layout
@@ -266,7 +266,7 @@ def every_checksum_is_checked(subject: SensorUnderTest, name: str) -> None:
     )  # otherwise the offset of a checksum has no field
     for match in _common(frames) if is_told and not sealing else []:
         path = _standing(subject, name, match, frames[0])
-        if path in (named or free) and (named or match.doubt >= PROVEN):
+        if path in (named or free) and (named or match.evidence_bits >= PROVEN):
             fits = f"{_in_words(match, len(frames[0]))} fits every vector"
             raise ViolationError(
                 "LS212", f"{fits}, but no Checksummed verifies it", f"{name}.{path}"
@@ -319,12 +319,12 @@ def _fitting(
             leaf.info.bits,
         )
 
-    matches = search(frames, stands=stands)
+    matches = search(frames, is_possible_place=stands)
     return [match for match in matches if not _needs_class(match)] or matches
 
 
 def _needs_class(match: ChecksumMatch) -> bool:
-    return match.paste.startswith("class ")
+    return needs_class(match.algorithm)
 
 
 def _in_words(match: ChecksumMatch, length: int) -> str:
@@ -336,7 +336,7 @@ def _in_words(match: ChecksumMatch, length: int) -> str:
     if _needs_class(match):
         algorithm = match.algorithm.describe()
     else:
-        algorithm = match.paste
+        algorithm = match.source
     return f"{algorithm} over {match.span.describe(match.place, length)}{order}"
 
 
@@ -348,11 +348,11 @@ def _common(frames: list[bytes]) -> list[ChecksumMatch]:
     if max(map(len, frames), default=0) <= SHORT:
         return search(frames)
     first, *others = [
-        {(match.paste, match.place, match.span): match for match in search([frame])}
+        {(match.source, match.place, match.span): match for match in search([frame])}
         for frame in frames
     ]
     return [
-        replace(match, doubt=match.doubt * len(frames))
+        replace(match, evidence_bits=match.evidence_bits * len(frames))
         for key, match in first.items()
         if all(key in other for other in others)
     ]

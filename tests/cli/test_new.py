@@ -15,7 +15,7 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import spec
-from lidarspec.drafting.draft import DistributionNames
+from lidarspec.drafting.distribution import DistributionNames
 from lidarspec.exports import EXPORTS, export
 from lidarspec.simulation.simulator import simulate
 from tests.architecture import Module, private_imports

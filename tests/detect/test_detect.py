@@ -33,7 +33,7 @@ from lidarspec.detect.listen import (
     probe,
     read_samples,
 )
-from lidarspec.drafting.crc_search import DIVISION_WORK, QUICK_WORK, crc_matches, divide_remainder
+from lidarspec.drafting.crc_search import DIVISION_WORK, QUICK_WORK, crc_matches, remainder
 from lidarspec.drafting.periods import find_structure
 from lidarspec.drafting.samples import SampleFrames
 from lidarspec.spec import Crc
@@ -538,9 +538,9 @@ class TestStructure:
         def count_and_divide(a: int, b: int) -> int:
             nonlocal divided
             divided += max(a.bit_length() - b.bit_length() + 1, 0) // 8
-            return divide_remainder(a, b)
+            return remainder(a, b)
 
-        monkeypatch.setattr("lidarspec.drafting.crc_search.divide_remainder", count_and_divide)
+        monkeypatch.setattr("lidarspec.drafting.crc_search.remainder", count_and_divide)
         monkeypatch.setattr("lidarspec.drafting.crc_search.QUICK_WORK", QUICK_WORK // 64)
         samples = SampleFrames(make_bodies(size, number))
         assert list(crc_matches(samples, quick=True)) == []
@@ -564,7 +564,7 @@ class TestStructure:
         found = find_structure([data[:1000], data[1000:]], datagrams=False)
         assert found is not None
         assert (found.sync[:2], found.period, len(found.frames)) == (b"\x54\x2c", 47, 59)
-        assert (found.checksums[0].paste, found.checksums[0].right) == (
+        assert (found.checksums[0].source, found.checksums[0].right) == (
             "Crc(width=8, poly=0x4D)",
             59,
         )
@@ -579,7 +579,7 @@ class TestStructure:
             None,
             "10 + 3 x byte at 3",
         )
-        assert found.checksums[0].paste == "WordXor(head=8, groups=(1, 2))"
+        assert found.checksums[0].source == "WordXor(head=8, groups=(1, 2))"
 
     @pytest.mark.slow
     def test_long_frames_with_shorter_ones_in_them(self) -> None:

@@ -13,13 +13,13 @@ import pytest
 
 import lidarspec
 import lidarspec.spec
-from lidarspec.drafting.checksum_search import MaskedChecksum, WordSum, search
+from lidarspec.drafting.checksum_search import OffsetChecksum, WordSum, search
 from lidarspec.drafting.crc_search import (
     common_divisor,
     crc_matches,
-    divide_remainder,
     divisors,
     quotient,
+    remainder,
     solve,
 )
 from lidarspec.drafting.samples import ChecksumMatch, ChecksumPlace, SampleFrames, sort_matches
@@ -130,7 +130,7 @@ def test_a_crc_that_no_catalogue_knows(width: int, *, reflected: bool) -> None:
         match.algorithm(frame[: -width // 8]) == crc(frame[: -width // 8]) for frame in frames
     )
     assert (
-        match.algorithm == crc or match.open
+        match.algorithm == crc or match.is_ambiguous
     )  # several pairs of init and xorout can be the same function
 
 
@@ -141,7 +141,7 @@ def test_init_and_xorout_are_undetermined_for_frames_of_one_length() -> None:
     match = find_best(frames)
     assert isinstance(match.algorithm, Crc)
     assert match.algorithm.poly == crc.poly
-    assert match.open
+    assert match.is_ambiguous
     assert "cannot be told apart" in match.remarks[0]
     assert all(match.algorithm(frame[:-2]) == crc(frame[:-2]) for frame in frames)
 
@@ -167,7 +167,7 @@ def test_a_checksum_that_skips_the_first_bytes() -> None:
         pytest.param(WordXor(), marks=pytest.mark.slow),
         WordSum("little"),
         WordSum("big", carry=True),
-        pytest.param(MaskedChecksum(Sum(8), 0xFF, negative=True), marks=pytest.mark.slow),
+        pytest.param(OffsetChecksum(Sum(8), 0xFF, negative=True), marks=pytest.mark.slow),
     ],
     ids=lambda checksum: checksum.describe(),
 )
@@ -185,9 +185,9 @@ def test_plain_checksums(checksum: Checksum) -> None:
         *(
             pytest.param(checksum, marks=pytest.mark.slow)
             for checksum in (
-                MaskedChecksum(Sum(8), 0x5A),
-                MaskedChecksum(Sum(16), 0, negative=True),
-                MaskedChecksum(Sum(16), 0x1234),
+                OffsetChecksum(Sum(8), 0x5A),
+                OffsetChecksum(Sum(16), 0, negative=True),
+                OffsetChecksum(Sum(16), 0x1234),
             )
         ),
     ],
@@ -198,7 +198,7 @@ def test_the_printed_python_computes_the_same_checksum(checksum: Checksum) -> No
     scope: dict[str, Any] = vars(lidarspec) | {
         name: getattr(lidarspec.spec, name) for name in ("Checksum", "Xor", "WordXor")
     }
-    exec(match.paste, scope)
+    exec(match.source, scope)
     pasted = scope["Check"]()
     for frame in frames:
         first, last = match.span.ranges(match.place, len(frame))[0]
@@ -213,14 +213,14 @@ def test_the_printed_python_computes_the_same_checksum(checksum: Checksum) -> No
 def test_grouped_words_around_a_field(number: int) -> None:
     match = find_best(simulate(lidarspec.sensor("cspc-m1c1-mini"), 40)[-number:])
     assert (match.algorithm, match.place) == (WordXor(head=8, groups=(1, 2)), ChecksumPlace(8, 2))
-    assert match.paste == "WordXor(head=8, groups=(1, 2))"
+    assert match.source == "WordXor(head=8, groups=(1, 2))"
 
 
 @pytest.mark.slow
 def test_an_xor_with_a_constant_is_found_and_its_place_a_guess() -> None:
-    frames = make_sealed_frames(MaskedChecksum(Xor(), 0x33), 40, 27)
+    frames = make_sealed_frames(OffsetChecksum(Xor(), 0x33), 40, 27)
     matches = search(frames)
-    assert {match.algorithm for match in matches} == {MaskedChecksum(Xor(), 0x33)}
+    assert {match.algorithm for match in matches} == {OffsetChecksum(Xor(), 0x33)}
     assert ChecksumPlace(-1, 1) in [match.place for match in matches]
     assert all("at other places" in match.remarks[-1] for match in matches if match.span.head == 0)
 
@@ -262,7 +262,7 @@ def test_division() -> None:
     source = random.Random(1)
     for _ in range(50):
         a, b = source.getrandbits(60), source.getrandbits(20) | 1
-        q, r, product = quotient(a, b), divide_remainder(a, b), 0
+        q, r, product = quotient(a, b), remainder(a, b), 0
         for bit in range(q.bit_length()):
             product ^= (b << bit) * (q >> bit & 1)
         assert product ^ r == a
@@ -299,8 +299,8 @@ def test_batches_of_the_checksums_without_a_name() -> None:
     for checksum in (
         WordSum("big"),
         WordSum("little", carry=True),
-        MaskedChecksum(Sum(8), 7, negative=True),
-        MaskedChecksum(Xor(), 9),
+        OffsetChecksum(Sum(8), 7, negative=True),
+        OffsetChecksum(Xor(), 9),
     ):
         assert checksum.batch(rows).tolist() == [checksum(row.tobytes()) for row in rows]
         assert checksum.describe()

@@ -14,13 +14,10 @@ import pytest
 
 import lidarspec as ls
 from lidarspec import UsageError, WireError
-from lidarspec.drafting.checksum_search import MaskedChecksum
-from lidarspec.drafting.draft import (
-    DistributionNames,
-    Draft,
-    draft,
-    make_template_values as text_of,
-)
+from lidarspec.drafting.checksum_search import OffsetChecksum
+from lidarspec.drafting.distribution import DistributionNames
+from lidarspec.drafting.draft import Draft, make_draft
+from lidarspec.drafting.draft_code import make_template_values as text_of
 from lidarspec.drafting.periods import find_rising_fields
 from lidarspec.drafting.samples import ChecksumPlace
 from lidarspec.expressions.columns import align
@@ -48,7 +45,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def draft_file(name: str) -> Draft:
     opened = open_transport(str(capture(name)))
     try:
-        return draft([chunk.data for chunk in opened.chunks()], datagrams=opened.datagrams)
+        return make_draft([chunk.data for chunk in opened.chunks()], datagrams=opened.datagrams)
     finally:
         opened.close()
 
@@ -82,8 +79,8 @@ def share(sensor: ls.Sensor, source: Path) -> float:
 def test_three_frames_of_one_length_and_a_crc() -> None:
     found = draft_file(LD06)
     assert (found.sync, found.size, len(found.frames), found.share) == (b"\x54\x2c", 47, 3, 1.0)
-    assert found.seal is not None
-    assert (found.seal.algorithm, found.seal.place, found.seal.right) == (
+    assert found.checksum is not None
+    assert (found.checksum.algorithm, found.checksum.place, found.checksum.right) == (
         Crc(8, 0x4D),
         ChecksumPlace(-1, 1),
         3,
@@ -100,8 +97,8 @@ def test_a_count_that_only_the_frame_cut_off_gives_away() -> None:
         "10 + 3 x byte at 3",
         4,
     )
-    assert found.seal is not None
-    assert (found.seal.algorithm, found.seal.place) == (
+    assert found.checksum is not None
+    assert (found.checksum.algorithm, found.checksum.place) == (
         WordXor(head=8, groups=(1, 2)),
         ChecksumPlace(8, 2),
     )
@@ -120,7 +117,7 @@ def test_blocks_with_a_little_endian_angle_and_no_checksum(
     name: str, frames: int, clock: str
 ) -> None:
     found = draft_file(name)
-    assert (found.sync, found.size, len(found.frames), found.seal) == (
+    assert (found.sync, found.size, len(found.frames), found.checksum) == (
         b"\xff\xee",
         1206,
         frames,
@@ -139,7 +136,7 @@ def test_blocks_with_a_little_endian_angle_and_no_checksum(
 @pytest.mark.slow
 def test_blocks_with_a_big_endian_angle_among_packets_of_another_kind() -> None:
     found = draft_file(HELIOS)
-    assert (found.sync, found.size, len(found.frames), found.seal) == (
+    assert (found.sync, found.size, len(found.frames), found.checksum) == (
         b"\x55\xaa\x05\x5a",
         1248,
         750,
@@ -215,7 +212,7 @@ def test_a_draft_is_written_as_the_projects_own_sensors_are(tmp_path: Path) -> N
     sources = {
         "blocks": b"".join(simulate(ls.sensor("velodyne-vlp16"), 60)),
         "count": b"".join(simulate(ls.sensor("cspc-coin-d4"), 60)),
-        "class": make_frames(b"\x5a\xc3", MaskedChecksum(Sum(8), 0x55), skip=1),
+        "class": make_frames(b"\x5a\xc3", OffsetChecksum(Sum(8), 0x55), skip=1),
         "over": make_frames(b"\x5a\xc3", Crc(16, 0x1021), skip=3),
         "angles": b"".join(simulate(ls.sensor("ldrobot-ld06"), 300)),
     }
@@ -271,7 +268,7 @@ SEALED = [
     (Sum(16), 0, "big"),
     (Crc(16, 0x1021), 2, "big"),
     (Crc(32, 0x04C11DB7, 0xFFFFFFFF, True, True, 0xFFFFFFFF), 1, "little"),
-    (MaskedChecksum(Sum(8), 0xFF, negative=True), 3, "little"),
+    (OffsetChecksum(Sum(8), 0xFF, negative=True), 3, "little"),
 ]
 
 
@@ -327,10 +324,10 @@ def test_a_wrapping_index_does_not_make_a_longer_frame(tmp_path: Path) -> None:
     ]
     frames = [bytes([0xFA, 0xA0 + i % 90, 0x00, 0x4B]) + row for i, row in enumerate(rows)]
     data = b"".join(frame + Fold15()(frame).to_bytes(2, "little") for frame in frames)
-    found = draft([data[9:]], datagrams=False)
+    found = make_draft([data[9:]], datagrams=False)
     assert (found.sync[:1], found.size, len(found.frames)) == (b"\xfa", 22, 899)
-    assert found.seal is not None
-    assert (found.seal.algorithm, found.seal.place) == (Fold15(), ChecksumPlace(-2, 2))
+    assert found.checksum is not None
+    assert (found.checksum.algorithm, found.checksum.place) == (Fold15(), ChecksumPlace(-2, 2))
     assert [
         (one.name, one.first, one.circle) for one in found.candidates if one.kind == "counter"
     ] == [("counter_1", 0xA0, 0xFA)]
@@ -360,14 +357,14 @@ def test_a_length_in_bytes_with_short_frames_of_another_kind_between(tmp_path: P
         return whole + Sum(16)(whole).to_bytes(2, "big")
 
     (tmp_path / "some.bin").write_bytes(b"".join(map(frame, range(300))))
-    found = draft([(tmp_path / "some.bin").read_bytes()], datagrams=False)
+    found = make_draft([(tmp_path / "some.bin").read_bytes()], datagrams=False)
     assert (found.sync, str(found.length), len(found.frames)) == (
         b"\xaa\x00",
         "2 + 1 x byte at 2",
         294,
     )
-    assert found.seal is not None
-    assert (found.seal.algorithm, found.seal.place, found.seal.order) == (
+    assert found.checksum is not None
+    assert (found.checksum.algorithm, found.checksum.place, found.checksum.order) == (
         Sum(16),
         ChecksumPlace(-2, 2),
         "big",
@@ -407,7 +404,7 @@ def test_noise_has_no_candidates() -> None:
 )
 def test_bytes_without_frames_are_refused(tmp_path: Path, data: bytes) -> None:
     with pytest.raises(WireError, match="no repeated frame structure"):
-        draft([data], datagrams=False)
+        make_draft([data], datagrams=False)
     (tmp_path / "some.bin").write_bytes(data)
     assert (
         "no repeated frame structure"
@@ -443,7 +440,7 @@ def test_points_may_depend_on_no_field() -> None:
 def written(frames: list[bytes], *, datagrams: bool = False) -> dict[str, str]:
     """The texts of a draft of these frames."""
     return text_of(
-        draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams),
+        make_draft(frames if datagrams else [b"".join(frames)], datagrams=datagrams),
         origin="the tests",
         link="",
     )
@@ -487,4 +484,4 @@ def test_a_nearly_constant_field_is_not_a_checksum() -> None:
     draw = random.Random(1)
     bodies = [b"\x0f\x55\x07\x09\x01\x02" + bytes([draw.randrange(2)]) for _ in range(200)]
     frames = [body + Xor()(body).to_bytes(1) for body in bodies]
-    assert draft([b"".join(frames)], datagrams=False).seal is None
+    assert make_draft([b"".join(frames)], datagrams=False).checksum is None
