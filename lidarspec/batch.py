@@ -206,7 +206,7 @@ def convert_piece(piece: FilePiece) -> Record:
             counted = _count_scans(piece, piece.iter_numbered(scans), counts)
             first = next(counted, None)
             if first is None and piece.is_last and not piece.first:
-                raise WireError(f"no scan: {scans.stats}")
+                raise WireError(f"no scan found: {scans.stats}")
             if first is not None:
                 _write(piece, itertools.chain([first], counted))
             return piece.record(
@@ -269,8 +269,8 @@ def make_pieces(
             target = source
         if target in by_output and by_output[target].source != source:
             raise UsageError(
-                f"{by_output[target].source} and {source} would both become {target}: convert them"
-                " to two folders"
+                f"{by_output[target].source} and {source} would both be written to {target}:"
+                " convert them into two folders"
             )
         by_output[target] = FilePiece(
             source, name, options, target if to else "", every_point, size, select
@@ -467,7 +467,8 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
             client = distributed.Client(scheduler)
         except (OSError, ValueError) as error:
             raise suggest(
-                SourceError(f"{scheduler}: no Dask scheduler answers: {error}"), "dask scheduler"
+                SourceError(f"{scheduler}: no reply from the Dask scheduler: {error}"),
+                "dask scheduler",
             ) from error
         with client, client.get_executor(pure=False) as executor:
             yield executor
@@ -535,10 +536,10 @@ def convert(
             if manifest.is_new and not force and manifest.has(piece.target)
         ]:
             error = UsageError(
-                f"{taken[0]} exists already, and no {MANIFEST} says of what it was made; it is not"
-                " overwritten"
+                f"{taken[0]} exists already, and no {MANIFEST} tells which source it was made"
+                " from; it is not overwritten"
             )
-            raise suggest(error, "the same with --force, or into another folder")
+            raise suggest(error, "repeat with --force, or with another folder")
         if not force:
             finished = {piece.source: manifest.find_records(piece) for piece in todo}
             yield from ((record, True) for records in finished.values() for record in records)
@@ -581,10 +582,10 @@ def _iter_results(
             result = future.result()
         except BrokenProcessPool:
             error = SourceError(
-                "a worker process was killed, maybe for want of memory; what it was at is not"
-                " written"
+                "a worker process was killed, possibly because memory ran out; its current"
+                " piece was not written"
             )
-            raise suggest(error, "the same again, which goes on where this ended") from None
+            raise suggest(error, "repeat the command: it resumes where this one ended") from None
         except Exception as failure:  # an error of a survey, or a Dask worker that died repeatedly
             result = piece.describe_failure(failure)
         if isinstance(result, dict):
@@ -688,5 +689,5 @@ def _partition(piece: FilePiece) -> Any:
         tables = iter_tables(piece.iter_numbered(scans), every_point=piece.every_point)
         table = import_library("pyarrow", "arrow").concat_tables(tables)
         if not table.num_rows and piece.is_last and not piece.first:
-            raise WireError(f"no scan in {piece.source}: {scans.stats}")
+            raise WireError(f"no scan found in {piece.source}: {scans.stats}")
     return table.to_pandas()

@@ -47,7 +47,7 @@ _NOT_ITS_OWN = ("construct", "numpy", "pluggy", "hypothesis", "_pytest")
 
 def struct_error(error: Exception, *, path: str, sensor: str = "") -> SpecError:
     """Return the error for an expression or a checksum of a struct that raised."""
-    reason = f"an expression of the struct failed: {type(error).__name__}: {error}"
+    reason = f"an expression of the struct raised {type(error).__name__}: {error}"
     return SpecError(reason, path=path, sensor=sensor, rule="LS115")
 
 
@@ -250,8 +250,8 @@ class LibraryError(UsageError):
         if installed_version:
             found = f"version {installed_version} is installed"
         else:
-            found = "it is missing"
-        super().__init__(f"this needs {needed}; {found}" + (f" ({cause})" if cause else ""))
+            found = "it is not installed"
+        super().__init__(f"this requires {needed}; {found}" + (f" ({cause})" if cause else ""))
         suggest(self, f"pip install 'lidarspec[{extra}]'")
 
 
@@ -323,8 +323,8 @@ def refuse_text(data: object) -> None:
     """Raise UsageError for a text or a path in place of bytes."""
     if isinstance(data, str | os.PathLike):
         raise UsageError(
-            f"bytes are taken, not {type(data).__name__}: bytes.fromhex(...) of hexadecimal text,"
-            " lidarspec.open(...) of a file"
+            f"expected bytes, got {type(data).__name__}: use bytes.fromhex(...) for"
+            " hexadecimal text, lidarspec.open(...) for a file"
         )
 
 
@@ -501,7 +501,7 @@ def system_errors(place: object) -> Iterator[None]:
         SourceError: also for an invalid path.
     """
     if "\0" in str(place):
-        raise SourceError(f"{str(place)!r}: no path has a zero byte in it")
+        raise SourceError(f"{str(place)!r}: a path must not contain a zero byte")
     try:
         yield
     except LidarSpecError:  # a timeout is an OSError too
@@ -514,5 +514,5 @@ def failure_reason(place: object, error: OSError) -> str:
     """Return the reason why the system refused a path, such as a missing folder."""
     folder = os.path.dirname(str(place))
     if isinstance(error, FileNotFoundError) and folder and not os.path.isdir(folder):
-        return f"there is no folder {folder}"
+        return f"folder {folder} does not exist"
     return error.strerror or str(error)

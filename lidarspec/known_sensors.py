@@ -210,6 +210,7 @@ def unknown_sensor_error(
         )
     if not installed:
         return suggest(
-            UnknownSensor(name, hint="; no sensor is installed"), install_command(ANY_DISTRIBUTION)
+            UnknownSensor(name, hint="; no sensor plugin is installed"),
+            install_command(ANY_DISTRIBUTION),
         )
     return UnknownSensor(name, installed, aliases=aliases)

@@ -337,7 +337,7 @@ class Registry:
         names = {other.name for other in self._offered[home] if other.value == entry.value}
         if sensor.id not in names and entry.name not in sensor.aliases:
             raise SpecError(
-                f"its entry point is called {entry.name!r}, and none of {entry.value} has its id",
+                f"its entry point is called {entry.name!r}, but {entry.value} has another id",
                 sensor=sensor.id,
             )
         aliases = sorted(names.union(sensor.aliases) - {sensor.id})
@@ -412,8 +412,7 @@ class Registry:
             whose = [home[0] for home in self._claims[name]]
             owners = f"{' and '.join(dict.fromkeys(whose))} each have a sensor of this name"
             error = UsageError(
-                f"{name}: {owners}; say whose it is in {own_settings()}: [owners] {name} ="
-                f' "{whose[0]}"'
+                f'{name}: {owners}; choose one in {own_settings()}: [owners] {name} = "{whose[0]}"'
             )
             raise suggest(error, "lidarspec plugins")
         for entry in self._offered.get(home, []):
@@ -607,7 +606,7 @@ class Registry:
 
     def _check(self, sensor: Any, own: list[Any]) -> None:
         if not isinstance(sensor, Sensor):
-            raise SpecError(f"lidarspec_sensors returns sensors, not {type(sensor).__name__}")
+            raise SpecError(f"lidarspec_sensors must return sensors, got {type(sensor).__name__}")
         for name in (sensor.id, *sensor.aliases):
             if sum(name in (s.id, *s.aliases) for s in own) > 1:
                 raise SpecError(
@@ -670,10 +669,10 @@ def named_owners() -> dict[str, str]:
             isinstance(value, str) for value in named.values()
         ):
             raise UsageError(
-                f'{file}: [owners]: ids and distributions, such as acme-x1 = "acme-lidars"'
+                f'{file}: [owners]: expected ids and distributions, such as acme-x1 = "acme-lidars"'
             )
     except LidarSpecError as error:
-        warnings.warn(f"{error}; its [owners] are left out", stacklevel=2)
+        warnings.warn(f"{error}; its [owners] are ignored", stacklevel=2)
         return {}
     return named
 
@@ -710,9 +709,11 @@ def _import_in_time(entry: EntryPoint) -> Any:
         )
         thread.join(max(LIMIT - PATIENCE, 0))
     if not outcome:
-        _hanging[entry.module] = f"it hangs: not loaded after {LIMIT:g} s{_describe_place(thread)}"
+        _hanging[entry.module] = (
+            f"it hangs: loading took more than {LIMIT:g} s{_describe_place(thread)}"
+        )
         warnings.warn(
-            f"{entry.distribution}: {_hanging[entry.module]}; what it adds is left out",
+            f"{entry.distribution}: {_hanging[entry.module]}; the plugin is ignored",
             stacklevel=2,
         )
         raise SpecError(_hanging[entry.module])
@@ -755,11 +756,11 @@ def _letters(name: str) -> str:
 
 def _reseal(frame: Frame, algorithm: Any) -> Frame:
     if not isinstance(algorithm, Checksum):
-        raise SpecError(f"returns a Checksum or None, not {type(algorithm).__name__}")
+        raise SpecError(f"must return a Checksum or None, got {type(algorithm).__name__}")
     struct = prepare(frame.struct)
     seal = next(seals(struct), None)
     if seal is None:
-        raise SpecError("answers for a frame without a checksum")
+        raise SpecError("returns a checksum for a frame without one")
     seal.algorithm = algorithm
     return replace(frame, struct=struct)
 
@@ -778,7 +779,7 @@ def _check_hooks(plugin: Any, name: str) -> None:
             continue
         if attribute not in HOOKS:
             raise SpecError(
-                f"there is no hook {attribute!r}; hooks are {', '.join(HOOKS)}", path=name
+                f"unknown hook {attribute!r}: expected one of {', '.join(HOOKS)}", path=name
             )
         if not _is_hook(function):
             raise SpecError(f"{attribute} lacks @hookimpl", path=name)
@@ -856,7 +857,7 @@ def _trial(*homes: Home) -> tuple[str, str]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     names = [name for home in homes for name in home]
     command = [sys.executable, "-P", "-c", code, *names, mark, str(LIMIT)]
-    hangs = f"it hangs: not loaded after {LIMIT:g} s"
+    hangs = f"it hangs: loading took more than {LIMIT:g} s"
     pipe = subprocess.PIPE
     try:
         done = subprocess.run(
@@ -877,14 +878,14 @@ def _trial(*homes: Home) -> tuple[str, str]:
             (
                 hangs
                 if "Timeout (" in complaints
-                else f"it ends the process, with code {done.returncode}"
+                else f"it ends the process with code {done.returncode}"
             ),
             "",
         )
     text = " ".join((printed + complaints).split())
-    effects = [f"it prints {shown(text)}"] * bool(text) + [f"it leaves a thread: {threads}"] * bool(
-        threads
-    )
+    effects = [f"it prints {shown(text)}"] * bool(text) + [
+        f"it starts a thread that keeps running: {threads}"
+    ] * bool(threads)
     return "", "; ".join(effects)
 
 
@@ -992,12 +993,12 @@ def _from_file(text: str) -> Sensor:
         ids = local.add(module, name=str(file))
     if not ids:
         raise SpecError(
-            "there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor",
+            "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor",
             path=str(file),
         )
     if len(ids) > 1 and not wanted:
         raise UsageError(
-            f"{file} describes several sensors, name one:"
+            f"{file} describes several sensors: choose one of"
             f" {', '.join(f'{file}:{name}' for name in ids)}"
         )
     if wanted and wanted not in ids:
@@ -1020,7 +1021,7 @@ def import_file(file: Path) -> ModuleType:
         f"lidarspec_file_{file.stem}_{crc32(bytes(file.resolve())):08x}", file
     )
     if module_spec is None or module_spec.loader is None:
-        raise SourceError(f"{file} is no Python file: its name does not end in .py")
+        raise SourceError(f"{file} is not a Python file: its name does not end in .py")
     module = importlib.util.module_from_spec(module_spec)
     sys.modules[module.__name__] = module
     try:

@@ -54,7 +54,7 @@ def find_file_system(url: str) -> Any:
         try:
             return fsspec.core.url_to_fs(url)[0]
         except ImportError as error:
-            reason = f"{url}: {scheme}:// takes {DRIVERS[scheme]}, which is not installed"
+            reason = f"{url}: {scheme}:// requires {DRIVERS[scheme]}, which is not installed"
             raise suggest(UsageError(reason), f"pip install {DRIVERS[scheme]}") from error
 
 
@@ -95,7 +95,7 @@ def find_files(pattern: str) -> list[tuple[str, str]]:
     else:
         paths = [path for path in glob.glob(pattern, recursive=True) if os.path.isfile(path)]
     if not paths:
-        raise SourceError(f"{pattern}: there is no such file")
+        raise SourceError(f"{pattern}: no such file")
     names = (
         normalise_path(path).removeprefix(normalise_path(fixed)).lstrip("/")
         if fixed != pattern

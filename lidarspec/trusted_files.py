@@ -79,7 +79,7 @@ def describe_sharing(status: os.stat_result, others: int) -> str:
         return f"belongs to user {status.st_uid}"
     mode = stat.S_IMODE(status.st_mode)
     if mode & others:
-        return f"is open to others: chmod {mode & ~others:o} makes it yours"
+        return f"is accessible to other users: run chmod {mode & ~others:o}"
     return ""
 
 
@@ -109,9 +109,9 @@ def trust(folder: str | Path) -> Path:
 
     allowed = Path(folder).resolve()
     if not allowed.is_dir() or len(str(allowed).splitlines()) > 1:
-        raise UsageError(f"{folder} is no folder")
+        raise UsageError(f"{folder} is not a folder")
     if reason := find_distrust(allowed / "."):
-        raise UsageError(f"{reason}; whoever writes there could run programs as you")
+        raise UsageError(f"{reason}; other users could run programs as you")
     file = user_folder() / TRUSTED
     if not is_trusted(allowed):
         with system_errors(file):
@@ -132,7 +132,7 @@ def resolve_beside(folder: Path, value: object) -> Path:
     else:
         path = folder
     if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
-        raise UsageError(f"{value!r} is no file beside it")
+        raise UsageError(f"{value!r} is not a file in the folder that names it")
     return path
 
 
@@ -158,7 +158,7 @@ def read_document(path: Path, kind: Literal["TOML", "JSON"] = "TOML") -> Any:
     except RecursionError:
         reason = "its brackets are nested too deeply"
     except UnicodeDecodeError:
-        reason = "it is no text in UTF-8"
+        reason = "it is not UTF-8"
     except ValueError as error:
         reason = error
     raise UsageError(f"{path}: not {kind}: {reason}")

@@ -96,7 +96,7 @@ def test_pieces_have_the_points_of_one_pass_and_a_bad_file_stops_no_other(
     assert {"north/a.parquet", "north/b.parquet"} < outputs(tmp_path).keys()
     failed = [record for record in records(tmp_path) if "error" in record]
     assert [Path(record["source"]).name for record in failed] == ["bad.bin"]
-    assert failed[0]["error"].startswith("no scan: ")
+    assert failed[0]["error"].startswith("no scan found: ")
     told = next(record for record in records(tmp_path) if record["source"].endswith("a.bin"))
     assert told["points"] == pq.read_metadata(tmp_path / "north" / "a.parquet").num_rows
     assert {"size", "modified", "digest", "versions", "scans"} < told.keys()
@@ -244,10 +244,7 @@ def test_a_hostile_manifest_is_a_source_error_with_its_line(drives: Path, tmp_pa
 
 def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path) -> None:
     out, source = tmp_path / "out", drives / "*.bin"
-    assert (
-        "there is no such file"
-        in ran("convert", drives / "*.lsr", out, "--to", "parquet", code=3).stderr
-    )
+    assert "no such file" in ran("convert", drives / "*.lsr", out, "--to", "parquet", code=3).stderr
     assert "format" in ran("convert", source, out, "--to", "parket", code=2).stderr
     assert (
         "--to parquet"
@@ -283,7 +280,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(drives: Path, tmp_path: Path
     ran("convert", source, out, "--to", "csv", code=3)
     (tmp_path / "a.bin").touch()
     (tmp_path / "a.hex").touch()
-    with pytest.raises(UsageError, match="would both become"):
+    with pytest.raises(UsageError, match="would both be written to"):
         run(tmp_path / "a.*", tmp_path / "x")
     taken = tmp_path / "taken"
     taken.mkdir()
@@ -321,7 +318,7 @@ def test_an_unreachable_scheduler_is_reported(drives: Path, tmp_path: Path) -> N
 
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
-        pytest.raises(SourceError, match="no Dask scheduler answers"),
+        pytest.raises(SourceError, match="no reply from the Dask scheduler"),
     ):
         run(drives / "*.bin", tmp_path / "out", scheduler="tcp://127.0.0.1:9")
 

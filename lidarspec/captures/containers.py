@@ -70,11 +70,11 @@ CONTAINERS = {
     rb"Rar!\x1a\x07": ("a RAR archive", "7z x {}"),
     rb".{257}ustar": ("a tar archive", "tar -xf {}"),
     rb"snoop\x00{3}|btsnoop\x00|\x34\xcd\xb2\xa1|\xa1\xb2\xcd\x34": (
-        "a capture of another format",
+        "a capture in an unsupported format",
         "editcap {} capture.pcapng",
     ),
     rb"version https://git-lfs": (
-        "a pointer of Git LFS, in the place of the file itself",
+        "a Git LFS pointer instead of the file",
         "git lfs pull",
     ),
     rb"\x89HDF\r\n": ("an HDF5 file", ""),
@@ -82,18 +82,18 @@ CONTAINERS = {
     rb"ARROW1\x00\x00|FEA1": ("an Arrow file", ""),
     rb"\x93NUMPY": ("a NumPy array", ""),
     rb"\x80[\x02\x03](?:[\]})(]q\x00|c\w|\x8a\n)|\x80[\x04\x05]\x95.{5}\x00{3}": (
-        "a pickle of Python",
+        "a Python pickle",
         "",
     ),
-    rb"# \.PCD v|ply\r?\n|LASF|ASTM-E57": ("a file of points", ""),
-    rb"\x89PNG\r\n|\xff\xd8\xff[\xdb\xe0\xe1\xee]|GIF8[79]a|.{4}ftyp": ("a picture or a film", ""),
+    rb"# \.PCD v|ply\r?\n|LASF|ASTM-E57": ("a point cloud file", ""),
+    rb"\x89PNG\r\n|\xff\xd8\xff[\xdb\xe0\xe1\xee]|GIF8[79]a|.{4}ftyp": ("an image or a video", ""),
     rb"%PDF-": ("a PDF document", ""),
-    rb"\x7fELF": ("a program", ""),
+    rb"\x7fELF": ("an executable file", ""),
     rb"\s*(?:\[\s*)?\{\s*\"[^\"]*\"\s*:": ("JSON", ""),
     rb"(?i)\s*<(?:\?xml|!doctype|html)": ("an XML or HTML page", ""),
 }
 _REFUSED = CONTAINERS | {
-    beginning: (f"compressed by {packing.name} again and again", packing.command)
+    beginning: (f"compressed more than once by {packing.name}", packing.command)
     for beginning, packing in PACKINGS.items()
 }
 
@@ -156,7 +156,7 @@ class UnpackedFile(io.RawIOBase):
             self._count += len(data)
             return data
         except EOFError:
-            self.damage = Damage(f"{self.name} is cut off{self._read}", 0)
+            self.damage = Damage(f"{self.name} is truncated{self._read}", 0)
         except (
             Exception
         ) as error:  # each library raises its own for damaged bytes, and bz2 and gzip raise OSError
@@ -166,13 +166,13 @@ class UnpackedFile(io.RawIOBase):
             size = self._packed.seek(0, os.SEEK_END) if place else 0
             where = f" before byte {place} of {size}" * bool(place)
             self.damage = Damage(
-                f"{self.name} is damaged{where} ({error}){self._read}", max(size - place, 1)
+                f"{self.name} is corrupt{where} ({error}){self._read}", max(size - place, 1)
             )
         return b""
 
     @property
     def _read(self) -> str:
-        return f": the {self._count} bytes that could be unpacked were read"
+        return f": the {self._count} bytes that could be decompressed were read"
 
 
 def find_damage(file: BinaryIO) -> Damage | None:
@@ -220,7 +220,7 @@ def unpack(name: str, file: BinaryIO, member: str = "") -> BinaryIO:
             content = import_library(packing.module, "zstd").open(file)
         file = cast(BinaryIO, io.BufferedReader(UnpackedFile(name, file, content), FILLED))
     if member:
-        raise UsageError(f"{name} is no zip archive: there is no {member} in it")
+        raise UsageError(f"{name} is not a zip archive, so it does not contain {member}")
     return file
 
 
@@ -234,7 +234,7 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
     """Open one file of a zip archive."""
     if not file.seekable():
         raise SourceError(
-            f"{name} is a zip archive, and its table stands at its end: give its file, not a pipe"
+            f"{name} is a zip archive, which cannot be read from a pipe: pass the file"
         )
     try:
         archive = zipfile.ZipFile(file)
@@ -248,11 +248,11 @@ def _of_archive(name: str, file: BinaryIO, member: str) -> Any:
         raise
     except Exception as error:  # for damaged archives zipfile raises many types
         if isinstance(error, zipfile.BadZipFile):
-            command = f"zip -FF {quote(name)} --out mended.zip"
+            command = f"zip -FF {quote(name)} --out repaired.zip"
         else:
             command = f"unzip {quote(name)}"
         raise suggest(
-            SourceError(f"{name} is a zip archive, and is not read: {error}"), command
+            SourceError(f"cannot read the zip archive {name}: {error}"), command
         ) from error
 
 
@@ -272,13 +272,10 @@ def _choose_member(name: str, archive: zipfile.ZipFile, names: list[str], member
         return readable[0]
     shown = ", ".join((readable or names)[:NAMED]) + ", ..." * (len(readable or names) > NAMED)
     if not readable:
-        raise SourceError(
-            f"{name} is a zip archive, and is not read: there is no capture in it, but"
-            f" {shown or 'nothing'}"
-        )
+        raise SourceError(f"the zip archive {name} contains no capture, only {shown or 'nothing'}")
     raise suggest(
-        UsageError(f"{name} holds {len(readable)} captures: {shown}"),
-        f"the same with {quote(f'{name}?file={readable[0]}')}",
+        UsageError(f"{name} contains {len(readable)} captures: {shown}"),
+        f"repeat with {quote(f'{name}?file={readable[0]}')}",
     )
 
 
@@ -302,8 +299,7 @@ def refuse_container(path: str, start: bytes) -> None:
     for beginning, (what, command) in _REFUSED.items():
         if re.match(beginning, start, re.DOTALL):
             error = SourceError(
-                f"{path} is {what}, and is not read: this takes captures, recordings and bytes as a"
-                " sensor sent them"
+                f"{path} is {what}: expected a capture, a recording or the raw bytes of a sensor"
             )
             raise (
                 suggest(error, command.format(quote(path)))

@@ -320,7 +320,9 @@ def datagram_frame(datagram: Datagram) -> bytes:
     if len(source[0]) == 16:
         limit += _EXTRA_PAYLOAD_BYTES_IPV6
     if len(datagram.data) > limit:
-        raise UsageError(f"a datagram of {len(datagram.data)} bytes: UDP carries at most {limit}")
+        raise UsageError(
+            f"a datagram has {len(datagram.data)} bytes, and UDP carries at most {limit}"
+        )
     return build_udp_frame(datagram.data, source, destination)
 
 
@@ -352,9 +354,9 @@ def _pack_endpoints(*endpoints: tuple[str, int]) -> list[tuple[bytes, int]]:
         try:
             addresses.append(ipaddress.ip_address(host).packed)
         except ValueError:
-            raise UsageError(f"{host!r} is not an IP address, which a capture requires") from None
+            raise UsageError(f"{host!r} is not an IP address: a capture requires one") from None
         if not 0 <= port < 1 << 16:
-            raise UsageError(f"{port} is not a UDP port")
+            raise UsageError(f"{port} is not a UDP port: expected 0 to 65535")
     if len({len(address) for address in addresses}) > 1:
         addresses = [_to_ipv6(address) for address in addresses]
     return [(address, port) for address, (_, port) in zip(addresses, endpoints, strict=True)]

@@ -580,14 +580,18 @@ def packet_record(data: bytes, at: int) -> bytes:
     """
     seconds, nanoseconds = divmod(at, _SECOND)
     if not 0 <= seconds < 1 << 32:
-        raise UsageError(f"a capture time of {at} ns: pcap holds the years 1970 to 2106")
+        raise UsageError(
+            f"capture time {at} ns is out of range: pcap supports the years 1970 to 2106"
+        )
     _refuse_size(data)
     return _RECORD.pack(seconds, nanoseconds, len(data), len(data)) + data
 
 
 def _refuse_size(data: bytes) -> None:
     if len(data) > LARGEST_PACKET:
-        raise UsageError(f"a packet of {len(data)} bytes: a record holds at most {LARGEST_PACKET}")
+        raise UsageError(
+            f"a packet has {len(data)} bytes, and a record holds at most {LARGEST_PACKET}"
+        )
 
 
 def record_size(data: bytes | bytearray, at: int) -> int:
@@ -628,7 +632,7 @@ def _pcapng_head(link: int) -> bytes:
 
 def _pcapng_record(data: bytes, at: int) -> bytes:
     if not 0 <= at < 1 << 63:
-        raise UsageError(f"a capture time of {at} ns: times count from 1970")
+        raise UsageError(f"capture time {at} ns is negative: times count from 1970")
     _refuse_size(data)
     head = struct.pack("<IIIII", 0, at >> 32, at & 0xFFFFFFFF, len(data), len(data))
     return _block(ENHANCED_PACKET, head + data + bytes(-len(data) % 4))

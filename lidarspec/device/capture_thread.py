@@ -68,7 +68,9 @@ class BoundedQueue:
         size: int = MAX_QUEUED_BYTES,
     ) -> None:
         if policy not in POLICIES:
-            raise UsageError(f"a full queue can {' or '.join(POLICIES)}, not {policy!r}")
+            raise UsageError(
+                f"invalid overflow policy: expected {' or '.join(POLICIES)}, got {policy!r}"
+            )
         self._blocks = policy == "block"
         self._max_chunks = chunks
         self._max_bytes = size
@@ -282,8 +284,8 @@ class CaptureThread:
         if ahead is None:
             return
         self.warnings = [
-            f"the clock of this computer was set, and is {ahead / 1e9:+.3f} s from the arrival"
-            " times, which go on evenly"
+            f"the clock of this computer was set by {ahead / 1e9:+.3f} s; arrival times"
+            " continue without a step"
         ]
         if self._log is not None:
             self._log.event("clock", chunk.at, ahead_ns=ahead)

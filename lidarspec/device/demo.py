@@ -161,8 +161,8 @@ def _read(
         raise failure
     if sum(one.whole for one in scans) >= turns:
         return replies, tuple(scans), device.stats
-    number = f"{len(scans)} scans in {EXTRA_TIMEOUT_S + turns:g} s, and not {turns}"
-    raise SourceError(f"the simulated {device.sensor.id} gave {number}: {device.stats}")
+    number = f"{len(scans)} scans in {EXTRA_TIMEOUT_S + turns:g} s, expected {turns}"
+    raise SourceError(f"the simulated {device.sensor.id} sent {number}: {device.stats}")
 
 
 def _free_port() -> int:

@@ -290,7 +290,7 @@ class Device(ClosingContext):
             SourceError: if a file has already been read to its end.
         """
         if not self.sensor.imu_frames:
-            raise UsageError(f"{self.sensor.id}: no frame says what an IMU felt")
+            raise UsageError(f"{self.sensor.id}: no frame type contains IMU samples")
         reader = self._get_reader(None)
         ahead = self._take_ahead()
         yield_timer = _YieldTimer(wait)
@@ -344,7 +344,7 @@ class Device(ClosingContext):
         while not (self._unseen_scans and self._input.caught_up(mark)):
             if self._input.ended:
                 raise SourceError(
-                    f"{self.source}: no further scan, since the input is {self._input.state}"
+                    f"{self.source}: no further scan, because the input is {self._input.state}"
                 )
             batch = self._next_batch(max(deadline - time.monotonic(), 0.0))
             if batch is not None:
@@ -360,7 +360,9 @@ class Device(ClosingContext):
 
     def make_timeout_error(self) -> SourceTimeout:
         """Return the error for a scan that did not arrive in time."""
-        error = SourceTimeout(f"{self.source}: no scan in time; the source is {self.state}")
+        error = SourceTimeout(
+            f"{self.source}: no scan within the timeout; the source is {self.state}"
+        )
         return suggest(error, f"lidarspec doctor {quote(str(self.source))} -s {self.sensor.id}")
 
     def skip_until(self, time_ns: int) -> bool:
@@ -465,7 +467,7 @@ class Device(ClosingContext):
         try:
             if not isinstance(opened, LiveTransport):
                 if record is not None:
-                    raise UsageError(f"{self.source} is a file already: there is nothing to record")
+                    raise UsageError(f"{self.source} is already a file, so it cannot be recorded")
                 return FileInput(self.source, self.sensor, opened, backend=backend)
             # This must not refer to the device: the cycle would keep it alive.
             make_recorder = partial(
@@ -545,9 +547,7 @@ class Device(ClosingContext):
             self._latest_stream = None
             self._unseen_scans.clear()
         elif self._input.state == "ended":
-            raise SourceError(
-                f"{self.source} has been read to its end: open it again to read it once more"
-            )
+            raise SourceError(f"{self.source} was read to its end: open it again to read it again")
         return ahead
 
     def _iter_batches(
@@ -584,8 +584,8 @@ class Device(ClosingContext):
         if not self._contradiction:
             return []
         return [
-            f"{self.source}: read as {self.sensor.id}, and {self._contradiction}; next: lidarspec"
-            f" detect {quote(str(self.source))}"
+            f"{self.source}: read as {self.sensor.id}, but {self._contradiction}; next:"
+            f" lidarspec detect {quote(str(self.source))}"
         ]
 
 
@@ -654,12 +654,15 @@ def open(
 
 def _describe_nominal(sensor: Sensor) -> str:
     """Return a warning about a nominal calibration, with the option that replaces it."""
-    text = f"{sensor.id}: points by the nominal calibration of the model, not of this unit"
+    text = f"{sensor.id}: points use the nominal calibration of the model, not the one of this unit"
     files = [name for name in sensor.configure.files if name not in sensor.options]
     if files:
-        return f"{text}; its own: -O {files[0]}=FILE, in Python sensor.configure({files[0]}=FILE)"
+        return (
+            f"{text}; pass it with -O {files[0]}=FILE, or in Python"
+            f" sensor.configure({files[0]}=FILE)"
+        )
     if sensor.state:
-        return f"{text}, where no {' or '.join(sensor.state)} frame had come"
+        return f"{text}, because no {' or '.join(sensor.state)} frame has arrived"
     return text
 
 

@@ -305,10 +305,7 @@ class FileInput(DeviceInput):
             and not any(name in stats.frames for name in self.sensor.main_frames)
         ):
             kind = "data frame" if self.sensor.has_points else "frame"
-            text = (
-                f"{self._source}: {stats.bytes_in} bytes, and no {kind} of {self.sensor.id}"
-                " among them"
-            )
+            text = f"{self._source}: no {kind} of {self.sensor.id} in {stats.bytes_in} bytes"
             warnings.append(f"{text}; next: lidarspec detect {quote(str(self._source))}")
         return warnings
 
@@ -346,11 +343,11 @@ class FileInput(DeviceInput):
 
     def send(self, name: str, /, *, timeout: float | None = None, **arguments: Any) -> Reply:
         raise CommandError(
-            f"{self.sensor.id} {name}: {self._source} is a file, there is no device to send it to"
+            f"{self.sensor.id} {name}: {self._source} is a file, so no command can be sent"
         )
 
     def write(self, data: bytes, link: str = "data") -> None:
-        raise SourceError(f"{self._source} is a file, there is no device to send bytes to")
+        raise SourceError(f"{self._source} is a file, so no bytes can be sent")
 
     def close(self) -> None:
         self.state = "closed"

@@ -61,7 +61,7 @@ class FileScans(ClosingContext):
         opened = open_transport(source, sensor)
         if isinstance(opened, LiveTransport):
             opened.close()
-            raise UsageError(f"{source} is no file")
+            raise UsageError(f"{source} is not a file")
         self._sensor = sensor
         self._transport = opened
         try:

@@ -101,13 +101,13 @@ class LinkState:
         """The current problem of the link, with the next command; empty without a problem."""
         name = self.name
         if name == "disconnected":
-            text = "the device is gone; waiting for it to come back"
+            text = "the device is disconnected; waiting for it to return"
         elif name == "silent":
-            text = f"nothing has arrived{self._describe_others()} for {self.silent_for:.1f} s"
+            text = f"no data received{self._describe_others()} for {self.silent_for:.1f} s"
         elif name == "no frames":
-            text = f"{self._frameless_bytes} bytes, and no frame of {self._sensor.id} among them"
+            text = f"no frame of {self._sensor.id} in {self._frameless_bytes} bytes"
             if self._transport.baud:
-                text = f"{text}: {self._transport.baud} baud is likely wrong"
+                text = f"{text}: {self._transport.baud} baud is probably wrong"
         else:
             return []
         return [f"{self._source}: {text}; next: {self.suggest_command()}"]
@@ -117,7 +117,7 @@ class LinkState:
         other = self._other_sender
         if other is not None and self.name == "silent":
             chosen = with_option(self._source, "src", endpoint(other))
-            return f"the same with {quote(chosen)} to read that one"
+            return f"repeat with {quote(chosen)} to read that sender"
         if self._decoder.stats.bytes_in and not self._decoder.stats.frames:
             return f"lidarspec detect {quote(str(self._source).partition('?')[0])}"
         return f"lidarspec doctor {quote(str(self._source))} -s {self._sensor.id}"
@@ -132,7 +132,10 @@ class LinkState:
         if other is None:
             return ""
         count = self._senders.foreign + self._transport.foreign
-        return f" from the sensor, and {count} datagrams from others, such as {endpoint(other)},"
+        return (
+            f" from the sensor, but {count} datagrams from other senders, such as"
+            f" {endpoint(other)},"
+        )
 
     @property
     def _frameless_bytes(self) -> int:

@@ -152,7 +152,7 @@ class LiveInput(DeviceInput):
         if self._recorder is not None and self._recorder.error is not None:
             warnings.append(f"the recording has stopped: {self._recorder.error}")
         silent = [
-            f"{self._source}: {error}; it is started again"
+            f"{self._source}: {error}; sending it again"
             for error in list(self._session.unanswered.values())
         ]
         if self._closed:
@@ -188,10 +188,11 @@ class LiveInput(DeviceInput):
                     and not self.sensor.commands[name].starts
                 ):
                     self._reported_warnings.append(
-                        f"{error}; it is read as it stands, without what it would say of itself"
+                        f"{error}; the sensor is read without the values that it should have"
+                        " reported"
                     )
                 elif isinstance(error, ReplyTimeout) and self._link_state.has_data:
-                    self._reported_warnings.append(f"{error}; data come all the same")
+                    self._reported_warnings.append(f"{error}; the sensor sends data anyway")
                 else:
                     raise suggest(error, self._link_state.suggest_command()) from None
             else:
@@ -205,7 +206,7 @@ class LiveInput(DeviceInput):
             self.sensor = self.sensor.configure(**self.learned)
         except UsageError as error:
             raise CommandError(
-                f"{self.sensor.id}: what it says of itself cannot be: {error}"
+                f"{self.sensor.id}: the values that the sensor reported are invalid: {error}"
             ) from error
         with self._decoder_lock, self._session_lock:
             data = self._captures["data"]
@@ -293,7 +294,7 @@ class LiveInput(DeviceInput):
         refuse_text(data)
         if link not in self.sensor.links:
             raise UsageError(
-                f"{self.sensor.id} has no link {link!r}; its links are"
+                f"{self.sensor.id} has no link {link!r}: expected one of"
                 f" {', '.join(self.sensor.links)}"
             )
         if self._closed:
@@ -425,7 +426,7 @@ class LiveInput(DeviceInput):
                 self._failure = item
                 self._failure.__cause__ = None  # hides the context in the capture thread
             else:
-                self._failure = SourceError(f"{self._source}: nothing is read any more: {item}")
+                self._failure = SourceError(f"{self._source}: reading has stopped: {item}")
                 self._failure.__cause__ = item
 
     def _decode(self, link: str, chunks: list[Chunk]) -> None:
@@ -526,7 +527,8 @@ class LiveInput(DeviceInput):
                     if self.learned.get(name, value) != value
                 ]
                 self._reported_warnings += [
-                    f"{self._source}: the sensor that came back has another {name}: open it again"
+                    f"{self._source}: the sensor that reconnected reports another {name}: open"
+                    " it again"
                     for name in changed
                 ]
 

@@ -104,11 +104,11 @@ class NamedDevice:
         file = self.source.partition("?")[0]
         reason = ""
         if self.sensor is not None and is_file_name(self.sensor):
-            reason = f"sensor {self.sensor!r} is Python, which would run"
+            reason = f"sensor {self.sensor!r} is a Python file, which would be executed"
         elif is_remote(self.source):
             reason = (
-                f"source {self.source!r} is a URL, which would be contacted or lead outside"
-                f" {folder}"
+                f"source {self.source!r} is a URL, which would be contacted or could lead"
+                f" outside {folder}"
             )
         elif os.path.isfile(file):
             try:
@@ -119,8 +119,7 @@ class NamedDevice:
             return None
         return self._suggest_trust(
             UsageError(
-                f"{self.file}: [device.{self.name}]: {reason}: that takes a folder that you have"
-                " allowed"
+                f"{self.file}: [device.{self.name}]: {reason}: this requires a trusted folder"
             )
         )
 
@@ -148,10 +147,10 @@ def find_device(source: str | Path) -> NamedDevice | None:
             paths = sorted({device.file for device in by_name.values()})
             suggestion = _suggestion(word, by_name)
             raise UsageError(
-                f"{word!r} is no file, and no device of {', '.join(paths)}{suggestion}"
+                f"{word!r} is neither a file nor a device of {', '.join(paths)}{suggestion}"
             )
     for error in errors:
-        warnings.warn(f"{error}; its devices are left out", stacklevel=2)
+        warnings.warn(f"{error}; its devices are ignored", stacklevel=2)
     device = by_name.get(word)
     if device is None:
         return None
@@ -159,7 +158,8 @@ def find_device(source: str | Path) -> NamedDevice | None:
         raise refusal
     if device.shadowed_file:
         warnings.warn(
-            f"{word}: the device of {device.file}, not that of {device.shadowed_file}", stacklevel=2
+            f"{word}: using the device of {device.file}, not the one of {device.shadowed_file}",
+            stacklevel=2,
         )
     return device
 
@@ -201,7 +201,7 @@ def find_settings_files() -> list[Path]:
             continue
         if not (reason := find_distrust(path)):
             return [*paths, path]
-        warnings.warn(f"{path} is not read: {reason}", stacklevel=2)
+        warnings.warn(f"cannot read {path}: {reason}", stacklevel=2)
     return paths
 
 
@@ -215,13 +215,13 @@ def read_settings_file(path: Path) -> dict[str, NamedDevice]:
     content = read_document(path)
     is_own = path == own_settings()
     if "owners" in content and not is_own:
-        raise UsageError(f"{path}: [owners] stands in your own settings alone, {own_settings()}")
+        raise UsageError(f"{path}: [owners] is only allowed in your own settings, {own_settings()}")
     _check_keys(path, "", content, ["device", "owners"])
     tables = content.get("device", {})
     if not isinstance(tables, dict) or not all(
         isinstance(table, dict) for table in tables.values()
     ):
-        raise UsageError(f"{path}: devices are tables of their own: [device.front]")
+        raise UsageError(f"{path}: write each device as a table of its own, such as [device.front]")
     is_trusted_file = is_own or is_trusted(path.parent)
     return {
         name: replace(_make_device(path, name, table), is_trusted=is_trusted_file)
@@ -233,13 +233,14 @@ def _make_device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice
     place = f"[device.{name}]"
     if not _NAME.fullmatch(name):
         raise UsageError(
-            f"{path}: {place}: a name is a letter, then letters, digits, '-' and '_', and no port"
-            " such as COM4"
+            f"{path}: {place}: invalid name: expected a letter, then letters, digits, '-' and"
+            " '_', and not a port such as COM4"
         )
     _check_keys(path, place, table, _KEYS)
     if "source" not in table:
         raise UsageError(
-            f'{path}: {place}: source is missing, such as source = "serial:///dev/ttyUSB0"'
+            f"{path}: {place}: source is missing: expected for example source ="
+            ' "serial:///dev/ttyUSB0"'
         )
     for key, kind, expected in (
         ("source", str, "text"),
@@ -248,7 +249,7 @@ def _make_device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice
         ("options", dict, "a table"),
     ):
         if key in table and not isinstance(table[key], kind):
-            raise UsageError(f"{path}: {place}: {key} is {expected}, not {shown(table[key])}")
+            raise UsageError(f"{path}: {place}: {key} must be {expected}, got {shown(table[key])}")
     options = {key: _resolve_path(path, value) for key, value in table.get("options", {}).items()}
     if "mount" in table:
         mount = _make_mount(path, place, table["mount"])
@@ -256,12 +257,12 @@ def _make_device(path: Path, name: str, table: Mapping[str, Any]) -> NamedDevice
         mount = None
     sensor = table.get("sensor")
     if options and sensor is None:
-        raise UsageError(f"{path}: {place}: options are a sensor's: name the sensor as well")
+        raise UsageError(f'{path}: {place}: options require a sensor: add sensor = "ID"')
     source = _resolve_path(path, table["source"])
     if _NAME.fullmatch(source) and not os.path.exists(source):
         raise UsageError(
-            f"{path}: {place}: source {source!r} is a name again; a device names its port, address"
-            " or file"
+            f"{path}: {place}: source {source!r} is the name of another device: expected a"
+            " port, address or file"
         )
     return NamedDevice(
         name,
@@ -286,7 +287,7 @@ def _make_mount(path: Path, place: str, table: Mapping[str, Any]) -> Mount:
                 expected = "true or false"
             else:
                 expected = "a number"
-            raise UsageError(f"{path}: {place}: mount.{key} is {expected}, not {shown(value)}")
+            raise UsageError(f"{path}: {place}: mount.{key} must be {expected}, got {shown(value)}")
     return Mount(**table)
 
 

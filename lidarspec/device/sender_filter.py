@@ -86,7 +86,7 @@ class SenderCheck:
             f"{self._source}: {one} and {two} both send frames of {self._sensor.id}; choose one"
             f" with {chosen}"
         )
-        return suggest(error, f"the same with {quote(chosen)}")
+        return suggest(error, f"repeat with {quote(chosen)}")
 
 
 class SenderFilter(SenderCheck):
@@ -137,11 +137,11 @@ class SenderFilter(SenderCheck):
         if self.other_sender is None or self._owner is None:
             return []
         text = (
-            f"{self._source}: {endpoint(self._owner)} is read; {endpoint(self.other_sender)} sends"
-            " as well, and is left out"
+            f"{self._source}: reading {endpoint(self._owner)}; ignoring"
+            f" {endpoint(self.other_sender)}, which sends as well"
         )
         other = quote(with_option(self._source, "src", endpoint(self.other_sender)))
-        return [f"{text}; next: the same with {other} to read that one"]
+        return [f"{text}; next: repeat with {other} to read the other sender"]
 
     def select(self, chunks: Sequence[Chunk]) -> list[Chunk]:
         """Return the datagrams that the sensor sent, and count the others.

@@ -131,7 +131,7 @@ class PendingReply:
             UsageError: if the command is not done.
         """
         if self._outcome is None:
-            raise UsageError(f"{self._place} is not answered yet")
+            raise UsageError(f"{self._place} has no reply yet")
         if isinstance(self._outcome, CommandError):
             raise self._outcome
         return self._outcome
@@ -158,7 +158,7 @@ class ExpectedReply:
     def find_differences(self, frame: str, values: Any) -> list[str]:
         """Return the differences between a frame and the reply in words; empty if equal."""
         if frame not in self.tables:
-            return [f"a frame {frame}"]
+            return [f"a {frame} frame"]
         expected = {
             path: value for path, value in self.values.items() if path in self.tables[frame]
         }
@@ -513,7 +513,7 @@ class Session:
         if self._use_refusal(line, item, values, now):
             return
         if current is None or current.expected is None:
-            differs = ["not asked for"]
+            differs = ["not requested"]
         else:
             differs = current.expected.find_differences(item.frame, values)
         if current is not None and not differs and now >= current.sent[0]:
@@ -563,7 +563,9 @@ class Session:
                 Reply(current.name, item.frame, values, True, now, fields=self._table(item.frame))
             )
             current.pending.settle(
-                CommandError(f"{self.sensor.id} {current.name}: the sensor refuses it: {why}")
+                CommandError(
+                    f"{self.sensor.id} {current.name}: the sensor refused the command: {why}"
+                )
             )
         else:
             return False
@@ -612,13 +614,12 @@ def learn_options(sensor: Sensor, reply: Reply) -> dict[str, Any]:
         }
     except Exception as error:
         raise CommandError(
-            f"{place}: nothing can be learned from the reply: {type(error).__name__}: {error}"
+            f"{place}: the reply could not be interpreted: {type(error).__name__}: {error}"
         ) from error
     for name, value in options.items():
         if not isinstance(value, bytes | int | float):
             raise CommandError(
-                f"{place}: {name} is learned as a number, bytes or a text, not as"
-                f" {type(value).__name__}"
+                f"{place}: {name} must be a number, bytes or a string, got {type(value).__name__}"
             )
     return {
         name: Learned(value) if isinstance(value, bytes) else value
@@ -640,7 +641,7 @@ def _describe_labels(fields: Mapping[str, FieldInfo], values: Any) -> str:
 def _make_timeout_error(sensor: Sensor, request: _PendingCommand) -> CommandError:
     place = f"{sensor.id} {request.name}"
     if request.wrong:
-        return CommandError(f"{place}: the device answered with {request.wrong}")
+        return CommandError(f"{place}: unexpected reply: {request.wrong}")
     if len(request.sent) > 1:
         often = f", sent {len(request.sent)} times"
     else:
@@ -650,12 +651,12 @@ def _make_timeout_error(sensor: Sensor, request: _PendingCommand) -> CommandErro
     else:
         stop = ""
     if stop:
-        hint = f"; it is answered only while the sensor is stopped: send {stop!r} first"
+        hint = f"; the sensor replies only while it is stopped: send {stop!r} first"
     else:
         hint = ""
     waited = f"{request.timeout / NS_PER_S:g} s{often}"
     return ReplyTimeout(
-        f"{place}: no {' or '.join(request.command.replies)} frame came within {waited}{hint}"
+        f"{place}: no {' or '.join(request.command.replies)} frame received within {waited}{hint}"
     )
 
 

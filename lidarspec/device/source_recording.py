@@ -219,8 +219,8 @@ class SourceRecording:
                         raise
                     except (Exception, SystemExit) as error:
                         failures[
-                            f"{sensor.id}: decoding fails ({type(error).__name__}: {error}); the"
-                            " recording goes on"
+                            f"{sensor.id}: decoding failed ({type(error).__name__}: {error});"
+                            " the recording continues"
                         ] = None
                         time.sleep(CHECK_PERIOD_S)
                     current = {
@@ -279,9 +279,12 @@ class SourceRecording:
                     yield ""
                     for event in self._count_queued(source, queue, log, CHECK_PERIOD_S):
                         if event is LinkEvent.LOST:
-                            yield f"{self._source}: the device is gone; waiting for it to come back"
+                            yield (
+                                f"{self._source}: the device is disconnected; waiting for it to"
+                                " return"
+                            )
                         elif event is LinkEvent.BACK:
-                            yield f"{self._source}: the device is back"
+                            yield f"{self._source}: the device has returned"
             finally:
                 self._end(log)
                 self._count_queued(source, queue, log, 0.0)
@@ -327,8 +330,8 @@ class SourceRecording:
         )
         if self._count is not None and not counts:
             raise UsageError(
-                f"-n counts packets, and {self._source} is a byte stream: name the sensor with -s,"
-                " or give a time with -t"
+                f"-n counts packets, but {self._source} is a byte stream: name the sensor with"
+                " -s, or limit the time with -t"
             )
         self.recorder = make_recorder(
             source, self._source, self._target, sensor, overwrite=self._overwrite

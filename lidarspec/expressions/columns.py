@@ -39,16 +39,16 @@ BITWISE = {np.bitwise_and, np.bitwise_or, np.bitwise_xor, np.invert}
 
 #: messages for operations that would need a single truth value of a column.
 NO_TRUTH = (
-    "a column has an answer for each packet: & | ~ in place of `and`, `or`, `not` and a < f.x < b,"
-    " np.where in place of `if`"
+    "a column has one value per packet: use & | ~ instead of `and`, `or`, `not` and a < f.x <"
+    " b, and np.where instead of `if`"
 )
 NO_BITS = (
-    "& | ~ take conditions, and fields are float64: each comparison in parentheses, (f.a < 1) &"
-    " (f.b < 2); for bits a BitStruct"
+    "& | ~ require conditions, and fields are float64: put each comparison in parentheses,"
+    " (f.a < 1) & (f.b < 2); declare bits in a BitStruct"
 )
 NO_TEXT = (
-    "columns are numbers and cannot be combined with {!r}; a field of bytes has one number per"
-    " byte, such as 65 for b'A'"
+    "columns are numbers and cannot be combined with {!r}; a field of bytes has one number"
+    " per byte, such as 65 for b'A'"
 )
 
 Carry = dict[int, NDArray[np.float64]]
@@ -150,8 +150,7 @@ class Column(NDArrayOperatorsMixin):
         """Return one element of an array field for each packet; nan if a packet has fewer."""
         if not self.source or not isinstance(index, int):
             raise SpecError(
-                "only fields have elements, each by one index: f.columns[0].timestamp,"
-                " f.distances[-1]"
+                "only fields have elements, one per index: f.columns[0].timestamp, f.distances[-1]"
             )
         return _column(self.batch, self.frame, f"{self.source}[{index}]")
 
@@ -205,7 +204,7 @@ class Column(NDArrayOperatorsMixin):
         schema = self.batch.table.schema
         own = [index for index, name in enumerate(self.axes) if name is not None]
         if len(axes) < len(own):
-            raise SpecError(f"a column with {len(own)} axes cannot be put on {axes}")
+            raise SpecError(f"a column with {len(own)} axes cannot be moved to {axes}")
         names = {schema.places[axis]: axis for axis in map(schema.axis, axes)}
         places = sorted(names)[len(axes) - len(own) :]
         array = self.array
@@ -235,7 +234,7 @@ class Column(NDArrayOperatorsMixin):
         ):  # of one element in all packets
             names = list(schema.fields[self.source].axes)
         if not names:
-            raise SpecError("there is an index of arrays only, and these values are in none")
+            raise SpecError("index requires values inside an array")
         return AlongAxis((names[-1],), np.arange(self.array.shape[1 + schema.places[names[-1]]]))
 
     def steps(self) -> AlongAxis | NDArray[np.intp]:
@@ -506,8 +505,8 @@ def _merge_axis_names(first: str | None, name: str | None) -> str | None:
         and not name.startswith("?")
     ):
         raise SpecError(
-            f"axis {first.strip('?')!r} meets axis {name.strip('?')!r}: put one on the other's"
-            " place with .on(...)"
+            f"axes {first.strip('?')!r} and {name.strip('?')!r} belong to different arrays:"
+            " move one value to the axis of the other with .on(...)"
         )
     return min(first, name, key=lambda one: (one.startswith("?"), one.endswith("?")))
 
@@ -597,13 +596,13 @@ def _find_axis(
         if found:
             names = [" x ".join(names) for names in found.values()]
             reason = (
-                f"goes with {' as well as with '.join(names)}: say which with"
+                f"matches {' as well as with '.join(names)}: choose one with"
                 f" along({found[max(found)][-1]!r}, ...)"
             )
             break
     else:
         arrays = ", ".join(f"{axis} {length}" for (_, length), axis in whole.items())
-        reason = f"goes with no array of the frame: {arrays or 'it has none'}"
+        reason = f"matches no array of the frame: {arrays or 'it has none'}"
     raise SpecError(f"an array of {' x '.join(map(str, shape))} values {reason}", rule="LS214")
 
 
@@ -633,8 +632,8 @@ def align_points(
         else:
             where = "along a further axis"
         raise SpecError(
-            f"points {where}, where no field of theirs is ({_describe_lengths(named, axes)});"
-            " numbers go along an array with along(...)",
+            f"points vary {where}, but none of their fields does"
+            f" ({_describe_lengths(named, axes)}); use along(...) for numbers along an array",
             rule="LS214",
         )
     return arrays, axes, ready, shape
@@ -683,7 +682,7 @@ def broadcast_shape(
         return np.broadcast_shapes(*(array.shape for array in arrays.values()))
     except ValueError:
         raise SpecError(
-            f"lengths that do not go together: {_describe_lengths(arrays, axes)}", rule="LS214"
+            f"the arrays have different lengths: {_describe_lengths(arrays, axes)}", rule="LS214"
         ) from None
 
 
@@ -857,8 +856,7 @@ class Fields:
         """Return one element of an array of structs; a negative index counts from the end."""
         if not self._prefix or not isinstance(index, int):
             raise SpecError(
-                "only arrays have elements, each by one index: f.columns[0].timestamp,"
-                " f.distances[-1]"
+                "expected one index per array, as in f.columns[0].timestamp or f.distances[-1]"
             )
         return Fields(self._batch, f"{self._prefix.removesuffix('.')}[{index}].", self._frame)
 
@@ -903,7 +901,7 @@ def _column(batch: Batch, frame: str, path: str) -> Column:
         and path not in table.schema.columns
         and without_indices(path)[0] in table.schema.columns
     ):
-        raise SpecError("there is no such element", path=path)
+        raise SpecError("the array has no such element", path=path)
     if not frame:
         return field_column(batch.table.schema.columns[path], batch.table, depth, batch)
     defaults = batch.defaults.get(frame, {})

@@ -185,7 +185,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         if kwargs.get("out") is not None:
             raise SpecError("columns cannot be changed in place; write a new expression instead")
         if method != "__call__":
-            raise UntraceableError(f"np.{ufunc.__name__}.{method} takes several values together")
+            raise UntraceableError(f"np.{ufunc.__name__}.{method} combines several values")
         return self.apply_function(
             (lambda *arrays: ufunc(*arrays, **kwargs)) if kwargs else ufunc, *inputs
         )
@@ -229,7 +229,7 @@ class TracedColumn(NDArrayOperatorsMixin):
         if sample.array.size > self.node.sample.array.size:
             if not self.node.sample.array.size:
                 return np.nan
-            raise UntraceableError("an array shorter than the one that it is put on")
+            raise UntraceableError("an array that is shorter than the target of .on()")
         if (
             sample.axes == self.node.sample.axes
             and sample.array.shape == self.node.sample.array.shape
@@ -280,10 +280,10 @@ class TracedColumn(NDArrayOperatorsMixin):
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        raise UntraceableError(f".{name} of a column")
+        raise UntraceableError(f"attribute .{name} of a column")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        raise UntraceableError("a column is made an array")
+        raise UntraceableError("conversion of a column to an array")
 
     def __bool__(self) -> bool:
         raise SpecError(NO_TRUTH, rule="LS213")
@@ -488,10 +488,10 @@ class Expression:
             UntraceableError: if it depends on more than fields of the frame in the same arrays.
         """
         if node.fields is None:
-            raise UntraceableError("made of more than fields of the frame")
+            raise UntraceableError("not only fields of the frame")
         infos = tuple(schema.fields[source.path] for source in node.fields)
         if len({info.axes for info in infos}) != 1:
-            raise UntraceableError("made of fields of different arrays")
+            raise UntraceableError("fields of different arrays")
         return cls(node, infos)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
@@ -581,7 +581,7 @@ class _ResultPart:
 
     def __init__(self, expression: Expression, made: Made) -> None:
         if any(info.axes or info.optional for info in expression.fields):
-            raise UntraceableError("not every packet has its fields once")
+            raise UntraceableError("a field that occurs several times or is optional")
         self._expression = expression
         self._made = made
         self._known: dict[tuple[Any, ...], NDArray[np.int64]] = {}

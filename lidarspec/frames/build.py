@@ -48,7 +48,9 @@ def build(
     if frame not in sensor.frames:
         raise UnknownFrame(frame, sensor.frames, place=sensor.id)
     if value is not None and not isinstance(value, Mapping):
-        raise UsageError(f"{sensor.id} {frame}: fields come by name, not as {type(value).__name__}")
+        raise UsageError(
+            f"{sensor.id} {frame}: expected fields by name, got {type(value).__name__}"
+        )
     declared = sensor.frames[frame]
     place = f"{sensor.id} {frame}"
     checker = _Values(make_schema(declared.tree), list_paths(declared.tree), place, units=units)
@@ -68,8 +70,8 @@ def build(
     data = frame_coder(declared).encode(struct, (value or {}).get(SPELLING))
     if data is None:
         raise UsageError(
-            f"{place}: {declared.wire} cannot write these values: a number is too large for its"
-            " digits, or a text has a mark in it"
+            f"{place}: {declared.wire} cannot encode these values: a number has too many"
+            " digits, or a text contains a separator"
         )
     return data
 
@@ -133,7 +135,8 @@ class _Values:
             return bytes(numbers)
         except (TypeError, ValueError):
             raise UsageError(
-                f"{self._place}: {shown} takes bytes, or numbers from 0 to 255, not {numbers!r:.60}"
+                f"{self._place}: {shown} must be bytes, or numbers from 0 to 255, not"
+                f" {numbers!r:.60}"
             ) from None
 
     def _number(self, info: FieldInfo, value: Any, shown: str) -> Any:

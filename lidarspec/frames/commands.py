@@ -93,11 +93,11 @@ def argument_slot(sensor: SensorDescription, name: str, argument: str) -> Argume
     takes |= {"int"} if isinstance(declared.kind, Address) else set()
     if slot.info.kind not in takes or (slot.is_array and isinstance(declared.kind, Range)):
         if slot.is_array:
-            what = f"an array, of which an element is {declared.path}[0]"
+            what = f"an array; one element is {declared.path}[0]"
         else:
             what = f"a field of kind {slot.info.kind!r}"
         raise SpecError(
-            f"{type(declared.kind).__name__} cannot stand in {declared.path!r}, which is {what}",
+            f"{type(declared.kind).__name__} does not fit {declared.path!r}, which is {what}",
             path=place,
             sensor=sensor.id,
         )
@@ -130,14 +130,14 @@ def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> Argume
     left = counts[len(indices) :]
     if len(left) > 1 or len(indices) > len(counts) - (info.kind == "bytes"):
         reason = (
-            f"{path!r} names {len(indices)} elements of the {len(counts) - (info.kind == 'bytes')}"
-            " arrays that its field is in"
+            f"{path!r} has {len(indices)} indices, but the field is inside"
+            f" {len(counts) - (info.kind == 'bytes')} arrays"
         )
         raise SpecError(reason, path=place, sensor=sensor.id)
     for index, count in zip(indices, counts, strict=False):
         if isinstance(count, int) and index >= count:
             raise SpecError(
-                f"{path!r}: there are {count} elements, of which {index} is none",
+                f"{path!r}: index {index} is out of range for {count} elements",
                 path=place,
                 sensor=sensor.id,
             )
@@ -161,7 +161,7 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
     info = slot.info
     if isinstance(kind, Range):
         if not isinstance(value, int | float | np.number):
-            raise UsageError(f"{place}: {argument} is a number, not {value!r:.60}")
+            raise UsageError(f"{place}: {argument} must be a number, not {value!r:.60}")
         if not kind.low <= value <= kind.high:
             raise OutOfRange(argument, value, kind.low, kind.high, unit=info.unit, place=place)
         raw = info.raw(value)
@@ -171,7 +171,7 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
         data = kind.pack(value, slot.room)
     except ValueError:
         raise UsageError(
-            f"{place}: {argument} is {kind.words(slot.room)}, not {value!r:.60}"
+            f"{place}: {argument} must be {kind.words(slot.room)}, not {value!r:.60}"
         ) from None
     if info.kind == "other":
         if isinstance(value, bytes):

@@ -81,10 +81,10 @@ def _check_columns(root: tree.Node) -> None:
     """Raise `NotCompilableError` if a field of a tree has values that no column holds."""
     for info in make_schema(root).fields.values():
         if info.dtype is None:
-            wide = f"its {info.bits} bits are more than a column holds"
+            wide = f"its {info.bits} bits do not fit in a column"
             raise NotCompilableError(
                 info.path,
-                wide if info.bits > 64 else "its values are not all plain numbers of one kind",
+                wide if info.bits > 64 else "its values are not plain numbers of one type",
             )
 
 
@@ -93,7 +93,9 @@ def check_control(info: tree.FieldInfo) -> None:
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
         raise NotCompilableError(
             info.path,
-            "elements of one array differ in layout: Parts(struct, count) reads such in bulk",
+            "elements of one array have different layouts: Parts(struct, count) supports this",
         )
     if info.axes or info.kind != "int":
-        raise NotCompilableError(info.path, "the layout depends on a field that is not one integer")
+        raise NotCompilableError(
+            info.path, "the layout depends on a field that is not a single integer"
+        )

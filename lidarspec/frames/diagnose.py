@@ -62,11 +62,14 @@ class Fault:
         if self.kind == CUT_OFF:
             return self._shortage()
         if self.kind == TRAILING:
-            return f"{self.got - self.expected} more bytes after the frame's {self.expected}"
+            return (
+                f"{self.got - self.expected} bytes after the end of the frame at byte"
+                f" {self.expected}"
+            )
         if self.kind == CONDITION:
-            return f"{self.path}: the check does not hold"
+            return f"{self.path}: the check failed"
         if self.kind == LENGTH and self.got is None:
-            return f"{self.path}: the header leads to a frame that is not {self.expected}"
+            return f"{self.path}: expected a frame {self.expected}"
         if self.kind == COUNT:
             return f"{self.path}: invalid count or length {self.got}"
         return f"{self.path} at byte {offset}: {self.kind} {self.got}, expected {self.expected}"
@@ -169,7 +172,7 @@ def _describe_misfit(part: ExaminedFrame) -> Fault:
     if shortage is not None:
         return shortage
     end = part.start + len(part.data)
-    return Fault(LENGTH, part.prefix, part.start, "filled by its parts", None, end)
+    return Fault(LENGTH, part.prefix, part.start, "that is filled by its parts", None, end)
 
 
 def _wrong_lengths(
@@ -210,7 +213,7 @@ def _broken_conditions(
         leaves = [layout.leaves[info.path] for info in condition.fields]
         end = examined.start + max((leaf.byte_span[1] for leaf in leaves), default=0)
         path = f"{examined.prefix}.{_first_failure(condition, layout, row)}".strip(".")
-        yield Fault(CONDITION, path, end, "a condition that holds", "one that does not", end)
+        yield Fault(CONDITION, path, end, "a condition that is true", "false", end)
 
 
 def _first_failure(condition: Condition, layout: Layout, row: NDArray[np.uint8]) -> str:
@@ -280,4 +283,4 @@ def _refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPartError) 
         return Fault(LENGTH, path, length.first_byte, failure.number, length.raw, end)
     if failure.number is not None:
         return Fault(COUNT, path, end, f"at most {examined.limit}", failure.number, end)
-    return Fault(LENGTH, path, end, f"1 to {examined.limit} bytes long", None, end)
+    return Fault(LENGTH, path, end, f"of 1 to {examined.limit} bytes", None, end)

@@ -125,8 +125,8 @@ class _Encoder:
             return self._layouts.layout_for(self._read_header)
         except TooLongError as fault:
             raise UsageError(
-                f"{self._place}: {self._prefix or fault or 'the frame'}: these values give no"
-                f" frame of at most {self._layouts.limit} bytes"
+                f"{self._place}: {self._prefix or fault or 'the frame'}: the frame would be"
+                f" longer than {self._layouts.limit} bytes with these values"
             ) from None
 
     def _read_header(self, leaf: Leaf | PartsSize) -> int:
@@ -255,9 +255,7 @@ class _Encoder:
         if not isinstance(value, list | tuple | bytes):
             raise self._wrong(shown, "a list of its elements", value)
         if len(value) != count:
-            raise UsageError(
-                f"{self._place}: {shown}: expected {count} elements, found {len(value)}"
-            )
+            raise UsageError(f"{self._place}: {shown}: expected {count} elements, got {len(value)}")
         for index, element in enumerate(value):
             self._indices[node.axis] = index
             self._collect(node.element, element, path, f"{shown}[{index}]", layout)
@@ -338,7 +336,7 @@ class _Encoder:
         if not isinstance(value, bytes | bytearray):
             raise self._wrong(shown, f"{size} bytes", value)
         if len(value) != size:
-            raise UsageError(f"{self._place}: {shown}: expected {size} bytes, found {len(value)}")
+            raise UsageError(f"{self._place}: {shown}: expected {size} bytes, got {len(value)}")
         return bytes(value)
 
     def _float(self, shown: str, value: Any) -> float:
@@ -403,19 +401,19 @@ class _Encoder:
             count = region.rule.count
             if count is not None and count != len(parts[axis]):
                 raise UsageError(
-                    f"{self._place}: {self._shown(axis)}: {count} parts are announced, and"
-                    f" {len(parts[axis])} are given"
+                    f"{self._place}: {self._shown(axis)}: expected {count} parts, got"
+                    f" {len(parts[axis])}"
                 )
             _, walked = region.in_rows(row)
             if walked.status[0] != FOUND or walked.sizes[0] != region.size:
                 raise UsageError(
-                    f"{self._place}: {self._shown(axis)}: the parts have other sizes than the"
-                    " frame announces"
+                    f"{self._place}: {self._shown(axis)}: the sizes of the parts do not match"
+                    " the header"
                 )
         for condition in layout.conditions:
             if not layout.meets_condition(condition, row)[0]:
                 named = ", ".join(info.path for info in condition.fields)
-                raise UsageError(f"{self._place}: a condition on {named} does not hold")
+                raise UsageError(f"{self._place}: the condition on {named} is false")
 
     def _shown(self, path: str) -> str:
         return f"{self._prefix}.{path}".strip(".")
@@ -529,7 +527,7 @@ def _find_count(
     for value in itertools.chain((guess,), tried):
         if value <= top and length_for(value) == length:
             return value
-    raise UsageError(f"{axis}: no value of {field} gives {length}")
+    raise UsageError(f"{axis}: no value of {field} results in the length {length}")
 
 
 def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:

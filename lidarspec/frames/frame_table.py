@@ -405,7 +405,8 @@ class ParsedTable:
             if info.dtype is None:
                 return _make_object_column(values)
             raise SpecError(
-                "its branches give values of different shapes, and a column has one", path=path
+                "its branches have values of different shapes, which cannot be one column",
+                path=path,
             ) from None
         return column
 
@@ -472,7 +473,7 @@ class ParsedTable:
         lengths = self._lengths(axis)
         if any(len(frame_lengths) > 1 for frame_lengths in lengths):
             raise SpecError(
-                "its length differs within one frame, and a column has one for each frame",
+                "its length varies within one frame, which cannot be one column",
                 path=axis,
             )
         return np.array([max(frame_lengths, default=0) for frame_lengths in lengths], np.intp)
@@ -587,7 +588,7 @@ def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
     elif column.ndim == 1 or isinstance(value, bool):
         column[index] = 0 if value is None else value
     elif value is not None:
-        raise ValueError("a value where another frame has an array")
+        raise ValueError("expected an array, as in the other frames")
 
 
 def _collect_lengths(value: Any, names: list[str], brackets: int) -> set[int]:

@@ -632,7 +632,7 @@ def _find_likeliest(sensor: SensorDescription, data: bytes, faults: list[WireErr
     else:
         begins = "is empty"
     return WireError(
-        f"no frame type fits: the data {begins}, expected {', '.join(starts)}",
+        f"no frame type matches: the data {begins}, expected {', '.join(starts)}",
         sensor=sensor.id,
         expected=starts,
         got=data[:4],

@@ -168,7 +168,7 @@ def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
         raise struct_error(fault, path=name, sensor=sensor.id) from fault
     size = stream.tell()
     return WireError(
-        f"{len(data) - size} more bytes after the frame's {size}",
+        f"{len(data) - size} bytes after the end of the frame at byte {size}",
         sensor=sensor.id,
         frame=name,
         offset=size,

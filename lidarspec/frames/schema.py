@@ -213,11 +213,12 @@ class Schema:
         ]
         if len(found) != 1:
             if found:
-                reason = f"several arrays are called {name!r}"
+                reason = f"the frame has several arrays named {name!r}"
             else:
-                reason = f"there is no array {name!r} in the frame"
+                reason = f"the frame has no array {name!r}"
             raise SpecError(
-                f"{reason}; there are {', '.join(found or self.places) or 'none'}", rule="LS214"
+                f"{reason}; expected one of {', '.join(found or self.places) or 'none'}",
+                rule="LS214",
             )
         return found[0]
 

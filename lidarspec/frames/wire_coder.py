@@ -95,7 +95,7 @@ class _FieldFinder:
         self._node = self._tree.header(struct, since=self._node)
         if isinstance(self._node.leaf, PartsSize):
             raise SpecError(
-                "parts are found by their bytes, and these frames are text",
+                "frames of text cannot contain parts",
                 path=self._node.leaf.info.path,
             )
         leaves, end = _known_fields(self._node)
@@ -128,7 +128,7 @@ class FormCoder(Coder):
         tree = frame_layouts(frame)
         if isinstance(tree, NotCompilableError):
             raise SpecError(
-                f"a wire form needs fields with computable places: {tree.reason}", path=tree.path
+                f"a wire form requires fields with fixed offsets: {tree.reason}", path=tree.path
             )
         self.form = form
         self.tree: HeaderTree = tree
@@ -218,10 +218,10 @@ class FormCoder(Coder):
             reason = f"begins with {got.hex(' ') or 'nothing'}, expected {begins.hex(' ')}"
             return Problem(0, reason, expected=begins, got=got)
         if 0 < size < len(data):
-            reason = f"{len(data) - size} more bytes after the frame's {size}"
+            reason = f"{len(data) - size} bytes after the end of the frame at byte {size}"
             return Problem(size, reason, expected=size, got=len(data))
         if size <= 0:
-            reason = f"frame has no end in its {len(data)} bytes"
+            reason = f"no end of frame in {len(data)} bytes"
             return Problem(len(data), reason, got=len(data))
         if decoded.problem is not None and decoded.problem.reason:
             return decoded.problem
@@ -237,7 +237,7 @@ class FormCoder(Coder):
         else:
             offset = decoded.problem.offset
         if not leaves:
-            reason = f"the header does not fit the frame's {size} bytes"
+            reason = f"the header does not match the frame length of {size} bytes"
             return Problem(offset, reason, got=size)
         got = data[offset : offset + SHOWN_BYTES]
         reason = f"{path or 'frame'} at byte {offset}: {got!r} is not {expected}"

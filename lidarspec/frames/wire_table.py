@@ -186,7 +186,7 @@ def _rows(
                 "; ".join(filter(None, (condition, describe_end(node)))),
             )
             for kind in node.kinds:
-                said = f"{kind.name} in it" if kind.name else ""
+                said = f"in part {kind.name}" if kind.name else ""
                 yield from _rows(
                     kind.element, element, SizeFormula(0, (f"at({element})",)), said, seals
                 )
@@ -200,7 +200,7 @@ def _rows(
                 "check",
                 shown,
                 "",
-                "; ".join(filter(None, (condition, f"holds: {format_formula(node.condition)}"))),
+                "; ".join(filter(None, (condition, f"required: {format_formula(node.condition)}"))),
             )
         case tree.Never():
             yield WireRow(str(start), "0", "no frame", shown, "", condition)
@@ -268,22 +268,22 @@ def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
     """Return the alternatives of a part, each with its condition in words."""
     if isinstance(node, tree.When):
         condition_text = format_formula(node.condition)
-        return [(f"if {condition_text}", node.then), (f"unless {condition_text}", node.otherwise)]
+        return [(f"if {condition_text}", node.then), (f"if not {condition_text}", node.otherwise)]
     key = format_formula(node.key)
     if isinstance(node.key, tree.Ref):
         labels = node.key.info.labels
     else:
         labels = {}
     cases = [(f"if {key} == {labels.get(value, value)!r}", case) for value, case in node.cases]
-    return [*cases, (f"for other values of {key}", node.default)]
+    return [*cases, (f"if {key} is another value", node.default)]
 
 
 def describe_end(node: tree.PartSequence) -> str:
     """Describe what determines the last one of some parts."""
     if node.count is not None:
-        return f"{format_formula(node.count)} parts of sizes of their own"
+        return f"{format_formula(node.count)} parts of variable size"
     if node.within is not None:
-        return f"as many parts as fill {format_formula(node.within)} bytes"
+        return f"parts that fill {format_formula(node.within)} bytes"
     assert node.size is not None
     following = ", ".join(
         dict.fromkeys(
@@ -291,8 +291,8 @@ def describe_end(node: tree.PartSequence) -> str:
         )
     )
     return (
-        f"a chain: {format_formula(node.size)} bytes, then as many as {following} of the part"
-        " before says; 0 ends it"
+        f"a chain: the first part has {format_formula(node.size)} bytes, each part gives the"
+        f" size of the next in {following}; 0 ends it"
     )
 
 
@@ -385,6 +385,6 @@ def _describe_seal(node: tree.Sealed) -> str:
     if node.declared:
         name = node.declared.describe()
     else:
-        name = "a checksum that a hook supplies"
+        name = "a checksum that a hook provides"
     first, last = (path.removeprefix(f"{node.struct.path}.") for path in node.over or ("", ""))
     return f"{name} over " + (f"{first} to {last}" if first != last else first or "all other bytes")

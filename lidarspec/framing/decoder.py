@@ -90,7 +90,7 @@ class Decoder:
         sums: Sums | None = None,
     ) -> None:
         if not sensor.incoming:
-            raise UsageError(f"{sensor.id} has no frames yet: configure it with its file first")
+            raise UsageError(f"{sensor.id} has no frames yet: configure it with a file first")
         self.sensor = sensor
         self.stream = stream
         self.backend = backend
@@ -465,7 +465,7 @@ def select_backend(name: str) -> str:
         place = BACKEND
         name = os.environ[BACKEND]
     if name not in BACKENDS:
-        raise UsageError(f"{place} is one of {', '.join(BACKENDS)}, not {name!r}")
+        raise UsageError(f"{place} must be one of {', '.join(BACKENDS)}, not {name!r}")
     return name
 
 

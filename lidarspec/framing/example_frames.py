@@ -108,7 +108,7 @@ def make_random_header(
     for _ in range(HEADERS):
         with contextlib.suppress(TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
             return _header(engine.frame, source, drawn, keys)
-    raise SpecError("no header was found that gives a frame within its longest length")
+    raise SpecError("no header leads to a frame within max_length")
 
 
 def _header(
@@ -121,7 +121,8 @@ def _header(
         except UnknownSelectorError as unknown:
             if isinstance(unknown.leaf, PartsSize):
                 raise SpecError(
-                    "a header alone does not make a frame of parts", path=unknown.leaf.info.path
+                    "an example of a frame with parts requires more than a header",
+                    path=unknown.leaf.info.path,
                 ) from None
             own = drawn.get(unknown.leaf.info.path)
             if own:
@@ -288,7 +289,7 @@ def _make_along_sweep(
     sweep = sensor.simulation_of(frame).sweep
     if sweep is None:
         raise SpecError(
-            "no random frame passes `plausible`, and there is no `sweep` to start from",
+            "no random frame passes `plausible`, and no `sweep` is declared",
             path=frame,
             sensor=sensor.id,
         )
@@ -307,7 +308,7 @@ def _make_along_sweep(
         if plausible_rows:
             return plausible_rows[0]
     raise SpecError(
-        "neither random frames nor those along `sweep` pass `plausible`",
+        "neither random frames nor frames of `sweep` pass `plausible`",
         path=frame,
         sensor=sensor.id,
     )

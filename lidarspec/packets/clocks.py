@@ -341,7 +341,7 @@ def clock_terms(
         else:
             scaling = None
         if info is None or scaling is None or info.axes:
-            reason = "a clock is one field of the frame, with a unit of time and outside arrays"
+            reason = "a clock must be a field with a unit of time, outside of arrays"
             raise SpecError(
                 reason if info else "no data frame has this field for the clock",
                 path=path,
@@ -390,5 +390,5 @@ def _nanoseconds(seconds: Any, number: int) -> Times:
     else:
         flat = None
     if flat is None:
-        raise SpecError("a clock gives one time for each packet")
+        raise SpecError("a clock must have one time per packet")
     return np.rint(np.clip(np.nan_to_num(flat), -9e9, 9e9) * 1e9).astype(np.int64)

@@ -183,7 +183,7 @@ class CounterOrder:
         """Return the counter and the clock of a batch."""
         info = batch.table.schema.fields.get(self._rule.field)
         if info is None or info.axes:
-            raise SpecError("a sequence is a field of the header", path=self._rule.field)
+            raise SpecError("a sequence must be a field outside of arrays", path=self._rule.field)
         numbers = batch.table.raw(self._rule.field)
         periods = self._last(batch, (1 << info.bits) - 1) - self._rule.first + 1
         if not isinstance(periods, int) or periods <= MAX_SIGNED_PERIOD:

@@ -97,7 +97,7 @@ def read_samples(
     with plugin_errors(f"imu of {frame}", sensor.id, function), np.errstate(all="ignore"):
         result = function(Fields(batch))
         if not isinstance(result, Imu):
-            raise TypeError(f"has to return Imu, not {type(result).__name__}")
+            raise TypeError(f"must return Imu, not {type(result).__name__}")
         values = dict(
             zip(
                 [*UNITS, "time"],

@@ -351,8 +351,7 @@ def _nested_dtype(
         here = prefix + name
         if len(_forms(schema, here)) > 1:
             raise SpecError(
-                "a value, a struct or an array by turns in its branches: ask for its columns one"
-                " by one",
+                "its branches are a value, a struct or an array: request its columns one by one",
                 path=here,
             )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]

@@ -182,9 +182,7 @@ class PointCloud:
             ValueError: with ``copy=False``, since x, y and z are columns of their own.
         """
         if copy is False:
-            raise ValueError(
-                "x, y and z of a PointCloud are columns of their own, of which (N, 3) is a copy"
-            )
+            raise ValueError("x, y and z of a PointCloud are separate columns, so xyz is a copy")
         if dtype is None:
             return self.xyz
         return self.xyz.astype(dtype, copy=False)
@@ -218,20 +216,19 @@ class PointCloud:
         """
         if self.shape is None or self.column is None:
             raise UsageError(
-                "a picture is made of organised points whose columns have numbers: Polar(...,"
-                " column=...)"
+                "an image requires organised points with a column number: Polar(..., column=...)"
             )
         each = grid_of(self).column
         numbers, counts = np.unique(self.column[::each], return_counts=True)
         wrong = numbers[(numbers >= columns) | (counts > 1)]
         if len(wrong):
             if wrong[0] < columns:
-                reason = f"comes {int(counts[numbers == wrong[0]][0])} times"
+                reason = f"occurs {int(counts[numbers == wrong[0]][0])} times"
             else:
-                reason = f"is not one of {columns}"
+                reason = f"exceeds the {columns} columns"
             raise UsageError(
-                f"column {wrong[0]} {reason}: give the points of one turn, and how many columns"
-                " that has"
+                f"column {wrong[0]} {reason}: pass the points of one revolution, and its"
+                " number of columns"
             )
         place = np.full(columns, -1)
         place[self.column[::each]] = np.arange(self.shape[0])
@@ -256,7 +253,7 @@ class PointCloud:
                 what = f"{self.shape[1]} rows"
             else:
                 what = "points that are not organised"
-            raise UsageError(f"{np.size(shifts)} shifts for {what}")
+            raise UsageError(f"expected shifts for {what}, got {np.size(shifts)}")
         grid, (columns, rows) = grid_of(self), self.shape
         source = (np.arange(columns)[:, None] - np.asarray(shifts)) % columns
         places = source * rows + np.arange(rows)
@@ -468,7 +465,7 @@ class ExtraColumns(Mapping[str, NDArray[Any]]):
             column = self._lazy.read(name)
             if column is not None:
                 return column
-        raise KeyError(f"{name}: there are {', '.join(self) or 'none'}")
+        raise KeyError(f"{name}: expected one of {', '.join(self) or 'none'}")
 
     def __contains__(self, name: object) -> bool:
         return name in self._lazy.source.extra  # without computing the column

@@ -107,7 +107,7 @@ class Plan:
         result, self.tape = graph.trace(function, sample)
         self._schema = schema = sample.table.schema
         if not isinstance(result, Polar | Cartesian):
-            raise UntraceableError(f"points that are {type(result).__name__}")
+            raise UntraceableError(f"a result of type {type(result).__name__}")
         self.function = function
         self.layout = layout
         self.nominal = result.nominal
@@ -135,7 +135,7 @@ class Plan:
             is_full(self.parts[name], self.width) for name in ("xyz" if self.exact else ["range"])
         ):
             raise UntraceableError(
-                f"not every point has {'coordinates' if self.exact else 'a range'} of its own"
+                f"points that share {'coordinates' if self.exact else 'a range'}"
             )
         self.positive = list[Node]()
         named = {

@@ -122,7 +122,7 @@ def evaluate_plainly(
     ):
         result = function(Fields(batch))
         if not isinstance(result, Polar | Cartesian):
-            raise TypeError(f"has to return Polar or Cartesian, not {type(result).__name__}")
+            raise TypeError(f"must return Polar or Cartesian, not {type(result).__name__}")
         return _flatten(packets, result, batch, find_stamp(packets, epoch), final=final)
 
 

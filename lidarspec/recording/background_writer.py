@@ -62,9 +62,7 @@ class RecordFile:
         try:
             self._file = open(self._opened, "wb" if overwrite else "xb", buffering=0)  # noqa: SIM115  closed by `close`
         except FileExistsError:
-            raise UsageError(
-                f"{path} exists already; it is not overwritten unless asked for"
-            ) from None
+            raise UsageError(f"{path} already exists and was not overwritten") from None
         except OSError as error:
             raise SourceError(f"{path}: {failure_reason(path, error)}") from None
         self.size = 0
@@ -220,7 +218,7 @@ class BackgroundWriter:
                 PATIENCE,
             ):
                 raise SourceTimeout(
-                    f"{self.path}: the disk has not taken the recording within {PATIENCE:.0f} s"
+                    f"{self.path}: the disk did not store the recording within {PATIENCE:.0f} s"
                 )
         self._raise_failure()
 
@@ -345,9 +343,9 @@ class BackgroundWriter:
             with self._changed:
                 reason = (error.strerror if isinstance(error, OSError) else None) or error
                 if self._file.is_settled:
-                    held = f"the recording is whole up to byte {self._file.size}"
+                    held = f"the recording is complete up to byte {self._file.size}"
                 else:
-                    held = "what was there before is kept"
+                    held = "the existing content is unchanged"
                 self.error = WriteError(self.path, str(reason), held)
                 self._changed.notify_all()
         finally:

@@ -117,9 +117,9 @@ class Header:
         """
         if not _ID.fullmatch(self.sensor):
             raise UsageError(
-                f"its header gives {self.sensor[:40]!r} for the id of a sensor"
+                f"its header contains the invalid sensor id {self.sensor[:40]!r}"
                 if self.sensor
-                else "it names no sensor"
+                else "it does not name a sensor"
             )
         installed = named_sensor(self.sensor)
         try:
@@ -130,8 +130,8 @@ class Header:
             )
         except UsageError as error:
             raise UsageError(
-                f"it was recorded with an option that has to be given again, as -s {self.sensor} -O"
-                f" ...: {error}"
+                "it was recorded with an option that must be passed again, as in -s"
+                f" {self.sensor} -O ...: {error}"
             ) from None
 
 
@@ -149,7 +149,7 @@ def read_header(data: bytes) -> Header:
     except (ValueError, RecursionError):
         values = None
     if not isinstance(values, dict):
-        raise WireError("the header of the recording is no JSON object", data=data[:16])
+        raise WireError("the header of the recording is not a JSON object", data=data[:16])
     known = {
         item.name: values.get(item.name, getattr(_BLANK, item.name)) for item in fields(Header)
     }
@@ -218,8 +218,8 @@ def pack_record(
         )
     except struct.error:
         raise UsageError(
-            f"a record of {len(data)} bytes at {at} ns from {sender} to {receiver}: no record can"
-            " hold that"
+            f"a record of {len(data)} bytes at {at} ns from {sender} to {receiver} exceeds the"
+            " limits of the format"
         ) from None
     body = b"".join((head, addresses, data))
     return body + _CRC.pack(zlib.crc32(body))
@@ -359,14 +359,14 @@ class Recording(ClosingContext):
             self.header = read_header(first[1].data)
             if self.header.version > VERSION:
                 raise SourceError(
-                    f"{self.path}: written in format {self.header.version}, and this lidarspec"
-                    f" knows {VERSION}"
+                    f"{self.path}: written in format {self.header.version}, but this version"
+                    f" supports format {VERSION}"
                 )
             return self._keep_known(pairs)
         if not self.salvage:
-            damage = WireError(f"{self.path}: the header of the recording is damaged or cut off")
+            damage = WireError(f"{self.path}: the header of the recording is corrupt or truncated")
             raise suggest(
-                damage, f"lidarspec record {quote(str(self.path))} --salvage -o mended.lsr"
+                damage, f"lidarspec record {quote(str(self.path))} --salvage -o repaired.lsr"
             )
         self.header = Header()
         return self._keep_known(itertools.chain([] if first is None else [first], pairs))
@@ -464,7 +464,7 @@ def _endpoint(address: Address | None) -> bytes:
     try:
         return bytes([len(host)]) + host + _PORT.pack(address[1])
     except (ValueError, struct.error):
-        raise UsageError(f"{address}: no address and port that a record can hold") from None
+        raise UsageError(f"{address}: not an address and port") from None
 
 
 @lru_cache(maxsize=256)

@@ -128,5 +128,6 @@ class RecordingSwitch:
                 current.discard()
         if not current.records:
             self.trouble = (
-                f"nothing came while {Path(current.path).name} was recorded: it is removed"
+                f"no data arrived while {Path(current.path).name} was recorded: the file was"
+                " removed"
             )

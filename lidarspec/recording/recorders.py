@@ -279,8 +279,8 @@ def open_recorder(
     if suffix in WRITINGS and not datagrams:
         if not sensor:
             raise UsageError(
-                f"{path}: a capture of a byte stream has a packet for each frame: name the sensor"
-                " with -s, or record an .lsr"
+                f"{path}: a capture of a byte stream requires frames: name the sensor with -s,"
+                " or record an .lsr"
             )
         return FrameRecorder(
             path,
@@ -289,8 +289,7 @@ def open_recorder(
         )
     if suffix == ".bin" and datagrams:
         raise UsageError(
-            f"{path}: bytes alone do not say where a datagram ends: record datagrams in an .lsr or"
-            " .pcap file"
+            f"{path}: raw bytes have no datagram borders: record datagrams in an .lsr or .pcap file"
         )
     if suffix == ".lsr":
         return Recorder(path, sensor, source, datagrams=datagrams, baud=baud, overwrite=overwrite)

@@ -93,7 +93,7 @@ class PlanarScans:
 
     def _no_such_ring(self, scan: Scan, rings: str) -> UsageError:
         return UsageError(
-            f"{scan.sensor.id}: ring {self._ring} is asked for, and its points have {rings}"
+            f"{scan.sensor.id}: ring {self._ring} does not exist; the rings are {rings}"
         )
 
     def _make_grid(self, scan: Scan) -> tuple[int, Field]:

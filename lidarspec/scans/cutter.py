@@ -194,9 +194,9 @@ def _find_packet(end: ScanEnd, first: NDArray[np.intp]) -> int:
 def _describe_missing_end(rule: Split) -> str:
     if isinstance(rule, OnWrap):
         return (
-            f"the angle does not pass {rule.at:g} ({rule.name}): is the rotor blocked? No scan has"
-            " ended"
+            f"the angle does not pass {rule.at:g} ({rule.name}): is the rotor blocked? No scan"
+            " was completed"
         )
     if isinstance(rule, Every):
-        return "no scan has begun or ended by time"
-    return f"no scan has begun or ended by {rule.name}"
+        return "no scan was completed by time"
+    return f"no scan was completed by {rule.name}"

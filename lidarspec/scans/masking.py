@@ -214,6 +214,6 @@ def describe_sector(sector: Sector) -> str:
     if sector.contains(0.0):
         angles.reverse()
     return (
-        f"nothing comes from about {angles[0]:.0f} to {angles[1]:.0f} degrees of each turn: taken"
-        " for a masked sector, which is no loss, and scans are cut there"
+        f"no points from about {angles[0]:.0f} to {angles[1]:.0f} degrees of each revolution:"
+        " assumed to be a masked sector, which is not counted as loss; scans are cut there"
     )

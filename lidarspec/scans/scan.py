@@ -185,6 +185,6 @@ def _check_count(count: Any, method: str) -> int:
     is_whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
     if not is_whole or count < 1:
         raise UsageError(
-            f"{method} takes how many sectors the turn has, a whole number from 1 on, not {count!r}"
+            f"{method} requires the number of sectors, an integer of at least 1, not {count!r}"
         )
     return int(count)

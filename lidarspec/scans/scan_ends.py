@@ -229,7 +229,7 @@ def _read_field(points: EvaluatedPoints, path: str) -> Column:
         except UnknownField as error:
             raise SpecError(str(error), path="scan", rule="LS216") from None
     if not isinstance(column, Column):
-        raise SpecError("scans are cut by a field, and this is a struct", path=path)
+        raise SpecError("expected a field that ends scans, got a struct", path=path)
     return column
 
 

@@ -73,8 +73,7 @@ class Selection:
         start, stop = self.scans
         if min(start, stop or 0) < 0:
             raise UsageError(
-                "a scan is counted from the first one: from the last, all of a source would have to"
-                " be read first"
+                "scans are counted from the first one; negative numbers are not supported"
             )
         begin, end = self.times
         object.__setattr__(self, "times", (_add_zone(begin), _add_zone(end)))
@@ -82,7 +81,7 @@ class Selection:
             if low is not None and high is not None:
                 _check_order(low, high)
         if self.every < 1:
-            raise UsageError(f"each {self.every}th scan: the number is 1 or more")
+            raise UsageError(f"every must be at least 1, not {self.every}")
 
     @property
     def is_timed(self) -> bool:
@@ -108,9 +107,9 @@ def _add_zone(moment: Moment | None) -> Moment | None:
 def _check_order(low: Any, high: Any) -> None:
     """Raise UsageError unless an interval begins before it ends."""
     if isinstance(low, datetime) != isinstance(high, datetime):
-        raise UsageError(f"one end is a date and the other is not: {low} to {high}")
+        raise UsageError(f"expected two dates or two times, got {low} to {high}")
     if low > high:
-        raise UsageError(f"end before start: {low} to {high}")
+        raise UsageError(f"the end is before the start: {low} to {high}")
     if low == high:
         raise UsageError(f"start and end are equal: {low}")
 
@@ -168,8 +167,8 @@ class TimeSlice:
         if first > MIN_DATE_NS:
             dates = f" ({format_date(first)} to {format_date(last)})"
         text = (
-            f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}, and nothing"
-            " of that is asked for"
+            f"{source} has {number} from 0 s to {(last - first) * 1e-9:.3f} s{dates}, and the"
+            " selection is outside"
         )
         return suggest(UsageError(text), f"lidarspec info {quote(str(source))}")
 
@@ -210,7 +209,7 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
     any_came = False
     for chunk in source.chunks():
         if chunk.at is None:
-            raise UsageError(f"{name} does not say when its bytes arrived, by which --slice goes")
+            raise UsageError(f"{name} has no arrival times, which --slice requires")
         is_first = wanted.first is None
         if wanted.holds(np.array([chunk.at]))[0]:
             any_came = True
@@ -311,16 +310,15 @@ class ScanSelector:
         if self._selection.is_timed:
             return self.slice.missed_error(self._source, f"{number},")
         return UsageError(
-            f"{self._source} has {number}, from 0 to {self._seen - 1}, and none of them is"
-            " asked for"
+            f"{self._source} has {number}, from 0 to {self._seen - 1}; the selection lies outside"
         )
 
     def _time(self, scan: Scan) -> int:
         by_host = self._selection.time == "host"
         if not scan.host_ns and (by_host or scan.sensor.clock is None):
             raise suggest(
-                UsageError(f"{self._source} does not say when its bytes arrived"),
-                "the same with --scans 5:10",
+                UsageError(f"{self._source} has no arrival times"),
+                "repeat with --scans 5:10",
             )
         if by_host:
             return scan.host_ns

@@ -492,7 +492,7 @@ class SimulatedDevice:
         stream_simulation = frame_simulation(self.sensor, frame, blocked=bool(self.faults.rotor))
         if not stream_simulation.interval:
             raise SpecError(
-                "nothing says how often it is sent: declare its `rate`",
+                "its rate is unknown: declare `rate`",
                 path=frame,
                 sensor=self.sensor.id,
             )

@@ -111,7 +111,7 @@ class FaultyLink:
 
     def __init__(self, faults: Faults, *, seed: int = 0, stream: bool) -> None:
         if stream and faults.reorder:
-            raise UsageError("reorder is for datagrams; bytes on a line keep their order")
+            raise UsageError("reorder requires datagrams; a byte stream keeps its order")
         self._faults = faults
         self._stream = stream
         self._source = random.Random(f"line {seed}")

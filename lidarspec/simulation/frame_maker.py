@@ -40,7 +40,7 @@ class FrameMaker:
         engine = get_codec(sensor.frames[frame])
         if isinstance(engine, PlainCodec):
             raise SpecError(
-                f"cannot be simulated, since it is not compiled: {engine.reason}",
+                f"cannot be simulated, because it is not compiled: {engine.reason}",
                 path=frame,
                 sensor=sensor.id,
             )
@@ -133,7 +133,7 @@ class FrameMaker:
             data = self._coder.encode(struct)
             if data is None:
                 raise SpecError(
-                    f"{self.engine.frame.wire} cannot write these values",
+                    f"{self.engine.frame.wire} cannot encode these values",
                     path="simulation",
                     sensor=self._sensor,
                 )
@@ -230,9 +230,11 @@ class FrameMaker:
         given = ", ".join(
             f"{path} = {values[path]}" for path in self._layout_fields if path in values
         )
-        reason = f"with {given} there is no frame of at most {self._limit} bytes (max_length)"
+        reason = f"with {given} the frame exceeds {self._limit} bytes (max_length)"
         if left_out:
-            reason = f"sweep has to give {left_out[0]!r}, which the length of the frame depends on"
+            reason = (
+                f"sweep must return {left_out[0]!r}, because the length of the frame depends on it"
+            )
         return SpecError(reason, path=path, sensor=self._sensor)
 
     def _rows(
@@ -248,7 +250,7 @@ class FrameMaker:
                 continue
             if leaf is None:
                 raise SpecError(
-                    "sweep gives a value to a field that the frame does not have",
+                    "sweep returns a value for a field that the frame does not have",
                     path=path,
                     sensor=self._sensor,
                 )

@@ -241,10 +241,10 @@ def parse_scene(table: Mapping[str, Any], place: str = "scene") -> Room:
     walls = None
     if "room" in table:
         if not isinstance(table["room"], Mapping):
-            raise UsageError(f"{place}: room: one table, [room]")
+            raise UsageError(f"{place}: room: expected one table, [room]")
         walls = _box(table["room"], f"{place}: room")
         if not all(low < 0 < high for low, high in zip(walls.low, walls.high, strict=True)):
-            raise UsageError(f"{place}: room: the sensor, at [0, 0, 0], has to stand in it")
+            raise UsageError(f"{place}: room: must contain the sensor, which is at [0, 0, 0]")
     boxes = [_box(entry, where) for entry, where in _entries(table, "box", place)]
     movers = [_mover(entry, where) for entry, where in _entries(table, "mover", place)]
     return Room(walls, tuple(boxes), tuple(movers))
@@ -255,8 +255,7 @@ def _box(table: Mapping[str, Any], place: str) -> Box:
     low, high = (_numbers(table, name, 3, place) for name in ("low", "high"))
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise UsageError(
-            f"{place}: every number of high has to be above that of low, and {low} and {high} are"
-            " not so"
+            f"{place}: expected high above low in each coordinate, got low {low} and high {high}"
         )
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
@@ -265,16 +264,18 @@ def _mover(table: Mapping[str, Any], place: str) -> Mover:
     _known(table, ("size", "path", "speed", "floor"), place)
     size = _numbers(table, "size", 3, place)
     if min(size) <= 0:
-        raise UsageError(f"{place}.size: numbers above 0, not {size}")
+        raise UsageError(f"{place}.size: expected numbers above 0, got {size}")
     path = table.get("path")
     if not isinstance(path, list) or len(path) < 2:
-        raise UsageError(f"{place}.path: two places or more, such as [[1, -1], [1, 1]]")
+        raise UsageError(
+            f"{place}.path: expected at least two positions, such as [[1, -1], [1, 1]]"
+        )
     points = [
         _numbers({f"path[{index}]": point}, f"path[{index}]", 2, place)
         for index, point in enumerate(path)
     ]
     if len(set(map(tuple, points))) < 2:
-        raise UsageError(f"{place}.path: it leads nowhere")
+        raise UsageError(f"{place}.path: all positions are equal")
     others = {
         name: _number(table[name], f"{place}.{name}")
         for name in ("speed", "floor")
@@ -288,25 +289,27 @@ def _entries(
 ) -> list[tuple[Mapping[str, Any], str]]:
     entries = table.get(name, [])
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
-        raise UsageError(f"{place}: {name}: tables in double brackets, [[{name}]]")
+        raise UsageError(f"{place}: {name}: expected tables in double brackets, [[{name}]]")
     return [(entry, f"{place}: {name}[{index}]") for index, entry in enumerate(entries)]
 
 
 def _known(table: Mapping[str, Any], names: tuple[str, ...], place: str) -> None:
     for name in table:
         if name not in names:
-            hint = did_you_mean(name, names) or f"; known are {', '.join(names)}"
+            hint = did_you_mean(name, names) or f"; expected one of {', '.join(names)}"
             raise UsageError(f"{place}: unknown key {name!r}{hint}")
 
 
 def _numbers(table: Mapping[str, Any], name: str, count: int, place: str) -> list[float]:
     values = table.get(name)
     if not isinstance(values, list) or len(values) != count:
-        raise UsageError(f"{place}.{name}: {count} numbers in brackets, not {shown(values)}")
+        raise UsageError(
+            f"{place}.{name}: expected {count} numbers in brackets, got {shown(values)}"
+        )
     return [_number(value, f"{place}.{name}") for value in values]
 
 
 def _number(value: Any, place: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e6:
-        raise UsageError(f"{place}: a number, not {shown(value)}")
+        raise UsageError(f"{place}: expected a number, got {shown(value)}")
     return float(value)

@@ -302,7 +302,8 @@ class Measurement:
         targets = targets or self._linear(table)
         if not targets:
             reason = (
-                "no field in metres makes the range of a point: the sensor has to give `encode`"
+                "cannot set the range of a point, because no field in metres determines it:"
+                " declare `encode`"
             )
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(targets)
@@ -395,10 +396,7 @@ class PointPlacement(Measurement):
         """
         declared = self._sensor.simulation_of(self._frame).directions
         if declared is None:
-            reason = (
-                "points by coordinates are simulated along Simulation(directions=...), and none are"
-                " declared"
-            )
+            reason = "points by coordinates require Simulation(directions=...)"
             raise SpecError(reason, path="simulation", sensor=self._sensor.id)
         directions = np.full((2, len(numbers), *shape), np.nan)
         with plugin_errors(f"directions of {self._frame}", self._sensor.id, declared):
@@ -411,8 +409,8 @@ class PointPlacement(Measurement):
                     own > length for own, length in zip(stacked.shape[1:], shape, strict=False)
                 ) or stacked.ndim > 1 + len(shape):
                     raise SpecError(
-                        f"azimuth and elevation {azimuth.shape} do not broadcast to the points of"
-                        f" frame {number}, {shape}"
+                        f"azimuth and elevation {azimuth.shape} do not broadcast to the shape"
+                        f" of the points of frame {number}, {shape}"
                     )
                 corner: Any = tuple(
                     slice(0, length if length > 1 else None) for length in stacked.shape[1:]
@@ -485,7 +483,10 @@ class PointPlacement(Measurement):
                 if (twice != once).any() and np.allclose(thrice - twice, twice - once):
                     targets.append(RangeField(path, inner, None))
         if not targets:
-            reason = "no field of a point makes its coordinates: the sensor has to give `encode`"
+            reason = (
+                "cannot set the coordinates of a point, because no field determines them: declare"
+                " `encode`"
+            )
             raise SpecError(reason, path="points", sensor=self._sensor.id)
         return tuple(targets)
 
@@ -523,7 +524,7 @@ def _result(sensor: Sensor, frame: str, table: CompiledTable) -> tuple[Points, B
     measured = [getattr(result, name, None) for name in ("range", "x", "y", "z")]
     if not any(isinstance(part, Column) for part in measured):
         raise SpecError(
-            "no field makes the range of a point: it cannot be simulated",
+            "cannot be simulated, because no field determines the range of a point",
             path="points",
             sensor=sensor.id,
         )
@@ -689,7 +690,7 @@ class RestingImu:
                 paths.append(path)
         if not paths or zero.shape[0] != 6:
             raise SpecError(
-                "no field makes what the IMU feels: it cannot be simulated",
+                "cannot be simulated, because no field determines the IMU samples",
                 path=f"{self._frame}.imu",
                 sensor=self._sensor.id,
             )
@@ -821,7 +822,8 @@ class FrameSimulation:
         sweep = sensor.simulation_of(frame).sweep
         if sweep is None:
             raise UsageError(
-                f"{sensor.id} declares no sweep for {frame!r} frames, and cannot be simulated"
+                f"{sensor.id} cannot be simulated, because it declares no sweep for {frame!r}"
+                " frames"
             )
         self._sensor = sensor
         self._frame = frame

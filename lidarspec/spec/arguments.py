@@ -40,14 +40,13 @@ class Text:
 
     def __post_init__(self) -> None:
         if self.size < 1 or len(self.fill) != 1:
-            raise SpecError(
-                "Text(size, fill) has room for a byte at least, and is filled up with one"
-            )
+            raise SpecError("Text(size, fill) requires a size of at least 1 and a fill of one byte")
 
     def words(self, room: int | None) -> str:
         """Return the accepted values as text, for messages."""
         return (
-            f"a text of up to {min(self.size, room or self.size)} bytes in {self.encoding.upper()}"
+            f"a string of up to {min(self.size, room or self.size)} bytes in"
+            f" {self.encoding.upper()}"
         )
 
     def pack(self, value: Any, room: int | None) -> bytes:
@@ -140,7 +139,8 @@ class Count:
     def __post_init__(self) -> None:
         if self.bits < 1 or not 0 <= self.first < 1 << self.bits:
             raise SpecError(
-                "Count(bits, first) has a bit at least, and begins with a number that its bits hold"
+                "Count(bits, first) requires at least one bit, and a first number that fits"
+                " in its bits"
             )
 
     def at(self, index: int) -> int:
@@ -194,6 +194,6 @@ def argument(given: Any) -> Argument:
         case (str(path), kind) if kind is bytes:
             return Argument(path, Octets())
     raise SpecError(
-        "an argument is (path, lowest, highest), (path, Text(16)), (path, Address()) or (path,"
+        "an argument must be (path, lowest, highest), (path, Text(16)), (path, Address()) or (path,"
         f" bytes), not {given!r:.60}"
     )

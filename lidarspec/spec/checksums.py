@@ -259,7 +259,8 @@ class ZeroPadded(Checksum):
 
     def describe(self) -> str:
         return (
-            f"{self.algorithm.describe()} of the bytes padded with zeros to a multiple of {self.to}"
+            f"{self.algorithm.describe()} of the bytes, padded with zeros to a multiple of"
+            f" {self.to}"
         )
 
 

@@ -59,7 +59,7 @@ def check_simulation(simulation: object) -> None:
     """Raise SpecError unless the value is a `Simulation`."""
     if not isinstance(simulation, Simulation):
         raise SpecError(
-            f"expected a Simulation(...), got {simulation!r}; leave it out if nothing is needed",
+            f"expected a Simulation(...), got {simulation!r}",
             path="simulation",
         )
 
@@ -152,27 +152,28 @@ class Frame:
 
     def __post_init__(self) -> None:
         if self.direction not in ("in", "out"):
-            raise SpecError(f"direction is 'in' or 'out', not {self.direction!r}")
+            raise SpecError(f"direction must be 'in' or 'out', not {self.direction!r}")
         if self.max_length < 0 or self.confirm < 1:
-            raise SpecError("max_length and confirm are at least 1")
+            raise SpecError("max_length and confirm must be at least 1")
         check_simulation(self.simulation)
         freeze(self, "acknowledged")
         for name in ("points", "imu"):
             if isinstance(own := getattr(self, name), Mapping) and len(own) != 1:
                 raise SpecError(
-                    f"{name} stand in parts of one kind, not in {', '.join(own) or 'none'}",
+                    f"{name} must name parts of one kind, not {', '.join(own) or 'none'}",
                     path=name,
                 )
         if self.data and self.clock is not None:
-            raise SpecError("data have the clock of the sensor: give it there", path="clock")
+            raise SpecError(
+                "a data frame uses the clock of the sensor: declare it there", path="clock"
+            )
         longest = self.max_length or (0 if self.wire is not None else fixed_size(self.struct))
         object.__setattr__(self, "max_length", longest)
         object.__setattr__(self, "prepared", prepare(self.struct, self.room or sys.maxsize))
         object.__setattr__(self, "endless", check_struct(self.prepared))
         if not longest:
             raise SpecError(
-                "max_length may be left out only where the struct has a fixed size, and no wire"
-                " form"
+                "max_length is required, because the struct has no fixed size or has a wire form"
             )
 
     def __repr__(self) -> str:

@@ -119,7 +119,9 @@ def duration(text: str) -> float:
         number = text.strip().removesuffix(unit)
         if text.strip().endswith(unit) and _is_number(number) and 0 <= float(number) < float("inf"):
             return float(number) * seconds
-    raise UsageError(f"{text!r} is no duration: a number with ms, s, min or h, such as 10s")
+    raise UsageError(
+        f"invalid duration {text!r}: expected a number with ms, s, min or h, such as 10s"
+    )
 
 
 def share(text: str) -> float:
@@ -159,9 +161,10 @@ class Scaled(layer.DescribedField):
         ]
         if given[0] != "a field" or len(steps) < 2 or not scale or not isinstance(unit, str):
             wanted = (
-                'a field, the size of a step, its unit and an offset, Scaled(Int16ul, 0.001, "m")'
+                "a field, the size of a step, its unit and an offset, as in Scaled(Int16ul,"
+                ' 0.001, "m")'
             )
-            raise SpecError(f"Scaled takes {wanted}, not {', '.join(given)}")
+            raise SpecError(f"Scaled requires {wanted}, got {', '.join(given)}")
         super().__init__(subcon)
         self.scale = scale
         self.unit = unit
@@ -191,8 +194,8 @@ class SizeOf(layer.SizeField):
     def __init__(self, subcon: Construct, part: str = "", plus: int = 0) -> None:
         if not hasattr(subcon, "parse") or not isinstance(part, str) or not isinstance(plus, int):
             raise SpecError(
-                'SizeOf takes a field, the name of a part and a number, SizeOf(Int16ub, "body",'
-                f" 2), not {part!r} and {plus!r}"
+                "SizeOf requires a field, the name of a part and a number, as in SizeOf(Int16ub,"
+                f' "body", 2), got {part!r} and {plus!r}'
             )
         super().__init__(subcon, tuple(filter(None, part.split("."))), plus)
 
@@ -237,7 +240,7 @@ class Checksummed(layer.SealedStruct):
         while isinstance(inner, Checksummed):
             if self.over is None and inner.over is None:
                 both = f"the checksums {inner.fields[0]!r} and {self.fields[0]!r} cover each other"
-                raise SpecError(f"{both}: say over= of the one that is made first")
+                raise SpecError(f"{both}: declare over= for the inner one")
             inner = inner.subcon
 
     def _parse(self, stream: Any, context: Any, path: str) -> Any:
@@ -321,7 +324,7 @@ class Checksummed(layer.SealedStruct):
                 "",
                 0,
                 "a checksum algorithm",
-                "none; a lidarspec_checksum hook has to supply it",
+                "none; a lidarspec_checksum hook must provide it",
                 "checksum",
             )
         return self.algorithm(
@@ -417,15 +420,15 @@ class Parts(layer.Partition):
             following is None
         ):
             raise SpecError(
-                "Parts takes one of count=, within=, and size= with following=: what says where the"
-                " last part is"
+                "Parts requires one of count=, within=, or size= with following=, to find the"
+                " last part"
             )
         if isinstance(kinds, Mapping):
             self.cases = dict(kinds)
         else:
             self.cases = {"": kinds}
         if not self.cases or not all(map(layer.is_struct, self.cases.values())):
-            raise SpecError("a part is a Struct, or one of several Structs by name")
+            raise SpecError("expected a Struct, or several Structs by name")
         self.count = count
         self.size = size
         self.following = following
@@ -442,7 +445,7 @@ class Parts(layer.Partition):
             part = self.cases[kind]._parsereport(stream, context, place)
             self._take(parsed, kind, part, (spot, stream.tell()), announced, place)
             if stream.tell() - start > self.limit:
-                raise RangeError("parts longer than the frame can be", path=place)
+                raise RangeError("the parts are longer than the frame may be", path=place)
         return parsed
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -460,12 +463,12 @@ class Parts(layer.Partition):
             stream.write(data)
         if goes_on(built) != 0:
             raise RangeError(
-                f"more parts are announced than the {len(built)} that are given", path=path
+                f"the frame announces more parts than the {len(built)} that were given", path=path
             )
         return built
 
     def _sizeof(self, context: Any, path: str) -> int:
-        raise SizeofError("the size of parts is theirs", path=path)
+        raise SizeofError("the size of the parts depends on their content", path=path)
 
     def _rule(self, context: Any, path: str) -> Callable[[layer.ParsedParts], int]:
         """Return a function from the parts so far to the bytes of the next one.
@@ -550,7 +553,7 @@ class Parts(layer.Partition):
             return name
         if len(names) > 1 and layer.is_verifying(context):
             raise layer.MismatchError(
-                path, start, f"one of {', '.join(names)}", "none of these", "constant"
+                path, start, f"one of {', '.join(names)}", "none of them", "constant"
             )
         return names[-1]
 

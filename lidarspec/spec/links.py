@@ -128,9 +128,9 @@ class Udp(Link):
         if any(not 0 < port < 65536 for port in ports) or not (
             0 <= broadcast < 65536 and 0 <= local < 65536
         ):
-            raise SpecError("a UDP port is a number from 1 to 65535")
+            raise SpecError("a UDP port must be a number from 1 to 65535")
         if stream and assembled is not None:
-            raise SpecError("datagrams are fragments of messages, or pieces of a stream, not both")
+            raise SpecError("datagrams cannot be both fragments of messages and pieces of a stream")
         given = {
             "ports": tuple(ports),
             "stream": stream,

@@ -116,7 +116,7 @@ _WORDS: dict[object, str] = {
     bool: "true or false",
     float: "a number",
     int: "a whole number",
-    str: "a text",
+    str: "a string",
 }
 
 

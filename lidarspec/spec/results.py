@@ -77,7 +77,9 @@ class Extra:
     def __post_init__(self) -> None:
         if self.dtype is not None:
             if (kind := np.dtype(self.dtype)).kind not in "biuf":
-                raise SpecError(f"a column of points has numbers, not {kind}", path="extra")
+                raise SpecError(
+                    f"a column of points must contain numbers, not {kind}", path="extra"
+                )
             object.__setattr__(self, "dtype", kind)
 
 
@@ -90,9 +92,9 @@ def _name_extras(extra: Mapping[str, Any]) -> Mapping[str, Extra]:
     for name in extra:
         if not _NAME.fullmatch(name) or name in TAKEN:
             if name in TAKEN:
-                reason = "is the name of something else"
+                reason = "is a reserved name"
             else:
-                reason = "is no name: small letters, digits and _"
+                reason = "is not a valid name: use lower-case letters, digits and _"
             raise SpecError(f"{name!r} {reason}", path="extra")
     return MappingProxyType(
         {name: value if isinstance(value, Extra) else Extra(value) for name, value in extra.items()}
@@ -207,4 +209,4 @@ class Imu:
         for name in ("angular_velocity", "linear_acceleration"):
             value = getattr(self, name)
             if not isinstance(value, tuple | list) or len(value) != 3:
-                raise SpecError("(x, y, z), three columns", path=f"Imu.{name}")
+                raise SpecError("expected three columns (x, y, z)", path=f"Imu.{name}")

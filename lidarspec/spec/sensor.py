@@ -210,11 +210,11 @@ class SensorDescription:
         if function is not None:
             return function
         if self.imu_frames:
-            having = f"those of {', '.join(self.imu_frames)} have"
+            having = f"{', '.join(self.imu_frames)} have"
         else:
-            having = "no frame of the sensor has"
+            having = "no frame type of the sensor has"
         raise SpecError(
-            f"this frame type has nothing of an IMU; {having}", path=frame, sensor=self.id
+            f"this frame type has no IMU samples; {having} them", path=frame, sensor=self.id
         )
 
     def parts_with(self, function: Literal["points", "imu"], frame: str) -> str:
@@ -305,7 +305,7 @@ def _check_points(sensor: SensorDescription) -> None:
     if sensor.points is None and any(
         frame.data and frame.points is None for frame in sensor.frames.values()
     ):
-        raise SpecError("a data frame without a points function", path="points", sensor=sensor.id)
+        raise SpecError("a data frame requires a points function", path="points", sensor=sensor.id)
     for name in ("scan", "range_limits"):
         if getattr(sensor, name) is None:
             raise SpecError(
@@ -317,17 +317,19 @@ def _check_facts(sensor: SensorDescription) -> None:
     """Raise SpecError for a fact that is invalid on its own."""
     if not _ID.fullmatch(sensor.id):
         raise SpecError(
-            "an id is vendor-model in lower case with hyphens", path="id", sensor=sensor.id
+            "invalid id: expected vendor-model in lower case with hyphens",
+            path="id",
+            sensor=sensor.id,
         )
     if sensor.status not in STATUSES:
         raise SpecError(
-            f"status is one of {', '.join(STATUSES)}, not {sensor.status!r}",
+            f"status must be one of {', '.join(STATUSES)}, not {sensor.status!r}",
             path="status",
             sensor=sensor.id,
         )
     if not API - 1 <= sensor.api <= API:
         raise SpecError(
-            f"written for interface {sensor.api}; this engine reads {API - 1} and {API}",
+            f"written for plugin interface {sensor.api}; this version supports {API - 1} and {API}",
             path="api",
             sensor=sensor.id,
         )
@@ -342,20 +344,22 @@ def _check_facts(sensor: SensorDescription) -> None:
     unknown_roles = sorted(set(sensor.info) - set(ROLES))
     if unknown_roles:
         raise SpecError(
-            f"{unknown_roles[0]!r} is not among {', '.join(ROLES)}", path="info", sensor=sensor.id
+            f"unknown name {unknown_roles[0]!r}: expected one of {', '.join(ROLES)}",
+            path="info",
+            sensor=sensor.id,
         )
     unknown_directions = sorted(set(sensor.vendor_axes or ()) - set(DIRECTIONS))
     if unknown_directions:
         raise SpecError(
-            f"no direction {unknown_directions[0]!r}", path="vendor_axes", sensor=sensor.id
+            f"unknown direction {unknown_directions[0]!r}", path="vendor_axes", sensor=sensor.id
         )
     if sensor.beams is not None and sensor.beams < 1:
         raise SpecError(
-            f"a scan has at least 1 point, not {sensor.beams}", path="beams", sensor=sensor.id
+            f"a scan must have at least 1 point, not {sensor.beams}", path="beams", sensor=sensor.id
         )
     if sensor.turn is not None and not 0 < sensor.turn[0] <= sensor.turn[1]:
         raise SpecError(
-            f"the slowest and the fastest number of scans a second, not {sensor.turn}",
+            f"expected the lowest and the highest number of scans per second, got {sensor.turn}",
             path="turn",
             sensor=sensor.id,
         )
@@ -379,17 +383,17 @@ def _check_command(sensor: SensorDescription, name: str, command: Command) -> No
         other.starts or other.stops for other in sensor.commands.values()
     ):
         raise SpecError(
-            "only_stopped needs a command that starts or stops the data, and there is none",
+            "only_stopped requires a command that starts or stops the data",
             path=f"commands.{name}",
         )
     if command.learns is not None and not (command.replies and sensor.configure is not None):
         raise SpecError(
-            "learns needs a reply to learn from, and a `configure` function that takes the options",
+            "learns requires a reply, and a `configure` function that accepts the options",
             path=f"commands.{name}.learns",
         )
     if "timeout" in command.args:
         raise SpecError(
-            "'timeout' is the time to wait for the reply, and cannot be an argument",
+            "'timeout' is reserved for the reply timeout and cannot be an argument",
             path=f"commands.{name}.args",
         )
 
@@ -402,7 +406,7 @@ def _check_clock(sensor: SensorDescription) -> None:
     _check_names(sensor, "clock.reference", clock.reference[:1], sensor.frames)
     if clock.wraps_at is None or callable(clock.source):
         raise SpecError(
-            "reference completes a clock made of fields that starts again at `wraps_at`",
+            "reference requires a clock made of fields, with `wraps_at`",
             path="clock.reference",
             sensor=sensor.id,
         )
@@ -418,7 +422,9 @@ def _check_names(
     for name in names:
         if name is not None and name not in table and sensor.frames:
             raise SpecError(
-                f"{name!r} is not among {', '.join(table) or 'none'}", path=path, sensor=sensor.id
+                f"unknown name {name!r}: expected one of {', '.join(table) or 'none'}",
+                path=path,
+                sensor=sensor.id,
             )
 
 
@@ -486,7 +492,7 @@ class Configure:
                 except UsageError as error:
                     raise UsageError(f"{name}: {error}") from None
             elif not isinstance(value, bool | int | float | None) and not is_word:
-                raise UsageError(f"{name}: {shown(value)} is neither a number nor a word")
+                raise UsageError(f"{name}: expected a number or a word, got {shown(value)}")
         return checked
 
     def _call_function(self, options: Mapping[str, Any]) -> SensorDescription:
@@ -502,7 +508,9 @@ class Configure:
         for name, value in options.items():
             option = types.get(name, OptionType())
             if not option.accepts(value):
-                raise UsageError(f"{sensor.id}: {name} is {option.describe()}, not {shown(value)}")
+                raise UsageError(
+                    f"{sensor.id}: {name} must be {option.describe()}, not {shown(value)}"
+                )
             if option.is_file and value is not None and not isinstance(value, Learned):
                 _refuse_pipe(value)
         try:
@@ -523,7 +531,8 @@ def _refuse_pipe(path: str | PathLike[str]) -> None:
     """Raise UsageError for a pipe or device, which may never end."""
     if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
         raise UsageError(
-            f"{path!s}: a pipe or device is not read as a file; write its content to a file first"
+            f"{path!s}: expected a regular file, not a pipe or device; write its content to a"
+            " file first"
         )
 
 
@@ -533,27 +542,27 @@ def _check_cut(sensor: SensorDescription, degrees: object) -> None:
         isinstance(sensor.scan, OnChange) and bool(sensor.scan.angle)
     )
     if not has_angle:
-        raise UsageError(f"{sensor.id}: its scans are not cut at an angle, so cut cannot be set")
+        raise UsageError(f"{sensor.id}: cut cannot be set, because scans are not cut at an angle")
     if (
         isinstance(degrees, bool)
         or not isinstance(degrees, Real)
         or not math.isfinite(float(degrees))
     ):
-        raise UsageError(f"{sensor.id}: cut is an angle in degrees, not {shown(degrees)}")
+        raise UsageError(f"{sensor.id}: cut must be an angle in degrees, not {shown(degrees)}")
 
 
 def _check_shared(sensor: SensorDescription, options: Mapping[str, Any]) -> None:
     frame = options.get("frame", FRAMES_OF_REFERENCE[0])
     if frame not in FRAMES_OF_REFERENCE:
         raise UsageError(
-            f"{sensor.id}: frame is one of {', '.join(FRAMES_OF_REFERENCE)}, not {frame!r}"
+            f"{sensor.id}: frame must be one of {', '.join(FRAMES_OF_REFERENCE)}, not {frame!r}"
         )
     if frame == "vendor" and sensor.vendor_axes is None:
-        raise UsageError(f"{sensor.id} declares no axes of its vendor")
+        raise UsageError(f"{sensor.id} declares no vendor axes")
     if "cut" in options:
         _check_cut(sensor, options["cut"])
     if "answer" in options and options["answer"] not in sensor.data_frames:
         raise UsageError(
-            f"{sensor.id}: answer is one of {', '.join(sensor.data_frames)}, not"
+            f"{sensor.id}: answer must be one of {', '.join(sensor.data_frames)}, not"
             f" {options['answer']!r}"
         )

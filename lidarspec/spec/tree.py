@@ -673,7 +673,7 @@ class Sealed:
         """
         if self.declared is None:
             raise SpecError(
-                "a checksum without algorithm, and no lidarspec_checksum hook supplies one",
+                "a checksum without algorithm, and no lidarspec_checksum hook provides one",
                 path=self.fields[0],
             )
         return self.declared
@@ -1053,7 +1053,7 @@ class Scope:
             return self
         if name not in self.names:
             raise UntraceableExpressionError(
-                f"an expression asks for {name!r}, which is not a field before it"
+                f"an expression uses {name!r}, which is not an earlier field"
             )
         part = self.names[name]
         if isinstance(part, Scope):
@@ -1061,7 +1061,7 @@ class Scope:
         self.asked += [part] if isinstance(part, Ref) else part.refs
         if name in self.ambiguous:
             raise UntraceableExpressionError(
-                f"an expression asks for {name!r}, which has several forms"
+                f"an expression uses {name!r}, which has several forms"
             )
         if isinstance(part, Value):
             return part.read()
@@ -1071,7 +1071,7 @@ class Scope:
         return self[name]
 
     def __len__(self) -> int:
-        raise UntraceableExpressionError("an expression asks for the length of an array")
+        raise UntraceableExpressionError("an expression uses the length of an array")
 
 
 class Beside(Scope):
@@ -1151,7 +1151,7 @@ class Symbol:
         self.formula = formula
 
     def __bool__(self) -> bool:
-        raise UntraceableExpressionError("a Python function decides on the values of fields")
+        raise UntraceableExpressionError("a Python function branches on the values of fields")
 
     __index__ = __int__ = __float__ = __len__ = __iter__ = __bool__
 
@@ -1165,7 +1165,7 @@ class Symbol:
         return self
 
     def __getattr__(self, name: str) -> Any:
-        raise UntraceableExpressionError(f"an expression asks for {name!r} of a number")
+        raise UntraceableExpressionError(f"an expression uses the attribute {name!r} of a number")
 
     def __getitem__(self, key: object) -> Any:
         known = self.formula
@@ -1173,7 +1173,7 @@ class Symbol:
             path = f"{known.path}[{key}]"
             info = get_element(known.info, path, {known.info.axes[0]: key})
             return Symbol(Ref(path, info or known.info))
-        raise UntraceableExpressionError("an expression takes an element of an array, or a byte")
+        raise UntraceableExpressionError("an expression uses an element of an array, or a byte")
 
 
 def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
@@ -1184,7 +1184,7 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
         if not isinstance(known, Ref) or not known.info.labels:
             continue
         if symbol not in ("==", "!=") or not isinstance(pair[one], int | str):
-            raise UntraceableExpressionError("an expression takes the name of a value for a number")
+            raise UntraceableExpressionError("an expression uses a named value as a number")
         if pair[one] in known.info.labels:  # construct replaces this number by its name
             return Symbol(int(symbol == "!="))
         pair[one] = _find_label_value(known, pair[one]) if isinstance(pair[one], str) else pair[one]
@@ -1197,7 +1197,9 @@ def _trace_operation(symbol: str, left: Any, right: Any) -> Symbol:
 
 
 def _raise_no_integer(sign: str) -> Any:
-    raise UntraceableExpressionError(f"an expression with {sign!r}, which need not give an integer")
+    raise UntraceableExpressionError(
+        f"an expression with {sign!r}, whose result may not be an integer"
+    )
 
 
 _SYMBOLS = {

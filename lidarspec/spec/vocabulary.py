@@ -90,8 +90,8 @@ class AlongAxis(NDArrayOperatorsMixin):
         array = np.asarray(function(*arrays))
         if array.ndim != len(axes):
             raise SpecError(
-                f"an array of shape {array.shape} beside numbers along {', '.join(axes)}: say what"
-                " it is along with along(...)"
+                f"cannot combine an array of shape {array.shape} with numbers along"
+                f" {', '.join(axes)}: name its axis with along(...)"
             )
         return AlongAxis(tuple(axes.values()), array)
 
@@ -124,7 +124,7 @@ def along(axis: str | tuple[str, ...], values: Array) -> Any:
     array = np.asarray(values)
     if array.ndim != len(axes):
         raise SpecError(
-            f"along({axis!r}, ...) takes an array with an axis for each name, not one of shape"
+            f"along({axis!r}, ...) requires an array with one axis per name, got shape"
             f" {array.shape}"
         )
     return AlongAxis(axes, array)
@@ -330,12 +330,12 @@ def _refuse_folded(turn: Array, full: float) -> None:
     moved = angles[angles != 0]
     if moved.size and not np.mod(moved, full).any():
         reason = (
-            f"spread(start, end): every end is whole turns of {full:g} from its start, and all"
-            " points would have one angle"
+            f"spread(start, end): each end is a whole number of revolutions of {full:g} from"
+            " its start, so all points would have one angle"
         )
         raise SpecError(
-            f"{reason}; full= is the circle in the unit of the angles, and the index of a sample is"
-            " steps(count)",
+            f"{reason}; full= must be the full circle in the unit of the angles; use"
+            " steps(count) for the index of a sample",
             rule="LS215",
         )
 

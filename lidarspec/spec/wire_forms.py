@@ -338,13 +338,11 @@ class Tokens:
         marks = (self.start, self.sep, self.end)
         if any(len(mark) != 1 for mark in marks) or len(set(marks)) < 3:
             raise SpecError(
-                "the start, the separator and the end of tokens are one byte each, and differ",
+                "start, separator and end of tokens must be three different bytes",
                 path="wire",
             )
         if self.base not in (10, 16):
-            raise SpecError(
-                f"digits are decimal or hexadecimal, not of base {self.base}", path="wire"
-            )
+            raise SpecError(f"base must be 10 or 16, not {self.base}", path="wire")
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
         tokens = [[*text, self.sep[0]] for text in texts if len(text)]
@@ -552,8 +550,8 @@ class Echoes:
         room = self.most * self.size
         if len(characters) % room:
             raise SpecError(
-                f"{len(characters)} characters behind the head are no steps of {self.most} echoes"
-                f" of {self.size}",
+                f"expected groups of {self.most} echoes of {self.size} characters after the"
+                f" head, got {len(characters)} characters",
                 path="wire",
             )
         echoes = np.frombuffer(characters, np.uint8).reshape(-1, self.most, self.size)
@@ -597,8 +595,8 @@ class SixBits:
             or min(each.size, each.most) < 1
         ):
             raise SpecError(
-                "the mark between echoes is one character that is no digit, and an echo has at"
-                " least one that is",
+                "the mark between echoes must be one character that is not a digit, and size"
+                " and most at least 1",
                 path="wire",
             )
 
@@ -709,12 +707,12 @@ class Lines:
         object.__setattr__(self, "head", tuple(self.head))
         if self.width < 1 or min(self.head, default=1) < 1 or not 0 <= self.bare <= len(self.head):
             raise SpecError(
-                "lines have at least one character, and those without a check are among the first",
+                "lines must have at least one character, and lines without a check must come first",
                 path="wire",
             )
         if self.numbers is not None and self.numbers.echoes is not None and not self.head:
             raise SpecError(
-                "steps with echoes stand behind the head of a frame, and these lines have none",
+                "steps with echoes require lines with a head",
                 path="wire",
             )
 
@@ -889,7 +887,7 @@ class Escaped:
             or special & {b ^ self.xor for b in special}
         ):
             raise SpecError(
-                "flag and escape are two bytes that differ, and that no escaped one looks like",
+                "flag and escape must be two different bytes that no escaped byte equals",
                 path="wire",
             )
 
@@ -918,7 +916,9 @@ class Escaped:
         is_wrong = is_escape & np.append(is_escaped[1:] & is_escape[1:], True)[: len(body)]
         problem = None
         if is_wrong.any():
-            problem = Problem(1 + int(is_wrong.argmax()), "an escape is followed by no such byte")
+            problem = Problem(
+                1 + int(is_wrong.argmax()), "an escape is not followed by a valid byte"
+            )
         places = np.flatnonzero(~is_escape)
         struct = body[places] ^ (is_escaped[places] * np.uint8(self.xor))
         spans = [(1 + places - is_escaped[places], np.ones(len(places), np.intp))]

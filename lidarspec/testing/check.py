@@ -36,14 +36,14 @@ from lidarspec.trusted_files import read_document
 VECTORS = "vectors.json"
 #: Text of an error of the registry -> rule.
 SAID = (
-    ("there is no hook", "LS002"),
+    ("unknown hook", "LS002"),
     ("lacks @hookimpl", "LS003"),
     ("another sensor has this id", "LS005"),
-    ("returns sensors, not", "LS006"),
+    ("must return sensors, got", "LS006"),
     ("that returns a sensor", "LS006"),
     ("definition", "LS004"),
     ("lidarspec_checksum for", "LS010"),
-    ("max_length may be left out", "LS009"),
+    ("max_length is required", "LS009"),
 )
 
 
@@ -112,7 +112,7 @@ def _file(file: Path, wanted: str) -> CheckTarget:
         found_target.findings += _holders(found_target.sensors, file)
         if not found_target.sensors:
             raise SpecError(
-                "there is no function lidarspec_sensors, marked @hookimpl, that returns a sensor"
+                "the file defines no lidarspec_sensors, marked @hookimpl, that returns a sensor"
             )
     except SourceError:
         raise

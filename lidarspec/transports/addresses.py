@@ -87,7 +87,9 @@ class SourceAddress:
         if text is None:
             return None
         if not text.isdecimal() or not low <= int(text) <= high:
-            raise UsageError(f"{self.text}: {name} is a number from {low} to {high}, not {text!r}")
+            raise UsageError(
+                f"{self.text}: {name} must be a number from {low} to {high}, not {text!r}"
+            )
         return int(text)
 
     def switch(self, name: str) -> bool | None:
@@ -100,7 +102,7 @@ class SourceAddress:
         if text is None:
             return None
         if text.lower() not in _SWITCH_VALUES:
-            raise UsageError(f"{self.text}: {name} is 0 or 1, not {text!r}")
+            raise UsageError(f"{self.text}: {name} must be 0 or 1, not {text!r}")
         return _SWITCH_VALUES[text.lower()]
 
     def host_and_port(self) -> tuple[str, int | None]:
@@ -111,10 +113,10 @@ class SourceAddress:
         """
         match = _HOST_AND_PORT.fullmatch(self.location)
         if match is None:
-            raise UsageError(f"{self.text}: {self.location!r} is no host:port")
+            raise UsageError(f"{self.text}: expected host:port, got {self.location!r}")
         port = int(match[3]) if match[3] else None
         if port is not None and not 0 < port < 65536:
-            raise UsageError(f"{self.text}: a port is a number from 1 to 65535, not {port}")
+            raise UsageError(f"{self.text}: a port must be a number from 1 to 65535, not {port}")
         return match[1] or match[2] or "", port
 
 
@@ -157,7 +159,7 @@ def resolve_host(host: str, place: str) -> str:
             with contextlib.suppress(OSError, ValueError):
                 return str(socket.getaddrinfo(host, None, family, socket.SOCK_DGRAM)[0][4][0])
     error = UsageError(
-        f"{place}: there is no host {host!r}; name one, or its address, such as 192.168.1.200"
+        f"{place}: unknown host {host!r}: expected a host name or an address such as 192.168.1.200"
     )
     raise suggest(error, "lidarspec detect udp://")
 

@@ -50,26 +50,29 @@ def make_replay_outlet(destination: str, *, datagrams: bool, port: int = 0) -> O
         return Outlet(_make_udp_replay_line(destination, datagrams=datagrams, port=port))
     if destination != "pty" and not destination.startswith("tcp:"):
         raise UsageError(
-            "a replay goes to pty, udp://host:port, tcp://host:port or a new file, not to"
-            f" {destination!r}"
+            f"invalid destination {destination!r}: expected pty, udp://host:port, tcp://host:port"
+            " or a new file"
         )
     if datagrams:
         raise UsageError(
-            f"datagrams were recorded, and {destination} is a byte stream: play them to udp://{LOCALHOST}"
+            f"the recording contains datagrams, but {destination} is a byte stream: replay to"
+            f" udp://{LOCALHOST}"
         )
     if destination == "pty":
         return Outlet(PtyLine())
     host, named_port = _parse_host_and_port(destination)
     if named_port is None:
-        raise UsageError(f"{destination}: name the port to listen on, as in tcp://{LOCALHOST}:2111")
+        raise UsageError(
+            f"{destination}: specify the port to listen on, as in tcp://{LOCALHOST}:2111"
+        )
     return Outlet(TcpLine(host, named_port, sole=True))
 
 
 def _make_udp_replay_line(destination: str, *, datagrams: bool, port: int) -> UdpLine:
     if not datagrams:
         raise UsageError(
-            f"a byte stream was recorded, and {destination} takes datagrams: play it to pty or"
-            f" tcp://{LOCALHOST}:PORT"
+            f"the recording contains a byte stream, but {destination} requires datagrams:"
+            f" replay to pty or tcp://{LOCALHOST}:PORT"
         )
     host, named_port = _parse_host_and_port(destination)
     ports = (named_port,) if named_port else ()
@@ -80,17 +83,17 @@ def _make_data_line(sensor: Sensor, destination: str, link: str | Path | None) -
     if destination == "pty":
         if sensor.datagrams:
             raise UsageError(
-                f"{sensor.id} sends datagrams, which a serial port cannot carry: simulate it to"
+                f"{sensor.id} sends datagrams, which a serial port cannot carry: simulate to"
                 f" udp://{LOCALHOST}"
             )
         return PtyLine(link)
     if not destination.startswith(("udp://", "tcp://")):
         raise UsageError(
-            f"{destination!r} is no destination: pty, udp://HOST:PORT, tcp://HOST:PORT, or a file"
-            " (.lsr, .pcap, .pcapng, .bin)"
+            f"invalid destination {destination!r}: expected pty, udp://HOST:PORT,"
+            " tcp://HOST:PORT, or a file (.lsr, .pcap, .pcapng, .bin)"
         )
     if link is not None:
-        raise UsageError("a link leads to a pseudo-terminal: it goes with pty alone")
+        raise UsageError("a link is only supported for a pseudo-terminal: use --to pty")
     if destination.startswith("tcp://"):
         return _make_tcp_data_line(sensor, destination)
     return _make_udp_data_line(sensor, destination)
@@ -102,7 +105,7 @@ def _make_tcp_data_line(sensor: Sensor, destination: str) -> TcpLine:
     if port is None and isinstance(declared, Tcp):
         port = declared.port
     if port is None:
-        raise UsageError(f"{sensor.id} declares no TCP port: name one, as in tcp://{host}:2111")
+        raise UsageError(f"{sensor.id} declares no TCP port: specify one, as in tcp://{host}:2111")
     return TcpLine(host, port)
 
 
@@ -111,11 +114,11 @@ def _make_udp_data_line(sensor: Sensor, destination: str) -> UdpLine:
     declared = sensor.links.get("data")
     if not isinstance(declared, Udp) or not sensor.datagrams:
         raise UsageError(
-            f"{sensor.id} sends a stream of bytes, no datagrams: simulate it to pty or tcp://"
+            f"{sensor.id} sends a byte stream, not datagrams: simulate to pty or tcp://"
         )
     ports = (port,) if port else declared.ports[:2]
     if not ports:
-        raise UsageError(f"{sensor.id} declares no port: name one, as in udp://{host}:2368")
+        raise UsageError(f"{sensor.id} declares no UDP port: specify one, as in udp://{host}:2368")
     return UdpLine.to(host, ports)
 
 

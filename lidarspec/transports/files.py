@@ -127,8 +127,7 @@ class RecordingTransport(Transport):
                 self.unread = self._recording.leftover
         if self._invalid_events:
             self.warnings.append(
-                f"{self._recording.path}: {self._invalid_events} events were passed over,"
-                " which have no name"
+                f"{self._recording.path}: ignored {self._invalid_events} events without a name"
             )
 
     def skip_until(self, time_ns: int) -> bool:
@@ -136,7 +135,7 @@ class RecordingTransport(Transport):
         return self._has_skipped
 
     def write(self, data: bytes) -> None:
-        raise SourceError(f"{self._recording.path} is a recording: nothing can be sent to it")
+        raise SourceError(f"{self._recording.path} is a recording, so nothing can be sent to it")
 
     def close(self) -> None:
         self._recording.close()
@@ -164,8 +163,8 @@ class RecordingTransport(Transport):
         if name == "clock" and not self._has_clock_warning:
             self._has_clock_warning = True
             text = (
-                "the clock of the computer was set while it recorded; the arrival times go on"
-                " evenly, as it was at first"
+                "the clock of the computer was set during the recording; arrival times"
+                " continue without a step"
             )
             self.warnings.append(f"{self._recording.path}: {text}")
         return is_interruption
@@ -177,16 +176,16 @@ def _describe_damage(recording: Recording) -> str:
     if recording.salvage:
         return _describe_skipped(str(recording.path), recording.damaged, recording.leftover)
     if recording.is_cut:
-        return f"{recording.path} is cut off in its last record: {lost}, everything before them was"
-    mending = f"lidarspec record {quote(str(recording.path))} --salvage -o mended.lsr"
-    return f"{recording.path} is damaged at byte {recording.offset}: {lost}; next: {mending}"
+        return f"{recording.path} is truncated in its last record: {lost}, all earlier bytes were"
+    mending = f"lidarspec record {quote(str(recording.path))} --salvage -o repaired.lsr"
+    return f"{recording.path} is corrupt at byte {recording.offset}: {lost}; next: {mending}"
 
 
 def _describe_skipped(path: str, places: int, size: int) -> str:
     """Return a warning with the numbers of damaged places and of unread bytes."""
     return (
-        f"{path} is damaged in {places} place{'s' * (places > 1)}: {size} bytes were not read,"
-        " everything else was"
+        f"{path} is corrupt in {places} place{'s' * (places > 1)}: {size} bytes were not read,"
+        " all others were"
     )
 
 
@@ -232,7 +231,7 @@ class FileTransport(Transport):
         _check_end(self, self.file)
 
     def write(self, data: bytes) -> None:
-        raise SourceError(f"{self._path} is a file: nothing can be sent to it")
+        raise SourceError(f"{self._path} is a file, so nothing can be sent to it")
 
     def close(self) -> None:
         if self.file is not sys.stdin.buffer:
@@ -245,35 +244,36 @@ class FileTransport(Transport):
             self.warnings.append(_describe_skipped(self._path, stats.damaged, stats.lost))
         if _check_end(self, self.file) and stats.truncated_tail:
             self.warnings.append(
-                f"{self._path} is cut off in its last record; everything before it was read"
+                f"{self._path} is truncated in its last record; all earlier records were read"
             )
         if stats.snapped:
             self.warnings.append(
-                f"{self._path}: {stats.snapped} packets were cut by the capture's snap length"
+                f"{self._path}: {stats.snapped} packets were truncated by the snap length of"
+                " the capture"
             )
         if stats.other > stats.datagrams:
             self.warnings.append(
-                f"{self._path}: {stats.other} of {stats.packets} packets are no UDP over IP, and"
-                f" were not read: {_list_counts(stats.others)}"
+                f"{self._path}: {stats.other} of {stats.packets} packets are not UDP over IP"
+                f" and were not read: {_list_counts(stats.others)}"
             )
         if stats.unsupported:
             self.warnings.append(
                 f"{self._path}: {stats.unsupported.total()} of {stats.packets} packets have an"
-                f" unsupported link layer, and were not read: {_list_counts(stats.unsupported)};"
-                " next: editcap -C BYTES -T rawip IN.pcap OUT.pcap, which removes the BYTES before"
-                " the IP header"
+                " unsupported link layer and were not read:"
+                f" {_list_counts(stats.unsupported)}; next: editcap -C BYTES -T rawip IN.pcap"
+                " OUT.pcap, which removes the BYTES before the IP header"
             )
         if not stats.packets:
-            self.warnings.append(f"{self._path} is a capture without a packet")
+            self.warnings.append(f"{self._path} is a capture without packets")
         if stats.incomplete_fragments:
             self.warnings.append(
-                f"{self._path}: {stats.incomplete_fragments} IP fragments were left out, others of"
-                " their datagrams are missing"
+                f"{self._path}: {stats.incomplete_fragments} IP fragments were ignored,"
+                " because other fragments of their datagrams are missing"
             )
         if contradicting := stats.malformed - stats.damaged:
             self.warnings.append(
-                f"{self._path}: {contradicting} packets were left out, since their headers"
-                " contradict themselves"
+                f"{self._path}: {contradicting} packets were ignored, because their headers"
+                " are inconsistent"
             )
 
 
@@ -390,13 +390,14 @@ def open_file(
         log = find_log_kind(path, start)
         if log is not None and (file is not plain or path == "-"):
             raise SourceError(
-                f"{name} is {log.description}{' in a compressed file' * (file is not plain)}, and"
-                " is not read: give the file itself"
+                f"{name} is {log.description}{' in a compressed file' * (file is not plain)},"
+                " which cannot be read this way: pass the file itself"
             )
         refuse_container(name, start)
         if log is not None and is_remote(path):
             raise SourceError(
-                f"{path} is {log.description}, which is read from this computer alone: copy it here"
+                f"{path} is {log.description}, which can only be read from a local file: copy"
+                " it to this computer"
             )
         if log is not None:
             return BagTransport(path, log, sender=sender)

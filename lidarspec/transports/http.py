@@ -51,7 +51,7 @@ class HttpTransport(LiveTransport):
         try:
             status, body, location = self._send_request(str(request.method), path, request.body)
         except (OSError, http.client.HTTPException, ValueError) as error:
-            cause = system_reason(error) or f"no answer within {self._link.timeout:g} s"
+            cause = system_reason(error) or f"no reply within {self._link.timeout:g} s"
             self.warnings = [f"{self.label}{path}: {cause}"]
             return []
         if location:
@@ -66,7 +66,7 @@ class HttpTransport(LiveTransport):
             HttpRequest.parse(data)
         except Exception:
             raise UsageError(
-                f"{self.label}: over HTTP go messages as HttpRequest describes them, not"
+                f"{self.label}: expected an HTTP message as declared by HttpRequest, got"
                 f" {data[:16].hex(' ')}"
             ) from None
         self._requests.put(data)
@@ -107,7 +107,7 @@ class HttpTransport(LiveTransport):
                 raise ValueError(f"the reply is longer than {self._link.largest} bytes")
             if reply.length:
                 raise ValueError(
-                    f"the reply ends {reply.length} bytes too early, or took longer than"
+                    f"{reply.length} bytes of the reply are missing, or it took longer than"
                     f" {self._link.timeout:g} s"
                 )
             is_redirection = 300 <= reply.status < 400

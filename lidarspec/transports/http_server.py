@@ -111,7 +111,7 @@ class _Handler(BaseHTTPRequestHandler):
         )
         reply_data = self._line.handle_request(request)
         if reply_data is None:
-            self.send_error(504, "the simulated sensor has no answer to that")
+            self.send_error(504, "the simulated sensor has no reply to this request")
             return
         reply = HttpReply.parse(reply_data)
         self.send_response(reply.status)

@@ -81,7 +81,7 @@ def open_live(source: str | Path, sensor: Sensor | None = None) -> LiveTransport
     if isinstance(opened, LiveTransport):
         return opened
     opened.close()
-    raise UsageError(f"{source} is a file: nothing can be sent to it")
+    raise UsageError(f"{source} is a file, so nothing can be sent to it")
 
 
 def resolve(source: str | Path) -> str:
@@ -178,17 +178,16 @@ def control_link(source: str | Path, name: str, link: Link, host: str | None) ->
         return opened
     if opened is not None:
         raise SpecError(
-            f"{name} link: what a plugin gives has to derive from LiveTransport, and is a"
-            f" {type(opened).__name__}"
+            f"{name} link: expected a LiveTransport from the plugin, got a {type(opened).__name__}"
         )
     if not isinstance(link, Tcp | Udp | Http):
         raise UsageError(
-            f"{source}: no plugin is installed that opens a {type(link).__name__} link, which"
-            f" {name} is"
+            f"{source}: no installed plugin opens a {type(link).__name__} link, which {name}"
+            " requires"
         )
     raise source_error(
-        f"{source}: nobody knows the address of the {name} link",
-        f"the same with ?control=ADDRESS in {source}",
+        f"{source}: the address of the {name} link is unknown",
+        f"repeat with ?control=ADDRESS in {source}",
     )
 
 
@@ -202,13 +201,12 @@ def _open(address: SourceAddress, sensor: Sensor | None) -> Transport:
     if plugged is None:
         known = ", ".join(f"{scheme}:" for scheme in SCHEMES)
         raise UsageError(
-            f"no transport is installed for {address.scheme!r} sources; known are files, -"
-            f" (standard input), {known}"
+            f"unknown scheme {address.scheme!r}: expected a file, - (standard input), {known}"
         )
     if not isinstance(plugged, Transport):
         raise SpecError(
-            f"{address.scheme!r} sources: what a plugin gives has to derive from Transport, and is"
-            f" a {type(plugged).__name__}"
+            f"{address.scheme!r} sources: expected a Transport from the plugin, got a"
+            f" {type(plugged).__name__}"
         )
     return plugged
 

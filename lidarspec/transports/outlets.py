@@ -211,7 +211,7 @@ class UdpLine(OutletLine):
             )[0]
         except OSError as error:
             raise source_error(
-                f"udp://{host}{port_list}: there is no host {host!r} ({system_reason(error)})",
+                f"udp://{host}{port_list}: unknown host {host!r} ({system_reason(error)})",
                 f"ping {host}",
             ) from None
         numeric_host = str(address[0])
@@ -293,7 +293,7 @@ class UdpLine(OutletLine):
         port = chunk.receiver[1] if chunk.receiver else 0
         port = port or self._default_port
         if not port:
-            text = "the datagrams do not say which port they went to: name one, as in"
+            text = "the recording has no port for the datagrams: specify one, as in"
             raise UsageError(f"{self.local_source}: {text} udp://{self._host}:2368")
         return self._host, port
 
@@ -326,7 +326,7 @@ class UdpLine(OutletLine):
             return True  # an ICMP reply to an earlier datagram
         if self._host:
             reason = system_reason(error)
-            raise SourceError(f"{self.local_source}: nothing can be sent: {reason}") from None
+            raise SourceError(f"{self.local_source}: cannot send: {reason}") from None
         return False
 
 
@@ -615,7 +615,7 @@ class PtyLine(OutletLine):
             self._link = None
             self.unplug()
             raise source_error(
-                f"{link}: the link cannot be made: {system_reason(error)}", f"ls -l {link}"
+                f"{link}: cannot create the link: {system_reason(error)}", f"ls -l {link}"
             ) from None
 
 
@@ -684,7 +684,7 @@ class Outlet:
         if self.data.has_listener:
             self.data.send([chunk], patient=True)
         if not self.data.has_listener:
-            raise Disconnected(f"{self.local_source}: nobody reads any more")
+            raise Disconnected(f"{self.local_source}: the reader has closed it")
 
     def await_listener(self) -> None:
         """Wait for a new listener to the data; see `OutletLine.await_listener`."""
@@ -736,11 +736,11 @@ def listen(host: str, port: int) -> socket.socket:
     try:
         server = socket.create_server((host, port), family=family)
     except OSError as error:
-        next_step = f"the same with tcp://{LOCALHOST}:{port}"
+        next_step = f"repeat with tcp://{LOCALHOST}:{port}"
         if error.errno == errno.EADDRINUSE:
             next_step = f"ss -ltnp 'sport = :{port}'"
         raise source_error(
-            f"tcp://{host}:{port}: cannot listen there: {system_reason(error)}", next_step
+            f"tcp://{host}:{port}: cannot listen: {system_reason(error)}", next_step
         ) from None
     server.setblocking(False)
     return server
@@ -752,7 +752,7 @@ def has_terminals() -> bool:
 
 
 def _missing_terminal_error(text: str) -> SourceError:
-    return source_error(text, f"the same with --to tcp://{LOCALHOST}:2111")
+    return source_error(text, f"repeat with --to tcp://{LOCALHOST}:2111")
 
 
 def _bind_udp(host: str, port: int) -> socket.socket:

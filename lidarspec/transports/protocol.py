@@ -52,7 +52,7 @@ class Origin:
         else:
             port = match[2]
         if port is not None and not (port.isdecimal() and 0 < int(port) < 65536):
-            raise UsageError(f"src={text}: a sender is ADDRESS or ADDRESS:PORT")
+            raise UsageError(f"src={text}: expected ADDRESS or ADDRESS:PORT")
         return cls(host, None if port is None else int(port))
 
     def __contains__(self, sender: Sender | None) -> bool:
@@ -229,7 +229,7 @@ def no_bytes(source: str | Path, warnings: Sequence[str]) -> str:
     Args:
         warnings: the warnings of the file's transport, which may give the reason.
     """
-    return "; ".join(warnings) or f"{source} holds no bytes"
+    return "; ".join(warnings) or f"{source} contains no bytes"
 
 
 class Disconnected(SourceError):

@@ -162,7 +162,7 @@ class Replay:
                 self._start = time.monotonic()
             yield from self._run_once()
             if not self.chunks:
-                raise WireError(f"{self._file} holds nothing that was received")
+                raise WireError(f"{self._file} contains no received data")
             if not self._loop:
                 return
 
@@ -195,8 +195,7 @@ class Replay:
             if chunk.at is None and self._speed is not None and self.is_timed:
                 if self._needs_times:
                     raise UsageError(
-                        f"{self._file} does not say when its bytes arrived: only --speed max can be"
-                        " kept"
+                        f"{self._file} has no arrival times, so only --speed max is supported"
                     )
                 self.is_timed = False
             yield chunk

@@ -71,10 +71,10 @@ class LogKind(NamedTuple):
 LOGS = {
     b"#ROSBAG V": LogKind("a ROS 1 bag", "rosbags.rosbag1", "Reader", "ros1"),
     b"\x89MCAP0\r\n": LogKind(
-        "an MCAP file, as ROS 2 bags are", "rosbags.rosbag2.storage_mcap", "McapReader"
+        "an MCAP file (ROS 2 bag)", "rosbags.rosbag2.storage_mcap", "McapReader"
     ),
     b"SQLite format 3\0": LogKind(
-        "an SQLite database, as ROS 2 bags are", "rosbags.rosbag2.storage_sqlite3", "Sqlite3Reader"
+        "an SQLite database (ROS 2 bag)", "rosbags.rosbag2.storage_sqlite3", "Sqlite3Reader"
     ),
 }
 #: a folder with metadata.yaml.
@@ -138,14 +138,14 @@ class BagTransport(Transport):
         if not self._links:
             topics = (
                 "; ".join(
-                    f"{link.topic} has {link.msgtype}"
+                    f"{link.topic} has type {link.msgtype}"
                     for link in (with_packets or self._log.connections)[:MAX_LISTED_TOPICS]
                 )
                 or "it is empty"
             )
             self.warnings.append(
-                f"{path} is {log.description} without packets{f' of {sender}' if sender else ''}:"
-                f" {topics}"
+                f"{path} is {log.description} without"
+                f" packets{f' of {sender}' if sender else ''}: {topics}"
             )
 
     def chunks(self) -> Iterator[Chunk]:
@@ -181,7 +181,7 @@ class BagTransport(Transport):
         return first is not None and first.layout.dim[0].label == STREAM
 
     def write(self, data: bytes) -> None:
-        raise SourceError(f"{self._path} is {self._kind.description}: nothing can be sent to it")
+        raise SourceError(f"{self._path} is {self._kind.description}, so nothing can be sent to it")
 
     def close(self) -> None:
         self._log.close()
@@ -215,7 +215,7 @@ class BagTransport(Transport):
             raise
         except Exception as error:
             raise SourceError(
-                f"{self._path} is {self._kind.description}, and is not read:"
+                f"{self._path} is {self._kind.description}, but cannot be read:"
                 f" {error or type(error).__name__}"
             ) from error
 

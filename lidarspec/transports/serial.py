@@ -166,7 +166,7 @@ class SerialTransport(StreamTransport):
             )
         if isinstance(error, ValueError) or "baud" in str(error).lower():
             return source_error(
-                f"{self.label}: it cannot run at {self.baud} baud: {error}",
+                f"{self.label}: the port does not support {self.baud} baud: {error}",
                 f"lidarspec detect {quote(self.label)}",
             )
         return source_error(f"{self.label}: {system_reason(error)}", "lidarspec ports")
@@ -184,7 +184,7 @@ class SerialTransport(StreamTransport):
             return b""
         data = os.read(descriptor, MAX_READ_BYTES)
         if not data:
-            raise disconnected_error(self.label, "it hung up")
+            raise disconnected_error(self.label, "the port was disconnected")
         return data
 
 
@@ -205,10 +205,10 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SerialTrans
     declared = data_link(sensor, Serial)
     baud = address.number("baud", 50, 20_000_000) or (declared.baud if declared else None)
     if not address.location:
-        raise UsageError(f"{address.text}: it names no port, as in serial:///dev/ttyUSB0")
+        raise UsageError(f"{address.text}: expected a port, as in serial:///dev/ttyUSB0")
     if baud is None:
         raise UsageError(
-            f"{address.text}: how fast is it? Name the sensor with -s, or say"
+            f"{address.text}: the baud rate is unknown: name the sensor with -s, or use"
             f" {address.text}?baud=115200"
         )
     dtr, rts = (declared.dtr, declared.rts) if declared else (None, None)

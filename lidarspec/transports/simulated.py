@@ -93,7 +93,7 @@ class SimulatedTransport(LiveTransport):
     def write(self, data: bytes) -> None:
         with self._changed:
             if not self.device.present:
-                raise Disconnected(f"{self.label}: the simulated sensor is unplugged")
+                raise Disconnected(f"{self.label}: the simulated sensor is disconnected")
             self.device.receive(data, time.monotonic_ns(), self._name)
             self._changed.notify_all()
 
@@ -101,7 +101,7 @@ class SimulatedTransport(LiveTransport):
         with self._changed:
             self.device.outgoing(time.monotonic_ns())
             if not self.device.present:
-                raise source_error(f"{self.label}: the simulated sensor is unplugged", "wait")
+                raise source_error(f"{self.label}: the simulated sensor is disconnected", "wait")
 
     def lines(self, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         """Do nothing: control lines have no effect on a simulated device."""
@@ -134,7 +134,7 @@ class SimulatedTransport(LiveTransport):
         unread = self._unread[self._name]
         self._unread[self._name] = []
         if not self.device.present:
-            raise Disconnected(f"{self.label}: the simulated sensor was unplugged")
+            raise Disconnected(f"{self.label}: the simulated sensor was disconnected")
         self._next_read_ns = now
         if unread and math.isfinite(self.device.rate):
             self._next_read_ns += _MIN_READ_INTERVAL_NS
@@ -157,7 +157,7 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> SimulatedTr
     address.check(OPTIONS)
     if not address.location and sensor is None:
         raise UsageError(
-            f"{address.text}: name the sensor, as in sim:ID; lidarspec sensors lists them"
+            f"{address.text}: expected a sensor, as in sim:ID; lidarspec sensors lists them"
         )
     if sensor is None or (address.location and named_sensor(address.location).id != sensor.id):
         sensor = named_sensor(address.location)
@@ -177,7 +177,7 @@ def parse_rate(text: str) -> float:
     except ValueError:
         rate = math.nan
     if not rate > 0:
-        raise UsageError(f"rate is a number above 0, or max, not {text!r}")
+        raise UsageError(f"rate must be a number above 0, or max, not {text!r}")
     return rate
 
 
@@ -190,6 +190,6 @@ def _make_device(sensor: Sensor, options: Mapping[str, str]) -> SimulatedDevice:
     faults = parse_faults({name: text for name, text in options.items() if name in FAULTS})
     seed = options.get("seed", "0")
     if not seed.isdecimal():
-        raise UsageError(f"seed is a whole number, not {seed!r}")
+        raise UsageError(f"seed must be an integer, not {seed!r}")
     rate = parse_rate(options.get("rate", "1"))
     return SimulatedDevice(sensor, scene=scene, seed=int(seed), rate=rate, faults=faults)

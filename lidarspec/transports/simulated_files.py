@@ -108,9 +108,7 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
     sent = {name: device.sent[name] for name in sensor.main_frames if device.sent[name]}
     if sent:
         frames = ", ".join(f"{number} {name}" for name, number in sent.items())
-        return UsageError(
-            f"nothing was written: {frames} frames were sent, and all of them were lost"
-        )
+        return UsageError(f"nothing was written: all sent frames ({frames}) were lost")
     if device.deadline is not None:
         due = f"its next frame is due after {device.deadline / SECOND:g} s"
         return UsageError(
@@ -119,9 +117,9 @@ def _explain_silence(device: SimulatedDevice, seconds: float) -> LidarSpecError:
         )
     recognized = ", ".join(device.commands_received) or "no command"
     missed = [name for name in _commands_on_open(sensor) if name not in device.commands_received]
-    cause = f"nothing starts its data after {recognized}"
+    cause = f"no command starts its data after {recognized}"
     if missed:
-        cause = f"{missed[0]!r} was sent to it, and it recognized {recognized}"
+        cause = f"{missed[0]!r} was sent, but it recognized {recognized}"
     return SpecError(
         f"nothing was written: the simulated sensor sends nothing; {cause}",
         path="on_open",

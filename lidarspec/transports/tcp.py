@@ -87,14 +87,14 @@ class TcpTransport(StreamTransport):
         host, port = self._address
         doctor = f"lidarspec doctor {quote(self.label)}{sensor_option(self._sensor)}"
         if isinstance(error, socket.gaierror):
-            return source_error(f"{self.label}: there is no host {host!r}", doctor)
+            return source_error(f"{self.label}: unknown host {host!r}", doctor)
         if error.errno == errno.ECONNREFUSED:
             return source_error(
                 f"{self.label}: {host} refuses connections to TCP port {port}", doctor
             )
         if isinstance(error, TimeoutError) or error.errno in (errno.ETIMEDOUT, errno.EHOSTUNREACH):
             return suggest(
-                SourceTimeout(f"{self.label}: {host} does not answer on TCP port {port}"),
+                SourceTimeout(f"{self.label}: no reply from {host} on TCP port {port}"),
                 f"ping {host}",
             )
         return source_error(
@@ -118,7 +118,5 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> TcpTranspor
     link = data_link(sensor, Tcp)
     port = port or (link.port if link else None)
     if not host or port is None:
-        raise UsageError(
-            f"{address.text}: host and port are needed, as in tcp://192.168.1.200:2111"
-        )
+        raise UsageError(f"{address.text}: expected host and port, as in tcp://192.168.1.200:2111")
     return TcpTransport(address.text, host, port, sensor=sensor)

@@ -315,10 +315,11 @@ class UdpTransport(LiveTransport):
     def write(self, data: bytes) -> None:
         if self._remote is None:
             text = (
-                f"{self.label}: no frame of the sensor has arrived yet, so nobody knows its address"
+                f"{self.label}: the address of the sensor is unknown, because no frame has"
+                " arrived yet"
             )
             raise source_error(
-                text, f"the same with {with_option(self.label, 'src', 'ADDRESS:PORT')}"
+                text, f"repeat with {with_option(self.label, 'src', 'ADDRESS:PORT')}"
             )
         try:
             self._sockets[0].socket.sendto(data, self._remote)
@@ -396,17 +397,17 @@ class UdpTransport(LiveTransport):
             )
         if error.errno == errno.EACCES:
             return source_error(
-                f"{self.label}: UDP port {port} needs rights that you do not have", doctor
+                f"{self.label}: UDP port {port} requires rights that you do not have", doctor
             )
         if error.errno == errno.EADDRNOTAVAIL:
             return source_error(
-                f"{self.label}: {host or group} is no address of this computer",
+                f"{self.label}: {host or group} is not an address of this computer",
                 f"lidarspec doctor udp://:{port}",
             )
         if group is not None and error.errno in (errno.ENODEV, errno.ENETUNREACH):
             return source_error(
-                f"{self.label}: no interface has a route to the group {group}; name one, as in"
-                f" udp://ADDRESS:{port}",
+                f"{self.label}: no interface has a route to the group {group}; specify one, as"
+                f" in udp://ADDRESS:{port}",
                 doctor,
             )
         return source_error(f"{self.label}: UDP port {port}: {system_reason(error)}", doctor)
@@ -542,13 +543,15 @@ def connect(address: SourceAddress, sensor: Sensor | None = None) -> UdpTranspor
         [port] if port else list(link.ports) if isinstance(link, Udp) else []
     )
     if not ports:
-        raise UsageError(f"{address.text}: which port? Name the sensor with -s, or say udp://:2368")
+        raise UsageError(
+            f"{address.text}: the port is unknown: name the sensor with -s, or use udp://:2368"
+        )
     group = address.options.get("group")
     if group is None and host and _is_multicast(host):
         host, group = "", host
     if group is not None and not _is_multicast(group):
         raise UsageError(
-            f"{address.text}: {group} is no multicast group (224.0.0.0 to 239.255.255.255)"
+            f"{address.text}: {group} is not a multicast group (224.0.0.0 to 239.255.255.255)"
         )
     whole = link is None or is_datagram(link)
     return UdpTransport(
@@ -572,8 +575,8 @@ def warn_of_small_buffer(requested: int, granted: int) -> list[str]:
     if granted >= requested:
         return []
     text = (
-        f"the system gave a receive buffer of {granted >> 10} KiB of {requested >> 10}: a busy"
-        " computer will lose packets"
+        f"the system granted a receive buffer of {granted >> 10} KiB instead of"
+        f" {requested >> 10}: packets may be lost under load"
     )
     return [f"{text}; next: sudo sysctl -w net.core.rmem_max={requested}"]
 
@@ -601,8 +604,8 @@ def _parse_ports(address: SourceAddress) -> list[int]:
     ports = [part for part in text.split(",") if part]
     if any(not part.isdecimal() or not 0 < int(part) < 65536 for part in ports):
         raise UsageError(
-            f"{address.text}: port is one number from 1 to 65535, or several with commas, not"
-            f" {text!r}"
+            f"{address.text}: port must be one number from 1 to 65535, or several with commas,"
+            f" not {text!r}"
         )
     return [int(part) for part in ports]
 

@@ -123,7 +123,7 @@ def test_verbs_take_compressed_files_and_pipes() -> None:
         piped.stdout.decode() == ran("read", "a.pcap", "--packets", "--json", "-s", SENSOR).stdout
     )
     refused = process("read", "-", "--packets", "-s", SENSOR, given=zip_bytes(capture()))
-    assert (refused.returncode, b"give its file, not a pipe" in refused.stderr) == (3, True)
+    assert (refused.returncode, b"which cannot be read from a pipe" in refused.stderr) == (3, True)
 
 
 @pytest.mark.slow
@@ -134,7 +134,7 @@ def test_one_of_several_captures_in_an_archive_is_named() -> None:
     assert len(read("one.zip")) == 40
     Path("two.zip").write_bytes(zip_bytes(capture(), "read.md", "drives/a b.pcap", "drives/b.pcap"))
     said = ran("convert", "two.zip", "out.csv", "-s", SENSOR, code=2).stderr
-    assert "two.zip holds 2 captures: drives/a b.pcap, drives/b.pcap" in said
+    assert "two.zip contains 2 captures: drives/a b.pcap, drives/b.pcap" in said
     assert "next: the same with 'two.zip?file=drives/a b.pcap'" in said
     assert len(read("two.zip?file=drives/a b.pcap")) == 40
     ran("convert", "two.zip?file=drives/b.pcap", "out.csv", "-s", SENSOR)
@@ -146,14 +146,14 @@ def test_one_of_several_captures_in_an_archive_is_named() -> None:
     Path("none.zip").write_bytes(zip_bytes(capture(), "read.md", "notes.md"))
     said = ran("read", "none.zip", "-s", SENSOR, code=3).stderr
     assert (
-        "none.zip is a zip archive, and is not read: there is no capture in it, but read.md,"
+        "none.zip is a zip archive, but cannot be read: there is no capture in it, but read.md,"
         " notes.md" in said
     )
     Path("cut.zip").write_bytes(zip_bytes(capture())[:3000])
     said = ran("read", "cut.zip", "-s", SENSOR, code=3).stderr
     assert (
-        "cut.zip is a zip archive, and is not read: File is not a zip file\n  next: zip -FF cut.zip"
-        " --out mended.zip" in said
+        "cut.zip is a zip archive, but cannot be read: File is not a zip file\n  next: zip -FF"
+        " cut.zip --out repaired.zip" in said
     )
     locked = bytearray(zip_bytes(capture()))
     for place in (locked.rindex(b"PK\x03\x04") + 6, locked.rindex(b"PK\x01\x02") + 8):
@@ -164,7 +164,7 @@ def test_one_of_several_captures_in_an_archive_is_named() -> None:
     assert "next: unzip locked.zip" in said
     Path("it.pcap").write_bytes(capture())
     assert (
-        "it.pcap is no zip archive: there is no a.pcap in it"
+        "it.pcap is not a zip archive, so it does not contain a.pcap"
         in ran("read", "it.pcap?file=a.pcap", "-s", SENSOR, code=2).stderr
     )
 
@@ -181,7 +181,7 @@ def test_a_truncated_compressed_file_is_read_to_its_end(packing: str) -> None:
         assert packets == sent[: len(packets)]
         assert 900 < len(packets) < 1501  # of bzip2, its last block is lost
         assert len(opened.warnings) == 1
-        assert opened.warnings[0].startswith("it.pcap.x is cut off: the ")
+        assert opened.warnings[0].startswith("it.pcap.x is truncated: the ")
         assert opened.unread == 0
 
 
@@ -198,26 +198,24 @@ def test_data_before_damage_is_read_with_one_warning(packing: str) -> None:
         packets = [chunk.data for chunk in opened.chunks()]
         assert packets[:900] == sent[:900]
         assert (
-            sum(said.startswith("it.pcap.x is damaged before byte") for said in opened.warnings)
+            sum(said.startswith("it.pcap.x is corrupt before byte") for said in opened.warnings)
             == 1
         )
         assert opened.unread > 0
-    assert "it.pcap.x is damaged before byte" in ran("record", "it.pcap.x", "-o", "it.lsr").stderr
+    assert "it.pcap.x is corrupt before byte" in ran("record", "it.pcap.x", "-o", "it.lsr").stderr
 
 
 OTHERS = {
-    "a pickle of Python": [pickle.dumps({"points": [1.0]}, protocol) for protocol in range(2, 6)],
+    "a Python pickle": [pickle.dumps({"points": [1.0]}, protocol) for protocol in range(2, 6)],
     "a NumPy array": [b"\x93NUMPY\x01\0"],
     "JSON": [b'{\n  "sensor": 1}', b'[{"a": 1}]'],
-    "a program": [b"\x7fELF\x02\x01"],
-    "a picture or a film": [b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0"],
+    "an executable file": [b"\x7fELF\x02\x01"],
+    "an image or a video": [b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0"],
     "an HDF5 file": [b"\x89HDF\r\n\x1a\n"],
-    "a file of points": [b"LASF", b"# .PCD v0.7\n", b"ply\n", b"ASTM-E57"],
+    "a point cloud file": [b"LASF", b"# .PCD v0.7\n", b"ply\n", b"ASTM-E57"],
     "an XML or HTML page": [b"<!DOCTYPE html>", b"<?xml version='1.0'?>"],
-    "a pointer of Git LFS, in the place of the file itself": [
-        b"version https://git-lfs.github.com/spec/v1\n"
-    ],
-    "compressed by gzip again and again": [gzip.compress(gzip.compress(gzip.compress(b"packets")))],
+    "a Git LFS pointer instead of the file": [b"version https://git-lfs.github.com/spec/v1\n"],
+    "compressed more than once by gzip": [gzip.compress(gzip.compress(gzip.compress(b"packets")))],
 }
 
 
@@ -225,10 +223,10 @@ OTHERS = {
 def test_files_of_other_kinds_are_named_whatever_they_are_called_and_packed_in(what: str) -> None:
     for data in OTHERS[what]:
         for name, held in (("it.bin", data), ("it.hex", data), ("it.bin.gz", gzip.compress(data))):
-            if "again" not in what or name == "it.bin":
+            if "more than once" not in what or name == "it.bin":
                 Path(name).write_bytes(held)
                 assert (
-                    f"{name} is {what}, and is not read"
+                    f"{name} is {what}: expected a capture"
                     in ran("convert", name, "out.csv", "-s", SENSOR, code=3).stderr
                 )
 

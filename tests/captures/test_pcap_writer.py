@@ -119,7 +119,7 @@ def test_full_disk_leaves_whole_records_and_one_clear_error(tmp_path: Path, room
         writer = open_recorder(path, datagrams=True)
         for _ in range(100):
             writer.write(chunk(BIG))
-        with pytest.raises(SourceError, match="whole up to byte 2140"):
+        with pytest.raises(SourceError, match="complete up to byte 2140"):
             writer.sync()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -66,9 +66,9 @@ def test_a_broken_source_ends_in_one_line_and_its_code(
     folder: Path, verb: str, place: Place, code: int, told: str
 ) -> None:
     if (verb, place) == ("send", babbling):
-        code, told = 5, "no ack frame came"
+        code, told = 5, "no ack frame received"
     if (verb, place) == ("send", silent):
-        told = "no ack frame came"
+        told = "no ack frame received"
     with place() as source:
         result = ran(*(source if word == "SOURCE" else word for word in VERBS[verb]), code=code)
     lines = result.stderr.splitlines()
@@ -108,7 +108,7 @@ def test_an_address_in_use_cannot_be_played_to(folder: Path, words: tuple[str, .
         result = ran(*words, "--to", source, code=3)
     number = source.rpartition(":")[2]
     assert result.stderr.splitlines() == [
-        f"{source}: cannot listen there: Address already in use",
+        f"{source}: cannot listen: Address already in use",
         f"  next: ss -ltnp 'sport = :{number}'",
     ]
 

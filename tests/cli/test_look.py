@@ -101,7 +101,7 @@ def check_shown_sensor(sensor: str) -> None:
     assert set(run_json("show", sensor)["frames"]) == set(ls.sensor(sensor).frames)
     plans = run_json("show", sensor, "--plan")
     assert set(plans) == {name for name, frame in ls.sensor(sensor).frames.items() if frame.data}
-    assert all("points a packet" in lines[0] for lines in plans.values()), plans
+    assert all("points per packet" in lines[0] for lines in plans.values()), plans
 
 
 @pytest.mark.slow

@@ -91,7 +91,7 @@ class TestSend:
             found = ran(
                 "send", made.name, "start", "-s", "cspc-m1c1-mini", "--timeout", "200ms", code=5
             )
-        assert "no ack frame came within 0.2 s" in found.stderr
+        assert "no ack frame received within 0.2 s" in found.stderr
         assert f"next: lidarspec doctor {made.name} -s cspc-m1c1-mini" in found.stderr
 
     @pytest.mark.slow

@@ -64,7 +64,7 @@ def test_the_event_loop_continues_without_data(line: Port) -> None:
             waiting.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await waiting
-            with pytest.raises(SourceError, match="no scan in time"):
+            with pytest.raises(SourceError, match="no scan within the timeout"):
                 await opened.latest(0.05)
         return turns
 

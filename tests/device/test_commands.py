@@ -162,7 +162,7 @@ def test_bytes_by_hand_go_out_as_they_are(line: Port, tmp_path: Path) -> None:
         opened.write(SENSOR.command("start"))
         assert opened.latest(TIMEOUT_S).complete
         for wrong, reason in (
-            (lambda: opened.write("a5 50"), "bytes are taken"),
+            (lambda: opened.write("a5 50"), "expected bytes"),
             (lambda: opened.write(b"1", "power"), "no link 'power'"),
         ):
             with pytest.raises(UsageError, match=reason):
@@ -211,7 +211,7 @@ def test_a_device_that_does_not_answer_does_not_open(line: Port) -> None:
 def test_a_streaming_device_can_be_opened(line: Port) -> None:
     device = Obedient(line, deaf=True, streaming=True)
     with working(device.work), ls.open(f"serial://{line.name}", IMPATIENT) as opened:
-        assert any("data come all the same" in warning for warning in opened.warnings)
+        assert any("the sensor sends data anyway" in warning for warning in opened.warnings)
         opened.latest(TIMEOUT_S)
 
 
@@ -442,7 +442,7 @@ def test_an_unknown_control_address_is_an_error() -> None:
     links: dict[str, Udp | Tcp] = {"data": Udp(7009), "control": Tcp(7010)}
     sensor = dataclasses.replace(SENSOR, links=links, commands=commands, on_close=())
     with pytest.raises(
-        (SourceError, CommandError), match="nobody knows the address of the control link"
+        (SourceError, CommandError), match="the address of the control link is unknown"
     ):
         ls.open(f"udp://127.0.0.1:{free_port()}", sensor)
 

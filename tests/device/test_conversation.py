@@ -153,19 +153,23 @@ def test_reported_values_configure_the_sensor_and_its_recording(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("said", "learns", "error"),
     [
-        (b"1 2 3", None, "what it says of itself cannot be: 3 angles, and there are 4 samples"),
+        (
+            b"1 2 3",
+            None,
+            "the values that the sensor reported are invalid: 3 angles, and there are 4 samples",
+        ),
         (
             b"",
             lambda reply: {"table": reply.nothing},
-            "nothing can be learned from the reply: AttributeError",
+            "the reply could not be interpreted: AttributeError",
         ),
         (
             b"",
             lambda reply: {"table": [1.0]},
-            "table is learned as a number, bytes or a text, not as list",
+            "table must be a number, bytes or a string, got list",
         ),
         (b"", lambda reply: {"tables": b""}, "unknown option 'tables'"),
-        (b"", lambda reply: {"frame": b"rep103"}, "frame is one of rep103, vendor"),
+        (b"", lambda reply: {"frame": b"rep103"}, "frame must be one of rep103, vendor"),
     ],
 )
 def test_an_invalid_reported_value_is_a_command_error(said: bytes, learns: Any, error: str) -> None:
@@ -193,7 +197,7 @@ def of_no_type(sensor: Sensor, *, table) -> Sensor:  # type: ignore[no-untyped-d
 @pytest.mark.parametrize("configure", [path_alone, of_no_type])
 def test_a_learned_value_is_not_a_path(configure: Any) -> None:
     sensor = teaching(configure=configure)
-    refused = pytest.raises(CommandError, match=r"table is .*, not Learned\(11 bytes\)")
+    refused = pytest.raises(CommandError, match=r"table must be .*, not Learned\(11 bytes\)")
     with (
         virtual_port(sensor, to=f"udp://127.0.0.1:{sensor.links['data'].ports[0]}") as port,
         refused,
@@ -202,7 +206,7 @@ def test_a_learned_value_is_not_a_path(configure: Any) -> None:
 
 
 def test_a_learning_command_needs_a_reply_and_an_option() -> None:
-    with pytest.raises(SpecError, match="learns needs a reply to learn from"):
+    with pytest.raises(SpecError, match="learns requires a reply"):
         dataclasses.replace(SENSOR, configure=None)
 
 
@@ -223,14 +227,15 @@ def test_a_sensor_that_returns_with_another_table_is_a_warning() -> None:
         assert angles(device) == ANGLES
         port.unplug()
         port.plug()
-        told = "the sensor that came back has another table: open it again"
+        told = "the sensor that reconnected reports another table: open it again"
         read_until(device, lambda: any(told in warning for warning in device.warnings))
 
 
 def silent(device: ls.Device) -> bool:
     """Whether it is said that the heartbeat is not answered."""
     return any(
-        "beat: no ack frame came" in said and "started again" in said for said in device.warnings
+        "beat: no ack frame received" in said and "sending it again" in said
+        for said in device.warnings
     )
 
 
@@ -306,8 +311,8 @@ def test_a_plugin_opens_a_link_of_its_own_kind() -> None:
     source, plugins = f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", Registry()
     with use_registry(plugins):
         for opened, error, said in [
-            (None, UsageError, "no plugin .* opens a Loop link, which control is"),
-            (3, SpecError, "and is a int"),
+            (None, UsageError, "no installed plugin opens a Loop link, which control requires"),
+            (3, SpecError, "got a int"),
         ]:
             plugin.opened = opened
             with (
@@ -392,7 +397,7 @@ def test_of_several_that_answer_a_broadcast_the_first_is_the_sensor() -> None:
         assert device.send("call", name="anna").confirmed
         read_until(device, lambda: device.stats.foreign == 1)
         assert any(
-            "127.0.0.2" in said and "127.0.0.3" in said and "left out" in said
+            "127.0.0.2" in said and "127.0.0.3" in said and "ignoring" in said
             for said in device.warnings
         )
         with udp("127.0.0.2") as own, udp("127.0.0.3") as other:
@@ -431,7 +436,7 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
         asked.request("GET", "/status")
         assert asked.getresponse().read() == body, "it is a web server like any other"
         asked.close()
-        with pytest.raises(UsageError, match="over HTTP go messages as HttpRequest describes them"):
+        with pytest.raises(UsageError, match="expected an HTTP message as declared by HttpRequest"):
             device.write(b"GET / HTTP/1.1", "web")
 
 
@@ -453,7 +458,11 @@ def test_pages_of_a_web_server_are_read_and_written() -> None:
             Http(1, largest=98),
             "the reply is longer than 98 bytes",
         ),
-        (b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\nshort", Http(1), "94 bytes too early"),
+        (
+            b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\nshort",
+            Http(1),
+            "94 bytes of the reply are missing",
+        ),
         (b"something else\r\n\r\n", Http(1), "/status: something else"),
         (b"", Http(1, timeout=0.1), "/status: "),
     ],
@@ -482,7 +491,10 @@ def test_a_missing_web_server_is_reported() -> None:
     sensor = with_pages({})
     said = pytest.raises(
         ReplyTimeout,
-        match=r"no page frame came within 0.3 s; http://127.0.0.1:\d+/status: Connection refused",
+        match=(
+            r"no page frame received within 0.3 s; http://127.0.0.1:\d+/status: Connection"
+            r" refused"
+        ),
     )
     with ls.open(f"udp://127.0.0.1:{free_port()}?control=127.0.0.1", sensor) as device, said:
         device.send("status", timeout=0.3)

@@ -303,10 +303,10 @@ def test_other_senders_change_no_cloud(tmp_path: Path) -> None:
         )
         assert device.stats.lost == device.stats.duplicates == 0
         read_until(device, lambda: device.stats.foreign == 120)
-        (said,) = (warning for warning in device.warnings if "left out" in warning)
+        (said,) = (warning for warning in device.warnings if "sends as well" in warning)
         senders = [":".join(map(str, each.getsockname())) for each in (own, other)]
         assert (
-            f"udp://:{number}: {senders[0]} is read; {senders[1]} sends as well, and is left out"
+            f"udp://:{number}: reading {senders[0]}; ignoring {senders[1]}, which sends as well"
             in said
         )
         assert f"'udp://:{number}?src={senders[1]}'" in said
@@ -328,7 +328,7 @@ def test_only_the_named_sender_is_read() -> None:
         read_until(device, lambda: device.state == "silent")
         said, stranger = device.warnings[-1], other.getsockname()[1]
         assert (
-            "nothing has arrived from the sensor, and 4 datagrams from others, such as"
+            "no data received from the sensor, but 4 datagrams from other senders, such as"
             f" 127.0.0.2:{stranger}, for" in said
         )
         for frame in frames:
@@ -353,7 +353,7 @@ def test_a_silent_sensor_is_not_replaced_by_another_sender() -> None:
             return device.newest(0.01) is not None or device.state == "silent"
 
         until(is_silent)
-        assert "datagrams from others, such as 127.0.0.3:" in device.warnings[-1]
+        assert "datagrams from other senders, such as 127.0.0.3:" in device.warnings[-1]
         assert device.stats.frames == {"data": 1}
         for frame in frames[1:]:
             own.sendto(frame, ("127.0.0.1", number))
@@ -378,7 +378,7 @@ def test_two_senders_of_one_address_are_separated_by_port() -> None:
             device, lambda: device.stats.foreign >= 28
         )  # the very first may be that of a restarted sensor
         assert sum(map(len, found)) <= 30
-        assert f"127.0.0.2:{other.getsockname()[1]} sends as well" in device.warnings[-1]
+        assert f"ignoring 127.0.0.2:{other.getsockname()[1]}, which" in device.warnings[-1]
 
 
 def test_a_sensor_that_returns_with_another_port_is_read() -> None:
@@ -447,7 +447,7 @@ def test_unplugged_and_plugged_in_again(line: Port, cycles: int) -> None:
             read_until(device, lambda: device.stats.pending == half)
             line.unplug()
             read_until(device, lambda: device.state == "disconnected")
-            assert any("waiting for it to come back" in warning for warning in device.warnings)
+            assert any("waiting for it to return" in warning for warning in device.warnings)
             line.plug()
             read_until(device, lambda: device.state != "disconnected")
             line.send(frames[0][half:] + b"".join(frames[1:]))
@@ -551,7 +551,7 @@ def test_a_recording_knows_where_the_line_was_interrupted(line: Port, tmp_path: 
 def test_a_file_is_not_recorded(tmp_path: Path) -> None:
     path = tmp_path / "raw.bin"
     path.write_bytes(b"".join(turning(TURNING, 3)))
-    with pytest.raises(UsageError, match="nothing to record"):
+    with pytest.raises(UsageError, match="cannot be recorded"):
         ls.open(path, TURNING, record=tmp_path / "more.lsr")
     assert not (tmp_path / "more.lsr").exists()
 
@@ -564,7 +564,7 @@ def test_frames_of_another_sensor_are_a_warning(tmp_path: Path, number: int) -> 
         assert list(device.scans())
         (warning,) = (warning for warning in device.warnings if "read as" in warning)
         assert (
-            f"{path}: read as velodyne-hdl32e, and the frames are those of velodyne-vlp16 ("
+            f"{path}: read as velodyne-hdl32e, but the frames are those of velodyne-vlp16 ("
             in warning
         )
         assert f"next: lidarspec detect {path}" in warning
@@ -590,7 +590,7 @@ def test_a_nominal_calibration_is_one_warning_with_a_command(
     with ls.open(path, "hesai-xt32") as device:
         assert all("nominal calibration" in repr(scan) for scan in device.scans())
         (warning,) = device.warnings
-        assert "-O calibration=FILE, in Python sensor.configure(calibration=FILE)" in warning
+        assert "-O calibration=FILE, or in Python sensor.configure(calibration=FILE)" in warning
     with ls.open(path, ls.sensor("hesai-xt32").configure(calibration=angles)) as device:
         assert not any("nominal" in repr(scan) for scan in device.scans())
         assert device.warnings == []
@@ -606,8 +606,7 @@ def test_a_file_without_a_frame_of_the_sensor_says_so(tmp_path: Path) -> None:
     with ls.open(path, "robosense-m1") as device:
         assert list(device.scans()) == []
         assert device.warnings == [
-            f"{path}: 6030 bytes, and no data frame of robosense-m1 among them; next: lidarspec"
-            f" detect {path}"
+            f"{path}: no data frame of robosense-m1 in 6030 bytes; next: lidarspec detect {path}"
         ]
 
 
@@ -618,7 +617,7 @@ def test_a_file_gives_one_scan_after_another(tmp_path: Path) -> None:
         whole = [scan for scan in device.scans() if scan.complete]
     with ls.open(path, TURNING) as device:
         assert [device.latest().stamp_ns for _ in whole] == [scan.stamp_ns for scan in whole]
-        with pytest.raises(SourceError, match="no further scan, since the input is ended"):
+        with pytest.raises(SourceError, match="no further scan, because the input is ended"):
             device.latest()
 
 
@@ -636,7 +635,7 @@ def test_iterators_continue_after_latest(tmp_path: Path) -> None:
         assert device.stats.frames["data"] == len(frames)
         assert (device.stats.duplicates, device.stats.lost) == (0, 0)
         for read_again in (device.packets, device.scans):
-            with pytest.raises(SourceError, match="has been read to its end: open it again"):
+            with pytest.raises(SourceError, match="was read to its end: open it again"):
                 next(read_again())
     with ls.open(path, TURNING) as device:
         device.latest()
@@ -712,7 +711,7 @@ def test_the_caller_has_its_turn_though_something_else_comes_all_the_time(given:
             )
         )
         assert not next(came)
-        with pytest.raises(TimeoutError, match="no scan in time"):
+        with pytest.raises(TimeoutError, match="no scan within the timeout"):
             device.latest(0.05)
 
 
@@ -721,7 +720,8 @@ def test_a_blocked_rotor_is_reported() -> None:
         scans = list(itertools.islice(device.scans(wait=1.0), 3))
         assert [scan is not None and scan.complete for scan in scans] == [False] * 3
         said = (
-            "the angle does not pass 0 (azimuth): is the rotor blocked? No scan has ended within"
+            "the angle does not pass 0 (azimuth): is the rotor blocked? No scan was completed"
+            " within"
             " 0.4 s"
         )
         assert device.warnings == [f"sim:ldrobot-ld06?rotor=blocked&rate=max: {said}"]

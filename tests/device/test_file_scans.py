@@ -182,5 +182,5 @@ def test_a_file_that_cannot_be_sought_is_one_piece(tmp_path: Path) -> None:
     with ls.open(path, sensor) as device:
         assert number == sum(1 for _ in device.scans())
     assert bookmark is None
-    with pytest.raises(UsageError, match="is no file"):
+    with pytest.raises(UsageError, match="is not a file"):
         FileScans("sim:ldrobot-stl27l", sensor)

@@ -119,10 +119,12 @@ def test_the_users_own_file_comes_first_and_the_nearest_one_adds_to_it(folder: P
     assert found["front"].sensor is None
     assert found["desk"].file == str(user)
     project = folder / "lidarspec.toml"
-    with pytest.warns(UserWarning, match=f"front: the device of {user}, not that of {project}"):
+    with pytest.warns(
+        UserWarning, match=f"front: using the device of {user}, not the one of {project}"
+    ):
         assert named_devices.find_device("front") == found["front"]
     said = ran("stats", "front", "-s", SENSOR, "-n", "1").stderr
-    assert said.count(f"front: the device of {user}, not that of {project}") == 1
+    assert said.count(f"front: using the device of {user}, not the one of {project}") == 1
     (folder / "deep" / "lidarspec.toml").write_text("", encoding="utf-8")
     assert list(named_devices.read_devices()) == ["front", "desk"]
 
@@ -137,7 +139,7 @@ def test_a_file_with_an_error_affects_its_own_devices_only(folder: Path, text: s
     settings_of_the_user(
         folder, f'[device.desk]\nsource = "{folder / "front.bin"}"\nsensor = "{SENSOR}"\n'
     )
-    with pytest.warns(UserWarning, match=rf"{broken}: not TOML: .*; its devices are left out"):
+    with pytest.warns(UserWarning, match=rf"{broken}: not TOML: .*; its devices are ignored"):
         assert ls.open("desk").sensor.id == SENSOR
     assert ran("stats", "desk").stderr.count(f"{broken}: not TOML") == 1
     assert ran("stats", "front", code=2).stderr.startswith(f"{broken}: not TOML")
@@ -156,12 +158,12 @@ def test_a_file_of_another_user_is_skipped_with_one_warning(folder: Path, whose:
     else:
         place = file if whose == "everybody's" else file.parent
         place.chmod(0o777)
-        reason = f"{place} is open to others: chmod 775 makes it yours"
-    with pytest.warns(UserWarning, match=f"{file} is not read: {reason}"):
+        reason = f"{place} is accessible to other users: run chmod 775"
+    with pytest.warns(UserWarning, match=f"cannot read {file}: {reason}"):
         device = named_devices.find_device("front")
     assert device is not None
     assert device.sensor == SENSOR  # that of the folder above, which is the user's
-    assert ran("stats", "front").stderr.count(f"{file} is not read: {reason}") == 1
+    assert ran("stats", "front").stderr.count(f"cannot read {file}: {reason}") == 1
 
 
 EVIL = (
@@ -199,7 +201,7 @@ def test_a_project_runs_no_python_until_its_folder_is_allowed(
         }.items():
             shell.setenv(name, value)
         assert ran(code=1).output == ""
-    with pytest.raises(ls.UsageError, match="is Python, which would run"):
+    with pytest.raises(ls.UsageError, match="is a Python file, which would be executed"):
         ls.open("front")
     assert not (folder / "ran").exists()
     if how == "verb":
@@ -229,12 +231,14 @@ def test_a_project_names_no_files_elsewhere_until_its_folder_is_allowed(
     (folder / "lidarspec.toml").write_text(text.format(place, place), encoding="utf-8")
     said = ran("stats", "front", code=2).stderr
     assert f"{folder / 'lidarspec.toml'}: [device.front]: calibration: " in said
-    assert "is no file beside it" in said
+    assert "is not a file in the folder that names it" in said
     if place != "/dev/stdin":
         assert "is a file outside" in ran("stats", "rear", code=2).stderr
     (folder / "lidarspec.toml").write_text(text.format("./inside.csv", place), encoding="utf-8")
     assert "inside.csv" in (said := ran("stats", "front", code=2).stderr)
-    assert "beside it" not in said  # it is read, and says something else than the sensor asks for
+    assert (
+        "the folder that names it" not in said
+    )  # it is read, and says something else than the sensor asks for
     assert "lidarspec trust" not in said
 
 
@@ -258,10 +262,10 @@ def test_only_a_folder_of_ones_own_can_be_allowed(folder: Path) -> None:
     folder.chmod(0o777)
     said = ran("trust", folder, code=2).stderr
     assert (
-        f"{folder} is open to others: chmod 775 makes it yours;"
-        " whoever writes there could run programs as you"
+        f"{folder} is accessible to other users: run chmod 775; other users could run programs"
+        " as you"
     ) in said
-    assert "is no folder" in ran("trust", folder / "front.bin", code=2).stderr
+    assert "is not a folder" in ran("trust", folder / "front.bin", code=2).stderr
 
 
 def test_paths_that_begin_with_a_dot_are_from_the_files_folder(folder: Path) -> None:
@@ -281,7 +285,7 @@ def test_a_path_is_no_name(folder: Path) -> None:
 def test_an_unknown_word_gets_a_suggestion(folder: Path) -> None:
     with pytest.raises(
         ls.UsageError,
-        match=r"'frnt' is no file, and no device of .*lidarspec.toml; did you mean 'front'\?",
+        match=r"'frnt' is neither a file nor a device of .*lidarspec.toml; did you mean 'front'\?",
     ):
         ls.open("frnt")
 
@@ -298,20 +302,23 @@ def test_without_settings_a_word_is_a_file(tmp_path: Path, monkeypatch: pytest.M
     ("text", "told"),
     [
         ("[devices.front]", r"unknown table 'devices'; did you mean 'device'\?"),
-        ("[device]\nfront = 1", r"devices are tables of their own: \[device.front\]"),
+        (
+            "[device]\nfront = 1",
+            r"write each device as a table of its own, such as \[device.front\]",
+        ),
         ("[device.front]", r"\[device.front\]: source is missing"),
         (
             '[device.front]\nsorce = "x.bin"',
             r"\[device.front\]: unknown key 'sorce'; did you mean 'source'\?",
         ),
-        ("[device.front]\nsource = 3", r"\[device.front\]: source is text, not 3"),
+        ("[device.front]\nsource = 3", r"\[device.front\]: source must be text, got 3"),
         (
             '[device.front]\nsource = "x.bin"\nsensor = ["a"]',
-            r"\[device.front\]: sensor is text, not \['a'\]",
+            r"\[device.front\]: sensor must be text, got \['a'\]",
         ),
         (
             '[device.front]\nsource = "x.bin"\nmount = 90',
-            r"\[device.front\]: mount is a table, not 90",
+            r"\[device.front\]: mount must be a table, got 90",
         ),
         (
             '[device.front]\nsource = "x.bin"\nmount = {yaw = 90}',
@@ -319,23 +326,29 @@ def test_without_settings_a_word_is_a_file(tmp_path: Path, monkeypatch: pytest.M
         ),
         (
             '[device.front]\nsource = "x.bin"\nmount = {yaw_deg = "90"}',
-            r"\[device.front\]: mount.yaw_deg is a number, not '90'",
+            r"\[device.front\]: mount.yaw_deg must be a number, got '90'",
         ),
-        ('[device.front]\nsource = "x.bin"\nmount = {x = true}', r"mount.x is a number, not True"),
-        ('[device.front]\nsource = "x.bin"\nmount = {x = inf}', r"mount.x is a number, not inf"),
+        (
+            '[device.front]\nsource = "x.bin"\nmount = {x = true}',
+            r"mount.x must be a number, got True",
+        ),
+        (
+            '[device.front]\nsource = "x.bin"\nmount = {x = inf}',
+            r"mount.x must be a number, got inf",
+        ),
         (
             '[device.front]\nsource = "x.bin"\nmount = {inverted = 1}',
-            r"mount.inverted is true or false, not 1",
+            r"mount.inverted must be true or false, got 1",
         ),
         (
             '[device.front]\nsource = "x.bin"\noptions = {zero = 1}',
-            r"options are a sensor's: name the sensor as well",
+            r"options require a sensor",
         ),
-        ('[device.front]\nsource = "rear"', r"source 'rear' is a name again"),
-        ('[device.COM4]\nsource = "x.bin"', r"\[device.COM4\]: a name is a letter"),
-        ('[device."a.bin"]\nsource = "x.bin"', r"\[device.a.bin\]: a name is a letter"),
+        ('[device.front]\nsource = "rear"', r"source 'rear' is the name of another device"),
+        ('[device.COM4]\nsource = "x.bin"', r"\[device.COM4\]: invalid name"),
+        ('[device."a.bin"]\nsource = "x.bin"', r"\[device.a.bin\]: invalid name"),
         ("[device.front", r"not TOML: "),
-        ('[owners]\nacme-x1 = "evil"', r"\[owners\] stands in your own settings alone"),
+        ('[owners]\nacme-x1 = "evil"', r"\[owners\] is only allowed in your own settings"),
     ],
 )
 def test_a_mistake_is_named_with_its_place(folder: Path, text: str, told: str) -> None:

@@ -140,11 +140,11 @@ def test_a_timeout_frees_the_link() -> None:
     assert session.deadline == SECOND
     session.tick(SECOND - 1)
     assert not first.done
-    with pytest.raises(UsageError, match="not answered yet"):
+    with pytest.raises(UsageError, match="has no reply yet"):
         first.result()
     session.tick(SECOND)
     with pytest.raises(
-        TimeoutError, match=r"shape-commands start: no ack frame came within 1 s"
+        TimeoutError, match=r"shape-commands start: no ack frame received within 1 s"
     ) as caught:
         first.result()
     assert isinstance(caught.value, ReplyTimeout)
@@ -263,7 +263,7 @@ def test_an_unexpected_reply_is_reported() -> None:
     session.receive([ack(3, result=7)], 1)
     session.tick(SECOND)
     with pytest.raises(
-        CommandError, match=r"the device answered with ack with result 7 instead of 0"
+        CommandError, match=r"unexpected reply: ack with result 7 instead of 0"
     ) as error:
         pending.result()
     assert not isinstance(error.value, ReplyTimeout)
@@ -435,10 +435,10 @@ def test_a_command_for_a_stopped_sensor_gives_that_reason() -> None:
     pending = session.request("ask", 0)
     session.tick(10 * SECOND)
     with pytest.raises(
-        ReplyTimeout, match="answered only while the sensor is stopped: send 'stop' first"
+        ReplyTimeout, match="the sensor replies only while it is stopped: send 'stop' first"
     ):
         pending.result()
-    with pytest.raises(ls.SpecError, match="needs a command that starts or stops the data"):
+    with pytest.raises(ls.SpecError, match="requires a command that starts or stops the data"):
         dataclasses.replace(SENSOR, commands={"ask": asking}, on_open=(), on_close=())
 
 
@@ -488,7 +488,7 @@ def test_values_that_are_found_out_can_be_given() -> None:
         CONVERSATION.command("hello", **{"head.number": 9, "host": "1.2.3.4"}), "order"
     )
     assert (given.head.number, list(given.host)) == (9, [1, 2, 3, 4])
-    with pytest.raises(UsageError, match="host is an IPv4 address, not '::1'"):
+    with pytest.raises(UsageError, match="host must be an IPv4 address, not '::1'"):
         CONVERSATION.command("hello", host="::1")
 
 
@@ -505,7 +505,8 @@ def test_a_late_refusal_does_not_fail_the_next_command() -> None:
     first = session.request("ask", 0)
     session.receive([ack(1, result=2)], 1)
     assert (str(first.failure), session.late) == (
-        "shape-commands ask: the sensor refuses it: Reply(ask, ack: code 1, result 2, check 101)",
+        "shape-commands ask: the sensor refused the command: Reply(ask, ack: code 1, result 2,"
+        " check 101)",
         0,
     )
     second = session.request("ask", 2)

@@ -179,7 +179,7 @@ def test_other_refusals_have_reasons_too() -> None:
         export(make_sensor("half" / Float16b), "ksy")
     with pytest.raises(ExportError, match="two members with the Kaitai name 'speed'"):
         export(make_sensor("speed" / Int8ul, "Speed" / Int8ul), "ksy")
-    with pytest.raises(ExportError, match="Python function decides"):
+    with pytest.raises(ExportError, match="Python function branches"):
         export(
             make_sensor(
                 "count" / Int8ul, "items_" / Array(lambda this: 2 if this.count > 3 else 1, Int8ul)

@@ -42,7 +42,7 @@ def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
     [
         (
             with_frame("x" / Bytes(lambda c: 1 if c.a else 2)),
-            "x: a Python function decides on the values",
+            "x: a Python function branches on the values",
         ),
         (with_frame("x" / Bytes(lambda c: {0: 1}[c.a])), "x: a Python function"),
         (with_frame("x" / Bytes(this.a / 2)), "x: an expression with '/'"),
@@ -50,7 +50,7 @@ def with_frame(*fields: Any, algorithm: Checksum | None = None) -> Sensor:
             with_frame("l" / Array(2, Int8ub), "x" / Bytes(this.l[1])),
             "l[1]: the layout depends on an array element",
         ),
-        (with_frame("x" / Bytes(this.later)), "x: an expression asks for 'later'"),
+        (with_frame("x" / Bytes(this.later)), "x: an expression uses 'later'"),
         (with_frame("x" / Switch(this.a, {"word": Int8ub})), "a has no value named 'word'"),
         (with_frame(algorithm=Own()), "the checksum Own is Python code"),
         (BARE, "has no frames until it is configured"),

@@ -298,21 +298,19 @@ PLAIN: dict[str, Case] = {
         frames="4b01",
         reason="PrefixedArray",
     ),
-    "VarInt": case("a" / VarInt, "b" / Int8ub, frames="810102 0102", reason="no fixed place"),
-    "ZigZag": case("a" / ZigZag, "b" / Int8ub, frames="810102 0102", reason="no fixed place"),
-    "CString": case(
-        "a" / CString("utf8"), frames="616200 00 c3a900", reason="a text has no numbers"
-    ),
+    "VarInt": case("a" / VarInt, "b" / Int8ub, frames="810102 0102", reason="no fixed offset"),
+    "ZigZag": case("a" / ZigZag, "b" / Int8ub, frames="810102 0102", reason="no fixed offset"),
+    "CString": case("a" / CString("utf8"), frames="616200 00 c3a900", reason="text has no numbers"),
     "NullTerminated": case(
         "a" / NullTerminated(GreedyBytes), "b" / Int8ub, frames="61620001", reason="terminator"
     ),
     "ProcessXor": case(
         "a" / FixedSized(2, ProcessXor(0x55, GreedyBytes)),
         frames="0102",
-        reason="makes other bytes",
+        reason="transforms bytes",
     ),
     "ProcessXor of a struct": case(
-        "a" / Prefixed(Int8ub, ProcessXor(0x55, TWO)), frames="020102", reason="makes other bytes"
+        "a" / Prefixed(Int8ub, ProcessXor(0x55, TWO)), frames="020102", reason="transforms bytes"
     ),
     "Transformed by a function": case(
         "a" / Transformed(TWO, flip, 2, flip, 2), frames="0102", reason="not plain bits"
@@ -321,12 +319,12 @@ PLAIN: dict[str, Case] = {
     "If in elements": case(
         "r" / Array(2, Struct("k" / Int8ub, "v" / If(this.k, Int8ub))),
         frames="000102 0000",
-        reason="Parts(struct, count) reads such in bulk",
+        reason="Parts(struct, count) supports this",
     ),
     "counts in elements": case(
         "r" / Array(2, Struct("n" / Int8ub, "v" / Array(this.n, Int8ub))),
         frames="000102 0000",
-        reason="Parts(struct, count) reads such in bulk",
+        reason="Parts(struct, count) supports this",
     ),
     "Checksummed in an array": case(
         "r" / Array(2, Checksummed(TWO, field="y", algorithm=Sum())),
@@ -357,7 +355,7 @@ PLAIN: dict[str, Case] = {
     ),
     "Terminated": case("a" / Int8ub, Terminated, frames="01", reason="Terminated", is_rest=True),
     "ProcessXor of the rest": case(
-        "a" / ProcessXor(0x55, GreedyBytes), frames="0102", reason="makes other", is_rest=True
+        "a" / ProcessXor(0x55, GreedyBytes), frames="0102", reason="transforms", is_rest=True
     ),
 }
 
@@ -568,7 +566,7 @@ def test_adapters_are_applied_in_points() -> None:
 
 
 REFUSED: dict[str, tuple[Callable[[], Construct], str]] = {
-    "Union": (lambda: construct.Union(0, "x" / Int16ub, "y" / Bytes(2)), "declare one of them"),
+    "Union": (lambda: construct.Union(0, "x" / Int16ub, "y" / Bytes(2)), "declare one"),
     "Seek": (lambda: construct.Seek(4), "outside the frame"),
     "Pointer": (lambda: construct.Pointer(1, Byte), "outside the frame"),
     "Flag": (lambda: construct.Flag, "use a BitStruct"),
@@ -582,7 +580,7 @@ REFUSED: dict[str, tuple[Callable[[], Construct], str]] = {
     "FocusedSeq of two": (lambda: FocusedSeq("v", "k" / Byte, "v" / Byte), "loses 'k'"),
     "ProcessXor before others": (
         lambda: Struct("x" / ProcessXor(1, GreedyBytes), "y" / Byte),
-        "ProcessXor has no end of its own",
+        "ProcessXor has no end in a stream",
     ),
 }
 

@@ -207,7 +207,7 @@ def test_the_longest_length_itself_is_allowed() -> None:
     assert len(frame) == sensor.frames["data"].max_length
     assert [data for _, _, data in decode_chunks(sensor, frame)] == [frame]
     too_many = dict(first=0, last=100, samples=[*samples, samples[0]])
-    with pytest.raises(UsageError, match=r"samples: .* at most 129 bytes"):
+    with pytest.raises(UsageError, match=r"samples: .* longer than 129 bytes"):
         sensor.build("data", too_many)
     roomy = dataclasses.replace(sensor.frames["data"], max_length=len(frame) + 3)
     longer = dataclasses.replace(sensor, frames={"data": roomy}).build("data", too_many)

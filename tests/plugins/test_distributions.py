@@ -28,13 +28,13 @@ REPORTS = {
     "syntax = lidarspec_broken.syntax": "SyntaxError",
     "exits = lidarspec_broken.exits": "SystemExit: leaving",
     "wrong-signature = lidarspec_broken.wrong_signature": "everything",
-    "misspelt = lidarspec_broken.misspelt": "there is no hook 'lidarspec_sensor'",
+    "misspelt = lidarspec_broken.misspelt": "unknown hook 'lidarspec_sensor'",
     "unmarked = lidarspec_broken.unmarked": "lidarspec_sensors lacks @hookimpl",
     "duplicate = lidarspec_broken.duplicate": (
         "acme-x1: another sensor has this id already: that of acme-lidars:acme_lidars"
     ),
     "raises = lidarspec_broken.raises": "ZeroDivisionError",
-    "no-sensor = lidarspec_broken.no_sensor": "returns sensors, not str",
+    "no-sensor = lidarspec_broken.no_sensor": "must return sensors, got str",
     "bad-spec = lidarspec_broken.bad_spec": "no field may be called 'state' or 'on'",
     "hook = lidarspec_broken.hook": "KeyError",
 }

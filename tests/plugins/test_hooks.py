@@ -158,7 +158,7 @@ def test_a_misspelt_hook_is_refused_by_name(registry: Registry) -> None:
         def lidarspec_point(self) -> None:
             """Never called."""
 
-    with pytest.raises(SpecError, match="no hook 'lidarspec_point'"):
+    with pytest.raises(SpecError, match="unknown hook 'lidarspec_point'"):
         registry.add(Misspelt(), name="misspelt")
 
 

@@ -72,7 +72,7 @@ def test_the_third_party_sensor_uses_all_mechanisms(tmp_path: Path) -> None:
 
 def test_a_file_of_another_kind_is_no_sensor(tmp_path: Path) -> None:
     (file := tmp_path / "readme.txt").write_text("hello", encoding="utf-8")
-    with pytest.raises(lidarspec.SourceError, match=r"readme\.txt is no Python file"):
+    with pytest.raises(lidarspec.SourceError, match=r"readme\.txt is not a Python file"):
         lidarspec.sensor(str(file))
 
 
@@ -97,7 +97,7 @@ def test_a_file_that_is_no_sensor_is_a_clear_error(tmp_path: Path) -> None:
         "import a_library_that_nobody_has": "a_library_that_nobody_has",
         "def broken(:": "SyntaxError",
         "raise SystemExit(3)": "SystemExit",
-        "": "no function lidarspec_sensors",
+        "": "the file defines no lidarspec_sensors",
         (
             "from lidarspec.spec import hookimpl\n@hookimpl\n"
             "def lidarspec_sensors():\n    return [1 / 0]"

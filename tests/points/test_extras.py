@@ -102,7 +102,7 @@ def test_unread_columns_are_not_computed() -> None:
     assert not any(name in cloud.lazy.computed for name in cloud.extra)
     assert cloud.extra["velocity"] is cloud.extra["velocity"]
     assert [name for name in cloud.extra if name in cloud.lazy.computed] == ["velocity"]
-    with pytest.raises(KeyError, match="velocty: there are velocity, near_ir"):
+    with pytest.raises(KeyError, match="velocty: expected one of velocity, near_ir"):
         cloud.extra["velocty"]
 
 

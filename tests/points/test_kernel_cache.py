@@ -131,7 +131,7 @@ def test_a_shared_cache_folder_is_not_used_with_one_warning(folder: Path) -> Non
     _is_read()
     folder.chmod(0o777)
     with pytest.warns(
-        UserWarning, match="kernels is open to others: chmod 700 makes it yours"
+        UserWarning, match="kernels is accessible to other users: run chmod 700"
     ) as said:
         assert [_is_read(), _is_read()] == [False, False]
     assert len(said) == 1
@@ -166,5 +166,5 @@ def test_a_full_disk_stores_no_kernel(folder: Path) -> None:
     ]  # or Python itself keeps half a module
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout == "42\n", done.stderr
-    assert "compiled code is not kept between runs: [Errno 27] File too large" in done.stderr
+    assert "compiled code cannot be stored for later runs: [Errno 27] File too large" in done.stderr
     assert [path.name for path in folder.iterdir()] == ["key"]

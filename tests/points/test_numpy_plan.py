@@ -137,7 +137,11 @@ def indexing(f: Fields) -> Polar:
 
 @pytest.mark.parametrize(
     ("points", "reason"),
-    [(branching, ".array"), (reducing, "np.add.reduce"), (indexing, "made an array")],
+    [
+        (branching, ".array"),
+        (reducing, "np.add.reduce"),
+        (indexing, "to an array"),
+    ],
 )
 def test_untraceable_functions_are_reported_and_evaluated(points: Any, reason: str) -> None:
     sensor = dataclasses.replace(lidarspec.sensor("ldrobot-stl27l"), points=points)

@@ -112,11 +112,17 @@ def test_lost_columns_leave_gaps_in_the_place_of_their_numbers(backend: str) -> 
 def test_points_without_a_grid_are_refused() -> None:
     cloud = cloud_of(frame(0), frame(16))
     for wrong, said in (
-        (lambda: cloud_of(frame(0), frame(0)).organise(TURN), "column 0 comes 2 times"),
-        (lambda: cloud.organise(20), "column 20 is not one of 20"),
+        (
+            lambda: cloud_of(frame(0), frame(0)).organise(TURN),
+            "column 0 occurs 2 times",
+        ),
+        (lambda: cloud.organise(20), "column 20 exceeds the 20"),
         (lambda: cloud[cloud.valid].organise(TURN), r"Polar\(..., column=...\)"),
-        (lambda: cloud.destagger([1, 2]), "2 shifts for 32 rows"),
-        (lambda: cloud[3:].destagger([1, 2]), "2 shifts for points that are not organised"),
+        (lambda: cloud.destagger([1, 2]), "expected shifts for 32 rows, got 2"),
+        (
+            lambda: cloud[3:].destagger([1, 2]),
+            "expected shifts for points that are not organised, got 2",
+        ),
     ):
         with pytest.raises(UsageError, match=said):
             wrong()

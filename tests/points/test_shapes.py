@@ -88,7 +88,9 @@ def test_a_spread_that_folds_everything_onto_one_value_says_so() -> None:
         points=lambda f: replace(shape.points(f), time=spread(0, f.count - 1, f.count, full=1.0)),
     )
     packets = folded.decode(b"".join(shape.example("data", seed=seed) for seed in range(3)))
-    with pytest.raises(PluginError, match=r"whole turns of 1 from its start.*steps\(count\)"):
+    with pytest.raises(
+        PluginError, match=r"whole number of revolutions of 1 from its start.*steps\(count\)"
+    ):
         packets.points()
 
 
@@ -494,29 +496,29 @@ def test_numbers_go_along_the_one_array_that_is_as_long_or_that_is_named(
     [
         (
             lambda f: Polar(range=f.near, azimuth=f.first * ANGLES),
-            r"3 values goes with near as well as with other\[\]: .*along\('other\[\]', ",
+            r"3 values matches near as well as with other\[\]: .*along\('other\[\]', ",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=np.zeros(7)),
-            r"7 values goes with no array of the frame: near 3, other 4, other\[\] 3",
+            r"7 values matches no array of the frame: near 3, other 4, other\[\] 3",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("other[]", ANGLES)),
-            r"along 'other\[\]', where no field of theirs is \(.*other\[\] 3",
+            r"along 'other\[\]', but none of their fields does \(.*other\[\] 3",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("other", np.zeros(4))),
-            r"axis 'near' meets axis 'other'",
+            r"axes 'near' and 'other' belong to different arrays",
         ),
         (
             lambda f: Polar(range=f.near, azimuth=along("further", ANGLES)),
-            r"no array 'further' in the frame; there are near, other, other\[\]",
+            r"no array 'further'; expected one of near, other, other\[\]",
         ),
         (
             lambda f: Polar(range=np.asarray(f.near)[:, :, 0], azimuth=0),
-            r"along 'other(\[\])?', where no field of theirs is",
+            r"along 'other(\[\])?', but none of their fields does",
         ),
-        (lambda f: Polar(range=f.first, azimuth=f.first.index), r"an index of arrays only"),
+        (lambda f: Polar(range=f.first, azimuth=f.first.index), r"values inside an array"),
     ],
 )
 def test_numbers_that_go_along_several_arrays_or_none_are_refused_by_their_names(
@@ -536,7 +538,7 @@ def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None
         replace(sensor, points=lambda f: Polar(range=f.other * np.ones((3, 1)), azimuth=0)), backend
     ).decode([bytes(16)])
     with pytest.raises(
-        SpecError, match=r"lengths that do not go together: 1: other 4 x other\[\] 3, 2: other 3"
+        SpecError, match=r"the arrays have different lengths: 1: other 4 x other\[\] 3, 2: other 3"
     ):
         terms.points()
     parts = reader(
@@ -545,7 +547,7 @@ def test_lengths_that_do_not_fit_are_named_with_their_axes(backend: str) -> None
     ).decode([bytes(16)])
     with pytest.raises(
         SpecError,
-        match=r"lengths that do not go together: range: other 4 x other\[\] 3, azimuth: other 2",
+        match=r"the arrays have different lengths: range: other 4 x other\[\] 3, azimuth: other 2",
     ):
         parts.points()
 

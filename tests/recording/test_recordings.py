@@ -266,7 +266,7 @@ def test_a_header_opens_no_file(text: str) -> None:
 
 def test_nothing_is_overwritten_without_permission(path: Path) -> None:
     path.write_bytes(b"precious")
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         Recorder(path)
     assert path.read_bytes() == b"precious"
 
@@ -292,7 +292,7 @@ def test_an_old_file_survives_a_full_disk(path: Path) -> None:
     path.write_bytes(b"precious")
     with (
         file_size_limit(600),
-        pytest.raises(SourceError, match="; what was there before is kept"),
+        pytest.raises(SourceError, match="; the existing content is unchanged"),
         Recorder(path, overwrite=True) as recorder,
     ):
         recorder.write(Chunk(bytes(10_000)))
@@ -385,7 +385,7 @@ def fill(path: Path) -> None:
     for number in range(200):
         recorder.write(Chunk(bytes([number]) * 1000, number))
         time.sleep(0.001)
-    with pytest.raises(SourceError, match=r"whole up to byte \d+"):
+    with pytest.raises(SourceError, match=r"complete up to byte \d+"):
         recorder.sync()
     for number in range(10):
         recorder.write(Chunk(b"more", number))
@@ -526,8 +526,7 @@ def test_damage_of_a_recording_is_reported(path: Path) -> None:
     with ls.open(path) as device:
         assert sum(len(packets) for packets in device.packets()) == 3
         assert device.warnings == [
-            f"{path} is cut off in its last record: 3 bytes were not read, everything before"
-            " them was"
+            f"{path} is truncated in its last record: 3 bytes were not read, all earlier bytes were"
         ]
 
 
@@ -540,14 +539,17 @@ ANGLES = "Channel,Elevation,Azimuth\n" + "".join(
 @pytest.mark.parametrize(
     ("value", "told"),
     [
-        (1, "calibration: 1 is no file beside it"),
-        ("1", "calibration: '1' is no file beside it"),
-        ("/dev/stdout", "is no file beside it"),
-        ("../angles.csv", "is no file beside it"),
-        ("link.csv", "is no file beside it"),
-        (["angles.csv"], r"calibration: \['angles.csv'\] is no file beside it"),
-        ("a\0b", "is no file beside it"),
-        ("here.csv", "is no file beside it"),
+        (1, "calibration: 1 is not a file in the folder that names it"),
+        ("1", "calibration: '1' is not a file in the folder that names it"),
+        ("/dev/stdout", "is not a file in the folder that names it"),
+        ("../angles.csv", "is not a file in the folder that names it"),
+        ("link.csv", "is not a file in the folder that names it"),
+        (
+            ["angles.csv"],
+            r"calibration: \['angles.csv'\] is not a file in the folder that names it",
+        ),
+        ("a\0b", "is not a file in the folder that names it"),
+        ("here.csv", "is not a file in the folder that names it"),
     ],
 )
 def test_a_recording_opens_no_descriptor_and_no_file_elsewhere(
@@ -601,9 +603,7 @@ def test_an_invalid_event_is_damage_of_the_recording(path: Path) -> None:
         file.write(b"".join(pack_record(3, event) for event in NO_EVENTS))
     with contextlib.closing(open_transport(path)) as opened:
         assert len(list(opened.chunks())) == 2
-    assert opened.warnings == [
-        f"{path}: {len(NO_EVENTS)} events were passed over, which have no name"
-    ]
+    assert opened.warnings == [f"{path}: ignored {len(NO_EVENTS)} events without a name"]
 
 
 KILLED = """

@@ -187,7 +187,7 @@ def test_datagrams_go_to_the_ports_of_then(datagrams: Path) -> None:
                 patient=True,
             )
             assert receiver.recv(9) == bytes([number])
-        with pytest.raises(UsageError, match="which port"):
+        with pytest.raises(UsageError, match="the recording has no port"):
             target.send([Chunk(b"nowhere")], patient=True)
 
 
@@ -304,11 +304,11 @@ def test_the_last_bytes_reach_a_slow_reader(stream: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "holds_datagrams", "reason"),
     [
-        ("pty", True, "datagrams were recorded"),
-        ("tcp://127.0.0.1:0", True, "datagrams were recorded"),
-        ("udp://127.0.0.1:9", False, "a byte stream was recorded"),
-        ("nonsense", False, "a replay goes to"),
-        ("tcp://127.0.0.1", False, "name the port"),
+        ("pty", True, "the recording contains datagrams"),
+        ("tcp://127.0.0.1:0", True, "the recording contains datagrams"),
+        ("udp://127.0.0.1:9", False, "the recording contains a byte stream"),
+        ("nonsense", False, "invalid destination 'nonsense': expected pty, udp://host:port"),
+        ("tcp://127.0.0.1", False, "specify the port"),
     ],
 )
 def test_impossible_destinations_give_a_reason(

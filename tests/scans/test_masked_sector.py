@@ -150,7 +150,7 @@ def test_the_sizes_of_batches_do_not_matter() -> None:
         scans += scan_stream.add(packet_stream.add([decoder.datagrams(part, [None] * len(part))]))
     assert_same_scans([*scans, *scan_stream.finish()], list(sensor.scans(frames)))
     assert decoder.stats.lost == 0
-    assert "from about 28 to 200 degrees of each turn" in decoder.stats.masked
+    assert "from about 28 to 200 degrees of each revolution" in decoder.stats.masked
 
 
 @pytest.mark.parametrize("lost", [range(20, 40), range(300, 330)], ids=["first turn", "later"])
@@ -216,7 +216,7 @@ def test_the_cut_of_the_user_has_priority_over_a_masked_sector(cut: float, begin
 
 def test_a_cut_that_cannot_be_is_refused() -> None:
     sensor = rotating(blocks_of(None, whole_packets=True))
-    with pytest.raises(UsageError, match="cut is an angle in degrees, not 'north'"):
+    with pytest.raises(UsageError, match="cut must be an angle in degrees, not 'north'"):
         sensor.configure(cut="north")
     with pytest.raises(UsageError, match="not cut at an angle"):
         EXTRAS.configure(cut=90)

@@ -278,9 +278,7 @@ def test_an_invalid_number_of_sectors_is_refused(number: Any) -> None:
     sensor = ls.sensor("ldrobot-stl27l")
     scan = next(sensor.scans(sensor.example("data")))
     for bins in (scan.to_bins, scan.to_laserscan):
-        with pytest.raises(
-            UsageError, match=f"{bins.__name__} takes how many sectors the turn has"
-        ):
+        with pytest.raises(UsageError, match=f"{bins.__name__} requires the number of sectors"):
             bins(number)
     assert scan.to_bins(np.int32(4)).shape == (4,)
 
@@ -327,7 +325,8 @@ def test_a_scan_whose_datagrams_are_mostly_lost_is_not_complete() -> None:
 def test_scans_of_a_wrong_sensor_and_of_a_plugin_that_raises_are_warned_of() -> None:
     other = b"".join(simulate(ls.sensor("cspc-m1c1-mini"), 40))
     with pytest.warns(
-        UserWarning, match=r"ldrobot-stl27l: no data frame in the data .*is it of another sensor\?"
+        UserWarning,
+        match=r"ldrobot-stl27l: no data frame in the data .*does it come from another sensor\?",
     ):
         assert not list(ls.sensor("ldrobot-stl27l").scans(other))
     with pytest.warns(UserWarning, match=r"distnace.*, at 12 packets"):

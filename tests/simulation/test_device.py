@@ -369,7 +369,7 @@ def test_faults_by_text() -> None:
         7,
         pytest.approx(20e-6),
     )
-    with pytest.raises(UsageError, match="keep their order"):
+    with pytest.raises(UsageError, match="reorder requires datagrams"):
         on(stl(), faults=Faults(reorder=2))
 
 

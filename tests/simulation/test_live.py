@@ -131,12 +131,12 @@ def test_a_scene_is_seen(tmp_path: Path) -> None:
     ("source", "said"),
     [
         ("sim:ldrobot-stl27", "did you mean 'ldrobot-stl27l'"),
-        ("sim:", "name the sensor"),
+        ("sim:", "expected a sensor"),
         ("sim:ldrobot-stl27l?error=0.1", "did you mean 'errors'"),
-        ("sim:ldrobot-stl27l?rate=-1", "rate is a number above 0"),
-        ("sim:ldrobot-stl27l?rate=nan", "rate is a number above 0"),
-        ("sim:ldrobot-stl27l?seed=x", "seed is a whole number"),
-        ("sim:ldrobot-stl27l?reorder=3", "keep their order"),
+        ("sim:ldrobot-stl27l?rate=-1", "rate must be a number above 0"),
+        ("sim:ldrobot-stl27l?rate=nan", "rate must be a number above 0"),
+        ("sim:ldrobot-stl27l?seed=x", "seed must be an integer"),
+        ("sim:ldrobot-stl27l?reorder=3", "keeps its order"),
         ("sim:ldrobot-stl27l?errors=2", "errors = 2.0 is outside"),
     ],
 )
@@ -314,14 +314,14 @@ def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
             SimulatedDevice(stl(), faults=Faults(loss=1.0)),
             0.1,
             UsageError,
-            "data frames were sent, and all of them were lost",
+            "all sent frames",
         ),
-        (SimulatedDevice(stopped), 0.1, SpecError, "nothing starts its data after stop"),
+        (SimulatedDevice(stopped), 0.1, SpecError, "no command starts its data after stop"),
         (
             SimulatedDevice(mistaken),
             0.1,
             SpecError,
-            "'start' was sent to it, and it recognized wake",
+            "'start' was sent, but it recognized wake",
         ),
     ):
         with pytest.raises(error, match=said):
@@ -331,16 +331,16 @@ def test_an_empty_file_is_an_error_with_the_reason(tmp_path: Path) -> None:
 
 def test_a_destination_that_cannot_carry_the_sensor_is_refused(tmp_path: Path) -> None:
     for sensor, place, said in (
-        (stl(), "udp://", "no datagrams"),
+        (stl(), "udp://", "not datagrams"),
         (vlp(), "pty", "datagrams, which a serial port cannot carry"),
         (vlp(), "tcp://", "declares no TCP port"),
-        (stl(), "http://localhost", "no destination"),
+        (stl(), "http://localhost", "invalid destination"),
         (vlp(), "udp://?rate=3", "unknown option"),
-        (vlp(), "udp://127.0.0.1:99999", "a port is a number"),
+        (vlp(), "udp://127.0.0.1:99999", "a port must be a number"),
     ):
         with pytest.raises(UsageError, match=said):
             make_simulated_outlet(sensor, place)
-    with pytest.raises(UsageError, match="goes with pty alone"):
+    with pytest.raises(UsageError, match="only supported for a pseudo-terminal"):
         make_simulated_outlet(vlp(), "udp://", tmp_path / "link")
     with pytest.raises(UnknownFormat):
         write_file(SimulatedDevice(stl()), tmp_path / "made.csv", 1)

@@ -439,7 +439,8 @@ def test_describe() -> None:
         "15-bit folded sum",
     )
     assert (
-        ZeroPadded(Xor(), 4).describe() == "XOR-8 of the bytes padded with zeros to a multiple of 4"
+        ZeroPadded(Xor(), 4).describe()
+        == "XOR-8 of the bytes, padded with zeros to a multiple of 4"
     )
     assert M1C1.describe() == "XOR-16 of 1+2-byte words after a head of 8 bytes"
 

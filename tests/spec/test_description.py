@@ -32,7 +32,7 @@ BYTE = Struct("value" / Int8ub)
         ),
         (
             lambda: Frame(BYTE, simulation=None),
-            "simulation: expected a Simulation(...), got None; leave it out",
+            "simulation: expected a Simulation(...), got None",
         ),  # type: ignore[arg-type]
         (
             lambda: Frame(BYTE, sweep=None),

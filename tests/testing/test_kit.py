@@ -601,7 +601,7 @@ def test_vectors_that_prove_nothing_are_findings(tmp_path: Path) -> None:
     [
         ({}, ""),
         ({"hex": "16 61 02 75"}, "sends 16 61 01 76, expected 16 61 02 75"),
-        ({"reply": "17 71 44 02 20"}, "the device answered with ack with code 2 instead of 1"),
+        ({"reply": "17 71 44 02 20"}, "unexpected reply: ack with code 2 instead of 1"),
         ({"command": "stop"}, "no command 'stop' sends this frame"),
         ({"args": {"speed": 3}}, "unknown"),
     ],

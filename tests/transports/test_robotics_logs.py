@@ -214,8 +214,8 @@ def test_packets_of_several_sensors_are_chosen_by_namespace_or_topic(tmp_path: P
     with contextlib.closing(open_transport(f"{path}?src=/left")) as opened:
         assert list(opened.chunks()) == []
         assert opened.warnings == [
-            f"{path} is an MCAP file, as ROS 2 bags are without packets of /left:"
-            f" /front/packets has {scan}; /rear/packets has {scan}"
+            f"{path} is an MCAP file (ROS 2 bag) without packets of /left:"
+            f" /front/packets has type {scan}; /rear/packets has type {scan}"
         ]
 
 
@@ -239,7 +239,9 @@ def test_a_log_of_points_says_that_it_has_no_packets(tmp_path: Path) -> None:
     said = ran(
         "convert", tmp_path / "a.bag", tmp_path / "out.csv", "-s", "velodyne-vlp16", code=4
     ).stderr
-    assert "a.bag is a ROS 1 bag without packets: /points has sensor_msgs/msg/PointCloud2" in said
+    assert (
+        "a.bag is a ROS 1 bag without packets: /points has type sensor_msgs/msg/PointCloud2" in said
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -70,11 +70,11 @@ def test_control_lines_are_ignored_by_ports_without_them(tmp_path: Path) -> None
         ("serial:///dev/ttyNONE9?baud=9600", SourceError, "no such port", "lidarspec ports"),
         ("COM44?baud=9600", SourceError, "no such port", "lidarspec ports"),
         ("serial:///dev/null?baud=9600", SourceError, "/dev/null: ", "lidarspec ports"),
-        ("/dev/ttyNONE9", UsageError, "how fast is it", ""),
+        ("/dev/ttyNONE9", UsageError, "the baud rate is unknown", ""),
         ("/dev/ttyNONE9?bud=9600", UsageError, "did you mean 'baud'", ""),
-        ("/dev/ttyNONE9?baud=fast", UsageError, "baud is a number", ""),
-        ("/dev/ttyNONE9?baud=9600&dtr=maybe", UsageError, "dtr is 0 or 1", ""),
-        ("serial://?baud=9600", UsageError, "names no port", ""),
+        ("/dev/ttyNONE9?baud=fast", UsageError, "baud must be a number", ""),
+        ("/dev/ttyNONE9?baud=9600&dtr=maybe", UsageError, "dtr must be 0 or 1", ""),
+        ("serial://?baud=9600", UsageError, "expected a port", ""),
     ],
 )
 def test_a_port_that_cannot_be_opened_gives_a_reason(

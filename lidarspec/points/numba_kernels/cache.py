@@ -79,7 +79,7 @@ class StoredKernel:
             path = _path(folder, key, self._name, result.target_context)
             _write(path, _digest(key, path.name, data) + data)
         except Exception as error:  # the kernel is at hand all the same
-            _warn(f"compiled code is not kept between runs: {error}")
+            _warn(f"compiled code cannot be stored for later runs: {error}")
 
 
 def is_stored(name: str) -> bool:
@@ -161,7 +161,7 @@ def _read(path: Path) -> bytes:
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _PLAINLY)) as file:
         status = os.fstat(file.fileno())
         if describe_sharing(status, _OTHERS) or not stat.S_ISREG(status.st_mode):
-            raise PermissionError(f"{path} is not its user's alone")
+            raise PermissionError(f"{path} is accessible to other users")
         return file.read()
 
 

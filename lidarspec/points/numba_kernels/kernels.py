@@ -145,7 +145,7 @@ def threads() -> int:
     """
     text = os.environ.get(THREADS, "1")
     if not text.isdecimal() or not int(text):
-        raise UsageError(f"{THREADS} is a number of threads, 1 or more, not {text!r}")
+        raise UsageError(f"{THREADS} must be a number of threads, at least 1, not {text!r}")
     return int(text)
 
 

@@ -53,11 +53,11 @@ def describe(plan: Plan) -> list[str]:
     axes = " x ".join(
         f"{axis} {length}" for axis, length in zip(plan.axes, plan.shape, strict=True)
     )
-    lines = [f"{plan.width} points a packet{': ' if axes else ''}{axes}"]
+    lines = [f"{plan.width} points per packet{': ' if axes else ''}{axes}"]
     plainly = [node for node in plan.tape.nodes if node in compiler.low or node in plan.eager]
-    lines.append(f"for each packet or block, plainly: {len(plainly)} values")
+    lines.append(f"per packet or block, by the reference evaluator: {len(plainly)} values")
     lines += [f"  {node.kind} {node.path}".rstrip() for node in plainly if node.kind != "call"]
-    lines.append(f"for each chunk of {program.chunk} packets, {len(tables)} tables:")
+    lines.append(f"per chunk of {program.chunk} packets, {len(tables)} tables:")
     outputs = {register: name for name, register in program.outputs.items()}
     for step in program.steps:
         if step.output in outputs:

@@ -282,7 +282,7 @@ class Compiler:
             rows = execution.part(execution.rows)
             np.copyto(out.reshape(-1, *leaf.shape), leaf.load(rows), casting="unsafe")
 
-        return self.program.step(f"{leaf.info.path}: some bits", kind, run)
+        return self.program.step(f"{leaf.info.path}: bits", kind, run)
 
     def _load(self, leaf: Leaf, dtype: np.dtype[Any], offset: int, kind: str) -> int:
         """Load some bytes of every element of a field."""
@@ -375,7 +375,7 @@ class Compiler:
                 target[...] = function(*(read(execution) for read in reads))
 
         name = getattr(function, "__name__", "function")
-        return self.program.step(f"{name} as it stands", kind, run, *used)
+        return self.program.step(f"copy {name}", kind, run, *used)
 
     def _argument(self, value: Any, depth: int) -> Callable[[ProgramRun], Any]:
         if not isinstance(value, Node):
@@ -398,7 +398,7 @@ class Compiler:
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
             out.reshape(-1, *shape)[...] = add_axes(execution.part(execution.values(value)), depth)
 
-        return self.program.step("computed plainly before", kind, run)
+        return self.program.step("already computed per packet", kind, run)
 
 
 def _constant(value: Any) -> Callable[[ProgramRun], Any]:

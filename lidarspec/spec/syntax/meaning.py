@@ -259,7 +259,7 @@ class _Builder:
             info = _integer(place.info)
             offset = place.offset()
             if offset is None:
-                reason = f"{info.path}: Tell in an array, or behind a part without a known size"
+                reason = f"{info.path}: Tell in an array, or after a part of unknown size"
                 offset = tree.Untraced(reason, "?")
             self._add_value(place, offset)
             return tree.Derived(info, "offset")
@@ -306,7 +306,7 @@ class _Builder:
         )
         value = self.node(con.subcon, inside)
         size = tree.size(value)
-        unknown = tree.Untraced(f"{info.path}: the place of a part without a known size", "?")
+        unknown = tree.Untraced(f"{info.path}: the offset of a part of unknown size", "?")
         start = None if place.offset is None else place.offset()
         end = tree.combine("+", start, size)
         for name, content in {"offset1": start, "offset2": end, "length": size}.items():
@@ -407,15 +407,15 @@ class _Builder:
             if not isinstance(expression, ExprMixin) and any(
                 ref.info.optional for ref in scope.asked
             ):
-                reason = "a Python function of a field that may be left out"
+                reason = "a Python function of an optional field"
             elif isinstance(value, bool | int):
                 return int(value)
             elif not isinstance(value, tree.Symbol):
-                reason = f"an expression that gives {value!r}"
+                reason = f"an expression with the constant value {value!r}"
             elif not is_key and isinstance(value.formula, tree.Ref) and value.formula.info.labels:
-                reason = "an expression takes the name of a value for a number"
+                reason = "an expression uses a named value as a number"
             elif fraction is not None and not may_be_fraction:
-                reason = f"an expression with {fraction!r}, which need not give an integer"
+                reason = f"an expression with {fraction!r}, whose result may not be an integer"
             else:
                 return value.formula
         except tree.UntraceableExpressionError as untraceable:
@@ -440,7 +440,7 @@ class _Builder:
             if isinstance(key, tree.Ref) and isinstance(odd[0], str):
                 reason = f"{key.path} has no value named {odd[0]!r}"
             else:
-                reason = f"a case for {odd[0]!r}, which is no integer"
+                reason = f"a case for {odd[0]!r}, which is not an integer"
             path = place.info.path
             key = tree.Untraced(f"{path}: {reason}", _spell(con.keyfunc, path))
         if isinstance(key, tree.Untraced):
@@ -531,8 +531,7 @@ class _Builder:
             scope = None if scope is None else scope.parent
         if scope not in self._measured:
             raise SpecError(
-                f"SizeOf measures {'.'.join(con.of)!r}, which is beyond the frame, or the part,"
-                " that it stands in",
+                f"SizeOf measures {'.'.join(con.of)!r}, which is outside its frame or part",
                 path=place.info.path,
             )
         index = len(self.sizes)
@@ -564,10 +563,7 @@ class _Builder:
         if isinstance(con, construct.RepeatUntil) or place.room is None:
             return tree.Opaque(place.name, place.info, kind, _INSTEAD[kind], (element,))
         if not isinstance(size, int) or not size:
-            reason = (
-                "elements of sizes of their own, which fill a length: say Parts(element,"
-                " within=...) for them"
-            )
+            reason = "elements of variable size that fill a length: use Parts(element, within=...)"
             return tree.Opaque(place.name, place.info, kind, reason, (element,))
         return tree.Repeat(place.name, axis, tree.calculate("//", place.room, size), element)
 
@@ -653,7 +649,7 @@ class _Builder:
             ):
                 return tree.Check(place.name, info.path, info.axes, condition)
             if asked:
-                reason = f"{info.path}: it asks for {asked[0].path}, another array or frame"
+                reason = f"{info.path}: it uses {asked[0].path}, which is in another array or frame"
             else:
                 reason = f"{info.path}: it may exceed 64 bits"
         except ValueError as code:
@@ -662,7 +658,7 @@ class _Builder:
             place.name,
             info,
             "Check",
-            f"{reason.partition(': ')[2]}: plausible=lambda f: ... is judged in bulk",
+            f"{reason.partition(': ')[2]}: use plausible=lambda f: ..., which is vectorized",
         )
 
     def _seal(self, con: SealedStruct, place: _Context) -> tree.Node:
@@ -672,7 +668,7 @@ class _Builder:
                 place.name,
                 place.info,
                 type(con).__name__,
-                "a checksum around something that is no struct",
+                "a checksum around a part that is not a struct",
                 (body,),
             )
         prefix = f"{place.info.path}." if place.info.path else ""
@@ -722,7 +718,7 @@ class _Builder:
                 name,
                 info,
                 kind,
-                _INSTEAD.get(kind, f"{kind} has no fixed place"),
+                _INSTEAD.get(kind, f"{kind} has no fixed offset"),
                 size=size,
                 form=_form(con),
                 terminator=_terminator(con),
@@ -777,8 +773,8 @@ class _Builder:
             fields = None
         if fields is None:
             reason = (
-                "a bit block whose values are not plain bits of it: declare the bits as they come,"
-                " and undo it in `points`"
+                "a bit block with values that are not plain bits: declare the bits, and"
+                " convert them in `points`"
             )
             return tree.Opaque(
                 place.name, place.info, type(con).__name__, reason, (inside,), in_bits=True
@@ -859,7 +855,7 @@ def _check_peeked(derived: tree.Derived, behind: Sequence[tree.Node]) -> tree.No
     needed = tree.size(derived.node)
     if isinstance(needed, int) and sum(map(_least_size, behind)) >= needed:
         return derived
-    reason = "Peek may read beyond the frame: name the bytes behind it in the same Struct"
+    reason = "Peek may read beyond the frame: declare the following bytes in the same Struct"
     return tree.Opaque(derived.name, derived.info, "Peek", reason)
 
 
@@ -909,7 +905,7 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
             found = []
         if not found:
             raise SpecError(
-                f"SizeOf measures {'.'.join(names)!r}, and there is no part {name!r}",
+                f"SizeOf measures {'.'.join(names)!r}, but there is no part {name!r}",
                 path=getattr(body, "path", ""),
             )
         node = found[0]
@@ -917,56 +913,53 @@ def _below(node: tree.Node, names: Iterable[str]) -> tree.Node:
 
 
 _TURNED = (
-    "{} makes other bytes of those on the wire: declare them as they come and undo it in `points`"
-    " (f.x ^ 0x55), or say a WireForm"
+    "{} transforms bytes: declare the bytes on the wire and transform them in `points` (f.x ^"
+    " 0x55), or use a WireForm"
 )
 
 #: of what construct alone can read, what to write in its place.
 _INSTEAD = {
     **{name: _TURNED.format(name) for name in ("ProcessXor", "ProcessRotateLeft", "Compressed")},
     **{
-        name: f"{name} has no numbers of its own: say the Array or Struct below it"
+        name: f"{name} has no numbers: use the Array or Struct inside it"
         for name in ("NamedTuple",)
     },
     "StringEncoded": (
-        "a text has no numbers and no fixed place: say Bytes(n), and decode it where it is shown"
+        "text has no numbers and no fixed offset: use Bytes(n), and decode it for display"
     ),
-    "Mapping": "Mapping to what is no name: say Enum, or Scaled(field, step, unit) for numbers",
+    "Mapping": (
+        "Mapping to values that are not names: use Enum, or Scaled(field, step, unit) for numbers"
+    ),
     "ExprAdapter": (
-        "ExprAdapter is Python code: say Scaled(field, step, unit, offset), or calculate it in"
+        "ExprAdapter is Python code: use Scaled(field, step, unit, offset), or compute it in"
         " `points`"
     ),
     "ExprValidator": (
-        "a test of values that are not listed: say OneOf with those that there are, or"
+        "a test without a list of values: use OneOf with the valid values, or"
         " plausible=lambda f: ..."
     ),
     "Computed": (
-        "a Python function of other fields: an expression of numbers such as this.a * 2 + 1 is"
-        " computed in bulk"
+        "a Python function of other fields: use an expression of numbers, such as this.a * 2 + 1"
     ),
     "Peek": "Peek of a part without a fixed size: declare its bytes as a field",
-    "Tell": "Tell within Parts: SizeOf says and holds the length of a part",
-    "Index": "Index is no field of the wire: in `points` the index of an element is f.x.index",
-    "LazyBound": "a part that contains itself has no fixed place: Parts for one after another",
-    "VarInt": "VarInt has no fixed place: a WireForm makes numbers of as many bytes as they need",
-    "ZigZag": "ZigZag has no fixed place: a WireForm makes numbers of as many bytes as they need",
+    "Tell": "Tell in Parts: use SizeOf for the length of a part",
+    "Index": "Index is not on the wire: in `points` the index of an element is f.x.index",
+    "LazyBound": "a part that contains itself has no fixed offset: use Parts for a sequence",
+    "VarInt": "VarInt has no fixed offset: use a WireForm for numbers of variable size",
+    "ZigZag": "ZigZag has no fixed offset: use a WireForm for numbers of variable size",
     "FocusedSeq": (
-        "PrefixedArray is compiled as a named member of a Struct alone: Struct('points' /"
+        "PrefixedArray is only compiled as a named member of a Struct: Struct('points' /"
         " PrefixedArray(...))"
     ),
     "Prefixed": (
-        "Prefixed is compiled as a named member of a Struct alone: Struct('part' / Prefixed(...))"
+        "Prefixed is only compiled as a named member of a Struct: Struct('part' / Prefixed(...))"
     ),
-    "Sequence": "the parts of a Sequence have no names: say Struct('a' / ..., 'b' / ...)",
-    "GreedyBytes": "it takes the rest of a datagram: Bytes(n) behind its length is read in bulk",
-    "GreedyRange": (
-        "it takes the rest of a datagram: PrefixedArray, or Prefixed(GreedyRange), is read in bulk"
-    ),
-    "NullTerminated": "a text up to a terminator has no fixed place: Bytes(n) is read in bulk",
-    "Terminated": "Terminated asks for the end of the datagram: leave it out",
-    "RepeatUntil": (
-        "RepeatUntil has no fixed place: say Array with a count, or Parts with one of its rules"
-    ),
+    "Sequence": "the parts of a Sequence have no names: use Struct('a' / ..., 'b' / ...)",
+    "GreedyBytes": "it reads the rest of a datagram: use Bytes(n) after its length",
+    "GreedyRange": ("it reads the rest of a datagram: use PrefixedArray or Prefixed(GreedyRange)"),
+    "NullTerminated": "text up to a terminator has no fixed offset: use Bytes(n)",
+    "Terminated": "Terminated expects the end of the datagram: leave it out",
+    "RepeatUntil": ("RepeatUntil has no fixed offset: use Array with a count, or Parts"),
 }
 
 #: what takes all bytes as they are.
@@ -1075,7 +1068,7 @@ def _constant(con: Const) -> Any:
         if isinstance(below, construct.Enum):
             if con.value not in below.encmapping:
                 raise SpecError(
-                    f"the constant {str(con.value)!r} is none of"
+                    f"invalid constant {str(con.value)!r}: expected one of"
                     f" {', '.join(map(str, below.encmapping))}"
                 )
             return int(below.encmapping[con.value])

@@ -34,7 +34,7 @@ SHADOWED = frozenset(name for name in dir(Container) if not name.startswith("_")
 
 #: the rule under which `lidarspec check` explains it, and the reason.
 _REFUSED: dict[type, tuple[str, str]] = {
-    type(construct.Pickled): ("LS110", "Pickled runs code from the wire"),
+    type(construct.Pickled): ("LS110", "Pickled executes code from the wire: use other fields"),
     construct.FlagsEnum: (
         "LS108",
         "FlagsEnum loses undeclared bits: declare each bit as a field of a BitStruct",
@@ -42,16 +42,13 @@ _REFUSED: dict[type, tuple[str, str]] = {
     construct.Union: (
         "LS109",
         (
-            "Union reads bytes in several ways, and edits of all but one are ignored on rebuild:"
-            " declare one of them"
+            "Union reads bytes in several ways and ignores edits of all but one on rebuild:"
+            " declare one"
         ),
     ),
     construct.Padded: (
         "LS106",
-        (
-            "padding loses its bytes on a round trip: declare it as a field, such as 'reserved' /"
-            " Bytes(n)"
-        ),
+        ("padding loses its bytes on a round trip: declare a field, such as 'reserved' / Bytes(n)"),
     ),
     construct.Aligned: (
         "LS106",
@@ -77,14 +74,16 @@ _BOUNDED = (construct.NullTerminated, construct.FixedSized, construct.Prefixed, 
 #: of what stands in a struct without a name, what to write in its place.
 _INSTEAD: dict[type, str] = {
     HeldCheck: (
-        "a Check has no name to be told by: 'valid' / Check(...), or plausible=lambda f: ..., which"
-        " is judged in bulk"
+        "a Check must have a name: 'valid' / Check(...); or use plausible=lambda f: ...,"
+        " which is vectorized"
     ),
-    construct.Probe: "Probe prints while it parses: lidarspec explain shows every byte of a frame",
+    construct.Probe: (
+        "Probe prints while parsing: use lidarspec explain to see every byte of a frame"
+    ),
     construct.StopIf: (
-        "StopIf leaves out what follows in a struct: 'rest' / If(this.more, Struct(...))"
+        "StopIf omits the rest of a struct: use 'rest' / If(this.more, Struct(...))"
     ),
-    construct.Seek: "Seek reads outside the frame: name the bytes between, 'reserved' / Bytes(n)",
+    construct.Seek: "Seek reads outside the frame: declare those bytes, 'reserved' / Bytes(n)",
 }
 
 
@@ -111,7 +110,7 @@ def check_struct(con: Construct) -> SpecError | None:
                 raise SpecError(reason, path=path, rule=rule)
         if isinstance(part, type(construct.Flag)) and not in_bits:
             raise SpecError(
-                "Flag keeps one bit of its byte only: use a BitStruct, or Int8ul",
+                "Flag keeps only one bit of its byte: use a BitStruct, or Int8ul",
                 path=path,
                 rule="LS107",
             )
@@ -123,7 +122,7 @@ def check_struct(con: Construct) -> SpecError | None:
             child.name == "frame" for case in part.cases.values() for child in unwrap(case).subcons
         ):
             raise SpecError(
-                "no field of a part may be called 'frame', which is the frame around it",
+                "no field of a part may be called 'frame', which is the outer frame",
                 path=f"{path}.frame",
                 rule="LS102",
             )
@@ -148,17 +147,15 @@ def _check_ends(
     below = children(con)
     endless: SpecError | None = None
     if con is construct.Terminated:
-        reason = (
-            "Terminated asks for the end of a stream: leave it out, the last field ends a frame"
-        )
+        reason = "Terminated expects the end of a stream: leave it out"
         endless = SpecError(reason, path=path, rule="LS111")
         if not is_last:
             raise endless
     if isinstance(con, (*GREEDY, *RECODING)) and not bounded:
         what = "count" if isinstance(con, construct.GreedyRange) else "length"
         reason = (
-            f"{author_class(con)} has no end of its own on a stream: give a {what}, or a"
-            " terminator, or bound it by Prefixed or FixedSized"
+            f"{author_class(con)} has no end in a stream: use a {what}, a terminator, Prefixed"
+            " or FixedSized"
         )
         endless = SpecError(reason, path=path, rule="LS111")
         if not is_last:
@@ -185,8 +182,8 @@ def _check_ends(
         else:
             named = ", unless it is a named member of a Struct"
         reason = (
-            f"{name} loses what its content leaves of it{named}: let the content end with a field"
-            " for it, 'rest' / GreedyBytes"
+            f"{name} loses bytes that its content does not read{named}: end the content with a"
+            " field for them, 'rest' / GreedyBytes"
         )
         raise SpecError(reason, path=path, rule="LS106")
     return endless
@@ -208,7 +205,7 @@ def _check_focus(con: construct.FocusedSeq, path: str) -> None:
     for member in con.subcons:
         if member.name != con.parsebuildfrom and not member.flagbuildnone:
             reason = (
-                f"FocusedSeq keeps {con.parsebuildfrom!r} alone, and loses"
+                f"FocusedSeq keeps only {con.parsebuildfrom!r} and loses"
                 f" {member.name or type(member).__name__!r}: use a Struct"
             )
             raise SpecError(reason, path=path, rule="LS105")
@@ -234,7 +231,9 @@ def _check_names(struct: Struct, path: str, *, in_bits: bool) -> None:
             continue
         if name in seen:
             raise SpecError(
-                "two fields of this name: the last one would win silently", path=place, rule="LS104"
+                "duplicate field name: the last field would silently replace the first",
+                path=place,
+                rule="LS104",
             )
         if name in RESERVED and not path:
             raise SpecError("no field may be called 'state' or 'on'", path=place, rule="LS102")
@@ -276,7 +275,7 @@ def _check_measures(
     )
     if is_number and measures_by_path.setdefault(path, measure) != measure:
         raise SpecError(
-            "its branches have different scales or units: give each a name of its own", path=path
+            "its branches have different scales or units: use a different name for each", path=path
         )
     for child in children(con):
         if not isinstance(con, Struct) or child.name is not None:

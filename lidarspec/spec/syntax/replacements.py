@@ -210,7 +210,7 @@ class FullRange(construct.GreedyRange):  # type: ignore[misc]
             place = f"{path}[{len(elements)}]"
             elements.append(self.subcon._parsereport(stream, context, place))
             if stream.tell() == start:
-                raise construct.RangeError("an element without a byte never ends", path=place)
+                raise construct.RangeError("an element without bytes repeats forever", path=place)
         return elements
 
     def _build(self, obj: Any, stream: Any, context: Any, path: str) -> Any:
@@ -506,7 +506,7 @@ class SizeField(Subconstruct):  # type: ignore[misc]
             start = marks[self.since][0] if self.since else start
         except (KeyError, TypeError):
             raise SpecError(
-                f"SizeOf measures {'.'.join(self.of)!r}, and there is no such part"
+                f"SizeOf measures {'.'.join(self.of)!r}, but there is no such part"
             ) from None
         return int(end - start + self.plus)
 

@@ -43,14 +43,14 @@ SPEED = Scaled(Int8ub, 0.05, "Hz")
 DATA = Checksummed(
     Struct(
         "header" / Const(b"\xaa"),
-        "length" / Rebuild(Int16ub, this.size + 8) * "of all that stands before the sum",
-        "version" / Int8ub * "of the protocol: 0 or 1",
+        "length" / Rebuild(Int16ub, this.size + 8) * "bytes before the checksum",
+        "version" / Int8ub * "protocol version, 0 or 1",
         "type" / Const(0x61, Int8ub),
         "command" / Const(0xAD, Int8ub) * "speed and samples",
-        "size" / Int16ub * "from the speed to the last sample",
+        "size" / Int16ub * "bytes from the speed to the last sample",
         "speed" / SPEED,
         "zero_offset" / Scaled(Int16sb, 0.01, "deg"),
-        "start_angle" / Scaled(Int16ub, 0.01, "deg") * "of the first sample",
+        "start_angle" / Scaled(Int16ub, 0.01, "deg") * "azimuth of the first sample",
         "samples"
         / Array(
             (this.size - 5) // 3,
@@ -64,11 +64,11 @@ DATA = Checksummed(
 SPEED_STRUCT = Checksummed(
     Struct(
         "header" / Const(b"\xaa\x00\x09"),
-        "version" / Int8ub * "of the protocol: 0 or 1",
+        "version" / Int8ub * "protocol version, 0 or 1",
         "type" / Const(0x61, Int8ub),
-        "command" / Const(0xAE, Int8ub) * "speed alone",
+        "command" / Const(0xAE, Int8ub) * "speed only",
         "size" / Const(1, Int16ub),
-        "speed" / SPEED * "while the motor comes to its speed",
+        "speed" / SPEED * "while the motor starts",
         "sum" / Int16ub,
     ),
     field="sum",
@@ -148,7 +148,7 @@ MODELS: dict[str, tuple[str, int, int, tuple[int, ...]]] = {
 def describe_difference(own: int, other: int) -> str | Relative:
     """Return how to distinguish two models by their packets per revolution."""
     if own == other:
-        return "nothing in the packets: the baud rate, or the label on the housing"
+        return "identical packets; see the baud rate, or the label on the housing"
     return Relative(
         f"packets start every {360 / other:g} degrees", partial(starts_on_grid, packets=other)
     )
@@ -175,7 +175,7 @@ def make_lidar(name: str) -> Sensor:
         status="vectors" if model == "Delta-2A" else "manual",
         source="kaiaai/LDS and lds2d"
         + "; two packets of a unit" * (model == "Delta-2A")
-        + ". Limits of range are assumed",
+        + ". Range limits are assumed",
     )
 
 

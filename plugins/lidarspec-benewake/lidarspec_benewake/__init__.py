@@ -49,7 +49,7 @@ BAUD = 6
 OUTPUT = 7
 FACTORY = 0x10
 SAVE = 0x11
-HEAD = "header" / Const(b"\x5a") * "then the length of the frame"
+HEAD = "header" / Const(b"\x5a") * "followed by the length of the frame"
 
 
 @cache
@@ -58,16 +58,16 @@ def make_data_frame(unit: str) -> Frame:
     step = METRES_PER_UNIT[unit]
     struct = Struct(
         "header" / Const(b"\x59\x59"),
-        "distance" / Scaled(Int16ul, step, "m") * "FFFC and above: none can be told",
-        "strength" / Int16ul * "of the signal; below 100 and at FFFF the distance is unreliable",
-        "temperature" / Scaled(Int16ul, 1 / 8, "degC", -256) * "of the chip",
+        "distance" / Scaled(Int16ul, step, "m") * "FFFC and above: no distance",
+        "strength" / Int16ul * "signal strength; below 100 and at FFFF the distance is unreliable",
+        "temperature" / Scaled(Int16ul, 1 / 8, "degC", -256) * "temperature of the chip",
         "checksum" / Int8ul,
     )
     return Frame(
         Checksummed(struct, field="checksum", algorithm=Sum(8)),
         data=True,
         plausible=lambda f: (f.distance <= 20) | (f.distance >= 0xFFFC * step),
-        acknowledged={"LS712": "its one beam has all points straight ahead"},
+        acknowledged={"LS712": "its single beam points straight ahead"},
     )
 
 
@@ -107,7 +107,7 @@ def make_id(number: int) -> Any:
     return "id" / Const(number, Int8ul)
 
 
-RATE_FIELD = "rate" / Scaled(Int16ul, 1, "Hz") * "of frames; 0: one for each trigger"
+RATE_FIELD = "rate" / Scaled(Int16ul, 1, "Hz") * "frames per second; 0: one per trigger"
 BAUD_FIELD = "baud" / Int32ul
 FRAMES = {
     "version": make_message(
@@ -116,7 +116,7 @@ FRAMES = {
     "rate": make_message(6, make_id(RATE), RATE_FIELD),
     "baud": make_message(8, make_id(BAUD), BAUD_FIELD),
     "setting": make_message(
-        5, "id" / Int8ul, "value" / Int8ul * "what is set; of an action, 0: it succeeded"
+        5, "id" / Int8ul, "value" / Int8ul * "the setting; for an action, 0: success"
     ),
     "request": make_message(4, "id" / Int8ul, out=True),
     "set_rate": make_message(6, make_id(RATE), RATE_FIELD, out=True),
@@ -235,7 +235,7 @@ def make_rangefinder(name: str) -> Sensor:
         on_open=("output_on",),
         range_limits=limits,
         relatives={
-            other: "nothing in its frames: the label on the housing"
+            other: "identical frames; see the label on the housing"
             for other in MODELS
             if other != name
         },

@@ -70,11 +70,13 @@ def make_data_frame(form: int, count: int, *rest: Construct) -> Frame:
         rest: the fields of a sample after distance and intensity.
     """
     struct = Struct(
-        "header" / Const(bytes([0x55, 0xAA, form, count])) * "sync, form and number of the samples",
+        "header"
+        / Const(bytes([0x55, 0xAA, form, count]))
+        * "sync, packet format and number of samples",
         "speed" / Scaled(Int16ul, 1 / 64, "rpm"),
-        "start_angle" / make_angle() * "of the first sample",
+        "start_angle" / make_angle() * "azimuth of the first sample",
         "samples" / Array(count, Struct("range" / DISTANCE, "intensity" / Int8ul, *rest)),
-        "end_angle" / make_angle() * "of the last sample",
+        "end_angle" / make_angle() * "azimuth of the last sample",
         "checksum" / Int16ul,
     )
     struct_with_sum = Checksummed(struct, field="checksum", algorithm=Fold15())
@@ -155,8 +157,8 @@ X1 = Sensor(
     turn=(4.5, 6.0),
     status="vectors",
     source=(
-        "three captured packets; kaiaai/LDS, LDS_CAMSENSE_X1; the housing's zero from the vendor's"
-        " SDK. Limits of range are assumed"
+        "three captured packets; kaiaai/LDS, LDS_CAMSENSE_X1; zero direction of the housing"
+        " from the vendor's SDK. Range limits are assumed"
     ),
 )
 
@@ -170,8 +172,7 @@ LDS08RR = dataclasses.replace(
     configure=None,  # the zero of its housing is not public
     status="capture",
     source=(
-        "two captured packets; kaiaai/LDS, LDS_LDS08RR_CAMSENSE. Limits of range and speed are"
-        " assumed"
+        "two captured packets; kaiaai/LDS, LDS_LDS08RR_CAMSENSE. Range and speed limits are assumed"
     ),
 )
 

@@ -55,7 +55,7 @@ DATA = Struct(
     "header_version" / Int8ul,
     "header_size" / Const(HEADER_BYTES, Int8ul),
     "flags" / Int16ul,
-    "time" / Scaled(Int64ul, 1e-6, "s") * "since 1970",
+    "time" / Scaled(Int64ul, 1e-6, "s") * "time since 1970",
     "point_version" / Int8ul,
     "point_size" / Const(POINT_BYTES, Int8ul),
     "count" / Int16ul,
@@ -64,11 +64,11 @@ DATA = Struct(
     / Array(
         this.count,
         Struct(
-            "x" / Scaled(Int16sl, 0.005, "m") * "to the right",
+            "x" / Scaled(Int16sl, 0.005, "m") * "positive to the right",
             "y" / Scaled(Int16ul, 0.005, "m") * "ahead",
             "z" / Scaled(Int16sl, 0.005, "m") * "up",
             "reflectivity" / Int8ul,
-            "after" / Scaled(Int8ul, 1e-6, "s") * "the point before",
+            "after" / Scaled(Int8ul, 1e-6, "s") * "time since the previous point",
             "channel" / Int8ul,
             "flags"
             / BitStruct(
@@ -76,8 +76,8 @@ DATA = Struct(
                 "noise" / BitsInteger(1),
                 "no_return" / BitsInteger(1),
                 "second" / BitsInteger(1) * "1: second return",
-                "boundary" / BitsInteger(1) * "1: first of a picture",
-                "parity" / BitsInteger(1) * "changes with each picture",
+                "boundary" / BitsInteger(1) * "1: first point of an image",
+                "parity" / BitsInteger(1) * "changes with each image",
                 "weak" / BitsInteger(1),
                 "saturated" / BitsInteger(1),
             ),
@@ -154,7 +154,8 @@ VISTA = Sensor(
     vendor_axes=("right", "forward", "up"),
     status="manual",
     source=(
-        "Sensor Communication Specifications (opening), and a public reader; the reach is assumed"
+        "Sensor Communication Specifications (opening), and a public reader; the maximum"
+        " range is assumed"
     ),
 )
 

@@ -86,9 +86,9 @@ def make_ack(header: bytes) -> Checksummed:
     return Checksummed(
         Struct(
             "header" / Const(header),
-            "mode" / Int8ul * "the command's mode ^ A0",
-            "length" / Const(7, Int8ul) * "of the data: firmware and reserved",
-            "firmware" / Int8ul * "to start: 3 is V3.0",
+            "mode" / Int8ul * "mode of the command ^ A0",
+            "length" / Const(7, Int8ul) * "bytes of data: firmware and reserved",
+            "firmware" / Int8ul * "in the reply to start: 3 is V3.0",
             "reserved" / Bytes(6),
             "checksum" / Int8ul,
         ),
@@ -100,17 +100,17 @@ def make_ack(header: bytes) -> Checksummed:
 INFO = Checksummed(
     Struct(
         "header" / Const(b"\xa5\x5a"),
-        "length" / Const(20, Int16ul) * "of the data: all that follows the type",
+        "length" / Const(20, Int16ul) * "bytes of data after the type",
         "sum" / Int16ul,
         "type" / Const(0x01, Int8ul) * "device information",
-        "model" / Bytes(12) * "ASCII, ends with 00",
+        "model" / Bytes(12) * "ASCII, terminated by 00",
         "zero_angle"
         / Scaled(Int16ul, 1, "deg")
-        * "from the data's zero to the one marked on the housing, clockwise",
+        * "from the zero direction of the data to the mark on the housing, clockwise",
         "direction" / Int8ul * "0: clockwise",
-        "correction" / Int8ul * "1: the host has to correct the angles",
+        "correction" / Int8ul * "1: the host must correct the angles",
         "reserved" / Bytes(3),
-        "revision" / Int8ul * "of the software",
+        "revision" / Int8ul * "software revision",
     ),
     field="sum",
     algorithm=Sum(16),
@@ -119,9 +119,9 @@ INFO = Checksummed(
 SCAN_START = Checksummed(
     Struct(
         "header" / Const(b"\xa5\x5a"),
-        "length" / Const(0, Int16ul) * "0: point packets follow without end",
+        "length" / Const(0, Int16ul) * "0: point packets follow until stop",
         "sum" / Int16ul,
-        "type" / Const(0x81, Int8ul) * "scan data begins",
+        "type" / Const(0x81, Int8ul) * "start of scan data",
     ),
     field="sum",
     algorithm=Sum(16),
@@ -133,7 +133,7 @@ AUXILIARY = Checksummed(
         "header" / Const(b"\xa5\x5a\x04\x00\xfe"),
         "checksum" / Int8ul,
         "type" / Const(0x06, Int8ul),
-        "value" / Int8ul * "38 to 3F were seen; its meaning is not known",
+        "value" / Int8ul * "values 38 to 3F observed; meaning unknown",
         "reserved" / Const(bytes(3)),
     ),
     field="checksum",
@@ -164,7 +164,8 @@ def make_data(first: Construct, sample: Construct, groups: tuple[int, ...]) -> C
     return Checksummed(
         Struct(
             "header" / Const(b"\xaa\x55"),
-            "mt" / BitStruct(first, "start" / BitsInteger(1) * "1: start packet, a turn begins"),
+            "mt"
+            / BitStruct(first, "start" / BitsInteger(1) * "1: start packet, a revolution begins"),
             "lsn" / Int8ul * "number of samples",
             "fsa" / make_angle() * "angle of the first sample",
             "lsa" / make_angle() * "angle of the last sample",
@@ -180,7 +181,7 @@ DISTANCE = "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return"
 DATA = make_data(
     "frequency"
     / Scaled(BitsInteger(7), 0.1, "Hz")
-    * "of scans, in a start packet; firmware number in the next packet; else 0",
+    * "scans per second in a start packet; firmware number in the next packet; else 0",
     ByteSwapped(
         BitStruct(
             DISTANCE, "intensity" / BitsInteger(8), "exposure" / BitsInteger(2) * "1 high, 2 low"
@@ -190,7 +191,7 @@ DATA = make_data(
 )
 OLDER_DATA = make_data(
     "reserved" / BitsInteger(7),
-    ByteSwapped(BitStruct(DISTANCE, "flags" / BitsInteger(2) * "not explained")),
+    ByteSwapped(BitStruct(DISTANCE, "flags" / BitsInteger(2) * "meaning unknown")),
     (2,),
 )
 
@@ -340,10 +341,11 @@ def has_state_bits(f: Fields) -> Any:
 # YDLIDAR sends the same packet with other meanings of the sample bits (YDLIDAR SDK, communication
 # protocol)
 TMINI_RELATIVE = Relative(
-    "bits are set beside the lowest of the third byte in packets that begin no turn", has_state_bits
+    "bits above the lowest one of the third byte in packets that do not begin a revolution",
+    has_state_bits,
 )
 YDLIDAR_RELATIVES: dict[str, str | Relative] = {
-    **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "the answers to its requests"),
+    **dict.fromkeys(("ydlidar-g2", "ydlidar-g4b", "ydlidar-s4b"), "its replies to requests"),
     **dict.fromkeys(("ydlidar-tmini", "ydlidar-tmini-pro", "ydlidar-tmini-plus"), TMINI_RELATIVE),
 }
 
@@ -401,7 +403,7 @@ TWO_BYTE_MODELS = (
     "f4 g1 g2a g2c g4 g4-pro g4c g5 g6 g7 s2 s4 tg15 tg30 tg50 tx20 tx8 x2 x3 x4 x4-pro"
 )
 SPEED_RELATIVE = Relative(
-    "start packets tell how fast it turns",
+    "start packets contain the speed",
     lambda f: np.asarray((f.mt.start == 1) & (f.mt.reserved > 0)).any(),
 )
 M1C1_MINI_V11 = Sensor(
@@ -474,15 +476,13 @@ def make_coin_simulation(model: str, **turns: Any) -> Simulation:
 COIN_D4 = make_coin(
     "COIN-D4",
     status="capture",
-    source=(
-        "the M1C1_Mini's manual; baud rate from the vendor's SDK; a captured start-up of a COIN-D4"
-    ),
+    source=("M1C1_Mini manual; baud rate from the vendor's SDK; captured start-up of a COIN-D4"),
 )
 COIN_D4A = make_coin(
     "COIN-D4A",
     range_limits=(0.001, 12.0),
     status="manual",
-    source="the vendor's driver, ros_cspc_lidar_coin_d4a: baud rate, 12 m",
+    source="vendor's driver, ros_cspc_lidar_coin_d4a: baud rate, 12 m",
 )
 COIN_D6 = make_coin(
     "COIN-D6",
@@ -495,8 +495,8 @@ COIN_D6 = make_coin(
     simulation=make_coin_simulation("COIN-D6", steps=400, hertz=10.0),
     status="manual",
     source=(
-        "the vendor's SDK (baud rate); what others saw of a COIN-D6: turns, points, the auxiliary"
-        " frame"
+        "vendor's SDK (baud rate); published observations of a COIN-D6: speed, points, the"
+        " auxiliary frame"
     ),
 )
 

@@ -86,14 +86,14 @@ FILE = Struct(
     "faces" / Int8ul,
     "fields" / Int8ul,
     "field_config" / Bytes(8),
-    "resolution" / Int8ul * "steps of all angles",
+    "resolution" / Int8ul * "step of all angles",
     "start" / Array(this.faces, Int32ul),
     "end" / Array(this.faces, Int32ul),
     "azimuth" / Array(LASERS, Int32sl),
     "elevation" / Array(LASERS, Int32sl),
     "azimuth_adjust" / Bytes(LASERS * 180),
     "elevation_adjust" / Bytes(LASERS * 180),
-    "sha256" / Bytes(32) * "of all bytes in front of it",
+    "sha256" / Bytes(32) * "SHA-256 of all preceding bytes",
 )
 
 
@@ -127,7 +127,7 @@ class Mirror(Calibration):
             ) from None
         if not file.faces or hashlib.sha256(data[:-32]).digest() != data[-32:]:
             raise UsageError(
-                f"{path!s}: the correction file is damaged: its SHA-256 is not that of its bytes"
+                f"{path!s}: the correction file is corrupt: its SHA-256 does not match"
             )
         unit = file.resolution / STEPS
         return dataclasses.replace(
@@ -178,16 +178,16 @@ def _steps(data: bytes, resolution: int) -> Table:
 
 VERSION = ("major" / Const(4, Int8ul), "minor" / OneOf(Int8ul, [1, 3]))
 CHANNEL = Struct(
-    "distance" / Int16ul * "steps of dis_unit; 0: no return",
+    "distance" / Int16ul * "in steps of dis_unit; 0: no return",
     "reflectivity" / Int8ul,
     "confidence" / Int8ul,
 )
 TAIL = (
     "tail_reserved" / Bytes(6),
-    "shutdown" / Int8ul * "bit 0: too hot, about to shut down",
+    "shutdown" / Int8ul * "bit 0: overheated, about to shut down",
     "tail_reserved_2" / Bytes(11),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
     "return_mode" / Int8ul * RETURN_MODES,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,

@@ -170,20 +170,20 @@ def columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[
                 path,
                 line,
                 places[0],
-                f"channel {channel:g}, and this model has channels 1 to {channels}",
+                f"channel {channel:g} is out of range: this model has channels 1 to {channels}",
             )
         if channel in listed:
             raise _fault(
                 path,
                 line,
                 places[0],
-                f"channel {channel:g} stands in line {listed[int(channel)][0]} already",
+                f"channel {channel:g} is already in line {listed[int(channel)][0]}",
             )
         listed[int(channel)] = line, values
     if missing := [channel for channel in range(1, channels + 1) if channel not in listed]:
         raise UsageError(
-            f"{path!s}: lists {len(listed)} channels, and this model has channels 1 to {channels};"
-            f" {missing[0]} is the first missing"
+            f"{path!s}: contains {len(listed)} channels, expected 1 to {channels}; channel"
+            f" {missing[0]} is the first missing one"
         )
     tables = list(np.array([listed[channel][1] for channel in sorted(listed)]).T)
     for (column, own), table, place in zip(wanted.items(), tables, places[1:], strict=True):
@@ -223,7 +223,7 @@ def content(path: str | Path | Learned) -> bytes:
         raise UsageError(f"{path!s}: not a correction file: {error}") from error
     if len(data) > LARGEST:
         raise UsageError(
-            f"{path!s}: not a correction file: it has more than {LARGEST // 1_000_000} MB"
+            f"{path!s}: not a correction file: it is larger than {LARGEST // 1_000_000} MB"
         )
     return data
 
@@ -234,10 +234,10 @@ def _place(path: str | Path | Learned, line: int, headings: list[str], column: C
         name, _, unit = heading.lower().partition("(")
         if re.sub(r"[^a-z]", "", name) in column.headings:
             if unit.strip(" )") not in ("", *column.units):
-                raise _fault(path, line, place, f"{heading!r} is not in {column.units[0]}")
+                raise _fault(path, line, place, f"{heading!r} must be in {column.units[0]}")
             return place
     raise UsageError(
-        f"{path!s}: line {line}: no column is headed {column.name!r}; the headings are"
+        f"{path!s}: line {line}: no column is named {column.name!r}; the names are"
         f" {', '.join(headings)[:QUOTED]!r}"
     )
 
@@ -249,13 +249,15 @@ def _value(
     try:
         value = float(text)
     except ValueError:
-        raise _fault(path, line, place, f"{column.name} is {text[:QUOTED]!r}, no number") from None
+        raise _fault(
+            path, line, place, f"{column.name} must be a number, got {text[:QUOTED]!r}"
+        ) from None
     if not column.low <= value <= column.high:  # nor nan
         raise _fault(
             path,
             line,
             place,
-            f"{column.name} {value:g} is not within {column.low:g} .. {column.high:g}"
+            f"{column.name} {value:g} is outside {column.low:g} .. {column.high:g}"
             f" {column.units[0]}",
         )
     return value
@@ -270,13 +272,13 @@ def _compare(
     spread = float(np.ptp(table))
     usual = float(np.ptp(own))
     if usual > 1 and not usual / UNLIKE < spread < usual * UNLIKE:
-        told = f"spread over {spread:g}" if spread else f"are all {table[0]:g}"
+        told = f"have a spread of {spread:g}" if spread else f"are all {table[0]:g}"
         raise _fault(
             path,
             line,
             place,
-            f"the {column.name}s {told}, those of this model over {usual:g} {column.units[0]}: is"
-            " it another unit?",
+            f"the {column.name}s {told}, but those of this model have a spread of {usual:g}"
+            f" {column.units[0]}: does the file belong to another unit?",
         )
 
 

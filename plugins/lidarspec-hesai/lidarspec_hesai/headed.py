@@ -41,13 +41,13 @@ def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> St
         "header_reserved" / Bytes(2),
         "lasers" / Const(lasers, Int8ul),
         "block_count" / Int8ul,
-        "first_return" / Int8ul * "which return the first block of a shot holds",
-        "dis_unit" / Scaled(Int8ul, 1, "mm") * "one step of a distance",
-        "return_count" / Int8ul * "returns of a shot; of some models the most that there can be",
+        "first_return" / Int8ul * "return in the first block of a shot",
+        "dis_unit" / Scaled(Int8ul, 1, "mm") * "step of a distance",
+        "return_count" / Int8ul * "returns per shot; for some models the maximum",
         "flags" / BitStruct("reserved" / BitsInteger(7), "sequence" / BitsInteger(1)),
     ]
     channel = Struct(
-        "distance" / Int16ul * "steps of dis_unit; 0: no return",
+        "distance" / Int16ul * "in steps of dis_unit; 0: no return",
         "reflectivity" / Int8ul,
         "reserved" / Int8ul,
     )

@@ -64,7 +64,7 @@ def packet(data_type: int, *body: Any) -> Struct:
         "time_version" / Int8ul,
         "data_type" / Const(data_type, Int8ul),
         "utc" / UTC,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
         *body,
         "crc" / Int32ul,
     )
@@ -83,11 +83,11 @@ DATA = Checksummed(
         ),
         "dirt"
         / Int32ul
-        * "on the window, two bits for each channel, those of the first in the lowest",
+        * "soiling of the window, two bits per channel, first channel in the lowest bits",
         "unit_state" / Int8ul,
         "reserved_id"
         / Int8ul
-        * "what the next field is: 12 to 15 the version of the software, 16 to 19 of the hardware",
+        * "content of the next field: 12 to 15 software version, 16 to 19 hardware version",
         "reserved_info" / Int16ul,
         "sequence" / Int16ul,
     ),
@@ -99,7 +99,7 @@ IMU = Checksummed(
         1,
         "acceleration"
         / Array(3, Scaled(Int16sl, 1 / 8192, "g"))
-        * "x, y, z of the unit's IMU, whose axes are not documented",
+        * "x, y, z of the unit's IMU; its axes are not documented",
         "rate" / Array(3, Scaled(Int16sl, 1 / 32.8, "deg/s")),
         "sequence" / Int16ul,
     ),
@@ -152,7 +152,7 @@ JT16 = Sensor(
     vendor_axes=("right", "forward", "up"),
     status="manual",
     source=(
-        "HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc, JT16 correction file); no"
-        " packet of this model was seen"
+        "HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc, JT16 correction file);"
+        " not tested with packets of this model"
     ),
 )

@@ -139,7 +139,7 @@ OT128_TIMES_US = {
 
 FLAGS = this._._._.flags
 CHANNEL = Struct(
-    "distance" / Int16ul * "steps of dis_unit; 0: no return",
+    "distance" / Int16ul * "in steps of dis_unit; 0: no return",
     "reflectivity" / Int8ul,
     "confidence" / If(FLAGS.confidence == 1, Int8ul),
     "weight" / If(FLAGS.weight == 1, Int8ul),
@@ -152,12 +152,12 @@ def tail(speed: float) -> Any:
     """Return the tail, with the motor's speed in steps of so many rpm."""
     return (
         "tail_reserved" / Bytes(9),
-        "azimuth_state" / Int16ul * "two bits a block, that of the first in the highest",
-        "operational_state" / Int8ul * "0 high performance; else standard, or saving energy",
+        "azimuth_state" / Int16ul * "two bits per block, first block in the highest bits",
+        "operational_state" / Int8ul * "0 high performance; else standard or energy saving",
         "return_mode" / Int8ul * RETURN_MODES,
         "motor_speed" / Scaled(Int16ul, speed, "rpm"),
         "utc" / UTC,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
         "factory" / Int8ul * FACTORY,
     )
 

@@ -53,7 +53,7 @@ PLAIN = Struct(
         BLOCKS,
         Struct(
             "sync" / Const(b"\xff\xee"),
-            "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise seen from above",
+            "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise, seen from above",
             "channels"
             / Array(
                 CHANNELS,

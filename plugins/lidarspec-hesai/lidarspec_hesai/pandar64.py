@@ -50,13 +50,15 @@ FIRING_US = (
 )
 # fmt: on
 
-CHANNEL = Struct("distance" / Int16ul * "steps of dis_unit; 0: no return", "reflectivity" / Int8ul)
+CHANNEL = Struct(
+    "distance" / Int16ul * "in steps of dis_unit; 0: no return", "reflectivity" / Int8ul
+)
 PLAIN = Struct(
     "sync" / Const(b"\xee\xff"),
     "lasers" / Const(CHANNELS, Int8ul),
     "block_count" / Const(BLOCKS, Int8ul),
     "header_reserved" / Bytes(1),
-    "dis_unit" / Scaled(Int8ul, 1, "mm") * "one step of a distance",
+    "dis_unit" / Scaled(Int8ul, 1, "mm") * "step of a distance",
     "header_end" / Const(bytes(2)),
     "blocks"
     / Array(

@@ -32,8 +32,10 @@ TURN = (
 UTC = Struct(
     "year"
     / Int8ul
-    * "from 70 on since 1900, below since 2000; 0: the last five bytes are Unix seconds,"
-    " big-endian",
+    * (
+        "70 and above: since 1900; below: since 2000; 0: the last five bytes are Unix seconds,"
+        " big-endian"
+    ),
     "month" / Int8ul,
     "day" / Int8ul,
     "hour" / Int8ul,
@@ -45,10 +47,10 @@ UTC = Struct(
 #: the tail of a Pandar40P and a Pandar64.
 TAIL_40P = (
     "reserved" / Bytes(5),
-    "shutdown" / Int8ul * "1: too hot, about to shut down",
+    "shutdown" / Int8ul * "1: overheated, about to shut down",
     "tail_reserved" / Bytes(2),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
     "return_mode" / Int8ul * RETURN_MODES,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,

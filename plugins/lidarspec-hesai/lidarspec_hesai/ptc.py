@@ -26,14 +26,18 @@ RESULTS = (
 )
 SETTINGS = {
     0x17: Struct("rate" / Scaled(Int16ub, 1, "rpm")),
-    0x1C: Struct("standby" / Int8ub * "1: the motor stands still"),
+    0x1C: Struct("standby" / Int8ub * "1: the motor is stopped"),
     0x1E: Struct(
         "mode"
         / Int8ub
-        * "0 last, 1 strongest, 2 both, 3 first, 4 first and last, 5 first and strongest, where a"
-        " model has it"
+        * (
+            "0 last, 1 strongest, 2 both, 3 first, 4 first and last, 5 first and strongest, if"
+            " the model supports it"
+        )
     ),
-    0x20: Struct("host" / Bytes(4), "port" / Int16ub * "of the data", "gps_port" / Int16ub),
+    0x20: Struct(
+        "host" / Bytes(4), "port" / Int16ub * "destination port of data", "gps_port" / Int16ub
+    ),
 }
 
 

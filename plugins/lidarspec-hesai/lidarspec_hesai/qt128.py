@@ -86,18 +86,18 @@ LOOP_2_US = (
 
 VERSION = ("major" / Const(3, Int8ul), "minor" / Const(2, Int8ul))
 CHANNEL = Struct(
-    "distance" / Int16ul * "steps of dis_unit; 0: no return",
+    "distance" / Int16ul * "in steps of dis_unit; 0: no return",
     "reflectivity" / Int8ul,
     "confidence" / Int8ul,
 )
 TAIL = (
     "tail_reserved" / Bytes(5),
-    "mode_flag" / Int8ul * "bit 0: the loop of the packet, with dual return",
+    "mode_flag" / Int8ul * "bit 0: loop of the packet, with dual return",
     "tail_reserved_2" / Bytes(6),
     "return_mode" / Int8ul * RETURN_MODES,
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "utc" / UTC,
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
     "factory" / Int8ul * FACTORY,
 )
 

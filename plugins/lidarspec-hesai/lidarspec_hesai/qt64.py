@@ -47,7 +47,7 @@ FIRING_US = (
 TAIL = (
     "reserved" / Bytes(10),
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
     "return_mode" / Int8ul * RETURN_MODES,
     "factory" / Int8ul * FACTORY,
     "utc" / UTC,

@@ -38,15 +38,15 @@ BLOCKS = 2
 TWO = Const(BLOCKS, Int8ul)
 CRC = Crc(32, poly=0x04C11DB7, init=0xFFFFFFFF)  # CRC-32/MPEG-2
 
-UNCHECKED = "not checked: what it covers is not known of this model"
+UNCHECKED = "not checked: the covered bytes are unknown for this model"
 
 
 def safety_part(crc: Construct) -> Construct:
     """Return the part on functional safety."""
     return Struct(
         "version" / Int8ul,
-        "status" / Int8ul * "bits 7 to 5 state, 4 and 3 type of the fault, 2 to 0 a counter",
-        "fault_number" / Int8ul * "how many faults, in the high half, and which of them this is",
+        "status" / Int8ul * "bits 7 to 5 state, 4 and 3 fault type, 2 to 0 counter",
+        "fault_number" / Int8ul * "high half: number of faults; low half: index of this fault",
         "fault_code" / Int16ul,
         "reserved" / Bytes(8),
         "crc" / crc,
@@ -66,10 +66,10 @@ FLAGS = BitStruct(
 )
 IMU = Struct(
     "temperature" / Scaled(Int16sl, 0.01, "degC"),
-    "acceleration_unit" / Int16ul * "one step of an acceleration, millionths of g",
-    "rate_unit" / Int16ul * "one step of a rate, hundredths of mdeg/s",
-    "time" / Int32ul * "steps of 25 ns",
-    "acceleration" / Array(3, Int16sl) * "x, y, z of the unit's IMU, whose axes are not documented",
+    "acceleration_unit" / Int16ul * "step of an acceleration, millionths of g",
+    "rate_unit" / Int16ul * "step of a rate, hundredths of mdeg/s",
+    "time" / Int32ul * "in steps of 25 ns",
+    "acceleration" / Array(3, Int16sl) * "x, y, z of the unit's IMU; its axes are not documented",
     "rate" / Array(3, Int16sl),
 )
 
@@ -113,13 +113,13 @@ def packet(
         *version,
         "status_version"
         / Int8ul
-        * "of what the tail says of the unit; tells models of one version",
+        * "version of the tail; differs between models of one protocol version",
         "header_reserved" / Bytes(1),
         "lasers" / Const(LASERS, Int8ul),
         "block_count" / blocks,
-        "first_return" / Int8ul * "which return the first block of a shot holds",
-        "dis_unit" / Scaled(Int8ul, 1, "mm") * "one step of a distance",
-        "return_count" / Int8ul * "returns of a shot; of some models the most that there can be",
+        "first_return" / Int8ul * "return in the first block of a shot",
+        "dis_unit" / Scaled(Int8ul, 1, "mm") * "step of a distance",
+        "return_count" / Int8ul * "returns per shot; for some models the maximum",
         "flags" / FLAGS,
         "body" / (Checksummed(body, "crc", CRC) if held else body),
         *(
@@ -158,11 +158,14 @@ def plausible(f: Fields) -> Any:
 
 
 #: findings of the kit that hold for these packets.
-UNSEEN = "no packet of this model was seen: what its CRCs cover is not known, and they are not held"
+UNSEEN = (
+    "not tested with packets of this model: the bytes covered by its CRCs are unknown, so they"
+    " are not checked"
+)
 ACKNOWLEDGED = {
     "LS205": (
-        "as found on a captured stream: header, version of the safety part and signature are under"
-        " no CRC"
+        "observed in a captured stream: no CRC covers header, version of the safety part and"
+        " signature"
     )
 }
 

@@ -28,7 +28,7 @@ TAIL = (
     "return_mode" / Int8ul * RETURN_MODES,
     "motor_speed" / Scaled(Int16ul, 1, "rpm"),
     "utc" / UTC,
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "within the second of utc",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time within the second of utc",
     "factory" / Int8ul * FACTORY,
 )
 
@@ -89,7 +89,7 @@ XT32 = spinning(
     range_limits=(0.05, 120.0),
     relatives={
         "hesai-xt32m": Relative(
-            "6 blocks in a packet, an XT32 sends 8", lambda f: f.block_count == 6
+            "6 blocks per packet; an XT32 sends 8", lambda f: f.block_count == 6
         )
     },
     status="capture",
@@ -124,7 +124,7 @@ XT32M = spinning(
     range_limits=(0.5, 300.0),
     relatives={
         "hesai-xt32": Relative(
-            "8 blocks in a packet, an XT32M sends 6", lambda f: f.block_count == 8
+            "8 blocks per packet; an XT32M sends 6", lambda f: f.block_count == 8
         )
     },
     status="vectors",

@@ -314,7 +314,7 @@ def test_a_file_of_another_model_is_refused(rows: str, tmp_path: Path) -> None:
 def test_a_file_that_is_missing_or_has_no_numbers_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ls.UsageError, match=r"none\.csv"):
         P40.configure(calibration=tmp_path / "none.csv")
-    with pytest.raises(ls.UsageError, match="line 2, column 2: elevation nan is not within"):
+    with pytest.raises(ls.UsageError, match="line 2, column 2: elevation nan is outside"):
         XT16.configure(
             calibration=angles(
                 tmp_path / "nan.csv", 16, rows="".join(f"{i},nan,0\n" for i in range(1, 17))
@@ -329,47 +329,47 @@ RADIANS = [f"{i},{np.deg2rad(2 * i - 17)},0" for i in range(1, 17)]
 FAULTY = {
     "a channel twice": (
         [HEAD, *ROWS, ROWS[4]],
-        "line 18, column 1: channel 5 stands in line 6 already",
+        "line 18, column 1: channel 5 is already in line 6",
     ),
     "a channel of others": (
         [HEAD, *ROWS, "17,1,1"],
-        "line 18, column 1: channel 17, and this model has channels 1 to 16",
+        "line 18, column 1: channel 17 is out of range: this model has channels 1 to 16",
     ),
-    "half a channel": ([HEAD, "1.5,1,1"], "line 2, column 1: channel 1.5, and"),
+    "half a channel": ([HEAD, "1.5,1,1"], "line 2, column 1: channel 1.5 is out"),
     "a channel missing": (
         [HEAD, *ROWS[1:]],
-        "lists 15 channels, and this model has channels 1 to 16; 1 is the first missing",
+        "contains 15 channels, expected 1 to 16; channel 1 is the first missing",
     ),
     "radians": (
         [HEAD, *RADIANS],
         (
-            "line 2, column 2: the elevations spread over 0.523599, those of this model over 30"
-            " degrees: is it another"
+            "line 2, column 2: the elevations have a spread of 0.523599, but those of this"
+            " model have a spread of 30 degrees"
         ),
     ),
     "radians said": (
         ["Channel,Elevation(rad),Azimuth", *RADIANS],
-        r"line 1, column 2: 'Elevation\(rad\)' is not in degrees",
+        r"line 1, column 2: 'Elevation\(rad\)' must be in degrees",
     ),
     "too high": (
         [HEAD, ROWS[0], "2,414,0"],
-        "line 3, column 2: elevation 414 is not within -90 .. 90 degrees",
+        "line 3, column 2: elevation 414 is outside -90 .. 90 degrees",
     ),
-    "too far around": ([HEAD, ROWS[0], "2,1,-414"], "line 3, column 3: azimuth -414 is not within"),
+    "too far around": ([HEAD, ROWS[0], "2,1,-414"], "line 3, column 3: azimuth -414 is outside"),
     "zeros": (
         [HEAD, *(f"{i},0,0" for i in range(1, 17))],
-        "line 2, column 2: the elevations are all 0, those",
+        "line 2, column 2: the elevations are all 0, but those",
     ),
-    "no number": ([HEAD, "1,x,0"], "line 2, column 2: elevation is 'x', no number"),
-    "a cell short": ([HEAD, "1,2"], "line 2, column 3: azimuth is '', no number"),
-    "no headings": (ROWS, "line 1: no column is headed 'channel'; the headings are '1, -15, 0.25'"),
+    "no number": ([HEAD, "1,x,0"], "line 2, column 2: elevation must be a number, got 'x'"),
+    "a cell short": ([HEAD, "1,2"], "line 2, column 3: azimuth must be a number, got ''"),
+    "no headings": (ROWS, "line 1: no column is named 'channel'; the names are '1, -15, 0.25'"),
     "another kind": (
         ["Channel,fire time(us)", "1,2"],
-        "line 1: no column is headed 'elevation'; the headings are 'Channel, fire time",
+        "line 1: no column is named 'elevation'; the names are 'Channel, fire time",
     ),
-    "a picture": (["\x89PNG\r\n\x1a\n\0\0\0"], "no column is headed 'channel'"),
+    "a picture": (["\x89PNG\r\n\x1a\n\0\0\0"], "no column is named 'channel'"),
     "empty": ([], "it is empty"),
-    "huge": ([HEAD, *ROWS, " " * 1_000_000], "it has more than 1 MB"),
+    "huge": ([HEAD, *ROWS, " " * 1_000_000], "it is larger than 1 MB"),
 }
 
 
@@ -401,8 +401,8 @@ def test_firing_times_are_microseconds(tmp_path: Path) -> None:
     with pytest.raises(
         ls.UsageError,
         match=(
-            r"column 2: the fire times spread over 1\.5e-05, those of this model over 45\.36"
-            r" microseconds"
+            r"column 2: the fire times have a spread of 1\.5e-05, but those of this model"
+            r" have a spread of 45\.36 microseconds"
         ),
     ):
         XT16.configure(firing_times=file)
@@ -752,8 +752,11 @@ def test_an_at128_has_the_angles_of_its_file(tmp_path: Path) -> None:
             r"unit\.dat: not a correction file of an AT128, version 1\.5 \(\.dat\)",
         ),
         (AT128_FILE[:-40], "not a correction file of an AT128"),
-        (AT128_FILE[:100] + b"x" + AT128_FILE[101:], "is damaged: its SHA-256"),
-        (AT128_FILE + b"x", "is damaged"),
+        (
+            AT128_FILE[:100] + b"x" + AT128_FILE[101:],
+            "is corrupt: its SHA-256",
+        ),
+        (AT128_FILE + b"x", "is corrupt: its SHA-256"),
     ],
     ids=["text", "short", "changed", "longer"],
 )

@@ -63,10 +63,10 @@ MODELS: dict[str, tuple[str, Geometry, tuple[float, float], Link, str]] = {
 def describe_difference(own: Geometry, other: Geometry) -> str | Relative:
     """Return how to distinguish a scanner from another one."""
     if own.last == other.last:
-        return "nothing in its scans: the model in its answer to get_parameters"
+        return "identical scans; see the model in its reply to get_parameters"
     if other.last > own.last:
         return Relative(f"steps beyond {own.last}", lambda f: decimal_value(f.last) > own.last)
-    return "its pace, or the model in its answer to get_parameters"
+    return "the packet rate, or the model in its reply to get_parameters"
 
 
 @cache
@@ -101,12 +101,12 @@ def configure(
     )
     if content not in geometry.kinds:
         raise UsageError(
-            f"{sensor.id}: content is one of {', '.join(geometry.kinds)}, not {content!r}"
+            f"{sensor.id}: content must be one of {', '.join(geometry.kinds)}, not {content!r}"
         )
     if not (steps.first <= steps.last <= geometry.end and 1 <= cluster <= 99):
         raise UsageError(
-            f"{sensor.id}: steps go from 0 up to {geometry.end}, and 1 to 99 make a cluster; not"
-            f" {steps.text.decode()}"
+            f"{sensor.id}: expected steps from 0 to {geometry.end} and a cluster of 1 to 99,"
+            f" got {steps.text.decode()}"
         )
     return dataclasses.replace(sensor, **make_scan_parts(sensor.id, content, steps))
 

@@ -17,7 +17,11 @@ from construct import Bytes, Const, Construct, GreedyBytes, Int8ub, Int32ub, Nul
 from lidarspec.spec import Checksum, Checksummed, Command, Frame, Lines, Scaled, Scip, SixBits, Text
 from lidarspec_hokuyo.scans import SCAN_COMMANDS
 
-STATUS = "status" / Bytes(2) * "00 done; of BM 02: the laser is on already; else what is wrong"
+STATUS = (
+    "status"
+    / Bytes(2)
+    * "00: success; reply to BM, 02: the laser is already on; else an error code"
+)
 #: Values that a scanner reports: reply -> command, and the first four letters of each line by name.
 REPORTED_VALUES: dict[str, tuple[bytes, dict[str, str]]] = {
     "version": (

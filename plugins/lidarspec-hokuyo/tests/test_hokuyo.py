@@ -80,9 +80,9 @@ def test_partial_and_clustered_scans_have_the_requested_directions() -> None:
     np.testing.assert_allclose(
         cloud.azimuth[:2], np.deg2rad(np.array([129.5, 133.5]) - 384) * 360 / 1024, atol=1e-6
     )
-    with pytest.raises(ls.UsageError, match="steps go from 0 up to 768"):
+    with pytest.raises(ls.UsageError, match="expected steps from 0 to 768"):
         URG.configure(last=1080)
-    with pytest.raises(ls.UsageError, match="content is one of distances, short"):
+    with pytest.raises(ls.UsageError, match="content must be one of distances, short"):
         URG.configure(content="intensities")
 
 
@@ -107,7 +107,7 @@ def test_a_step_with_several_echoes_has_a_point_for_each() -> None:
             cloud.azimuth, np.deg2rad(np.repeat([-0.25, 0, 0.25], 3)), atol=1e-6
         )
     with pytest.raises(
-        ls.UsageError, match="content is one of distances, intensities, short, not 'echoes'"
+        ls.UsageError, match="content must be one of distances, intensities, short, not 'echoes'"
     ):
         UST.configure(content="echoes")
 

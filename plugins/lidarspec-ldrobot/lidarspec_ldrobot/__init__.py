@@ -96,7 +96,7 @@ COMMAND = with_crc(
     "header" / Const(b"\x54"),
     "command" / Int8ul * "A0 start, A1 stop, A2 speed, A8 firmware of the motor's board",
     "length" / Const(4, Int8ul),
-    "speed" / Scaled(Int32ul, 1, "deg/s") * "0 in all but A2",
+    "speed" / Scaled(Int32ul, 1, "deg/s") * "0 except for A2",
 )
 
 
@@ -195,10 +195,11 @@ def relatives(own: str) -> dict[str, str | Relative]:
     others = {make_id(name): rate for name, rate in POINT_RATES_HZ.items() if name != own}
     return {
         name: (
-            "nothing in the data: it has as many points a second"
+            "identical packets at the same point rate"
             if rate == POINT_RATES_HZ[own]
             else Relative(
-                f"{rate} points a second, by its speed and angles", partial(matches_rate, rate=rate)
+                f"{rate} points per second, calculated from speed and angles",
+                partial(matches_rate, rate=rate),
             )
         )
         for name, rate in others.items()
@@ -278,7 +279,7 @@ LD20 = make_lidar(
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
     status="vectors",
-    source="one captured frame; baud and range are assumed to be the LD19's",
+    source="one captured frame; baud rate and range are assumed to equal those of the LD19",
 )
 STL06P = make_lidar(
     "STL-06P",
@@ -286,7 +287,10 @@ STL06P = make_lidar(
     links={"data": Serial(230_400)},
     range_limits=(0.02, 12.0),
     status="manual",
-    source="ldlidar_stl_ros2, lipkg.cpp (the rate); baud and range are assumed to be the LD19's",
+    source=(
+        "ldlidar_stl_ros2, lipkg.cpp (the rate); baud rate and range are assumed to equal those"
+        " of the LD19"
+    ),
 )
 LD14 = make_lidar(
     "LD14",
@@ -320,8 +324,8 @@ LD14P = make_lidar(
     turn=(2.0, 8.0),
     status="vectors",
     source=(
-        "ldlidar_sdk, as the LD14; commands as kaiaai/LDS sends them; Waveshare's page of the D200"
-        " kit (range, turns, baud)"
+        "ldlidar_sdk, same as the LD14; commands from kaiaai/LDS; Waveshare's page of the"
+        " D200 kit (range, speed, baud rate)"
     ),
 )
 

@@ -18,16 +18,18 @@ View = tuple[float, float, float, float]
 SOF = "sof" / Const(b"\xaa")
 GRAVITY = 9.80665  # m/s2
 REFLECTIVITY = (
-    "reflectivity"
-    / Int8ul
-    * "up to 150 as of a diffuse target, 0 to 100 %; above as of a retroreflector"
+    "reflectivity" / Int8ul * "up to 150: diffuse target, 0 to 100 %; above: retroreflector"
 )
-TAG = "tag" / Int8ul * "doubts about the point, and of the first generation its return; 0: none"
+TAG = (
+    "tag"
+    / Int8ul
+    * "confidence of the point, and the return number of first-generation models; 0: normal"
+)
 MILLIMETRES = tuple(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz")
 CENTIMETRES = tuple(axis / Scaled(Int16sl, 0.01, "m") for axis in "xyz")
 DEPTH = ("depth" / Scaled(Int32ul, 0.001, "m"),)
 DIRECTION = (
-    "zenith" / Scaled(Int16ul, 0.01, "deg") * "from the z axis",
+    "zenith" / Scaled(Int16ul, 0.01, "deg") * "angle from the z axis",
     "azimuth" / Scaled(Int16ul, 0.01, "deg"),
 )
 INERTIAL = (

@@ -63,7 +63,7 @@ MAX_POSITION_M = 1000.0  # of the extrinsics: twice the range of the Tele-15
 GPS = 3  # the timestamp type of dates
 IMU_RATE_HZ = 200
 MODEL_TYPES = "1 Mid-40, 2 Tele-15, 3 Horizon LiDAR, 6 Mid-70, 7 Avia"
-STATES = "0 starts, 1 normal, 2 saves power, 3 stands by, 4 error"
+STATES = "0 starting, 1 normal, 2 power saving, 3 standby, 4 error"
 COMMAND_PORT = 55_501
 DATA_PORT = 56_001
 IMU_PORT = 56_002  # of the host
@@ -72,9 +72,9 @@ IMU_PORT = 56_002  # of the host
 TIMESTAMP = Struct(
     "low"
     / Int32ul
-    * "of nanoseconds; of a date years since 2000, month, day and hour, a byte each",
+    * ("low part of nanoseconds; for a date: years since 2000, month, day and hour, a byte each"),
     "middle" / Int16ul,
-    "high" / Int16ul * "with `middle`, of a date: microseconds within the hour",
+    "high" / Int16ul * "with `middle`, for a date: microseconds within the hour",
 )
 
 
@@ -227,8 +227,8 @@ def make_message(packet_type: int, number: tuple[int, int] | None, *members: Any
         SOF,
         "version" / Const(1, Int8ul),
         "length" / SizeOf(Int16ul, "_"),
-        "packet_type" / Const(packet_type, Int8ul) * "0 command, 1 answer, 2 message",
-        "seq" / Int16ul * "that of the command, in an answer",
+        "packet_type" / Const(packet_type, Int8ul) * "0 command, 1 reply, 2 message",
+        "seq" / Int16ul * "in a reply, the value of the command",
         "crc16" / Int16ul,
     )
     names = ("cmd_set", "cmd_id")
@@ -253,7 +253,9 @@ POSE = (
     *(name / Scaled(Float32l, 1, "deg") for name in ("roll", "pitch", "yaw")),
     *(axis / Scaled(Int32sl, 0.001, "m") for axis in "xyz"),
 )
-STATUS = "status_code" / Int32ul * "as in packets of points; while it starts, per cent"
+STATUS = (
+    "status_code" / Int32ul * "as in point packets; start-up progress in percent while starting"
+)
 REQUEST = 0
 REPLY = 1
 NOTIFICATION = 2
@@ -276,11 +278,11 @@ GET_IMU = (1, 9)
 
 
 DATE = (
-    "year" / Int8ul * "since 2000",
+    "year" / Int8ul * "years since 2000",
     "month" / Int8ul,
     "day" / Int8ul,
     "hour" / Int8ul,
-    "microseconds" / Int32ul * "within the hour",
+    "microseconds" / Int32ul * "microseconds within the hour",
 )
 
 
@@ -523,7 +525,7 @@ def make_lidar(name: str) -> Sensor:
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
         relatives={
-            other: "the device type in what it broadcasts"
+            other: "the device type in its broadcast"
             for other in MODELS
             if other != name and MODELS[other][2] == rate
         },
@@ -534,9 +536,7 @@ def make_lidar(name: str) -> Sensor:
         },
         status="manual",
         acknowledged=(
-            {"LS507": "it sees nothing in a small room, which is nearer than its shortest range"}
-            if limits[0] > 1
-            else {}
+            {"LS507": "a small room is nearer than its shortest range"} if limits[0] > 1 else {}
         ),
         source=(
             "Livox-SDK communication protocol 1.3.0; Livox-SDK 9306596; livox_ros_driver (lds.h);"

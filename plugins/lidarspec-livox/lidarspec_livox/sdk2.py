@@ -80,7 +80,7 @@ SET_GPS_TIME = 0x0202
 CRC32 = Crc(32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF)
 CRC16 = Crc(16, 0x1021, init=0xFFFF)
 MAX_DATAGRAM_BYTES = 1472  # without fragmentation
-VARIABLE_COUNT = {"LS203": "a datagram holds any number of parameters"}
+VARIABLE_COUNT = {"LS203": "a datagram contains any number of parameters"}
 SHOTS = np.arange(96)  # shot numbers of a simulated packet
 IMU_RATE_HZ = 200
 DEVICE_TYPES = "9 MID-360, 10 HAP, 15 HAP, 35 MID-360S"
@@ -91,16 +91,16 @@ def make_packet(kind: int, *members: Any) -> Checksummed:
     header = Struct(
         "version" / Const(0, Int8ul),
         "length" / SizeOf(Int16ul),
-        "time_interval" / Scaled(Int16ul, 1e-7, "s") * "from the first point to the last",
+        "time_interval" / Scaled(Int16ul, 1e-7, "s") * "time from the first point to the last",
         "dot_num" / Int16ul,
-        "udp_cnt" / Int16ul * "packets of the frame",
-        "frame_cnt" / Int8ul * "means nothing while the pattern does not repeat",
+        "udp_cnt" / Int16ul * "packet counter within the frame",
+        "frame_cnt" / Int8ul * "unused with a non-repetitive pattern",
         "data_type" / Const(kind, Int8ul),
         "time_type" / Int8ul * "0 since power-up, 1 PTP or gPTP, 2 GPS",
-        "pack_info" / Default(Int8ul, 0) * "which tags the points have, of some firmware",
+        "pack_info" / Default(Int8ul, 0) * "tag format, for some firmware versions",
         "reserved" / Default(Bytes(11), bytes(11)),
-        "crc32" / Int32ul * "of all that follows; 0: not filled in",
-        "timestamp" / Scaled(Int64ul, 1, "ns") * "of the first point",
+        "crc32" / Int32ul * "CRC of all following bytes; 0: not set",
+        "timestamp" / Scaled(Int64ul, 1, "ns") * "time of the first point",
         *members,
     )
     covered = ("timestamp", *(member.name for member in members))
@@ -157,10 +157,10 @@ def make_message(cmd_id: int | None, *members: Any, ack: bool = True, lidar: boo
         SOF,
         "version" / Const(0, Int8ul),
         "length" / SizeOf(Int16ul, "_"),
-        "seq" / Int32ul * "that of the request, in an answer",
+        "seq" / Int32ul * "in a reply, the value of the request",
         "cmd_id" / (Int16ul if cmd_id is None else Const(cmd_id, Int16ul)),
-        "cmd_type" / Const(int(ack), Int8ul) * "0 request, 1 answer",
-        "sender_type" / Const(int(lidar), Int8ul) * "0 host, 1 Lidar",
+        "cmd_type" / Const(int(ack), Int8ul) * "0 request, 1 reply",
+        "sender_type" / Const(int(lidar), Int8ul) * "0 host, 1 lidar",
         "reserved" / Default(Bytes(6), bytes(6)),
         "crc16" / Int16ul,
     )
@@ -191,7 +191,7 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "point_type": (0x0000, NUMBER * "1 millimetres, 2 centimetres, 3 spherical"),
     "scan_pattern": (
         0x0001,
-        NUMBER * "0 does not repeat, 1 repeats, 2 repeats at a low frame rate",
+        NUMBER * "0 non-repetitive, 1 repetitive, 2 repetitive at a low frame rate",
     ),
     "lidar_address": (0x0004, NET),
     "state_host": (0x0005, HOST),
@@ -200,7 +200,7 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "attitude": (0x0012, ATTITUDE),
     "fov_0": (0x0015, FOV),
     "fov_1": (0x0016, FOV),
-    "fov_enabled": (0x0017, NUMBER * "bits 0 and 1: of fov_0 and fov_1"),
+    "fov_enabled": (0x0017, NUMBER * "bit 0: fov_0, bit 1: fov_1"),
     "detect_mode": (0x0018, NUMBER * "0 normal, 1 sensitive"),
     "io_functions": (0x0019, Bytes(4)),
     "work_mode": (0x001A, NUMBER * "1 sampling, 2 idle, 9 ready"),
@@ -212,7 +212,7 @@ PARAMETERS: dict[str, tuple[int, Any]] = {
     "mac": (0x8005, Bytes(6)),
     "work_state": (
         0x8006,
-        NUMBER * "1 sampling, 2 idle, 4 error, 5 self-check, 6 motor starts, 8 upgrade, 9 ready",
+        NUMBER * "1 sampling, 2 idle, 4 error, 5 self-check, 6 motor starting, 8 upgrade, 9 ready",
     ),
     "core_temperature": (0x8007, Scaled(Int32sl, 0.01, "degC")),
     "power_ups": (0x8008, Int32ul),
@@ -248,8 +248,10 @@ RESERVED = "data_reserved" / Default(Int16ul, 0)
 RESULT = (
     "result"
     / Int8ul
-    * "0 done, 1 failed, 2 not now, 3 out of range, 20 unknown, 21 after a reboot, 22 read only, 23"
-    " length, 24 keys"
+    * (
+        "0 done, 1 failed, 2 not now, 3 out of range, 20 unknown, 21 after a reboot, 22 read"
+        " only, 23 length, 24 keys"
+    )
 )
 
 
@@ -620,9 +622,9 @@ def is_fast(f: Fields) -> Any:
 
 RELATIVES: dict[str, str | Relative] = {
     "livox-mid360": Relative(
-        "5 us from a point to the next", lambda f: f.time_interval >= 3.3e-6 * f.dot_num
+        "5 us between points", lambda f: f.time_interval >= 3.3e-6 * f.dot_num
     ),
-    "livox-hap": Relative("2.2 us from a point to the next", is_fast),
-    "livox-mid360s": "the device type in its answer to a discovery, 35",
+    "livox-hap": Relative("2.2 us between points", is_fast),
+    "livox-mid360s": "the device type 35 in its reply to a discovery",
 }
 MID360, HAP = SENSORS = [make_lidar(name) for name in MODELS]

@@ -69,8 +69,8 @@ PERIOD: Construct = Scaled(Int16ub, 1e-6, "s") * "of 15 degrees"
 ANGLE: Construct = Scaled(Int16ub, 0.01, "deg")
 DISTANCE: Construct = Scaled(Int16ub, 0.001, "m") * "0 or FFFF: no return"
 SAMPLE = BitStruct(
-    "bright" / BitsInteger(1) * "1: reflects strongly",
-    "distance" / Scaled(BitsInteger(15), 0.001, "m") * "0: no return, and with bright 7FFF",
+    "bright" / BitsInteger(1) * "1: strong reflection",
+    "distance" / Scaled(BitsInteger(15), 0.001, "m") * "0: no return, as is 7FFF with bright",
 )
 TIME = (
     *DATE,
@@ -227,7 +227,7 @@ M10_GPS_DATA = Frame(Struct(*M10_HEAD, *TIME, "end" / END), data=True, plausible
 M10P_DATA = Frame(
     Struct(
         "header" / START,
-        "length" / Int16ub * "of the packet",
+        "length" / Int16ub * "bytes of the packet",
         "start_angle" / ANGLE,
         "period" / PERIOD,
         "samples" / Array((this.length - 20) // 2, SAMPLE),
@@ -245,7 +245,7 @@ INFO = Frame(
         "compensation"
         / BitStruct(
             "negative" / BitsInteger(1),
-            "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "told, and not applied",
+            "angle" / Scaled(BitsInteger(15), 0.01, "deg") * "reported, but not applied",
         ),
         "reserved" / Bytes(11),
         "end" / END,
@@ -255,11 +255,11 @@ COMMAND = Frame(
     Struct(
         "header" / MARK,
         "unused_1" / Const(bytes(169)),
-        "turns" / Default(Scaled(Int8ub, 1, "Hz"), 0) * "a second",
+        "turns" / Default(Scaled(Int8ub, 1, "Hz"), 0) * "revolutions per second",
         "unused_2" / Const(bytes(8)),
         "filter" / Int8ub * "A none, B normal, C near",
         "unused_3" / Const(bytes(2)),
-        "code" / Int8ub * "1 run, 3 turn, 6 filter, 8 tell of yourself, A speed",
+        "code" / Int8ub * "1 run, 3 speed, 6 filter, 8 report state, A speed",
         "argument" / Int8ub,
         "end" / END,
     ),
@@ -349,7 +349,7 @@ def lidar(name: str) -> Sensor:
         turn=model.hertz,
         status=model.status,
         source=(
-            "the vendor's ROS drivers, lslidar_driver and Lslidar_ROS2_driver V5. Limits of range"
+            "vendor's ROS drivers, lslidar_driver and Lslidar_ROS2_driver V5. Range limits"
             " are assumed"
         ),
     )

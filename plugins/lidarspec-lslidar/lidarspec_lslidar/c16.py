@@ -53,7 +53,7 @@ ELEVATION = np.array([-16.0, 0, -14, 2, -12, 4, -10, 6, -8, 8, -6, 10, -4, 12, -
 
 #: as the packets of this vendor have it.
 DATE = (
-    "year" / Int8ub * "from 2000 on",
+    "year" / Int8ub * "years since 2000",
     "month" / Int8ub,
     "day" / Int8ub,
     "hour" / Scaled(Int8ub, 3600, "s"),
@@ -66,7 +66,7 @@ DATA = Struct(
         BLOCKS,
         Struct(
             "flag" / Const(b"\xff\xee"),
-            "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise, at the block's first laser",
+            "azimuth" / Scaled(Int16ul, 0.01, "deg") * "clockwise, at the first laser of the block",
             "groups"
             / Array(
                 GROUPS,
@@ -81,7 +81,10 @@ DATA = Struct(
                     )
                 ),
             )
-            * "two firings; with dual return the next block has the other returns of the same",
+            * (
+                "two firings; with dual return the next block contains the other returns of the"
+                " same firings"
+            ),
         ),
     ),
     *DATE,
@@ -91,7 +94,7 @@ DATA = Struct(
 )
 DIFOP = Struct(
     "header" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
-    "rpm" / Scaled(Int16ub, 1, "rpm") * "as set",
+    "rpm" / Scaled(Int16ub, 1, "rpm") * "configured speed",
     "lidar_ip" / Bytes(4),
     "host_ip" / Bytes(4),
     "mac" / Bytes(6),
@@ -159,7 +162,7 @@ def configure(sensor: Sensor, /, *, distance_unit: float) -> Sensor:
         UsageError: for another unit.
     """
     if distance_unit not in UNITS:
-        raise UsageError(f"{sensor.id}: distance_unit is 0.4 or 0.25, not {distance_unit!r}")
+        raise UsageError(f"{sensor.id}: distance_unit must be 0.4 or 0.25, not {distance_unit!r}")
     return dataclasses.replace(sensor, points=partial(points, unit=distance_unit))
 
 
@@ -206,7 +209,7 @@ C16 = Sensor(
     info={"model": "data.model"},
     status="vectors",
     source=(
-        "Lslidar_ROS2_driver, C16_V4.0; C32 user manual (device information); one captured packet,"
-        " whose maker is not stated"
+        "Lslidar_ROS2_driver, C16_V4.0; C32 user manual (device information); one captured"
+        " packet of an unknown maker"
     ),
 )

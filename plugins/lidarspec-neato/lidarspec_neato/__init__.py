@@ -62,7 +62,7 @@ DATA = Checksummed(
                 "range"
                 / ByteSwapped(
                     BitStruct(
-                        "invalid" / BitsInteger(1) * "1: the distance is the number of an error",
+                        "invalid" / BitsInteger(1) * "1: the distance is an error number",
                         "weak" / BitsInteger(1) * "1: less signal than expected",
                         "distance" / Scaled(BitsInteger(14), 0.001, "m"),
                     )
@@ -90,7 +90,7 @@ LFCD = Struct(
             "reserved" / Bytes(2),
         ),
     ),
-    "trailer" / Bytes(2) * "said to be FF less the sum of all other bytes, twice",
+    "trailer" / Bytes(2) * "documented as FF minus the sum of all other bytes, twice",
 )
 
 
@@ -141,7 +141,7 @@ def sweep(i: int, count: int) -> dict[str, float]:
     return {"start_angle": i * count % 360, "speed": 300}
 
 
-NO_DIFFERENCE = "nothing in their packets: it counts the other way, or has another label"
+NO_DIFFERENCE = "identical packets; see the direction of rotation, or the label"
 XV11_MODELS = ("neato-xv11", "xiaomi-lds01rr", "xiaomi-lds02rr")
 
 XV11 = Sensor(
@@ -157,7 +157,7 @@ XV11 = Sensor(
     beams=360,
     relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "neato-xv11"},
     status="vectors",
-    source="xv_11_laser_driver; kaiaai/LDS, LDS_NEATO_XV11. Limits of range are assumed",
+    source="xv_11_laser_driver; kaiaai/LDS, LDS_NEATO_XV11. Range limits are assumed",
 )
 LDS01RR = dataclasses.replace(
     XV11,
@@ -165,7 +165,7 @@ LDS01RR = dataclasses.replace(
     vendor="Xiaomi",
     model="LDS01RR",
     relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "xiaomi-lds01rr"},
-    source="kaiaai/LDS, LDS_LDS01RR. Limits of range are assumed",
+    source="kaiaai/LDS, LDS_LDS01RR. Range limits are assumed",
 )
 LDS02RR = dataclasses.replace(
     XV11,
@@ -174,7 +174,7 @@ LDS02RR = dataclasses.replace(
     model="LDS02RR",
     points=partial(points, direction=-1),
     relatives={name: NO_DIFFERENCE for name in XV11_MODELS if name != "xiaomi-lds02rr"},
-    source="kaiaai/LDS, LDS_LDS02RR. Limits of range are assumed",
+    source="kaiaai/LDS, LDS_LDS02RR. Range limits are assumed",
 )
 HLS_LFCD2 = Sensor(
     "hitachi-hls-lfcd2",
@@ -186,7 +186,7 @@ HLS_LFCD2 = Sensor(
             data=True,
             plausible=is_lfcd_plausible,
             confirm=2,
-            acknowledged={"LS212": "its sources contradict each other on the trailer"},
+            acknowledged={"LS212": "its sources contradict each other about the trailer"},
         ),
         "command": Frame(Struct("letter" / Int8ul * "ASCII: b begin, e end"), direction="out"),
     },
@@ -205,8 +205,8 @@ HLS_LFCD2 = Sensor(
     turn=(4.83, 5.17),  # 300 +- 10 revolutions per minute (ROBOTIS, LDS-01)
     status="vectors",
     source=(
-        "hls_lfcd_lds_driver and the LDS-01's page of ROBOTIS; thijses/HLS_LFCD. What its trailer"
-        " is, is not proven"
+        "hls_lfcd_lds_driver and the LDS-01's page of ROBOTIS; thijses/HLS_LFCD. The meaning"
+        " of the trailer is unverified"
     ),
 )
 

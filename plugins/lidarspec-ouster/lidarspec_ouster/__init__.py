@@ -56,7 +56,7 @@ MODELS = {
 }
 #: of the extra columns, those that each return has for itself.
 EXTRA = ("signal", "near_ir", "flags", "window", "zone_mask", "red", "green", "blue")
-TOLD_BY = "nothing in their packets: the metadata name the model"
+TOLD_BY = "identical packets; see the model in the metadata"
 
 
 def points(f: Fields, unit: Unit) -> Polar:
@@ -210,14 +210,16 @@ def configure(
     metadata = metadata or (None if given else sensor.options.get("metadata"))
     if metadata is not None:
         if given:
-            raise UsageError(f"{sensor.id}: the metadata say {' and '.join(given)}: leave that out")
+            raise UsageError(
+                f"{sensor.id}: the metadata contain {' and '.join(given)}: omit this option"
+            )
         unit = read(metadata)
         known = [
             name for name, (line, *_) in MODELS.items() if unit.product.upper().startswith(line)
         ]
         if known and known[0] != sensor.model:
             raise UsageError(
-                f"{sensor.id}: these are metadata of an {unit.product}: -s"
+                f"{sensor.id}: the metadata belong to an {unit.product}: use -s"
                 f" ouster-{known[0].lower()}"
             )
         return dataclasses.replace(with_unit(sensor, unit), on_open=())
@@ -229,11 +231,11 @@ def configure(
     for name, most in (("rows", 128), ("turn", 4096)):
         if not 16 <= layout[name] <= most or layout[name] % 16:
             raise UsageError(
-                f"{sensor.id}: {name} is a multiple of 16 up to {most}, not {layout[name]}"
+                f"{sensor.id}: {name} must be a multiple of 16 up to {most}, not {layout[name]}"
             )
     if layout["profile"] not in PROFILES:
         raise UsageError(
-            f"{sensor.id}: profile is one of {', '.join(PROFILES)}, not {layout['profile']!r}"
+            f"{sensor.id}: profile must be one of {', '.join(PROFILES)}, not {layout['profile']!r}"
         )
     return with_unit(sensor, nominal(sensor.model, **layout))
 

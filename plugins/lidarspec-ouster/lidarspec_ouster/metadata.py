@@ -150,10 +150,11 @@ def read(metadata: str | Path | Learned) -> Unit:
     try:
         data = json.loads(Learned.content(metadata))
     except (ValueError, RecursionError) as error:
-        raise UsageError(f"{name}: no metadata of an Ouster sensor: {error}") from error
+        raise UsageError(f"{name}: not the metadata of an Ouster sensor: {error}") from error
     if not isinstance(data, dict):
         raise UsageError(
-            f"{name}: no metadata of an Ouster sensor: a {type(data).__name__}, not an object"
+            f"{name}: not the metadata of an Ouster sensor: expected an object, got"
+            f" {type(data).__name__}"
         )
     return Facts(name, merge_sections(data)).unit()
 
@@ -207,11 +208,12 @@ class Facts:
         if self._whole("pixels_per_column", ROWS, rows) != rows:
             raise self._fault(
                 "beam_altitude_angles",
-                f"{rows} angles for {self.data['pixels_per_column']} pixels of a column",
+                f"has {rows} angles, expected {self.data['pixels_per_column']} (pixels_per_column)",
             )
         if width % columns:
             raise self._fault(
-                "columns_per_frame", f"{width} is no multiple of {columns} columns in a packet"
+                "columns_per_frame",
+                f"{width} is not a multiple of columns_per_packet, which is {columns}",
             )
         first, last = map(int, self._numbers("column_window", 2, (0, width - 1)))
         product = str(self.data.get("prod_line", ""))
@@ -246,7 +248,8 @@ class Facts:
         profile = str(self.data.get("udp_profile_lidar", "LEGACY"))
         if profile not in PROFILES:
             raise self._fault(
-                "udp_profile_lidar", f"{profile[:60]} is none of {', '.join(PROFILES)}"
+                "udp_profile_lidar",
+                f"{profile[:60]} is not supported: expected one of {', '.join(PROFILES)}",
             )
         return profile
 
@@ -265,15 +268,15 @@ class Facts:
             or not 1 <= len(numbers) <= ROWS
             or not np.isfinite(numbers).all()
         ):
-            raise self._fault(key, "is missing" if given is None else "is no list of numbers")
+            raise self._fault(key, "is missing" if given is None else "must be a list of numbers")
         if count is not None and len(numbers) != count:
-            raise self._fault(key, f"has {len(numbers)} numbers, not {count}")
+            raise self._fault(key, f"has {len(numbers)} numbers, expected {count}")
         return numbers
 
     def _whole(self, key: str, most: int, usual: int | None) -> int:
         number = self.data.get(key, usual)
         if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= most:
-            raise self._fault(key, "is missing" if number is None else f"is not within 1 .. {most}")
+            raise self._fault(key, "is missing" if number is None else f"must be 1 to {most}")
         return number
 
     def _transform(self, key: str, usual: tuple[float, ...] | None) -> Any:
@@ -288,4 +291,4 @@ class Facts:
         return Facts(self.name, {key: given})._numbers(key, 16).reshape(4, 4)
 
     def _fault(self, key: str, reason: str) -> UsageError:
-        return UsageError(f"{self.name}: no metadata of an Ouster sensor: {key} {reason}")
+        return UsageError(f"{self.name}: not the metadata of an Ouster sensor: {key} {reason}")

@@ -123,15 +123,15 @@ SERIAL = BytesInteger(5, swapped=True)
 TIME = Scaled(Int64ul, 1, "ns")
 
 HEADER = (
-    "frame_id" / Int16ul * "number of the turn",
-    "init_id" / Int24ul * "another one after each start and change of the configuration",
+    "frame_id" / Int16ul * "counter of revolutions",
+    "init_id" / Int24ul * "changes with each start and each change of the configuration",
     "serial" / SERIAL * "prod_sn of the metadata",
     "alert_flags" / Int8ul,
     "reserved_13" / Bytes(3),
 )
 FUSA_HEADER = (
-    "init_id" / Int24ul * "another one after each start and change of the configuration",
-    "frame_id" / Int32ul * "number of the turn",
+    "init_id" / Int24ul * "changes with each start and each change of the configuration",
+    "frame_id" / Int32ul * "counter of revolutions",
     "alert_flags" / Int8ul,
     "reserved_9" / Bytes(2),
     "serial" / SERIAL * "prod_sn of the metadata",
@@ -139,7 +139,7 @@ FUSA_HEADER = (
 STATE = (
     "shutdown_countdown" / Scaled(Int8ul, 1, "s") * "thermal",
     "shot_limiting_countdown" / Scaled(Int8ul, 1, "s"),
-    "shutdown_state" / Int8ul * "low 4 bits",
+    "shutdown_state" / Int8ul * "in the low 4 bits",
     "shot_limiting_state" / Int8ul * "4 bits",
     "reserved_20" / Bytes(12),
 )
@@ -177,10 +177,10 @@ def packet(profile: str, rows: int, columns: int) -> Construct:
     pixels = "pixels" / Array(rows, pixel(profile))
     began = (
         "timestamp" / TIME,
-        "measurement_id" / Scaled(Int16ul, 1, "") * "number of the column in its turn",
+        "measurement_id" / Scaled(Int16ul, 1, "") * "index of the column in its revolution",
     )
     if profile == "LEGACY":
-        head = (*began, "frame_id" / Int16ul, "encoder" / Int32ul * "90112 counts a turn")
+        head = (*began, "frame_id" / Int16ul, "encoder" / Int32ul * "90112 counts per revolution")
         return Struct(
             "columns"
             / Array(columns, Struct(*head, pixels, "status" / Int32ul * "0xffffffff: valid"))
@@ -226,10 +226,7 @@ LEGACY_IMU = Struct(
     "timestamp" / TIME,
     "acceleration_timestamp" / TIME,
     "gyro_timestamp" / TIME,
-    *(
-        f"acceleration_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "sent in units of g"
-        for axis in AXES
-    ),
+    *(f"acceleration_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "sent in g" for axis in AXES),
     *(f"gyro_{axis}" / Scaled(Float32l, 1, "deg/s") for axis in AXES),
 )
 # One measurement of an ACCEL32_GYRO32_NMEA packet. Captured values are multiples of 9.80665/2048

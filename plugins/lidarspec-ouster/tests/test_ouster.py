@@ -352,14 +352,17 @@ def test_imu_measurements_come_in_si_units() -> None:
     ("change", "message"),
     [
         ({"beam_altitude_angles": None}, "beam_altitude_angles is missing"),
-        ({"beam_azimuth_angles": [1, 2]}, "beam_azimuth_angles has 2 numbers, not 16"),
-        ({"beam_azimuth_angles": [float("nan")] * 16}, "beam_azimuth_angles is no list of numbers"),
-        ({"columns_per_frame": 1 << 40}, "columns_per_frame is not within 1 .. 4096"),
-        ({"columns_per_frame": 500}, "500 is no multiple of 16"),
-        ({"pixels_per_column": 32}, "16 angles for 32 pixels"),
-        ({"udp_profile_lidar": "RNG99"}, "RNG99 is none of LEGACY"),
+        ({"beam_azimuth_angles": [1, 2]}, "beam_azimuth_angles has 2 numbers, expected 16"),
+        (
+            {"beam_azimuth_angles": [float("nan")] * 16},
+            "beam_azimuth_angles must be a list of numbers",
+        ),
+        ({"columns_per_frame": 1 << 40}, "columns_per_frame must be 1 to 4096"),
+        ({"columns_per_frame": 500}, "500 is not a multiple of columns_per_packet"),
+        ({"pixels_per_column": 32}, "has 16 angles, expected 32"),
+        ({"udp_profile_lidar": "RNG99"}, "RNG99 is not supported"),
         ({"lidar_to_sensor_transform": [1, 2]}, "lidar_to_sensor_transform has 2 numbers"),
-        ({"prod_line": "OS-0-32"}, "of an OS-0-32: -s ouster-os0"),
+        ({"prod_line": "OS-0-32"}, "to an OS-0-32: use -s ouster-os0"),
     ],
 )
 def test_metadata_that_cannot_be_are_refused_by_name(

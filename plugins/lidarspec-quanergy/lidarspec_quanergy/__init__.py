@@ -53,7 +53,7 @@ MQ8_ELEVATION = np.array(
 
 POSITION: Construct = Scaled(Int16ub, 360 / POSITIONS_PER_TURN, "deg") * "counter-clockwise"
 DISTANCES: Construct = Array(
-    LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; before version 5 a step is 10 mm"
+    LASERS, Scaled(Int32ub, 1e-5, "m") * "0: no return; 10 mm per step before version 5"
 )
 INTENSITIES: Construct = Array(LASERS, Int8ub * "255: saturated")
 
@@ -62,8 +62,8 @@ def make_header(kind: int, size: int) -> tuple[Construct, ...]:
     """Return the header fields of a packet with this kind and total size in bytes."""
     return (
         "signature" / Const(b"\x75\xbd\x7e\x97"),
-        "size" / Const(size, Int32ub) * "of the whole packet",
-        "seconds" / Scaled(Int32ub, 1, "s") * "since 1970",
+        "size" / Const(size, Int32ub) * "bytes of the packet",
+        "seconds" / Scaled(Int32ub, 1, "s") * "time since 1970",
         "nanoseconds" / Scaled(Int32ub, 1e-9, "s"),
         "version" / Bytes(3),
         "kind" / Const(kind, Int8ub),
@@ -89,13 +89,13 @@ THREE_RETURNS = Struct(
     ),
     "body_seconds" / Int32ub * "as in the header",
     "body_nanoseconds" / Int32ub * "as in the header",
-    "api" / Int16ub * "version of the packet",
-    "status" / Int16ub * "0 good, 1 software and firmware do not match, 2 watchdog",
+    "api" / Int16ub * "packet version",
+    "status" / Int16ub * "0 good, 1 version mismatch of software and firmware, 2 watchdog",
 )
 ONE_RETURN = Struct(
     *make_header(4, 2224),
-    "status" / Int16ub * "0 good, 1 software and firmware do not match, 2 watchdog",
-    "return_id" / Int8ub * "which of the three returns",
+    "status" / Int16ub * "0 good, 1 version mismatch of software and firmware, 2 watchdog",
+    "return_id" / Int8ub * "index of the return, of three",
     "reserved" / Bytes(1),
     "firings"
     / Array(
@@ -197,7 +197,7 @@ def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: 
                 points=partial(points, elevation=elevation),
                 simulation=Simulation(partial(sweep, more=more)),
                 acknowledged={
-                    "LS507": "of a wall each laser has one return, which the other two repeat"
+                    "LS507": "with a wall each laser has one return, repeated in the other two"
                 }
                 if more
                 else {},
@@ -211,10 +211,10 @@ def make_lidar(model: str, elevation: NDArray[np.float64], other: str, **facts: 
         vendor_axes=("forward", "left", "up"),
         turn=(5.0, 20.0),
         relatives={
-            f"quanergy-{other}": "nothing in the packets: the label, or the sensor's web page"
+            f"quanergy-{other}": "identical packets; see the label, or the sensor's web page"
         },
         status="manual",
-        source="quanergy_client; rate, turns and range are assumed",
+        source="quanergy_client; rate, speed and range are assumed",
         **facts,
     )
 

@@ -136,7 +136,7 @@ DATA = Struct(
             "flag" / BLOCK,
             "azimuth"
             / Scaled(Int16ub, 0.01, "deg")
-            * "of the rotor, clockwise, at the first laser of a pair of blocks",
+            * "angle of the rotor, clockwise, at the first laser of a pair of blocks",
             "channels" / Array(HALF, Struct("echo" / ECHO, "intensity" / Int8ub)),
         ),
     ),
@@ -166,7 +166,9 @@ DIFOP = Struct(
     "reserved_1070" / Bytes(10),
     "emitter_temperature" / Scaled(Int16ub, 0.01, "degC"),
     "reserved_1082" / Bytes(10),
-    "imu_rotation" / Array(4, Float32b) * "of the IMU in the lidar: quaternion x, y, z, w",
+    "imu_rotation"
+    / Array(4, Float32b)
+    * "orientation of the IMU in the lidar: quaternion x, y, z, w",
     "imu_position" / Array(3, Scaled(Float32b, 1, "m")),
     "reserved_1120" / Bytes(126),
     DIFOP_TAIL,
@@ -281,8 +283,8 @@ AIRY = Sensor(
     range_limits=(0.1, 60.0),  # Table 1
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware"},
     source=(
-        "Airy user manual 1.3, chapter 4.4 and appendices C and D; rs_driver (decoder_RSAIRY.hpp);"
-        " no packet was seen"
+        "Airy user manual 1.3, chapter 4.4 and appendices C and D; rs_driver"
+        " (decoder_RSAIRY.hpp); not tested with packets"
     ),
     **{**COMMON, "links": {"data": Udp(6699, 7788, 6688)}, "turn": (TURNS, TURNS)},
 )

@@ -107,8 +107,8 @@ def packet(rows: Construct) -> Struct:
         "header" / Const(b"\x55\xaa\x05\x5a"),
         "protocol_version" / Int16ub * "0 old, 1 latest",
         "reserved_6" / Bytes(2),
-        "top_packet_count" / Bytes(4) * "four counts, each 3 above the one before",
-        "bottom_packet_count" / Int32ub * "of packets",
+        "top_packet_count" / Bytes(4) * "four counts, each 3 above the previous one",
+        "bottom_packet_count" / Int32ub * "packet counter",
         "reserved_16" / Bytes(1),
         "range_resolution" / Int8ub * "1: 2.5 mm, 0: 5 mm",
         "angle_pulse_interval" / Scaled(Int16ub, 1e-6, "s"),
@@ -125,19 +125,19 @@ def packet(rows: Construct) -> Struct:
 #: Table 11: what stands from byte 313 on; the 16P has angles of 16 lasers and reserved bytes where
 #: others have those of 17 to 32.
 STATUS: tuple[Construct, ...] = (
-    "operating_status" / Bytes(12) * "current, and voltages: in, 12 V, 5 V, 2.5 V, APD",
+    "operating_status" / Bytes(12) * "current and voltages: input, 12 V, 5 V, 2.5 V, APD",
     "reserved_325" / Bytes(17),
     "board_temperatures" / Bytes(10),
     "measured_rpm" / Scaled(Int16ub, 1, "rpm"),
     "faults" / Bytes(6),
-    "code_wheel" / Int8ub * "whether it is calibrated",
+    "code_wheel" / Int8ub * "calibration state",
     "pps_trigger" / Int8ub,
     "reserved_362" / Bytes(20),
     "gprmc" / Bytes(86),
 )
 DIFOP_START = (*DIFOP_HEAD, *DIFOP_VERSIONS, *DIFOP_UNIT, *DIFOP_TIME, *STATUS)
 DIFOP_END = ("reserved_660" / Bytes(586), DIFOP_TAIL)
-OTHERS = Bytes(48) * "of lasers 17 to 32 in other models"
+OTHERS = Bytes(48) * "values of lasers 17 to 32 in other models"
 DIFOP_16 = Struct(
     *DIFOP_START,
     "vertical" / angles(16),
@@ -198,7 +198,7 @@ DIFOP_SIMULATION = Simulation(partial(sweep_difop, speed="measured_rpm"), rate=1
 PACKET_32 = Frame(packet(blocks(BLOCKS, LASERS, 0.0025)), data=True, plausible=plausible)
 INFORMATION_32 = Frame(DIFOP_32, simulation=DIFOP_SIMULATION)
 MODEL_5515 = Relative("type 6, Helios-5515", lambda f: f.lidar_type == TYPE_5515)
-NOT_5515 = Relative("another type than 6", lambda f: f.lidar_type != TYPE_5515)
+NOT_5515 = Relative("type other than 6", lambda f: f.lidar_type != TYPE_5515)
 
 HELIOS_16P = Sensor(
     "robosense-helios16p",
@@ -224,12 +224,12 @@ HELIOS_16P = Sensor(
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios32": Relative(
-            "pairs of blocks with one azimuth; or a packet each 0.67 ms", in_pairs
+            "pairs of blocks with one azimuth; or one packet every 0.67 ms", in_pairs
         ),
     },
     source=(
-        "RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; nebula's capture and"
-        " point clouds"
+        "RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; capture and"
+        " point clouds of nebula"
     ),
     **{**COMMON, "turn": (TURNS, 20.0), "status": "capture"},  # 600 and 1200 rpm (manual B.1)
 )
@@ -245,13 +245,13 @@ HELIOS_32 = dataclasses.replace(
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios16p": Relative(
-            "halves of blocks alike; or a packet each 1.33 ms", two_returns
+            "equal halves of blocks; or one packet every 1.33 ms", two_returns
         ),
     },
     status="manual",
     source=(
-        "rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; no packet of this model was"
-        " seen"
+        "rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; not tested with packets"
+        " of this model"
     ),
 )
 
@@ -265,7 +265,7 @@ HELIOS_5515 = dataclasses.replace(
     relatives={"robosense-helios16p": NOT_5515, "robosense-helios32": NOT_5515},
     status="capture",
     source=(
-        "rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; nebula's capture, which is of"
-        " this model"
+        "rs_driver (decoder_RSHELIOS.hpp); RS-Helios-16P user manual; capture of this model"
+        " from nebula"
     ),
 )

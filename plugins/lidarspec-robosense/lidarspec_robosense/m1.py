@@ -64,7 +64,7 @@ LINE = 125  # firings of a line in `sweep`, which makes 126 lines 0.2 degrees ap
 
 HEADER: tuple[Construct, ...] = (
     "magic" / Const(b"\x55\xaa\x5a\xa5"),
-    "pkt_psn" / Int16ub * "counts the packets of a frame; M1: 1 to 630, with dual return to 1260",
+    "pkt_psn" / Int16ub * "packet counter within the frame; M1: 1 to 630, with dual return to 1260",
     "protocol_version" / Int16ub,
     "wave_mode" / Int8ub * "0 dual, 4 strongest, 5 last, 6 first",
     "time_sync_mode" / Int8ub * "0 internal, 1 PPS, 2 PTP, 3 gPTP",
@@ -79,7 +79,7 @@ DATA = Struct(
     / Array(
         BLOCKS,
         Struct(
-            "time_offset" / Scaled(Int8ub, 1e-6, "s") * "after the packet's time",
+            "time_offset" / Scaled(Int8ub, 1e-6, "s") * "added to the time of the packet",
             "return_seq" / Int8ub * "0 single return, 1 first (nearer), 2 second (farther)",
             "channels"
             / Array(

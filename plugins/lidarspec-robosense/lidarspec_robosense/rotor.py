@@ -59,7 +59,7 @@ TEMPERATURE_BE = BitStruct(
 )
 #: in packets of both kinds, of the models that count seconds.
 TIME: tuple[Construct, ...] = (
-    "seconds" / Scaled(BytesInteger(6), 1, "s") * "since 1970, where synchronised",
+    "seconds" / Scaled(BytesInteger(6), 1, "s") * "time since 1970, if synchronized",
     "microseconds" / Scaled(Int32ub, 1e-6, "s"),
 )
 
@@ -79,7 +79,8 @@ def blocks(
         )
         channels = "groups" / Array(firings, groups)
     azimuth: Construct = (
-        Scaled(Int16ub, 0.01, "deg") * "of the rotor, clockwise, at the block's first laser"
+        Scaled(Int16ub, 0.01, "deg")
+        * "angle of the rotor, clockwise, at the first laser of the block"
     )
     return Array(count, Struct("flag" / flag, "azimuth" / azimuth, channels))
 
@@ -93,7 +94,7 @@ def angles(lasers: int, step: float = 0.01) -> Construct:
 #: the first 40 bytes of every DIFOP.
 DIFOP_HEAD: tuple[Construct, ...] = (
     "header" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
-    "rpm" / Scaled(Int16ub, 1, "rpm") * "as set",
+    "rpm" / Scaled(Int16ub, 1, "rpm") * "configured speed",
     "lidar_ip" / Bytes(4),
     "host_ip" / Bytes(4),
     "mac" / Bytes(6),
@@ -114,7 +115,7 @@ DIFOP_VERSIONS: tuple[Construct, ...] = (
     "motor_firmware" / Bytes(5),
     "hardware" / Bytes(3),
     "web_version" / Bytes(4),
-    "backup_checksums" / Bytes(16) * "of top board, bottom board, software, web page",
+    "backup_checksums" / Bytes(16) * "checksums of top board, bottom board, software, web page",
     "gateway" / Bytes(4),
     "subnet_mask" / Bytes(4),
     "reserved_91" / Bytes(201),

@@ -92,7 +92,7 @@ BPEARL_V4_ROTOR = dataclasses.replace(
 )
 
 DATE: tuple[Construct, ...] = (
-    "year" / Int8ub * "from 2000 on",
+    "year" / Int8ub * "years since 2000",
     "month" / Int8ub,
     "day" / Int8ub,
     "hour" / Int8ub,
@@ -110,8 +110,8 @@ def packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
         "reserved_8" / Bytes(12),
         *time,
         "lidar_type" / Int8ub * "1 RS-LiDAR-16, 2 RS-LiDAR-32",
-        "series" / Int8ub * "3 RS-Bpearl of version 4",
-        "version" / Int8ub * "4 of version 4",
+        "series" / Int8ub * "3: RS-Bpearl version 4",
+        "version" / Int8ub * "4: RS-Bpearl version 4",
         "reserved_33" / Bytes(5),
         "temperature" / TEMPERATURE,
         "reserved_40" / Bytes(2),
@@ -134,7 +134,7 @@ DIFOP_16 = difop_first(
     "reserved_468" / Bytes(697),
     "pitch"
     / Array(16, Scaled(Int24ub, 0.0001, "deg"))
-    * "size of the vertical angles, those of the first eight lasers below the horizon",
+    * "absolute vertical angles; the first eight lasers point below the horizon",
     "reserved_1213" / Bytes(33),
 )
 

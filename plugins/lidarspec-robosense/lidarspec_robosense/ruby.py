@@ -71,8 +71,8 @@ def packet(lasers: int) -> Struct:
         "temperature" / TEMPERATURE_BE,
         *TIME,
         "reserved_20" / Bytes(10),
-        "type_30" / Int8ub * "series as rs_driver has it",
-        "series" / Int8ub * "5 RS-Ruby Plus; as rs_driver has it, the model",
+        "type_30" / Int8ub * "the series, according to rs_driver",
+        "series" / Int8ub * "5 RS-Ruby Plus; the model, according to rs_driver",
         "model"
         / Int8ub
         * "1 RS-Ruby Plus, 2 RS-Ruby Plus 80, 3 RS-Ruby Plus 80V, 4 RS-Ruby Plus 48",
@@ -183,12 +183,15 @@ def model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = None) 
         info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", **named},
         relatives={
             relative: (
-                Relative("another series than 5", lambda f: ~is_plus(f))
+                Relative("series other than 5", lambda f: ~is_plus(f))
                 if plus
                 else Relative("series 5", is_plus)
             )
         },
-        source="RS-Ruby Plus and RS-Ruby user manuals; rs_driver; no packet of this model was seen",
+        source=(
+            "RS-Ruby Plus and RS-Ruby user manuals; rs_driver; not tested with packets of this"
+            " model"
+        ),
         **{
             **COMMON,
             "clock": Clock(

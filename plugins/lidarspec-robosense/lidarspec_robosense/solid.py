@@ -81,7 +81,7 @@ def packet(
     *tail: Construct,
 ) -> Struct:
     """A packet whose blocks have an offset of time, these parts, and channels of these fields."""
-    time = "time_offset" / Scaled(offset, 1e-6, "s") * "after the packet's time"
+    time = "time_offset" / Scaled(offset, 1e-6, "s") * "added to the time of the packet"
     return Struct(
         *HEADER,
         "blocks"
@@ -97,14 +97,14 @@ ATTRIBUTE = "attribute" / Int8ub * "E1: 1 normal, 2 noise"
 ONE = (RADIUS, *UNIT, "intensity" / Int8ub, ATTRIBUTE)
 TWO = (
     RADIUS,
-    "second_radius" / Scaled(Int16ub, 0.005, "m") * "of dual return",
+    "second_radius" / Scaled(Int16ub, 0.005, "m") * "second distance with dual return",
     *UNIT,
     "intensity" / Int8ub,
     "second_intensity" / Int8ub,
     ATTRIBUTE,
 )
 RETURN = "return_seq" / Int8ub * "0 single return, 1 first, 2 second"
-UNCHECKED = "not checked: what it covers is not published"
+UNCHECKED = "not checked: the covered bytes are not documented"
 SEALED = ("crc" / Int32ub * UNCHECKED, "rolling_counter" / Int16ub)
 
 M2_SCANNER = Scanner(25, 5, 1260, 1, wide=120, high=25)
@@ -295,7 +295,7 @@ M2 = dataclasses.replace(
     simulation=Simulation(partial(sweep, model=M2_SCANNER)),
     range_limits=(0.2, 250.0),  # rs_driver's limits for these models
     status="manual",
-    source="rs_driver (decoder_RSM2.hpp); no packet of this model was seen",
+    source="rs_driver (decoder_RSM2.hpp); not tested with packets of this model",
 )
 
 MX = dataclasses.replace(
@@ -317,7 +317,7 @@ MX = dataclasses.replace(
     ),  # whose packets have a second radius that is used
     range_limits=(0.2, 200.0),
     info={"serial": "difop.serial_number"},
-    source="rs_driver (decoder_RSMX.hpp); no packet of this model was seen",
+    source="rs_driver (decoder_RSMX.hpp); not tested with packets of this model",
 )
 
 E1 = dataclasses.replace(
@@ -338,7 +338,7 @@ E1 = dataclasses.replace(
     range_limits=(0.1, 200.0),  # E1 user manual, Table 1; rs_driver's
     info={"serial": "difop.serial_number", "firmware": "difop.software"},
     source=(
-        "E1 user manual, Tables 4 to 9; rs_driver (decoder_RSE1.hpp); no packet of this model was"
-        " seen"
+        "E1 user manual, Tables 4 to 9; rs_driver (decoder_RSE1.hpp); not tested with packets"
+        " of this model"
     ),
 )

@@ -401,7 +401,7 @@ def test_a_missing_port_makes_the_node_inactive(run: Any, client: Client, plugge
     client.until(lambda: client.diagnostics and client.diagnostics[-1].status[0].level == b"\2")
     assert client.state == "inactive"
     client.until(lambda: values(client.diagnostics[-1].status[0])["lifecycle"] == "inactive")
-    assert "waiting for it to come back" in client.diagnostics[-1].status[0].message
+    assert "waiting for it to return" in client.diagnostics[-1].status[0].message
     number = len(scans)
     client.until(lambda: len(scans) > number + 2)
     assert client.state == "active"
@@ -435,7 +435,7 @@ def test_a_sensor_that_falls_silent_makes_the_node_inactive_until_it_sends(
             client.until(
                 lambda: client.diagnostics and client.diagnostics[-1].status[0].level == b"\2"
             )
-            assert "nothing has arrived" in client.diagnostics[-1].status[0].message
+            assert "no data received" in client.diagnostics[-1].status[0].message
             sends.set()
             client.until(lambda: client.state == "active")
         finally:

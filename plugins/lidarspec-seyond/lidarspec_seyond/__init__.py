@@ -82,16 +82,16 @@ def make_difference(name: str, bits: int) -> Any:
 BLOCK_HEADER = (
     "angle"
     / Scaled(Int16sl, ANGLE_UNIT_RAD, "rad")
-    * "horizontal, of the first channel: 0 ahead, to the right positive",
-    "tilt" / Scaled(Int16sl, ANGLE_UNIT_RAD, "rad") * "vertical: up positive",
-    "after" / Scaled(Int16ul, 1e-5, "s") * "the start of the frame",
+    * "horizontal angle of the first channel: 0 ahead, positive to the right",
+    "tilt" / Scaled(Int16sl, ANGLE_UNIT_RAD, "rad") * "vertical angle, positive upwards",
+    "after" / Scaled(Int16ul, 1e-5, "s") * "time since the start of the frame",
     "line_index" / Int16ul,
     "more"
     / ByteSwapped(
         BitStruct(
             "reserved" / BitsInteger(2),
             "facet" / BitsInteger(3),
-            "region" / BitsInteger(2) * "0 sparse, 1 slow, 3 the centre",
+            "region" / BitsInteger(2) * "0 sparse, 1 slow, 3 centre",
             *(
                 make_difference(f"tilt_{channel}", bits)
                 for channel, bits in ((3, 9), (2, 9), (1, 8))
@@ -109,10 +109,10 @@ PIXEL = ByteSwapped(
         "elongation" / BitsInteger(4),
         "type" / BitsInteger(2) * "0 normal, 1 ground, 2 fog",
         "second" / BitsInteger(1) * "1: second return",
-        "strength" / BitsInteger(8) * "reflectance or intensity, by the flags; 255: a reflector",
+        "strength" / BitsInteger(8) * "reflectance or intensity, see flags; 255: reflector",
         "radius"
         / Scaled(BitsInteger(17), 0.005, "m")
-        * "twice that with long distances; 0: no return",
+        * "times 2 with long distances; 0: no return",
     )
 )
 
@@ -124,15 +124,15 @@ def make_packet(returns: int) -> Struct:
         "major" / Int8ul,
         "minor" / Int8ul,
         "firmware_sequence" / Int16ul,
-        "checksum" / Int32ul * "not checked: the vendor's header does not say which CRC it is",
+        "checksum" / Int32ul * "not checked: the vendor's header does not name the CRC",
         "size" / Int32ul,
-        "source" / Int8ul * "number of the lidar below, kind of time above",
+        "source" / Int8ul * "low bits: number of the lidar; high bits: type of time",
         "lidar_type" / Int8ul,
-        "start" / Scaled(Float64l, 1e-6, "s") * "of the frame, since 1970",
+        "start" / Scaled(Float64l, 1e-6, "s") * "start of the frame, since 1970",
         "mode" / Int8ul,
         "unit_status" / Int8ul,
         "frame" / Int64ul,
-        "part" / Int16ul * "of the frame",
+        "part" / Int16ul * "index of the packet within the frame",
         "packet" / Int16ul,
         "item_type" / Const(1, Int8ul) * "spherical points",
         "count" / Int24ul,
@@ -150,9 +150,7 @@ def make_packet(returns: int) -> Struct:
                 "last_packet" / BitsInteger(1),
                 "last_part" / BitsInteger(1),
                 "confidence" / BitsInteger(2),
-                "returns"
-                / BitsInteger(3)
-                * "1 one, 2 the two strongest, 3 the strongest and the farthest",
+                "returns" / BitsInteger(3) * "1 single, 2 two strongest, 3 strongest and farthest",
                 "reflectance" / BitsInteger(1) * "1: strength is reflectance, else intensity",
                 "upwards" / BitsInteger(1),
             )
@@ -231,7 +229,7 @@ def make_frame(returns: int) -> Frame:
         plausible=plausible,
         simulation=Simulation(partial(sweep, returns=returns)),
         acknowledged={
-            "LS506": "a frame is lines, each of which begins on the left",
+            "LS506": "a frame consists of lines, each of which begins on the left",
         },
     )
 
@@ -250,8 +248,8 @@ FALCON = Sensor(
     vendor_axes=("up", "right", "forward"),
     status="manual",
     source=(
-        "Innovusion SDK 3.102 (inno_lidar_packet.h, inno_lidar_packet_utils.h); no packet of a"
-        " sensor was seen"
+        "Innovusion SDK 3.102 (inno_lidar_packet.h, inno_lidar_packet_utils.h); not tested"
+        " with packets"
     ),
 )
 

@@ -27,14 +27,14 @@ RANGE = (
     "stop" / Scaled(Int32sb, 1e-4, "deg"),
 )
 CONTENT = (
-    "echoes" / Int8ub * "1: DIST1, 2: DIST2, 4: DIST3, and so on, added up",
+    "echoes" / Int8ub * "sum of 1: DIST1, 2: DIST2, 4: DIST3, and so on",
     "reserved" / Int8ub,
-    "strength" / Int8ub * "1: RSSI as well",
-    "wide" / Int8ub * "1: RSSI in 16 bits",
+    "strength" / Int8ub * "1: with RSSI",
+    "wide" / Int8ub * "1: 16-bit RSSI",
     "unit" / Int8ub,
     "encoders" / Int16ub,
     *(name / Int8ub for name in ("position", "name", "comment", "time")),
-    "interval" / Int16ub * "1: each scan, 2: every other one",
+    "interval" / Int16ub * "1: each scan, 2: every second scan",
 )
 #: what a scanner may refuse a command for, from 1 on (8014631, error codes).
 ERRORS = (

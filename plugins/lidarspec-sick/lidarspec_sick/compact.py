@@ -62,9 +62,7 @@ def module(version: int) -> Struct:
     azimuth = "azimuth" / If(
         this._.beam_content.has_azimuth == 1, Scaled(Int16ul, STEP, "rad", -ZERO * STEP)
     )
-    properties = (
-        "property" / If(this._.beam_content.has_property == 1, Int8ul) * "bit 0: a reflector"
-    )
+    properties = "property" / If(this._.beam_content.has_property == 1, Int8ul) * "bit 0: reflector"
     echo = Struct(
         "distance" / If(this._._.echo_content.has_distance == 1, Scaled(Int16ul, 0.001, "m")),
         "strength" / If(this._._.echo_content.has_strength == 1, Int16ul),
@@ -86,7 +84,7 @@ def module(version: int) -> Struct:
         "first_azimuth" / Array(this.layer_count, Scaled(Float32l, 1, "rad")),
         "last_azimuth" / Array(this.layer_count, Scaled(Float32l, 1, "rad")),
         *(["scale" / Float32l] if version == 4 else []),
-        "next_size" / Int32ul * "bytes of the next module, 0 behind the last",
+        "next_size" / Int32ul * "bytes of the next module; 0 in the last one",
         "available" / Int8ul,
         "echo_content"
         / BitStruct(
@@ -113,7 +111,7 @@ def telegram(version: int) -> Construct:
         "counter" / Int64ul,
         "sent" / Scaled(Int64ul, 1, "us"),
         "version" / Const(version, Int32ul),
-        "size" / Int32ul * "of the first module",
+        "size" / Int32ul * "bytes of the first module",
         "modules" / Parts(module(version), size=this.size, following=this.next_size),
         "crc" / Int32ul,
     )
@@ -238,11 +236,13 @@ def scanner(name: str) -> Sensor:
         sequence=Sequence("counter"),
         links={"data": Udp(2115), "imu": Udp(7503)},
         range_limits=limits,
-        relatives={other: "how many layers its modules have" for other in MODELS if other != name},
+        relatives={
+            other: "the number of layers of its modules" for other in MODELS if other != name
+        },
         status=status,
         source=(
-            "sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, turns, beams,"
-            " elevations of simulated layers"
+            "sick_scan_xd, compact_parser.cpp; 8027119 for segments. Assumed: ranges, scan"
+            " rates, beams, elevations of simulated layers"
         ),
     )
 

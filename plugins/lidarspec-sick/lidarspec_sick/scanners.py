@@ -144,7 +144,9 @@ def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0)
     """
     kind = MODELS[sensor.id][1]
     if echoes not in range(kind.echoes + 1):
-        raise UsageError(f"{sensor.id}: echoes is a number from 1 to {kind.echoes}, not {echoes!r}")
+        raise UsageError(
+            f"{sensor.id}: echoes must be a number from 1 to {kind.echoes}, not {echoes!r}"
+        )
     own = frames(dataclasses.replace(kind, echoes=echoes or kind.echoes), cola)
     return dataclasses.replace(
         sensor, frames=own, commands=commands("text" if cola == "A" else "scan")
@@ -154,9 +156,9 @@ def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0)
 def relative(own: Kind, other: Kind) -> str | Relative:
     """What tells a scanner of another kind."""
     if own == other:
-        return "nothing in its scans: its answer to get_identity, or the label on the housing"
+        return "identical scans; see its reply to get_identity, or the label on the housing"
     return Relative(
-        "the rate, the steps or the first angle", lambda f: other.fits(f) & ~own.fits(f)
+        "the scan rate, the angular step or the first angle", lambda f: other.fits(f) & ~own.fits(f)
     )
 
 

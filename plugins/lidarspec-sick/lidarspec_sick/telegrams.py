@@ -37,7 +37,7 @@ from lidarspec.spec import Checksummed, Fields, Frame, Polar, Scaled, SizeOf, To
 # metres before scaling: the smallest value that is a distance is 16 (8023198, reserved values)
 LEAST = 0.016
 AHEAD = 90.0  # degrees on the wire that lie straight ahead (sick_scan_xd)
-DISTANCE = Scaled(Int16ub, 0.001, "m") * "to be scaled; below 16: none"
+DISTANCE = Scaled(Int16ub, 0.001, "m") * "before scaling; below 16: no distance"
 HIGHEST = 1e6  # Hz; rates above are in Hz, not in 100 Hz, as sick_scan_xd says of some firmware
 MOST_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
 
@@ -46,7 +46,7 @@ def binary(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
     """Return a telegram of CoLa B: four times 02, a length, the content, and the XOR of it."""
     struct = Struct(
         "magic" / Const(b"\x02\x02\x02\x02"),
-        "length" / SizeOf(Int32ub, plus=-9) * "of the content",
+        "length" / SizeOf(Int32ub, plus=-9) * "bytes of the content",
         *parts,
         "checksum" / Int8ub,
     )
@@ -107,11 +107,13 @@ def scan(echoes: int) -> list[Construct]:
         * "0 0 ok, 0 1 error, 0 2 pollution warning, 0 4 pollution error",
         "telegram_counter" / Int16ub,
         "scan_counter" / Int16ub,
-        "time" / Scaled(Int32ub, 1, "us") * "since power-up, when the scan began",
-        "sent" / Scaled(Int32ub, 1, "us") * "since power-up",
+        "time" / Scaled(Int32ub, 1, "us") * "start of the scan, since power-up",
+        "sent" / Scaled(Int32ub, 1, "us") * "transmission time, since power-up",
         "inputs" / Array(2, Int8ub),
         "outputs" / Array(2, Int8ub),
-        "layer" / Scaled(Int16sb, 0.01, "deg") * "downwards; 0 but on an MRS1000",
+        "layer"
+        / Scaled(Int16sb, 0.01, "deg")
+        * "layer angle, positive downwards; 0 except for the MRS1000",
         "scan_rate" / Scaled(Int32ub, 0.01, "Hz"),
         "beam_rate" / Scaled(Int32ub, 100, "Hz"),
         "encoder_count" / Int16ub,
@@ -195,7 +197,7 @@ def scaled_intensity(channel: Fields) -> Any:
 def scans(cola: str, echoes: int) -> Frame:
     """Return the telegram of a scan with so many echoes, in CoLa "A" or "B"."""
     longest = 200 + echoes * 2 * (40 + 2 * MOST_BEAMS)
-    kind = "kind" / Bytes(3) * "sSN sent by itself, sRA asked for"
+    kind = "kind" / Bytes(3) * "sSN sent automatically, sRA sent on request"
     more = {
         "data": True,
         "plausible": partial(plausible, echoes=echoes),

@@ -175,7 +175,8 @@ def test_a_refusal_is_reported_at_once_in_words(cola: str) -> None:
     )
     with ls.open("sim:", sensor) as device:
         with pytest.raises(
-            CommandError, match=r"set_range: the sensor refuses it: error value_not_allowed \(4\)$"
+            CommandError,
+            match=r"set_range: the sensor refused the command: error value_not_allowed \(4\)$",
         ):
             device.send("set_range", timeout=60, step=0.5, start=0, stop=90)
         assert device.send("get_state", timeout=60).confirmed

@@ -133,7 +133,7 @@ def configure(
         sensor = dataclasses.replace(sensor, frames={**sensor.frames, "express": changed})
     if mode is not None:
         if mode not in range(0x100):
-            raise UsageError(f"{sensor.id}: mode is a number from 0 to 255, not {mode!r}")
+            raise UsageError(f"{sensor.id}: mode must be a number from 0 to 255, not {mode!r}")
         answers = {
             **sensor.simulation.answers,
             "mode_scan": sensor.simulation.answers["express_scan"],
@@ -177,15 +177,13 @@ def rplidar(
         on_close=("stop", "stop_motor"),
         acknowledged={}
         if status == "manual"
-        else {
-            "LS710": "the exchange is a unit's of others: the project's tests read it where it is"
-        },
+        else {"LS710": "the exchange is not redistributed; the project's tests read the original"},
         range_limits=range_limits,
         vendor_axes=("forward", "right", "up"),
         turn=turn,
         relatives={
             f"slamtec-rplidar-{other.lower()}": (
-                "nothing public: the label" if {name, other} == {*TWINS} else "info.model"
+                "no public difference; see the label" if {name, other} == {*TWINS} else "info.model"
             )
             for other in MODELS
             if other != name
@@ -207,7 +205,7 @@ A1 = rplidar(
     range_limits=(0.15, 12.0),
     turn=(1.0, 10.0),  # A1M8 data sheet, scan rate
     status="vectors",
-    source="A1M8 data sheet; an A1's exchange",
+    source="A1M8 data sheet; captured exchange with an A1",
 )
 A2 = rplidar(
     "A2",
@@ -217,7 +215,7 @@ A2 = rplidar(
     range_limits=(0.15, 16.0),  # an A2M8 sees from 0.15 to 12 m; the rest is assumed for the A2M7
     turn=(5.0, 15.0),
     status="manual",
-    source="A2M8 data sheet rev. 2.5 (12 m, turns); the reach of an A2M7 is assumed",
+    source="A2M8 data sheet rev. 2.5 (12 m, speed); the range of an A2M7 is assumed",
 )
 A3 = rplidar(
     "A3",
@@ -227,7 +225,7 @@ A3 = rplidar(
     range_limits=(0.2, 25.0),
     turn=(5.0, 15.0),
     status="vectors",
-    source="A3M1 data sheet; ultra capsules built after the SDK",
+    source="A3M1 data sheet; ultra capsules built from the SDK",
 )
 S1 = rplidar(
     "S1",
@@ -237,7 +235,7 @@ S1 = rplidar(
     range_limits=(0.1, 40.0),
     turn=(8.0, 15.0),
     status="manual",
-    source="ArduPilot's page of the S1 (40 m, turns); its nearest distance is assumed",
+    source="ArduPilot's page of the S1 (40 m, speed); its shortest distance is assumed",
 )
 S2 = rplidar(
     "S2",

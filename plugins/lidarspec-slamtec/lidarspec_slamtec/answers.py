@@ -61,7 +61,7 @@ VALUES: dict[int, Construct] = {
     MAX_DISTANCE: "max_distance" / Scaled(Int32ul, 1 / 256, "m"),
     ANSWER_TYPE: "answer_type"
     / Int8ul
-    * "type of the descriptor that announces the mode's data frames",
+    * "type in the descriptor that precedes the data frames of the mode",
 }
 _SIZES = np.full(MODE_NAME + 1, np.nan)
 _SIZES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
@@ -70,7 +70,7 @@ _SIZES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
 def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]:
     """Return the fields of a descriptor of this type and mode."""
     block = BitStruct(
-        "mode" / Const(mode, BitsInteger(2)) * "0: one answer, 1: an endless stream",
+        "mode" / Const(mode, BitsInteger(2)) * "0: one reply, 1: endless stream",
         "length" / length,
     )
     return (
@@ -113,7 +113,7 @@ CONFIG = Struct(
         this.key,
         {key: Struct(value) for key, value in VALUES.items()},
         default=Struct(
-            "data" / Bytes(this._.descriptor.length - 4) * "7F: the mode's name, ends with 00"
+            "data" / Bytes(this._.descriptor.length - 4) * "7F: name of the mode, terminated by 00"
         ),
     ),
 )
@@ -127,7 +127,7 @@ ANSWERS = {
     "info": single(
         0x04,
         20,
-        "model" / Int8ul * f"high nibble: series, low nibble: model in it; {MODEL_NUMBERS}",
+        "model" / Int8ul * f"high nibble: series, low nibble: model; {MODEL_NUMBERS}",
         "firmware_minor" / Int8ul,
         "firmware_major" / Int8ul,
         "hardware" / Int8ul,

@@ -75,7 +75,7 @@ def capsule(*fields: Construct) -> Checksummed:
 
 def start() -> Construct:
     """Return the angle of the first point, and whether this is the first capsule after a start."""
-    flag = "sync" / BitsInteger(1) * "S, 1: first after a start"
+    flag = "sync" / BitsInteger(1) * "S, 1: first capsule after a start"
     return "start" / ByteSwapped(BitStruct(flag, "angle" / Scaled(BitsInteger(15), 1 / 64, "deg")))
 
 
@@ -108,8 +108,13 @@ ULTRA = capsule(
             BitStruct(
                 "predict2"
                 / Scaled(BitsInteger(10, signed=True), 1, "")
-                * "in steps that the code word tells, from the next major; 511, -512: no return",
-                "predict1" / BitsInteger(10, signed=True) * "from this major; 511, -512: no return",
+                * (
+                    "difference to the next major, in steps given by the code word; 511, -512: no"
+                    " return"
+                ),
+                "predict1"
+                / BitsInteger(10, signed=True)
+                * "difference to this major; 511, -512: no return",
                 "major" / BitsInteger(12) * "0: no return",
             )
         ),

@@ -59,7 +59,7 @@ NODE = Struct(
     / BitStruct(
         "quality" / BitsInteger(6),
         "inverse" / BitsInteger(1) * "the inverse of start",
-        "start" / BitsInteger(1) * "S, 1: first node of a turn",
+        "start" / BitsInteger(1) * "S, 1: first node of a revolution",
     ),
     "beam"
     / ByteSwapped(
@@ -83,7 +83,7 @@ HQ = Checksummed(
                 "angle" / Scaled(Int16ul, 90 / 16384, "deg"),
                 "distance" / Scaled(Int32ul, 0.00025, "m") * "0: no return",
                 "quality" / Int8ul,
-                "flag" / Int8ul * "bit 0: first node of a turn",
+                "flag" / Int8ul * "bit 0: first node of a revolution",
             ),
         ),
         "crc" / Int32ul,

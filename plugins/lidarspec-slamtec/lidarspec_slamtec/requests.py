@@ -44,12 +44,12 @@ PLAIN = Struct(
     "start" / START,
     "cmd"
     / BitStruct(
-        "payload" / Const(0, BitsInteger(1)) * "0: none follows", "number" / BitsInteger(7)
+        "payload" / Const(0, BitsInteger(1)) * "0: no payload follows", "number" / BitsInteger(7)
     ),
 )
 PAYLOAD = make_request(
-    "cmd" / Int8ul * "80 and above",
-    "size" / Int8ul * "of the payload",
+    "cmd" / Int8ul * "80 or above",
+    "size" / Int8ul * "bytes of the payload",
     "payload" / Bytes(this.size),
 )
 
@@ -58,16 +58,16 @@ REQUESTS = {
     "express_request": asking(
         0x82,
         5,
-        "mode" / Int8ul * "0: express scan; else a number that get_mode_count allows",
+        "mode" / Int8ul * "0: express scan; else a scan mode, see get_mode_count",
         "flags" / Int16ul,
         "param" / Int16ul,
     ),
     "config_request": asking(0x84, 4, "key" / Int32ul),
     "mode_config_request": asking(
-        0x84, 6, "key" / Int32ul, "mode" / Int16ul * "the scan mode that is asked about"
+        0x84, 6, "key" / Int32ul, "mode" / Int16ul * "requested scan mode"
     ),
-    "rpm_request": asking(0xA8, 2, "speed" / Scaled(Int16ul, 1, "rpm") * "0: stand still"),
-    "pwm_request": asking(0xF0, 2, "duty" / Int16ul * "0: stand still, 1023: full"),
+    "rpm_request": asking(0xA8, 2, "speed" / Scaled(Int16ul, 1, "rpm") * "0: stop"),
+    "pwm_request": asking(0xF0, 2, "duty" / Int16ul * "0: stop, 1023: full speed"),
     "accessory_request": asking(0xFF, 4, "reserved" / Int32ul),
     "payload_request": Frame(
         PAYLOAD, direction="out", max_length=4 + 255, plausible=lambda f: f.cmd >= 0x80

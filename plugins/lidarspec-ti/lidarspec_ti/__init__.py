@@ -79,7 +79,7 @@ POINTS_PART = make_part(
     / Array(
         this.length // POINT_BYTES,
         Struct(
-            "x" / Scaled(Float32l, 1, "m") * "to the right",
+            "x" / Scaled(Float32l, 1, "m") * "positive to the right",
             "y" / Scaled(Float32l, 1, "m") * "ahead",
             "z" / Scaled(Float32l, 1, "m") * "up",
             "velocity" / Scaled(Float32l, 1, "m/s") * "positive away from the radar",
@@ -108,8 +108,8 @@ STATISTICS = Struct(
 TEMPERATURE = Struct(
     "type" / Const(9, Int32ul),
     "length" / Const(28, Int32ul),
-    "invalid" / Int32sl * "0: what follows holds",
-    "time" / Scaled(Int32ul, 0.001, "s") * "since power-up",
+    "invalid" / Int32sl * "0: the following values are valid",
+    "time" / Scaled(Int32ul, 0.001, "s") * "time since power-up",
     *(
         name / Scaled(Int16sl, 1, "degC")
         for name in (
@@ -130,12 +130,12 @@ DATA = Struct(
     "magic" / Const(bytes([2, 1, 4, 3, 6, 5, 8, 7])),
     "version"
     / Int32ul
-    * "of the SDK: major, minor, bugfix and build, a byte each, the highest first",
+    * "SDK version: major, minor, bugfix and build, one byte each, highest first",
     "length" / SizeOf(Int32ul),
     "platform" / Const(PLATFORM, Int32ul),
     "frame_number" / Int32ul,
-    "time" / Scaled(Int32ul, CYCLE_NS, "ns") * "cycles; starts again at 21.5 s",
-    "detected" / Int32ul * "points of the frame",
+    "time" / Scaled(Int32ul, CYCLE_NS, "ns") * "clock cycles; restarts at 21.5 s",
+    "detected" / Int32ul * "number of points",
     "tlv_count" / Int32ul,
     "subframe" / Int32ul,
     "tlvs"
@@ -220,7 +220,7 @@ IWR6843 = Sensor(
             data=True,
             max_length=32_768,
             points={"tlvs.points": points},
-            acknowledged={"LS203": "heat maps are long, and asked for seldom"},
+            acknowledged={"LS203": "heat maps are long and rarely requested"},
         )
     },
     points=None,

@@ -226,7 +226,7 @@ OTHERS = {
 HI_RES = {"velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24)}
 
 
-UNPUBLISHED = {"LS710": "the packet is of others: the project's tests read it where it is"}
+UNPUBLISHED = {"LS710": "the packet is not redistributed; the project's tests read the original"}
 
 VLP16 = Sensor(
     "velodyne-vlp16",
@@ -250,7 +250,7 @@ VLP16 = Sensor(
     # 12 blocks, or 6 shots: periods of 110.592 and 46.080 us
     relatives={
         "velodyne-hdl32e": (
-            "timestamp: a packet each 1327 us, with dual return 664 us; an HDL-32E's 553 and 276 us"
+            "one packet every 1327 us, with dual return 664 us; an HDL-32E: 553 and 276 us"
         ),
         **HI_RES,
         **OTHERS,
@@ -288,7 +288,7 @@ HDL32E = relative(
     range_limits=(0.9, 130.0),  # likewise
     relatives={
         "velodyne-vlp16": Relative(
-            "product 0x22; or a packet each 1327 us", lambda f: f.product == 0x22
+            "product 0x22; or one packet every 1327 us", lambda f: f.product == 0x22
         ),
         **HI_RES,
         **OTHERS,
@@ -302,7 +302,7 @@ PUCK_HI_RES = relative(
     HI_RES_FIRINGS,
     relatives={
         "velodyne-vlp16": Relative(
-            "product 0x22, or 0x21 of old firmware",
+            "product 0x22, or 0x21 with old firmware",
             lambda f: (f.product == 0x22) | (f.product == 0x21),
         ),
         "velodyne-hdl32e": Relative("product 0x21", lambda f: f.product == 0x21),
@@ -310,8 +310,8 @@ PUCK_HI_RES = relative(
     },
     status="manual",
     source=(
-        "velodyne_decoder (Puck Hi-Res.yml, packet_decoder.cpp), citing the VLP-16 user manual; no"
-        " packet of this model was seen"
+        "velodyne_decoder (Puck Hi-Res.yml, packet_decoder.cpp), citing the VLP-16 user"
+        " manual; not tested with packets of this model"
     ),
 )
 

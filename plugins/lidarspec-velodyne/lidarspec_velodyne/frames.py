@@ -52,7 +52,7 @@ def packet(
     """
     channel = Struct(
         "distance" / Scaled(Int16ul, unit, "m") * "0: no return",
-        "intensity" / Int8ul * "calibrated reflectivity: to 100 diffuse, above retroreflecting",
+        "intensity" / Int8ul * "calibrated reflectivity: up to 100 diffuse, above retroreflective",
     )
     block = Struct(
         "flag" / flag,
@@ -65,7 +65,7 @@ def packet(
     return Struct(
         "blocks" / Array(blocks, block),
         *empty,
-        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "of the first firing, since the top of the hour",
+        "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time of the first firing, since the full hour",
         "return_mode" / mode,
         "product" / product,
     )
@@ -73,10 +73,8 @@ def packet(
 
 MODE = Int8ul * "0x37 strongest, 0x38 last, 0x39 dual; not set by HDL-32E firmware before 2.2.20"
 BANK = Int16ub * "0xFFEE lasers 1 to 32, 0xFFDD 33 to 64, 0xFFCC 65 to 96, 0xFFBB 97 to 128"
-PRODUCT = (
-    Int8ul
-    * "0x21 HDL-32E, 0x22 VLP-16, 0x24 Puck Hi-Res; not to be trusted: VLP-16 with old firmware"
-    " sends 0x21"
+PRODUCT = Int8ul * (
+    "0x21 HDL-32E, 0x22 VLP-16, 0x24 Puck Hi-Res; unreliable: VLP-16 with old firmware sends 0x21"
 )
 
 POSITION = Struct(
@@ -88,29 +86,29 @@ POSITION = Struct(
             "gyro"
             / Int16ul
             * "HDL-32E: signed, in the low 12 bits; 0.09766 deg/s; the VLP-16 sends 0",
-            "temperature" / Scaled(Int16ul, 1, "") * "likewise; 0.1453 degC, from 25 degC",
-            "accel_x" / Int16ul * "likewise; 0.001221 g",
-            "accel_y" / Int16ul * "likewise; 0.001221 g",
+            "temperature" / Scaled(Int16ul, 1, "") * "as gyro; 0.1453 degC, from 25 degC",
+            "accel_x" / Int16ul * "as gyro; 0.001221 g",
+            "accel_y" / Int16ul * "as gyro; 0.001221 g",
         ),
     ),
     "reserved" / Bytes(149),
     "top_board_temperature"
     / Scaled(Int8ul, 1, "degC")
-    * "this and the other readings but time, PPS and NMEA: firmware since 2018",
+    * "all readings except time, PPS and NMEA require firmware since 2018",
     "bottom_board_temperature" / Scaled(Int8ul, 1, "degC"),
-    "adc_temperature" / Scaled(Int8ul, 1, "degC") * "when the ADC was calibrated last",
-    "adc_temperature_change" / Scaled(Int16sl, 1, "degC") * "since then",
-    "adc_age" / Scaled(Int32ul, 1, "s") * "since then",
+    "adc_temperature" / Scaled(Int8ul, 1, "degC") * "at the last calibration of the ADC",
+    "adc_temperature_change" / Scaled(Int16sl, 1, "degC") * "change since the last calibration",
+    "adc_age" / Scaled(Int32ul, 1, "s") * "time since the last calibration",
     "adc_reason" / Int8ul * "0 none, 1 power-on, 2 manual, 3 temperature, 4 periodic",
     "adc_status" / Int8ul * "bit 0 calibrating, 1 temperature limit met, 2 time limit met",
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "since the top of the hour",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time since the full hour",
     "pps" / Int8ul * "0 absent, 1 synchronizing, 2 locked, 3 error",
     "thermal_status" / Int8ul * "0 ok, 1 shut down",
     "shutdown_temperature" / Scaled(Int8ul, 1, "degC") * "at the last thermal shutdown",
     "power_up_temperature" / Scaled(Int8ul, 1, "degC"),
     "nmea"
     / Bytes(NMEA)
-    * "a GPRMC or GPGGA sentence, filled up with zeros; all 0 without a GPS receiver",
+    * "GPRMC or GPGGA sentence, padded with zeros; all 0 without a GPS receiver",
     "unused" / Bytes(178),
 )
 

@@ -165,10 +165,10 @@ BLOCK = Struct(
 )
 DATA = Struct(
     "blocks" / Array(BLOCKS, BLOCK),
-    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "of the first firing, since the top of the hour",
+    "timestamp" / Scaled(Int32ul, 1e-6, "s") * "time of the first firing, since the full hour",
     "status_type"
     / Int8ul
-    * "a letter: H, M, S time, D, N, Y date, G GPS, T temperature, V version, W others by turns",
+    * "letter: H, M, S time, D, N, Y date, G GPS, T temperature, V version, W others in turn",
     "status_value" / Int8ul,
 )
 
@@ -232,8 +232,8 @@ def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sens
         ) from None
     if len(lasers) != 2 * SLOTS or set(table) != set(range(2 * SLOTS)):
         raise UsageError(
-            f"{calibration!s}: lists {len(table)} lasers of {len(lasers)}, and an HDL-64E has 0 to"
-            f" {2 * SLOTS - 1}, each once"
+            f"{calibration!s}: contains {len(table)} lasers of {len(lasers)}, expected each of"
+            f" 0 to {2 * SLOTS - 1} once"
         )
     offset, vertical, *metres = (
         tuple(column) for column in np.array([table[laser] for laser in sorted(table)]).T
@@ -255,7 +255,7 @@ def _number(laser: ElementTree.Element, name: str) -> float:
     text = laser.findtext(name)
     value = float(text) if text is not None else math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{name} of a laser is {text!r}")
+        raise ValueError(f"{name} of a laser must be finite, got {text!r}")
     return value
 
 
@@ -297,8 +297,7 @@ def model(series: str, unit: Unit, other: str) -> Sensor:
         turn=TURN,
         relatives={
             f"velodyne-hdl64e-{other}": (
-                "timestamp: a packet each 288 us of an S2, 346 us of an S3; with dual return half"
-                " of these"
+                "one packet every 288 us (S2) or 346 us (S3); half of this with dual return"
             )
         },
         status="manual",

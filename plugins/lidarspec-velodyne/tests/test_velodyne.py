@@ -478,9 +478,9 @@ def test_the_hour_is_that_of_the_position_packets() -> None:
 def test_without_a_date_times_start_at_the_hour_with_a_warning(nmea: bytes, pps: int) -> None:
     packets = decode(VLP16, [position(nmea, pps=pps), packet(steps(0), {}, time_us=2_000_000)])
     assert packets.time_ns.tolist() == [2_000_000_000]
-    assert (
-        packets.stats.undated
-        == "times count from where the sensor's clock began: no position frame has told the date"
+    assert packets.stats.undated == (
+        "times count from the start of the sensor's clock: no position frame with the date"
+        " has arrived"
     )
 
 
@@ -567,8 +567,8 @@ def test_an_invalid_hdl64e_file_is_refused(tmp_path: Path) -> None:
     ):
         sensor.configure(calibration=text)
     with pytest.raises(
-        ls.UsageError, match="lists 32 lasers of 32, and an HDL-64E has 0 to 63, each once"
+        ls.UsageError, match="contains 32 lasers of 32, expected each of 0 to 63 once"
     ):
         sensor.configure(calibration=write_velodyne_xml(tmp_path / "vlp32.xml", 32))
-    with pytest.raises(ls.UsageError, match="rotCorrection_ of a laser is 'nan'"):
+    with pytest.raises(ls.UsageError, match="rotCorrection_ of a laser must be finite"):
         sensor.configure(calibration=write_velodyne_xml(tmp_path / "nan.xml", rotCorrection_="nan"))

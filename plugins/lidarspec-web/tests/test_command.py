@@ -197,7 +197,7 @@ def test_reading_continues_when_a_port_returns(tmp_path: Path) -> None:
             sim.terminate()
             sim.wait(DEADLINE)
             gone = page.state(lambda state: state["state"] == "disconnected" and state["warnings"])
-            assert "the device is gone" in gone["warnings"][0]
+            assert "the device is disconnected" in gone["warnings"][0]
             sim = begin()
             back = page.state(
                 lambda state: state["state"] == "streaming" and state["figures"]["disconnects"]

@@ -128,7 +128,9 @@ def test_an_unplugged_sensor_is_reported_until_it_returns(browser: Any) -> None:
             "it is not said that the sensor is gone",
         )
         visit.until(
-            lambda: "the device is gone; waiting for it to come back" in visit.text("#warnings"),
+            lambda: (
+                "the device is disconnected; waiting for it to return" in visit.text("#warnings")
+            ),
             "it is not said what comes next",
         )
         before = visit.value("lidarspec.picture.scan.scan")

@@ -264,7 +264,7 @@ def test_a_failing_source_is_reported(tmp_path: Path) -> None:
         ) as station,
         station.page() as page,
     ):
-        assert "nothing of that is asked for" in page.until("ended")["text"]
+        assert "the selection" in page.until("ended")["text"]
     assert isinstance(station.failure, UsageError)
 
 

@@ -96,9 +96,11 @@ def make_data_frame(form: Form) -> Frame:
         / BitStruct(
             "frequency"
             / frequency
-            * "of scans, in a zero packet, raw 0: not given; in others the state of a T-mini or an"
-            " X4 Pro",
-            "start" / BitsInteger(1) * "1: zero packet, a turn begins",
+            * (
+                "scans per second in a zero packet, 0: not given; in other packets the state of a"
+                " T-mini or an X4 Pro"
+            ),
+            "start" / BitsInteger(1) * "1: zero packet, a revolution begins",
         ),
         "lsn" / Int8ul * "number of samples",
         "fsa" / make_angle() * "angle of the first sample",
@@ -171,12 +173,12 @@ def describe_difference(own: Model, other: Model) -> str | Relative:
     """Return how to recognize another model with the same sample size."""
     if other.has_state and not own.has_state:
         return Relative(
-            "CT has bits set in packets that begin no turn",
+            "bits of CT are set in packets that do not begin a revolution",
             partial(has_state, slowest=own.form.slowest),
         )
     if own.number and other.number:
         return "info.model"
-    return "nothing in the packets: the baud rate, or the label on the housing"
+    return "identical packets; see the baud rate, or the label on the housing"
 
 
 def relatives(name: str) -> dict[str, str | Relative]:

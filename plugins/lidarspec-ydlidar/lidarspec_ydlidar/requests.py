@@ -27,7 +27,7 @@ def make_reply(kind: int, *fields: Construct, size: int) -> Frame:
 
 
 SCAN_START = Frame(
-    Struct("descriptor" / Const(b"\xa5\x5a\x05\x00\x00\x40\x81") * "packets follow without end")
+    Struct("descriptor" / Const(b"\xa5\x5a\x05\x00\x00\x40\x81") * "packets follow until stop")
 )
 ANSWERS = {
     "scan_start": SCAN_START,
@@ -38,16 +38,18 @@ ANSWERS = {
         * ", ".join(f"{model.number} {name}" for name, model in MODELS.items() if model.number),
         "firmware" / Struct("minor" / Int8ul, "major" / Int8ul),
         "hardware" / Int8ul,
-        "serial" / Bytes(16) * "a digit a byte",
+        "serial" / Bytes(16) * "one digit per byte",
         size=20,
     ),
     "health": make_reply(
         0x06, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul, size=3
     ),
-    "speed": make_reply(0x04, "frequency" / Scaled(Int32ul, 0.01, "Hz") * "of scans", size=4),
+    "speed": make_reply(
+        0x04, "frequency" / Scaled(Int32ul, 0.01, "Hz") * "scans per second", size=4
+    ),
     "setting": make_reply(
         0x04,
-        "value" / Int8ul * "number of the sampling rate, or of the direction of rotation",
+        "value" / Int8ul * "number of the sampling rate, or direction of rotation",
         size=1,
     ),
     "stamp": Frame(

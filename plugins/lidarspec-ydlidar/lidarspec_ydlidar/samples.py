@@ -66,7 +66,7 @@ SAMPLE_8 = make_packed_sample(REFLECTION_FLAGS, "intensity" / BitsInteger(8))
 
 TRIANGLE = Form(make_plain_distance(0.00025), correction=camera_angle)
 TRIANGLE_FLAGGED = Form(
-    make_packed_sample(FLAGS * "not 0: disturbed by another lidar"), correction=camera_angle
+    make_packed_sample(FLAGS * "not 0: interference from another lidar"), correction=camera_angle
 )
 TRIANGLE_8 = Form(SAMPLE_8, 3, (1, 2), camera_angle, has_intensity=True)
 TRIANGLE_10 = Form(

@@ -16,6 +16,6 @@ test("ages and reasons are short", () => {
 
 test("the path of the source is not repeated", () => {
   const source = "/dev/serial/by-id/usb-Silicon_Labs_CP2102_USB_to_UART_Bridge_Controller_0001-if00-port0";
-  assert.equal(shorten(`${source}: the device is gone`, source), "the device is gone");
+  assert.equal(shorten(`${source}: the device is disconnected`, source), "the device is disconnected");
   assert.equal(shorten("/tmp/a/drive.lsr has ended", "/tmp/a/drive.lsr"), "drive.lsr has ended");
 });
