@@ -79,18 +79,44 @@ def random_frame(
     """
     engine = get_codec(sensor.frames[frame])
     if not engine.is_compiled or engine.schema.parts:
-        return _make_of_values(sensor, frame, engine, source, drawn)
+        return make_of_values(sensor, frame, source, drawn)
+    _, row = random_row(sensor, frame, source, drawn)
+    data = frame_coder(engine.frame).encode(row.tobytes())
+    assert data is not None  # as `random_row` has checked
+    return data
+
+
+def random_row(
+    sensor: SensorDescription,
+    frame: str,
+    source: random.Random,
+    drawn: Drawn = NOTHING,
+    tries: int = TRIES,
+) -> tuple[Layout, NDArray[np.uint8]]:
+    """Return a random header's layout, and a valid struct of it, (size,).
+
+    Args:
+        frame: a type with layouts and without parts.
+        drawn: field path -> what draws its raw value.
+        tries: how often random frames are made, and then how often frames along the sweep.
+
+    Raises:
+        SpecError: if none of them is plausible.
+    """
+    engine = get_codec(sensor.frames[frame])
     for attempt in range(
-        TRIES if sensor.simulation_of(frame).sweep is None else TRIES_BEFORE_SWEEP
+        tries if sensor.simulation_of(frame).sweep is None else min(tries, TRIES_BEFORE_SWEEP)
     ):
         layout, chosen = make_random_header(engine, source, drawn)
         number = min(GROWTH**attempt, LARGEST_BATCH, max(BATCH_BYTES // max(layout.size, 1), 1))
         rows = _random(engine, layout, number, source)
         _store_drawn(layout, rows, chosen, drawn, source)
-        plausible_rows = _plausible(sensor, frame, layout, _set_headers(rows, layout, chosen))
-        if plausible_rows:
-            return plausible_rows[0]
-    return _make_along_sweep(sensor, frame, engine, source, drawn)
+        rows = _set_headers(rows, layout, chosen)
+        rows = rows[valid_mask(sensor, frame, layout, rows)]
+        row = _first_encodable(sensor, frame, rows)
+        if row is not None:
+            return layout, row
+    return _make_along_sweep(sensor, frame, engine, source, drawn, tries)
 
 
 def make_random_header(
@@ -104,7 +130,7 @@ def make_random_header(
     Raises:
         SpecError: where hundreds of headers give no frame.
     """
-    keys = sorted(_switch_keys(engine.frame.tree))
+    keys = sorted(switch_keys(engine.frame.tree))
     for _ in range(HEADERS):
         with contextlib.suppress(TooLongError, ArithmeticError, LookupError, TypeError, ValueError):
             return _header(engine.frame, source, drawn, keys)
@@ -131,7 +157,7 @@ def _header(
                 values[unknown.leaf.info.path] = _some_value(source, unknown.leaf, keys)
 
 
-def _switch_keys(root: Node) -> Iterator[int]:
+def switch_keys(root: Node) -> Iterator[int]:
     """Yield the values of keys that have no name: fields are known to have those with one."""
     for node in nodes(root):
         if isinstance(node, Select):
@@ -192,11 +218,20 @@ def _random(engine: Codec, layout: Layout, number: int, source: random.Random) -
     return rows
 
 
-def _make_of_values(
-    sensor: SensorDescription, frame: str, engine: Codec, source: random.Random, drawn: Drawn
+def make_of_values(
+    sensor: SensorDescription,
+    frame: str,
+    source: random.Random,
+    drawn: Drawn,
+    tries: int = LARGEST_BATCH * TRIES,
 ) -> bytes:
-    """Return a frame with parts, or without layouts: its values are drawn one by one."""
-    for _ in range(LARGEST_BATCH * TRIES):
+    """Return a frame with parts, or without layouts: its values are drawn one by one.
+
+    Raises:
+        SpecError: if none of so many tries gives a valid frame.
+    """
+    engine = get_codec(sensor.frames[frame])
+    for _ in range(tries):
         try:
             values = random_value(engine.frame.prepared, source, drawn)
             data = build(sensor, frame, _left_open(values, engine.frame.tree), {})
@@ -251,38 +286,51 @@ def _set_headers(
     return rows
 
 
-def _plausible(
+def valid_mask(
     sensor: SensorDescription, frame: str, layout: Layout, rows: NDArray[np.uint8]
-) -> list[bytes]:
+) -> NDArray[np.bool_]:
+    """Return for each struct, with constants and checksums, whether its values are allowed, (n,).
+
+    Raises:
+        SpecError: if `plausible` raises.
+    """
+    declared = sensor.frames[frame]
     if layout.conditions:
-        rows = rows[layout.meets(rows)]
+        mask = layout.meets(rows)
+    else:
+        mask = np.ones(len(rows), np.bool_)
+    if declared.plausible is None:
+        return mask
+    rows = rows[mask]
     table = CompiledTable(
-        get_codec(sensor.frames[frame]).schema, [LayoutRows(layout, np.arange(len(rows)), rows)]
+        get_codec(declared).schema, [LayoutRows(layout, np.arange(len(rows)), rows)]
     )
-    if sensor.frames[frame].plausible is None:
-        return _sent(sensor, frame, layout, rows)
     errors: list[PluginError] = []
-    good = np.flatnonzero(check_plausibility(sensor.frames[frame], table, errors) == 0)
+    mask[mask] = check_plausibility(declared, table, errors) == 0
     if errors:
         raise SpecError(
             errors[0].reason, path=f"{frame}.plausible", sensor=sensor.id, rule=errors[0].rule
         )
-    return _sent(sensor, frame, layout, rows[good])
+    return mask
 
 
-def _sent(
-    sensor: SensorDescription, frame: str, layout: Layout, rows: NDArray[np.uint8]
-) -> list[bytes]:
-    """Return the first frame that can be written in the form of its type, or none."""
+def _first_encodable(
+    sensor: SensorDescription, frame: str, rows: NDArray[np.uint8]
+) -> NDArray[np.uint8] | None:
+    """Return the first struct that can be written in the form of its type, or None."""
     encode = frame_coder(sensor.frames[frame]).encode
-    frames = (encode(row.tobytes()) for row in rows)
-    return next(([data] for data in frames if data is not None), [])
+    return next((row for row in rows if encode(row.tobytes()) is not None), None)
 
 
 def _make_along_sweep(
-    sensor: SensorDescription, frame: str, engine: Codec, source: random.Random, drawn: Drawn
-) -> bytes:
-    """Return a frame with the values that the sensor's `sweep` declares.
+    sensor: SensorDescription,
+    frame: str,
+    engine: Codec,
+    source: random.Random,
+    drawn: Drawn,
+    tries: int,
+) -> tuple[Layout, NDArray[np.uint8]]:
+    """Return a layout and a struct with the values that the sensor's `sweep` declares.
 
     It is used if random values are never plausible.
     """
@@ -293,7 +341,7 @@ def _make_along_sweep(
             path=frame,
             sensor=sensor.id,
         )
-    for _ in range(TRIES):
+    for _ in range(tries):
         values = sweep(source.randrange(10_000))
         layout, chosen = make_random_header(
             engine, source, {**_draw_stated(engine, values), **drawn}
@@ -304,9 +352,11 @@ def _make_along_sweep(
             if leaf is not None and path not in chosen:
                 _store_swept(leaf, rows, value)
         _store_drawn(layout, rows, chosen, drawn, source)
-        plausible_rows = _plausible(sensor, frame, layout, _set_headers(rows, layout, chosen))
-        if plausible_rows:
-            return plausible_rows[0]
+        rows = _set_headers(rows, layout, chosen)
+        rows = rows[valid_mask(sensor, frame, layout, rows)]
+        row = _first_encodable(sensor, frame, rows)
+        if row is not None:
+            return layout, row
     raise SpecError(
         "neither random frames nor frames of `sweep` pass `plausible`",
         path=frame,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import io
 import re
 import sys
@@ -531,6 +532,8 @@ def random_value(
     all other frames are random bytes in a layout.
 
     Args:
+        source: if it has the methods `draw_number` and `draw_elements`, they draw integers,
+            floats and arrays.
         drawn: field path -> what draws its value in place of chance.
         scope: what its expressions see.
     """
@@ -568,7 +571,10 @@ def random_value(
     if isinstance(con, Array):
         count = check_bound(construct.evaluate(con.count, scope), con.limit, "count", path)
         check_bound(count * _elements(con.subcon, scope), con.limit, "count", path)
-        return [random_value(con.subcon, source, drawn, scope, path) for _ in range(count)]
+        draw_one = functools.partial(random_value, con.subcon, source, drawn, scope, path)
+        if hasattr(source, "draw_elements"):
+            return source.draw_elements(count, draw_one)
+        return [draw_one() for _ in range(count)]
     if isinstance(con, construct.IfThenElse):
         return random_value(
             con.thensubcon if construct.evaluate(con.condfunc, scope) else con.elsesubcon,
@@ -601,7 +607,7 @@ def random_value(
             None,
         )
     if isinstance(con, construct.NullTerminated) or not isinstance(con, Subconstruct):
-        return _random_leaf(con, source, scope)
+        return _random_leaf(con, source, scope, path)
     if isinstance(con, construct.Adapter):
         return remove_private(
             con.parse(con.subcon.build(random_value(con.subcon, source, drawn, scope, path)))
@@ -662,7 +668,17 @@ def _random_part(con: Construct, source: random.Random, drawn: Drawn, scope: Any
     return random_value(con, source, drawn, scope, path)
 
 
-def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
+def _number_kind(con: Construct) -> str:
+    """Return "f" for a float, "i" for a signed and "u" for an unsigned integer."""
+    if not isinstance(con, FormatField):
+        return "i" if con.signed else "u"
+    code = con.fmtstr[-1]
+    if code in "efd":
+        return "f"
+    return "i" if code.islower() else "u"
+
+
+def _random_leaf(con: Construct, source: random.Random, scope: Any, path: str) -> Any:
     if con is construct.Pass or isinstance(con, construct.Check | PaddingField | Reserved):
         # whether a Check holds, and how much there is to fill, is seen when the frame is built
         return None
@@ -678,6 +694,8 @@ def _random_leaf(con: Construct, source: random.Random, scope: Any) -> Any:
         return source.randbytes(
             check_bound(construct.evaluate(con.length, scope), con.limit, "length", "")
         )
+    if hasattr(source, "draw_number") and isinstance(con, FormatField | BytesInteger | BitsInteger):
+        return source.draw_number(path, bit_width(con), _number_kind(con))
     if (
         isinstance(con, FormatField | BytesInteger | BitsInteger) and source.random() < 0.5
     ):  # it may be a count

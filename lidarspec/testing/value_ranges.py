@@ -1,0 +1,446 @@
+"""The valid values of the fields of one layout, for strategies that draw them field by field.
+
+Frames can break the conditions of a struct and the sensor's `plausible`. Both are functions that
+only accept or refuse a whole frame. So one valid frame is searched first, the *base*. Then each
+field is varied alone in it: the range of a field reaches from its base value to the first value
+that is refused, found by bisection. Values from these ranges mostly fit together. If they do not,
+`LayoutRanges.repair` takes as many of them as the base allows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import functools
+import itertools
+import random
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarspec.errors import LidarSpecError, SpecError
+from lidarspec.frames.build import build
+from lidarspec.frames.layout import Layout, Leaf
+from lidarspec.frames.layout_tree import UnknownSelectorError, layout_of
+from lidarspec.frames.parse import parse
+from lidarspec.frames.wire_coder import frame_coder
+from lidarspec.framing.example_frames import make_of_values, random_row, return_raw, valid_mask
+from lidarspec.framing.frame_engine import get_codec
+from lidarspec.framing.results import VALID
+from lidarspec.sensor_operations import Sensor
+from lidarspec.spec.tree import formulas, nodes, refs
+
+#: Number of tries to find a valid frame with a header, which may have none.
+TRIES = 5
+#: Raw values of a field, (1, ...) as its arrays are.
+Values = NDArray[Any]
+#: Maximum number of bytes of the frames that are tried at a time.
+BATCH_BYTES = 1 << 22
+
+
+class LayoutRanges:
+    """The valid values of the fields of one layout.
+
+    Args:
+        header: raw values of the fields that the layout depends on, by path.
+        base: a valid struct of the layout, (size,).
+
+    Attributes:
+        layout: the layout.
+        free: the fields to draw: those that the header, constants, lengths and checksums do not
+            decide.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        frame: str,
+        layout: Layout,
+        header: Mapping[str, int],
+        base: NDArray[np.uint8],
+    ) -> None:
+        self._sensor = sensor
+        self._frame = frame
+        self._header = header
+        self._base = base.reshape(1, -1)
+        self.layout = layout
+        decided = {*header, *(leaf.info.path for leaf, _ in layout.following)}
+        for seal in layout.seals:
+            decided.update(leaf.info.path for leaf in seal.leaves)
+        self.free = [
+            leaf
+            for path, leaf in layout.leaves.items()
+            if path not in decided and leaf.info.const is None and 0 not in leaf.shape
+        ]
+
+    def make_struct(self, values: Mapping[str, Values], fixed: Container[str]) -> bytes | None:
+        """Return the struct with these values, or with the closest ones that are valid.
+
+        Args:
+            fixed: the fields that keep their values; None is returned if no struct has them.
+        """
+        row = self._rows([values])
+        if self._valid(row)[0]:
+            return row.tobytes()
+        kept = {path: value for path, value in values.items() if path in fixed}
+        if kept and not self._valid(self._rows([kept]))[0]:
+            others = self._with_base_of(kept)
+            return None if others is None else others.make_struct(values, ())
+        return self._rows([self.repair(values, kept)]).tobytes()
+
+    def _with_base_of(self, values: Mapping[str, Values]) -> LayoutRanges | None:
+        """Return ranges whose base has these values, None if no valid struct is found."""
+        fixed = {path: functools.partial(return_raw, raw) for path, raw in self._header.items()}
+        for path, value in values.items():
+            elements = itertools.cycle(value.flat)
+            fixed[path] = functools.partial(lambda known, _: next(known), elements)
+        with contextlib.suppress(SpecError):
+            layout, row = random_row(self._sensor, self._frame, random.Random(0), fixed)
+            return LayoutRanges(self._sensor, self._frame, layout, self._header, row)
+        return None
+
+    def repair(
+        self, values: Mapping[str, Values], fixed: Mapping[str, Values]
+    ) -> Mapping[str, Values]:
+        """Return the fixed values, and those of the others that are valid together with them.
+
+        The base has values for the rest. A field in an array keeps the elements that are valid.
+        """
+        kept = dict(fixed)
+        for leaf in self.free:
+            path = leaf.info.path
+            if path not in values or path in kept:
+                continue
+            if self._valid(self._rows([{**kept, path: values[path]}]))[0]:
+                kept[path] = values[path]
+            elif leaf.shape:
+                mixed = self._mix(kept, leaf, values[path])
+                if self._valid(self._rows([{**kept, path: mixed}]))[0]:
+                    kept[path] = mixed
+        return kept
+
+    def _mix(self, kept: Mapping[str, Values], leaf: Leaf, values: Values) -> Values:
+        """Return the elements of an array that are valid one by one, the others as in the base."""
+        base = leaf.load(self._base)
+        mixed = base.copy()
+        tried = []
+        for index in range(values.size):
+            one = base.copy()
+            one.flat[index] = values.flat[index]
+            tried.append({**kept, leaf.info.path: one})
+        for index, is_valid in enumerate(self._each_valid(tried)):
+            if is_valid:
+                mixed.flat[index] = values.flat[index]
+        return mixed
+
+    @functools.cached_property
+    def ranges(self) -> Mapping[str, tuple[int, int]]:
+        """The lowest and the highest raw value of each free field of integers or bytes, by path."""
+        if not self._has_rules:
+            return {
+                leaf.info.path: _limits(leaf)
+                for leaf in self.free
+                if leaf.info.kind in ("int", "bytes")
+            }
+        bounded = [
+            leaf
+            for leaf in self.free
+            if leaf.info.kind in ("int", "bytes") and leaf.info.allowed is None
+        ]
+        # A small value may only be valid beside other small ones, and a large one beside large
+        # ones, so that the base is varied as it was found and with small values.
+        ends = [self._find_ranges(bounded)]
+        if self._shrink_base(bounded):
+            ends.append(self._find_ranges(bounded))
+        ranges = {}
+        for leaf in bounded:
+            own = [found[leaf.info.path] for found in ends]
+            ranges[leaf.info.path] = min(low for low, _ in own), max(high for _, high in own)
+        return ranges
+
+    def _find_ranges(self, leaves: Sequence[Leaf]) -> dict[str, tuple[int, int]]:
+        """Return the range of each field with the other fields as in the base."""
+        starts = {leaf.info.path: int(leaf.load(self._base).flat[0]) for leaf in leaves}
+        lowest = {leaf.info.path: (starts[leaf.info.path], _limits(leaf)[0]) for leaf in leaves}
+        highest = {leaf.info.path: (starts[leaf.info.path], _limits(leaf)[1]) for leaf in leaves}
+        low = find_ends(lowest, self._take)
+        high = find_ends(highest, self._take)
+        return {path: (low[path], high[path]) for path in starts}
+
+    def _shrink_base(self, leaves: Sequence[Leaf]) -> bool:
+        """Bring each field of the base as close to 0 as possible; return whether any changed."""
+        before = self._base.copy()
+        for leaf in leaves:
+            path = leaf.info.path
+            start = int(leaf.load(self._base).flat[0])
+            found = find_ends({path: (start, 0)}, self._take)[path]
+            (is_valid,) = self._take([(path, found)])
+            if is_valid:
+                values = np.broadcast_to(np.array(found, leaf.info.dtype), (1, *leaf.shape))
+                self._base = self._rows([{path: values}])
+        return bool((self._base != before).any())
+
+    @property
+    def _has_rules(self) -> bool:
+        """Whether any values of these fields are refused."""
+        declared = self._sensor.frames[self._frame]
+        return bool(
+            declared.plausible is not None or declared.wire is not None or self.layout.conditions
+        )
+
+    def _take(self, values: Sequence[tuple[str, int]]) -> list[bool]:
+        """Return for each (path, value) whether the base is valid with it in all elements."""
+        tried = []
+        for path, value in values:
+            leaf = self.layout.leaves[path]
+            full = np.broadcast_to(np.array(value, leaf.info.dtype), (1, *leaf.shape))
+            tried.append({path: full})
+        return list(self._each_valid(tried))
+
+    def _each_valid(self, tried: list[dict[str, Values]]) -> Iterator[bool]:
+        """Yield for each set of values whether the base is valid with it."""
+        step = max(BATCH_BYTES // self.layout.size, 1)
+        for start in range(0, len(tried), step):
+            yield from self._valid(self._rows(tried[start : start + step])).tolist()
+
+    def _rows(self, values: list[Any]) -> NDArray[np.uint8]:
+        """Return the base with each of these sets of values, one a row, with checksums."""
+        rows = np.repeat(self._base, len(values), 0)
+        for index, own in enumerate(values):
+            for path, raw in own.items():
+                self.layout.leaves[path].store(rows[index : index + 1], raw)
+        for path, number in self._header.items():
+            self.layout.leaves[path].store(rows, number)
+        self.layout.seal(rows)
+        return rows
+
+    def _valid(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Return for each row whether it is valid, (n,)."""
+        return _are_valid(self._sensor, self._frame, self.layout, rows)
+
+
+def find_ends(
+    wanted: Mapping[str, tuple[int, int]],
+    take: Callable[[Sequence[tuple[str, int]]], Sequence[bool]],
+) -> dict[str, int]:
+    """Return the last valid value of each field on the way from a valid value to another one.
+
+    Args:
+        wanted: path -> a valid value, and the end of the way.
+        take: returns for each (path, value) whether it is valid.
+    """
+    valid = {path: start for path, (start, _) in wanted.items()}
+    refused: dict[str, int] = {}
+    ends = [(path, end) for path, (start, end) in wanted.items() if start != end]
+    for (path, end), is_valid in zip(ends, take(ends), strict=True):
+        if is_valid:
+            valid[path] = end
+        else:
+            refused[path] = end
+    while True:
+        middles = [
+            (path, (valid[path] + end) // 2)
+            for path, end in refused.items()
+            if abs(end - valid[path]) > 1
+        ]
+        if not middles:
+            return valid
+        for (path, middle), is_valid in zip(middles, take(middles), strict=True):
+            if is_valid:
+                valid[path] = middle
+            else:
+                refused[path] = middle
+
+
+#: Number of random frames whose headers are known to be valid, or that are valid themselves.
+KNOWN_HEADERS = 16
+KNOWN_FRAMES = 4
+#: Number of tries for each frame without layouts.
+WALKS = 300
+#: Number of frames without layouts of which one is valid if such frames are often valid.
+SINGLE_WALKS = 10
+
+
+@functools.lru_cache(maxsize=4096)
+def ranges_of(
+    sensor: Sensor, frame: str, header: tuple[tuple[str, int], ...]
+) -> LayoutRanges | None:
+    """Return the ranges of the frames with a header; None if no valid one is found.
+
+    Args:
+        frame: a type with layouts and without parts.
+        header: path and raw value of each field that the layout depends on.
+    """
+    values = dict(header)
+    layout = _layout(sensor, frame, values)
+    rows = np.zeros((1, layout.size), np.uint8)
+    frame_coder(sensor.frames[frame]).make_encodable(rows, layout)
+    for leaf in layout.leaves.values():
+        if leaf.info.initial:
+            leaf.store(rows, leaf.info.initial)
+    for path, value in header:
+        layout.leaves[path].store(rows, value)
+    layout.seal(rows)
+    if _are_valid(sensor, frame, layout, rows)[0]:
+        return LayoutRanges(sensor, frame, layout, values, rows[0])
+    fixed = {path: functools.partial(return_raw, value) for path, value in header}
+    with contextlib.suppress(SpecError):
+        layout, row = random_row(sensor, frame, random.Random(0), fixed, tries=TRIES)
+        return LayoutRanges(sensor, frame, layout, values, row)
+    return None
+
+
+@functools.lru_cache(maxsize=1024)
+def known_headers(sensor: Sensor, frame: str) -> list[tuple[tuple[str, int], ...]]:
+    """Return the headers of a few random frames, each once, the shortest frame first.
+
+    Raises:
+        SpecError: if no random frame is plausible.
+    """
+    sizes: dict[tuple[tuple[str, int], ...], int] = {}
+    for seed in range(KNOWN_HEADERS):
+        layout, row = random_row(sensor, frame, random.Random(seed))
+        sizes[_header_of(sensor, frame, row.tobytes())] = layout.size
+    return sorted(sizes, key=lambda header: (sizes[header], header))
+
+
+def _header_of(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, int], ...]:
+    """Return the fields of a struct that its layout depends on, with their values."""
+    values: dict[str, int] = {}
+    while True:
+        try:
+            _layout(sensor, frame, values)
+        except UnknownSelectorError as unknown:
+            leaf = unknown.leaf
+            if isinstance(leaf, Leaf):
+                values[leaf.info.path] = leaf.scalar(struct)
+        else:
+            return tuple(values.items())
+
+
+def _layout(sensor: Sensor, frame: str, header: Mapping[str, int]) -> Layout:
+    declared = sensor.frames[frame]
+    return layout_of(declared.tree, header, declared.room)
+
+
+def _are_valid(
+    sensor: Sensor, frame: str, layout: Layout, rows: NDArray[np.uint8]
+) -> NDArray[np.bool_]:
+    """Return for each struct whether it is valid and can be written in the form of its type."""
+    mask = valid_mask(sensor, frame, layout, rows)
+    declared = sensor.frames[frame]
+    if declared.wire is not None:
+        encode = frame_coder(declared).encode
+        for index in np.flatnonzero(mask):
+            mask[index] = encode(rows[index].tobytes()) is not None
+    return mask
+
+
+@functools.lru_cache(maxsize=1024)
+def known_frames(sensor: Sensor, frame: str) -> list[bytes]:
+    """Return a few valid frames without layouts, the shortest one first; none if none is found."""
+    found: set[bytes] = set()
+    with contextlib.suppress(SpecError):
+        for seed in range(KNOWN_FRAMES):
+            found.add(make_of_values(sensor, frame, random.Random(seed), {}, tries=WALKS))
+    return sorted(found, key=lambda data: (len(data), data))
+
+
+@functools.lru_cache(maxsize=1024)
+def is_often_valid(sensor: Sensor, frame: str) -> bool:
+    """Return whether some of a few random frames without layouts are valid."""
+    return any(_is_walk_valid(sensor, frame, seed) for seed in range(SINGLE_WALKS))
+
+
+def _is_walk_valid(sensor: Sensor, frame: str, seed: int) -> bool:
+    try:
+        make_of_values(sensor, frame, random.Random(seed), {}, tries=1)
+    except SpecError:
+        return False
+    return True
+
+
+@functools.lru_cache(maxsize=1024)
+def ranges_of_values(sensor: Sensor, frame: str) -> Mapping[str, tuple[int, int]]:
+    """Return the lowest and the highest raw value of integer fields of a frame without layouts.
+
+    They are found by changing one valid frame. Fields that decide what follows, such as counts,
+    are left out, and fields that can have no other value in that frame.
+    """
+    if sensor.frames[frame].plausible is None:
+        return {}
+    known = known_frames(sensor, frame)
+    if not known:
+        return {}
+    engine = get_codec(sensor.frames[frame])
+    base = parse(sensor, known[0], frame=frame)
+    rules = [formula for node in nodes(engine.frame.tree) for formula in formulas(node)]
+    deciding = {ref.path for rule in rules for ref in refs(rule)}
+    bounded = {
+        path: (info, values[0])
+        for path, info in engine.schema.all_fields.items()
+        if info.kind == "int"
+        and info.const is None
+        and info.rebuilt is None
+        and path not in deciding
+        and (values := list(_values_at(base, path.split("."))))
+    }
+
+    def take(tried: Sequence[tuple[str, int]]) -> list[bool]:
+        return [_builds(sensor, frame, _with_value(base, path, value)) for path, value in tried]
+
+    low = find_ends({path: (raw, info.limits[0]) for path, (info, raw) in bounded.items()}, take)
+    high = find_ends({path: (raw, info.limits[1]) for path, (info, raw) in bounded.items()}, take)
+    return {path: (low[path], high[path]) for path in bounded if low[path] < high[path]}
+
+
+def _values_at(parsed: Any, names: Sequence[str]) -> Iterator[int]:
+    """Yield the integers of a field of a parsed frame, in all elements of its arrays."""
+    if isinstance(parsed, list):
+        for element in parsed:
+            yield from _values_at(element, names)
+    elif names and isinstance(parsed, dict):
+        yield from _values_at(parsed.get(names[0]), names[1:])
+    elif not names and isinstance(parsed, int | str):
+        yield int(parsed)
+
+
+def _with_value(parsed: Any, path: str, value: int) -> Any:
+    """Return a copy of a parsed frame with another value of a field, in all elements."""
+    changed = copy.deepcopy(parsed)
+    *parents, name = path.split(".")
+    for holder in _holders(changed, parents):
+        if name in holder:
+            is_array = isinstance(holder[name], list)
+            holder[name] = [value] * len(holder[name]) if is_array else value
+    return changed
+
+
+def _holders(parsed: Any, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the mappings at a path of a parsed frame."""
+    if isinstance(parsed, list):
+        for element in parsed:
+            yield from _holders(element, names)
+    elif isinstance(parsed, dict) and names:
+        yield from _holders(parsed.get(names[0]), names[1:])
+    elif isinstance(parsed, dict):
+        yield parsed
+
+
+def _builds(sensor: Sensor, frame: str, values: Any) -> bool:
+    """Return whether values build a valid frame."""
+    try:
+        data = build(sensor, frame, values, {})
+    except LidarSpecError:
+        return False
+    engine = get_codec(sensor.frames[frame])
+    status = engine.survey(np.frombuffer(data, np.uint8), np.zeros(1, np.intp)).status
+    return bool(status[0] == VALID)
+
+
+def _limits(leaf: Leaf) -> tuple[int, int]:
+    if leaf.info.kind == "bytes":
+        return 0, 255
+    return leaf.info.limits
