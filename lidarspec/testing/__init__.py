@@ -20,7 +20,8 @@ order:
 * `streams`: streams of frames, decoded twice and in batches.
 * `cloud_assertions`: assertions about point clouds.
 * `vectors`: golden frames from a manual or capture.
-* `strategies`: Hypothesis strategies for authors; `value_ranges`: the values that fit together.
+* `strategies`: Hypothesis strategies for authors.
+* `value_ranges`: the values that fit together in one layout.
 * `check`: all of it without pytest, for a name, file, distribution or folder.
 * `pytest_plugin`, `fixtures`: fixtures for pytest; simulated sensors on real ports.
 """
