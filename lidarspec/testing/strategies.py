@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import SpecError, UnknownCommand, UnknownFrame, UsageError
 from lidarspec.frames.commands import ArgumentSlot, argument_slot
 from lidarspec.frames.layout import Leaf
-from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, layout_of
+from lidarspec.frames.layout_tree import TooLongError, UnknownSelectorError, find_layout
 from lidarspec.frames.parse import parse
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.example_frames import make_of_values, switch_keys
@@ -366,7 +366,7 @@ def _headers(draw: DrawFn, sensor: Sensor, frame: str, fields: Fields) -> Header
     asked = ""
     while True:
         try:
-            layout_of(declared.tree, header, declared.room)
+            find_layout(declared.tree, header, declared.room)
         except UnknownSelectorError as unknown:
             info = unknown.leaf.info
             asked = info.path

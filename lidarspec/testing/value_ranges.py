@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lidarspec.errors import LidarSpecError, SpecError
 from lidarspec.frames.build import build
 from lidarspec.frames.layout import Layout, Leaf
-from lidarspec.frames.layout_tree import UnknownSelectorError, layout_of
+from lidarspec.frames.layout_tree import UnknownSelectorError, find_layout
 from lidarspec.frames.parse import parse
 from lidarspec.frames.wire_coder import frame_coder
 from lidarspec.framing.example_frames import make_of_values, random_row, return_raw, valid_mask
@@ -322,7 +322,7 @@ def _header_of(sensor: Sensor, frame: str, struct: bytes) -> tuple[tuple[str, in
 
 def _layout(sensor: Sensor, frame: str, header: Mapping[str, int]) -> Layout:
     declared = sensor.frames[frame]
-    return layout_of(declared.tree, header, declared.room)
+    return find_layout(declared.tree, header, declared.room)
 
 
 def _are_valid(
