@@ -26,7 +26,7 @@ import handwritten_packets, handwritten_serial
 import numpy as np
 from inputs import Inputs
 from packet_workloads import BY_HAND, FIXED
-from lidarspec.simulation.simulator import opening
+from lidarspec.simulation.simulator import make_opening_frame
 
 inputs = Inputs(Path(sys.argv[2]), quick=True)
 
@@ -41,7 +41,7 @@ for key, function in BY_HAND.items():
     alike(key, inputs.array(key), function(inputs.array(key)))
 alike("stl27l", inputs.noisy("stl27l").data, handwritten_serial.stl27l_stream(inputs.noisy("stl27l").data))
 alike("m1c1", inputs.stream("m1c1"), handwritten_serial.m1c1_stream(inputs.stream("m1c1")))
-first = len(opening(inputs.sensor("rplidar")))
+first = len(make_opening_frame(inputs.sensor("rplidar")))
 alike("rplidar", inputs.stream("rplidar"), handwritten_serial.rplidar_stream(inputs.stream("rplidar"), first))
 assert handwritten_packets.payloads(inputs.capture("m1")).tobytes() == b"".join(inputs.frames("m1"))
 print("payloads")

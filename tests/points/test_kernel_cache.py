@@ -151,8 +151,8 @@ def test_a_folder_of_another_user_is_not_used(folder: Path) -> None:
 FULL = """
 import resource, signal
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-from lidarspec.points.numba_kernels.kernels import function_of
-print(function_of({source!r})(41))
+from lidarspec.points.numba_kernels.kernels import compile_source
+print(compile_source({source!r})(41))
 """
 
 
