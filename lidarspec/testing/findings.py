@@ -259,6 +259,6 @@ def list_unacknowledged(findings: list[Finding], sensor: Sensor, *, whole: bool)
                 else:
                     problem = "does not occur"
                 left.append(
-                    Finding("LS209", f"{key!r} is acknowledged, and {problem}", place, sensor.id)
+                    Finding("LS209", f"{key!r} is acknowledged, but {problem}", place, sensor.id)
                 )
     return left

@@ -170,7 +170,7 @@ def the_status_is_proven(subject: SensorUnderTest) -> None:
     """
     missing = lacking(subject)
     status = subject.sensor.status
-    require(status != "vectors" or not missing, "LS710", f"status is {status!r}, and {missing}")
+    require(status != "vectors" or not missing, "LS710", f"status is {status!r}, but: {missing}")
 
 
 def every_data_field_is_pinned_down(subject: SensorUnderTest, name: str) -> None:

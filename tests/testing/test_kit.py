@@ -397,10 +397,10 @@ def test_a_status_is_proven_by_vectors_of_its_own() -> None:
         json.loads(BY_VECTORS.read_text(encoding="utf-8")),
     )
     assert list_lacking(proven, None) == [
-        "LS710 : status is 'vectors', and no file of golden vectors"
+        "LS710 : status is 'vectors', but: no file of golden vectors"
     ]
     assert list_lacking(proven, [{**entry, "sensor": "broken-two"} for entry in known]) == [
-        "LS710 : status is 'vectors', and vectors.json has no vectors of broken-one"
+        "LS710 : status is 'vectors', but: vectors.json has no vectors of broken-one"
     ]
     assert (
         list_lacking(
