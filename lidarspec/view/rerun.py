@@ -59,7 +59,7 @@ def _open(log: RerunRecording, target: str) -> None:
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
         raise suggest(
-            UsageError("Rerun's viewer requires a display, and none was found"),
+            UsageError("Rerun's viewer requires a display"),
             "lidarspec view SOURCE --rerun -o scans.rrd",
         )
     else:

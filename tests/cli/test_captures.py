@@ -185,7 +185,7 @@ def test_senders_of_one_address_are_separated_by_port(tmp_path: Path) -> None:
             == 20
         )
     assert (
-        "2 senders were recorded"
+        "the datagrams of 2 senders"
         in ran("replay", recording, "--to", "udp://127.0.0.1:9", "--speed", "max").stderr
     )
 

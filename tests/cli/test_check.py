@@ -97,7 +97,9 @@ def test_a_file_with_the_id_of_an_installed_sensor_names_its_plugin(tmp_path: Pa
         "camsense-x1",
     ]
     assert {finding["code"] for finding in loading["findings"]} == {"LS005"}
-    said = "lidarspec-camsense has the same id (lidarspec.sensors = lidarspec_camsense)"
+    said = (
+        "the installed lidarspec-camsense has the same id (lidarspec.sensors = lidarspec_camsense)"
+    )
     assert loading["findings"][0]["what"] == said
     assert all(finding["line"] for finding in loading["findings"])
     assert not any(report["findings"] for report in others)

@@ -73,7 +73,7 @@ def test_of_a_long_recording_the_beginning_and_the_end_are_read(tmp_path: Path) 
     assert told["contents"][0]["sensors"] == ["ldrobot-stl27l"]
     text = ran("info", path).stdout
     assert "named in the file" in text
-    assert "what is counted is of its beginning" in text
+    assert "only its beginning is counted" in text
 
 
 @pytest.mark.slow

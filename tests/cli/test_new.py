@@ -128,7 +128,7 @@ def test_its_own_tests_pass(made: Path) -> None:
 def test_it_is_found_shown_simulated_and_converted(made: Path) -> None:
     assert "lidarspec.sensors = lidarspec_acme_x1" in run(made, "lidarspec", "plugins")
     shown = run(made, "lidarspec", "show", "acme-x1")
-    assert "command speed speed=5..15, answered by ack" in shown
+    assert "command speed speed=5..15, reply ack" in shown
     assert "CRC-16 poly 0x1021 init 0xffff over all other bytes" in shown
     suffix = "pcap" if "udp 2370" in shown else "bin"
     run(made, "lidarspec", "sim", "acme-x1", "--to", made / f"sent.{suffix}", "-t", "0.5s")

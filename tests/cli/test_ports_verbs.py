@@ -148,10 +148,10 @@ class TestDetect:
         )
         found = ran("detect", path, code=4)
         assert "sync      99 88 77" in found.stdout
-        assert "26 bytes each: 60 of them" in found.stdout
+        assert "26 bytes each: 60 frames" in found.stdout
         assert (
             "checksum  Crc(width=16, poly=0x8005, init=0xFFFF, refin=True, refout=True) in the last"
-            " 2 bytes: right in 60 of 60" in found.stdout
+            " 2 bytes: correct in 60 of 60" in found.stdout
         )
         told = json.loads(ran("detect", path, "--json", code=4).stdout)
         assert (told["sources"][0]["sensor"], told["structure"]["period"]) == (None, 26)
@@ -291,7 +291,7 @@ class TestDoctor:
                 "text": (
                     "/dev/ttyNONE7: no such port; check that it is plugged in, and its driver"
                 ),
-                "mend": "lidarspec ports",
+                "fix": "lidarspec ports",
             }
         ]
         with virtual_port("ldrobot-stl27l") as made:
@@ -305,9 +305,7 @@ class TestDoctor:
                 assert other.stdout is not None
                 assert other.stdin is not None
                 other.stdout.readline()
-                texts = {
-                    finding["mend"]: finding["text"] for finding in self._run_doctor(made.path)
-                }
+                texts = {finding["fix"]: finding["text"] for finding in self._run_doctor(made.path)}
                 other.stdin.close()
         assert f"(process {other.pid})" in texts[f"kill {other.pid}"]
 
@@ -341,9 +339,7 @@ class TestDoctor:
             number = free.getsockname()[1]
         silent = self._run_doctor(f"udp://127.0.0.1:{number}", "-t", "300ms")
         assert any("no data received" in finding["text"] for finding in silent)
-        assert any(
-            "only packets to 127.0.0.1 are listened to" in finding["text"] for finding in silent
-        )
+        assert any("receives only packets to 127.0.0.1" in finding["text"] for finding in silent)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             frames = simulate(ls.sensor("robosense-m1"), 40)
             with working(

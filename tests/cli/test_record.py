@@ -151,7 +151,7 @@ def test_recorded_replayed_and_recorded_again_it_is_the_same(
     stream: Path, tmp_path: Path, started: Callable[..., Running]
 ) -> None:
     player = started("replay", stream, "--json")
-    place = player.hears(r"playing \S+ to (/dev/\S+),")[1]
+    place = player.hears(r"replaying \S+ to (/dev/\S+) when")[1]
     assert player.hears("next: (.*)")[1] == f"lidarspec view {place} -s {STREAM}"
     again = tmp_path / "again.lsr"
     ran("record", place, "-s", STREAM, "-o", again, "-n", 40)
@@ -413,7 +413,7 @@ def test_a_loop_serves_one_reader_after_another_until_ctrl_c(
     stream: Path, tmp_path: Path, started: Callable[..., Running]
 ) -> None:
     player = started("replay", stream, "--loop")
-    place = player.hears(r"playing \S+ to (/dev/\S+),")[1]
+    place = player.hears(r"replaying \S+ to (/dev/\S+) when")[1]
     for number, name in enumerate(("one.lsr", "two.lsr"), start=1):
         ran("record", place, "-s", STREAM, "-o", tmp_path / name, "-n", 60)
         assert read_received(tmp_path / name).startswith(read_received(stream))

@@ -465,7 +465,7 @@ def test_the_counter_that_never_jumps_is_taken_and_the_others_are_offered() -> N
         for i in range(200)
     ]
     assert (
-        'sequence=Sequence("counter_4"),  # a jump in it is a loss; or counter_2'
+        'sequence=Sequence("counter_4"),  # a jump is a loss; or counter_2'
         in written(frames)["arguments"]
     )
 

@@ -154,7 +154,7 @@ def test_colours_are_for_terminals_and_not_with_no_color() -> None:
     shown = {}
     for colour in ("", "1"):
         with terminal.Terminal(*words, columns=120, lines=60, NO_COLOR=colour) as window:
-            assert window.ended() == 4
+            assert window.wait_until_end() == 4
             shown[colour] = window.raw
     assert re.search(r"\x1b\[[0-9;]*3[1-7]m", shown[""])
     assert not re.search(r"\x1b\[[0-9;]*3[1-7]m", shown["1"])

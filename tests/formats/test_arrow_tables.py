@@ -194,7 +194,7 @@ def test_times_in_the_name_share_scans_out(tmp_path: Path) -> None:
     ]
     assert numbers == [{0, 1}, {2}, {3}, {4}]  # they count on
     assert find_existing(name) == [str(tmp_path / file) for file in files]
-    with pytest.raises(UsageError, match=r"00\.parquet: its time comes again"):
+    with pytest.raises(UsageError, match=r"00\.parquet would be written twice"):
         write(tmp_path / "%H.parquet", [at(0, 0), at(1, 3600), at(2, 86_400)])
 
 

@@ -39,7 +39,7 @@ def offsets(axes: Any) -> np.ndarray:
 
 def test_a_planar_scan_is_drawn_from_above() -> None:
     one = simulate_scan("ldrobot-stl27l", 600)
-    axes, bar = figures.of_scan(one, choose_appearance(one.points), "title").axes
+    axes, bar = figures.draw_scan(one, choose_appearance(one.points), "title").axes
     cloud = one.points[one.points.valid]
     np.testing.assert_array_equal(offsets(axes), np.stack([cloud.y, cloud.x], axis=1))
     assert axes.get_aspect() == 1  # metres alike
@@ -54,7 +54,7 @@ def test_a_planar_scan_is_drawn_from_above() -> None:
 
 def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
     one = simulate_scan("velodyne-vlp16", 160)
-    above, side, bar = figures.of_scan(
+    above, side, bar = figures.draw_scan(
         one, choose_appearance(one.points, ramp="intensity"), "title"
     ).axes
     cloud = one.points[one.points.valid]
@@ -70,7 +70,7 @@ def test_a_scan_with_heights_is_seen_from_its_side_too() -> None:
 
 def test_a_fitted_scan_fills_the_panel() -> None:
     one = simulate_scan("velodyne-vlp16", 160)
-    above, side, _ = figures.of_scan(
+    above, side, _ = figures.draw_scan(
         one, fit_to_points(one.points, choose_appearance(one.points)), "title"
     ).axes
     cloud = one.points[one.points.valid]
@@ -81,7 +81,7 @@ def test_a_fitted_scan_fills_the_panel() -> None:
 
 def test_every_intensity_is_counted() -> None:
     scans = [scan(number, points=2000) for number in range(3)]
-    (axes,) = figures.of_intensities(iter(scans), "title").axes
+    (axes,) = figures.draw_intensities(iter(scans), "title").axes
     counts = [patch.get_height() for patch in axes.patches]
     assert sum(counts) == sum(int(one.points.valid.sum()) for one in scans)
     strengths = np.concatenate(
@@ -95,8 +95,8 @@ def test_every_intensity_is_counted() -> None:
         axes.patches[-1].get_x() + axes.patches[-1].get_width()
     ]
     np.testing.assert_array_equal(counts, np.histogram(strengths, edges)[0])
-    with pytest.raises(UsageError, match="no intensities"):
-        figures.of_intensities([scan(0, intensity=False)], "title")
+    with pytest.raises(UsageError, match="no intensity"):
+        figures.draw_intensities([scan(0, intensity=False)], "title")
 
 
 def at_range(number: int, metres: float) -> Scan:
@@ -109,7 +109,7 @@ def at_range(number: int, metres: float) -> Scan:
 
 
 def test_ranges_stand_at_their_time() -> None:
-    axes, _ = figures.of_ranges(
+    axes, _ = figures.draw_ranges(
         [at_range(number, 2.0 + number) for number in range(10)], "title"
     ).axes
     mesh = axes.collections[0]
@@ -126,7 +126,7 @@ def test_a_long_source_is_held_in_part() -> None:
     peaks = []
     for number in (900, 1800):
         tracemalloc.start()
-        figure = figures.of_ranges((at_range(index, 2.0) for index in range(number)), "title")
+        figure = figures.draw_ranges((at_range(index, 2.0) for index in range(number)), "title")
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         assert f"{number:,} scans, of which one in" in figure.get_suptitle()
@@ -143,15 +143,15 @@ def lossy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_rates_are_those_of_stats(lossy: Path) -> None:
     with ls.open(lossy) as device:
         feed = LiveScans(device)
-        rates = figures.Rates(feed, math.inf)
+        rates = figures.RateSeries(feed, math.inf)
         reading = feed.meter.summary(device.stats)
     assert rates.totals[0].sum() == reading.packets
-    packets, scans, lost, wrong = figures.of_rates(rates, "title").axes
+    packets, scans, lost, wrong = figures.draw_rates(rates, "title").axes
     assert [axes.get_ylabel() for axes in (packets, scans, lost, wrong)] == [
         "packets [1/s]",
         "scans [1/s]",
         "lost [%]",
-        "wrong [%]",
+        "invalid [%]",
     ]
     values, edges, _ = packets.patches[0].get_data()
     assert np.median(values) == pytest.approx(reading.packet_rate_hz, rel=0.1)
@@ -168,7 +168,7 @@ def test_packets_without_times_are_refused(tmp_path: Path) -> None:
     sensor = ls.sensor("camsense-x1")
     (tmp_path / "a.bin").write_bytes(b"".join(simulate(sensor, 100)))
     assert (
-        "bear no times"
+        "packets have no times"
         in ran(
             "plot",
             tmp_path / "a.bin",

@@ -156,7 +156,7 @@ from lidarspec.view import terminal_window
 def broken(self, columns, lines):
     raise MemoryError("by hand")
 
-window.Window.cells = broken
+terminal_window.Window.cells = broken
 from lidarspec.spec import hookimpl
 
 found = ls.sensor("ldrobot-stl27l")
