@@ -152,7 +152,7 @@ def test_where_no_viewer_can_be_shown_one_line_says_so(tmp_path: Path) -> None:
         in ran("view", "sim:ldrobot-stl27l", "--rerun", "-o", "a.txt", code=2).stderr
     )
     assert (
-        "-o is for --rerun"
+        "-o requires --rerun"
         in ran("view", "sim:ldrobot-stl27l", "--web", "-o", "a.rrd", code=2).stderr
     )
     assert "choose one" in ran("view", "sim:ldrobot-stl27l", "--rerun", "--web", code=2).stderr
