@@ -18,7 +18,7 @@ from lidarspec.cli.terminal import note
 from lidarspec.device.device import Device, open as open_device
 from lidarspec.device.session import Reply
 from lidarspec.errors import CommandError, LidarSpecError, UnknownFrame, UsageError, suggest
-from lidarspec.explaining.assignments import arguments, values
+from lidarspec.explaining.assignments import parse_arguments, parse_values
 from lidarspec.explaining.explanation import describe_reply, explain
 from lidarspec.explaining.input_segments import explain_piece, iter_pieces
 from lidarspec.frames.schema import make_schema
@@ -67,7 +67,9 @@ def build(
     try:
         data = sensor.build(
             frame,
-            values(make_schema(sensor.frames[frame].tree), assignments, f"{sensor.id} {frame}"),
+            parse_values(
+                make_schema(sensor.frames[frame].tree), assignments, f"{sensor.id} {frame}"
+            ),
         )
     except LidarSpecError as error:
         raise suggest(error, f"lidarspec show {quote(str(sensor_id))}") from None
@@ -225,7 +227,9 @@ def _send(
     sensor = device.sensor
     _refuse_file(device, source)
     try:
-        return device.send(command, timeout=timeout, **arguments(sensor, command, assignments))
+        return device.send(
+            command, timeout=timeout, **parse_arguments(sensor, command, assignments)
+        )
     except UsageError as error:
         raise suggest(error, f"lidarspec show {sensor.id}") from None
     except CommandError as error:

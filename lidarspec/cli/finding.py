@@ -28,7 +28,7 @@ from lidarspec.detect.identification import (
     select_best,
 )
 from lidarspec.detect.listen import (
-    LISTEN,
+    LISTEN_S,
     ignore_progress,
     list_start_required,
     list_udp_ports,
@@ -261,7 +261,7 @@ def _text(match: ChecksumMatch, length: int) -> str:
     "-t",
     "--duration",
     type=DURATION,
-    default=LISTEN,
+    default=LISTEN_S,
     metavar="TIME",
     help="Time to listen at each port and baud rate.",
 )
@@ -296,7 +296,7 @@ def detect(
                 source,
                 duration,
                 start=start,
-                tell=lambda text: progress(lambda: f"listening to {text}"),
+                on_progress=lambda text: progress(lambda: f"listening to {text}"),
             )
     fitting = [one for one in found_verdicts if one.scores]
     if fitting or any(one.fault for one in found_verdicts):
@@ -334,9 +334,13 @@ def _code(source: str | None, verdicts: Sequence[Verdict]) -> int:
 
 
 def _detect_source(
-    source: str, duration: float, *, start: bool, tell: Callable[[str], None] = ignore_progress
+    source: str,
+    duration: float,
+    *,
+    start: bool,
+    on_progress: Callable[[str], None] = ignore_progress,
 ) -> list[Verdict]:
-    verdicts = identify_senders(source, seconds=duration, tell=tell)
+    verdicts = identify_senders(source, seconds=duration, on_progress=on_progress)
     if start and not any(one.scores for one in verdicts):
         for sample in probe(source):
             verdicts = [select_best([*verdicts, identify_sample(sample)])]
@@ -617,7 +621,7 @@ def _structure_text(structure: FrameStructure) -> str:
     "-t",
     "--duration",
     type=DURATION,
-    default=LISTEN,
+    default=LISTEN_S,
     metavar="TIME",
     help="Time to listen at each port and baud rate.",
 )

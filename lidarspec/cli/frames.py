@@ -20,7 +20,7 @@ from lidarspec.errors import UsageError, WireError, suggest
 from lidarspec.explaining.explanation import Explanation, values
 from lidarspec.explaining.formatting import TextSpan, number
 from lidarspec.explaining.input_segments import InputPiece, explain_piece, iter_pieces
-from lidarspec.explaining.listing import LINED, Line, list_differences
+from lidarspec.explaining.listing import LINE_BYTES, Line, list_differences
 from lidarspec.plugins import sensor as named_sensor
 from lidarspec.scans import selection as scans
 from lidarspec.sensor_operations import Sensor
@@ -183,7 +183,11 @@ def listing(
             place = ""
         else:
             place = next(
-                (value.path for value in part.fields.values() if value.covers(at - piece.offset)),
+                (
+                    value.path
+                    for value in part.fields.values()
+                    if value.covers_byte(at - piece.offset)
+                ),
                 "",
             )
         if verdicts and part.fault is not None:
@@ -429,9 +433,9 @@ def _title(sensor: Sensor, piece: InputPiece, frame: str) -> str:
 def _raw_text(raw: Any) -> str:
     if not isinstance(raw, bytes | bytearray):
         return str(raw)
-    if len(raw) <= 2 * LINED:
+    if len(raw) <= 2 * LINE_BYTES:
         return raw.hex(" ")
-    return f"{raw[: 2 * LINED].hex(' ')} ... ({len(raw)} bytes)"
+    return f"{raw[: 2 * LINE_BYTES].hex(' ')} ... ({len(raw)} bytes)"
 
 
 def plain(parsed: Any) -> Any:

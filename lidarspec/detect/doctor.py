@@ -1,6 +1,6 @@
-"""Diagnose a source without data, or without usable data.
+"""Diagnose a source without data, or without valid data.
 
-Each finding has the command that fixes the problem.
+Each finding has the command that fixes the problem, if there is a command for it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from shlex import quote
 
 from lidarspec.detect.identification import (
-    CLEAR,
+    CLEAR_SHARE,
     Verdict,
     identify_sample,
     identify_senders,
@@ -21,7 +21,7 @@ from lidarspec.detect.identification import (
     verb_to_show,
 )
 from lidarspec.detect.listen import (
-    LISTEN,
+    LISTEN_S,
     list_bauds,
     list_start_required,
     list_udp_ports,
@@ -45,9 +45,9 @@ class Diagnosis:
     """The result of one check.
 
     Attributes:
-        ok: whether there is no problem.
-        text: a description.
-        fix: the command that fixes it; "" if there is none, or no problem.
+        ok: whether no problem was found.
+        text: a description of the result.
+        fix: the command that fixes the problem; "" if there is no command for it.
     """
 
     ok: bool
@@ -56,28 +56,29 @@ class Diagnosis:
 
 
 def examine(
-    source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN
+    source: str | Path, sensor: Sensor | None = None, *, seconds: float = LISTEN_S
 ) -> Iterator[Diagnosis]:
     """Check a source, and yield findings in the order of the checks.
 
     Args:
-        sensor: the expected sensor; by default it is detected.
-        seconds: time to listen.
+        source: the source to check.
+        sensor: the expected sensor; None to detect it.
+        seconds: time to listen, for each baud rate.
     """
     text = resolve(source)
     address = live_address(text)
     if address is None:
-        yield from _file(text, sensor)
+        yield from _examine_file(text, sensor)
     elif address.scheme == "serial":
-        yield from _serial(text, address, sensor, seconds)
+        yield from _examine_serial(text, address, sensor, seconds)
     elif address.scheme == "udp":
-        yield from _udp(text, address, sensor, seconds)
+        yield from _examine_udp(text, address, sensor, seconds)
     else:
         yield from _examine_bytes(text, sensor, seconds)
 
 
 def examine_computer() -> Iterator[Diagnosis]:
-    """Check the ports of this computer, whatever is connected to them."""
+    """Check the ports and the receive buffer of this computer, without a source."""
     serial_ports = ports.list_serial_ports()
     if not serial_ports:
         yield Diagnosis(
@@ -86,14 +87,14 @@ def examine_computer() -> Iterator[Diagnosis]:
             "sudo dmesg | tail",
         )
     for port in serial_ports:
-        yield from _permission(port.path)
-        yield from _in_use(port.path)
+        yield from _check_permission(port.path)
+        yield from _check_serial_users(port.path)
     for number in list_udp_ports():
-        yield from _port_in_use(number)
-    yield from _buffer()
+        yield from _check_udp_users(number)
+    yield from _check_buffer()
 
 
-def _file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
+def _examine_file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
     if os.path.exists(path):
         name = path
     else:
@@ -105,16 +106,19 @@ def _file(path: str, sensor: Sensor | None) -> Iterator[Diagnosis]:
     elif os.path.getsize(name) == 0:
         yield Diagnosis(False, f"{path} is empty")
     else:
-        found_verdicts = identify_senders(path)
-        largest = max(found_verdicts, key=lambda verdict: verdict.sample.size)
+        verdicts = identify_senders(path)
+        largest = max(verdicts, key=lambda verdict: verdict.sample.size)
         if largest.sample.size:
-            yield _verdict(path, largest, sensor)
-        yield from _several(path, found_verdicts)
-        for text in largest.sample.warnings or [no_bytes(path, ())] * (not largest.sample.size):
+            yield _diagnose_data(path, largest, sensor)
+        yield from _check_single_sender(path, verdicts)
+        texts = list(largest.sample.warnings)
+        if not texts and not largest.sample.size:
+            texts = [no_bytes(path, ())]
+        for text in texts:
             yield Diagnosis(False, text)
 
 
-def _serial(
+def _examine_serial(
     source: str, address: SourceAddress, sensor: Sensor | None, seconds: float
 ) -> Iterator[Diagnosis]:
     port = address.location
@@ -125,45 +129,52 @@ def _serial(
             "lidarspec ports",
         )
         return
-    problems = [finding for finding in (*_permission(port), *_in_use(port)) if not finding.ok]
-    yield from problems or [Diagnosis(True, f"{port} exists and can be opened")]
-    if not problems:
-        yield from _examine_bytes(source, sensor, seconds)
+    problems = [*_check_permission(port), *_check_serial_users(port)]
+    if problems:
+        yield from problems
+        return
+    yield Diagnosis(True, f"{port} exists and can be opened")
+    yield from _examine_bytes(source, sensor, seconds)
 
 
-def _permission(port: str) -> Iterator[Diagnosis]:
-    if not ports.is_allowed(port):
-        group = ports.find_group(port)
-        text = f"{port}: no permission to open it"
-        by_group = Diagnosis(
+def _check_permission(port: str) -> Iterator[Diagnosis]:
+    """Yield a problem if this user may not open a serial port."""
+    if ports.is_allowed(port):
+        return
+    group = ports.find_group(port)
+    text = f"{port}: no permission to open it"
+    if group:
+        yield Diagnosis(
             False,
             f"{text}; members of the group {group} have it, from their next login",
             f"sudo usermod -aG {group} $USER",
         )
-        yield by_group if group else Diagnosis(False, f"{text}; only root has it", _rule(port))
+    else:
+        yield Diagnosis(False, f"{text}; only root has it", _udev_rule_command(port))
 
 
-def _rule(port: str) -> str:
-    """Return a command for a udev rule that lets every user open such ports."""
+def _udev_rule_command(port: str) -> str:
+    """Return a command for a udev rule that lets every user open ports of this kind."""
     kind = os.path.basename(port).rstrip("0123456789")
     rule = f'KERNEL=="{kind}[0-9]*", MODE="0666"'
     return f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-lidarspec.rules && sudo udevadm trigger"
 
 
-def _in_use(port: str) -> Iterator[Diagnosis]:
+def _check_serial_users(port: str) -> Iterator[Diagnosis]:
+    """Yield a problem for each other program that has a serial port open."""
     for user in ports.find_users(port):
         yield Diagnosis(False, f"{port} is in use by {user}", f"kill {user.pid}")
 
 
-def _udp(
+def _examine_udp(
     source: str, address: SourceAddress, sensor: Sensor | None, seconds: float
 ) -> Iterator[Diagnosis]:
-    numbers = _udp_numbers(address, sensor)
+    numbers = _select_udp_ports(address, sensor)
     host = address.host_and_port()[0]
-    busy = [finding for number in numbers for finding in _port_in_use(number)]
-    yield from busy
-    yield from _buffer()
-    if busy:
+    problems = [finding for number in numbers for finding in _check_udp_users(number)]
+    yield from problems
+    yield from _check_buffer()
+    if problems:
         return
     before = ports.received_per_interface()
     began = time.monotonic()
@@ -174,10 +185,11 @@ def _udp(
             name: (count - before.get(name, count)) / (time.monotonic() - began)
             for name, count in ports.received_per_interface().items()
         }
-        yield from _interfaces(numbers, host, rates)
+        yield from _check_interfaces(numbers, host, rates)
 
 
-def _udp_numbers(address: SourceAddress, sensor: Sensor | None) -> list[int]:
+def _select_udp_ports(address: SourceAddress, sensor: Sensor | None) -> list[int]:
+    """Return the ports of a SOURCE, of the sensor, or of all installed sensors."""
     port = address.host_and_port()[1]
     text = address.options.get("port", "")
     if text:
@@ -190,7 +202,8 @@ def _udp_numbers(address: SourceAddress, sensor: Sensor | None) -> list[int]:
     return list_udp_ports()
 
 
-def _port_in_use(number: int) -> Iterator[Diagnosis]:
+def _check_udp_users(number: int) -> Iterator[Diagnosis]:
+    """Yield a problem for each other program that has a UDP port open."""
     users = ports.find_udp_users(number)
     if users is None:
         return
@@ -204,19 +217,29 @@ def _port_in_use(number: int) -> Iterator[Diagnosis]:
         )
 
 
-def _buffer() -> Iterator[Diagnosis]:
+def _check_buffer() -> Iterator[Diagnosis]:
+    """Yield a problem if the system limits the receive buffer too much."""
     limit = Path("/proc/sys/net/core/rmem_max")
     try:
         granted = int(limit.read_text(encoding="ascii"))
     except (OSError, ValueError):
         return
     for text in warn_of_small_buffer(REQUESTED_BUFFER_BYTES, min(granted, REQUESTED_BUFFER_BYTES)):
-        said, _, command = text.partition("; next: ")
-        yield Diagnosis(False, said.replace("the system gave", "the system gives at most"), command)
+        problem, _, command = text.partition("; next: ")
+        problem = problem.replace("the system gave", "the system gives at most")
+        yield Diagnosis(False, problem, command)
 
 
-def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Iterator[Diagnosis]:
-    """Yield findings about interfaces, if packets arrive but none at the ports."""
+def _check_interfaces(
+    numbers: list[int], host: str, rates: dict[str, float]
+) -> Iterator[Diagnosis]:
+    """Yield the possible reasons why no packet arrives at some UDP ports.
+
+    Args:
+        numbers: the ports.
+        host: the address of this computer in the SOURCE; "" if it has none.
+        rates: interface -> received packets per second.
+    """
     listed = "/".join(map(str, numbers))
     active = {name: rate for name, rate in rates.items() if name != LOOPBACK and rate >= 1}
     if host:
@@ -249,14 +272,13 @@ def _interfaces(numbers: list[int], host: str, rates: dict[str, float]) -> Itera
 def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterator[Diagnosis]:
     """Check whether data arrives, and whether it is valid data of the sensor."""
     try:
+        verdicts: list[Verdict] = []
         if sensor is not None:
-            tried = [
+            verdicts = [
                 identify_sample(sample) for sample in read_sensor_sample(source, sensor, seconds)
             ]
-        else:
-            tried = []
-        if not any(one.scores for one in tried):
-            tried += identify_senders(source, seconds=seconds)
+        if not any(verdict.scores for verdict in verdicts):
+            verdicts += identify_senders(source, seconds=seconds)
     except LidarSpecError as error:
         command = suggestion(error)
         yield Diagnosis(
@@ -265,36 +287,47 @@ def _examine_bytes(source: str, sensor: Sensor | None, seconds: float) -> Iterat
             "" if "doctor" in command and not isinstance(error, UsageError) else command,
         )
         return
-    yield _verdict(source, max(tried, key=lambda one: (bool(one.scores), one.sample.size)), sensor)
-    yield from _several(source, tried)
+    best = max(verdicts, key=lambda verdict: (bool(verdict.scores), verdict.sample.size))
+    yield _diagnose_data(source, best, sensor)
+    yield from _check_single_sender(source, verdicts)
 
 
-def _several(source: str, verdicts: Sequence[Verdict]) -> Iterator[Diagnosis]:
-    """Yield a finding for several senders of one sensor's frames."""
-    senders: dict[str, list[str]] = {}
-    for one in verdicts:
-        if one.scores and one.sample.sender:
-            senders.setdefault(one.scores[0].sensor.id, []).append(one.sample.sender)
-    for name, several in senders.items():
-        if len(several) > 1:
-            command = f"lidarspec view {quote(with_option(source, 'src', several[0]))} -s {name}"
+def _check_single_sender(source: str, verdicts: Sequence[Verdict]) -> Iterator[Diagnosis]:
+    """Yield a problem if several senders send frames of one sensor."""
+    by_sensor: dict[str, list[str]] = {}
+    for verdict in verdicts:
+        if verdict.scores and verdict.sample.sender:
+            sensor_id = verdict.scores[0].sensor.id
+            by_sensor.setdefault(sensor_id, []).append(verdict.sample.sender)
+    for sensor_id, senders in by_sensor.items():
+        if len(senders) > 1:
+            chosen = quote(with_option(source, "src", senders[0]))
             yield Diagnosis(
-                False, f"{' and '.join(several)} all send frames of {name}: choose one", command
+                False,
+                f"{' and '.join(senders)} all send frames of {sensor_id}: choose one",
+                f"lidarspec view {chosen} -s {sensor_id}",
             )
 
 
-def _verdict(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
-    """Return the finding about the data of one sender."""
+def _diagnose_data(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
+    """Return the finding about the data of one sender.
+
+    Args:
+        source: the source, for suggested commands.
+        verdict: the result of the identification.
+        sensor: the expected sensor; None if the user has not named one.
+    """
     sample = verdict.sample
     ids = [score.sensor.id for score in verdict.scores]
-    may_be = {score.sensor.id: score.why for score in verdict.candidates} or dict(verdict.others)
+    # id of each possible sensor -> the evidence for it
+    possible = {score.sensor.id: score.why for score in verdict.candidates} or dict(verdict.others)
     quoted = quote(source)
     if not sample.size and sample.warnings:
         return Diagnosis(
             False, sample.warnings[0], f"lidarspec detect {quote(source.partition('?')[0])}"
         )
     if not sample.size:
-        return _nothing(source, sensor)
+        return _diagnose_silence(source, sensor)
     if verdict.fault:
         return Diagnosis(False, verdict.fault, f"lidarspec crc {quoted}")
     if not verdict.scores:
@@ -318,8 +351,8 @@ def _verdict(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
             f"lidarspec {verb_to_show(verdict.scores[0].sensor)} {quoted} -s {ids[0]}",
         )
     name = sensor.id if sensor is not None else ids[0]
-    if name not in may_be:
-        other, why = next(iter(may_be.items()))
+    if name not in possible:
+        other, why = next(iter(possible.items()))
         if verdict.candidates:
             command = f"lidarspec {verb_to_show(verdict.candidates[0].sensor)} {quoted} -s {other}"
         else:
@@ -334,10 +367,12 @@ def _verdict(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
             f"{name} sends{at}, but {link.baud} is declared",
             f"lidarspec {verb_to_show(score.sensor)} {again} -s {name}",
         )
-    cut_off = (
-        2 * max(frame.max_length for frame in score.sensor.incoming.values()) / sample.size
-    )  # the first and the last frame
-    if score.share + (0 if sample.datagrams else cut_off) < CLEAR:
+    share = score.share
+    if not sample.datagrams:
+        # The first and the last frame in a stream may be incomplete.
+        longest = max(frame.max_length for frame in score.sensor.incoming.values())
+        share += 2 * longest / sample.size
+    if share < CLEAR_SHARE:
         return Diagnosis(
             False,
             f"{name} sends{at}, but {1 - score.share:.0%} of the bytes are outside frames: check"
@@ -353,7 +388,7 @@ def _verdict(source: str, verdict: Verdict, sensor: Sensor | None) -> Diagnosis:
     )
 
 
-def _nothing(source: str, sensor: Sensor | None) -> Diagnosis:
+def _diagnose_silence(source: str, sensor: Sensor | None) -> Diagnosis:
     """Return the finding for a source without data."""
     quoted = quote(source)
     if sensor is not None and sensor in list_start_required():

@@ -4,10 +4,10 @@
 bytes in frames with a valid checksum and plausible values. `identify_sample` selects the best
 sensor.
 
-`distinguish` compares related models with the same frames, by the differences that their
-`relatives` declare: packets that only one of them sends, the pace of the clock in the packets, and
-the model that a frame names, in a text or by a documented value ("0x22 NAME"). If none of these
-differences is visible, all related models remain possible, also those that are not installed.
+`distinguish` decides between related models with the same frames. It uses packets that only one
+model sends, the pace of the clock in the packets, and the model name in a frame, as a text or as a
+documented value ("0x22 NAME"). If these do not decide, all related models remain possible,
+including models that are not installed.
 
 For a single frame, `find_fitting_sensors` returns the sensors with a frame type that matches it
 exactly, and `find_nearest_fault` the error of the sensor that parsed most of it.
@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.detect.listen import LISTEN, ignore_progress, read_samples
+from lidarspec.detect.listen import LISTEN_S, ignore_progress, read_samples
 from lidarspec.detect.sample_bytes import SampleBytes
 from lidarspec.detect.uninstalled_sensors import suggest_installation
 from lidarspec.device.named_devices import find_device
@@ -58,17 +58,17 @@ PACE_TOLERANCE = 0.03
 MAX_NAMED_FRAMES = 3
 #: Number of packets that are simulated to find the pace of a sensor's clock.
 SIMULATED_PACKETS = 64
-#: A number and its meaning in the documentation of a field.
-_VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
-#: Number of bytes that an error shows.
-SHOWN = 16
-#: Smallest share of the bytes that has to be in a sensor's frames for the sensor to fit.
-FITS = 0.2
-#: A sensor is as good as the best one if its share is at most this much smaller.
-AS_GOOD = 0.01
-#: Share of the bytes that identifies a sensor without doubt.
-CLEAR = 0.9
-#: Number of data frames that are no coincidence even if all checksums are invalid.
+#: A value and its meaning in the documentation of a field.
+_DOCUMENTED_VALUE = re.compile(r"\b(0x[0-9a-fA-F]+|\d+)\s+([^,;:]+)")
+#: Maximum number of bytes in an error.
+MAX_SHOWN_BYTES = 16
+#: A sensor fits if at least this share of the bytes is in its frames.
+FITTING_SHARE = 0.2
+#: Shares that differ by at most this value are equally good.
+EQUAL_SHARE_TOLERANCE = 0.01
+#: If this share of the bytes is in a sensor's frames, the sensor is certain.
+CLEAR_SHARE = 0.9
+#: Minimum number of data frames for a match without valid checksums, which may be coincidence.
 MIN_UNCHECKED_FRAMES = 3
 
 
@@ -76,9 +76,10 @@ class Distinction(NamedTuple):
     """The result of a comparison of related models.
 
     Attributes:
-        candidates: the candidates that may have sent the frames: id -> reason, "" if there is none.
-        others: related models, not installed, that may have sent the frames: id -> difference. If
-            `candidates` is empty, one of them did.
+        candidates: the candidates that may have sent the frames: id -> evidence; "" if there is no
+            evidence.
+        others: related models without an installed plugin that may have sent the frames: id ->
+            difference. If `candidates` is empty, one of these models has sent them.
     """
 
     candidates: dict[str, str]
@@ -92,11 +93,11 @@ def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Foun
 
     Args:
         candidates: sensors that decode the same data frames.
-        frames: sensor id -> the frames that this sensor decoded, in the order of their arrival.
+        frames: id of each candidate -> its decoded frames, in the order of arrival.
     """
     ids = {sensor.id for sensor in candidates}
     excluding = {
-        sensor.id: _excluding_relatives(sensor, frames[sensor.id]) for sensor in candidates
+        sensor.id: _find_excluding_relatives(sensor, frames[sensor.id]) for sensor in candidates
     }
     left = [sensor for sensor in candidates if not excluding[sensor.id]]
     reasons = {name: why for relatives in excluding.values() for name, why in relatives.items()}
@@ -124,17 +125,17 @@ def distinguish(candidates: Sequence[Sensor], frames: Mapping[str, Sequence[Foun
 
 
 def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
-    """Return the evidence that another model sent some frames, "" if there is none."""
+    """Return the evidence that another model sent some frames; "" if there is none."""
     relatives = map(registry().find, sensor.relatives)  # loads only their plugins
-    alike = [sensor, *(relative for relative in relatives if relative is not None)]
-    result = distinguish(alike, {one.id: frames for one in alike})
+    models = [sensor, *(relative for relative in relatives if relative is not None)]
+    result = distinguish(models, {model.id: frames for model in models})
     if sensor.id not in result.candidates:
         return "the frames are those of " + " or ".join(
             f"{name} ({why})" for name, why in (result.candidates or result.others).items()
         )
-    names = _models(sensor, frames)
+    names = _read_model_names(sensor, frames)
     fits = any(
-        _plain(part) in _plain(sensor.model)
+        _normalise(part) in _normalise(sensor.model)
         for name in names
         for part in re.split(r",| and ", name)
     )
@@ -143,17 +144,19 @@ def find_contradiction(sensor: Sensor, frames: Sequence[Found]) -> str:
     return f"{sensor.info['model']} is {names[0]}"
 
 
-def _excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
-    """Return the relatives that alone send most of these packets: id -> difference."""
-    single = {
+def _find_excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, str]:
+    """Return the related models that must have sent the frames: id -> difference.
+
+    More than half of the packets have a property that only this model has.
+    """
+    distinct_relatives = {
         name: relative
         for name, relative in sensor.relatives.items()
         if isinstance(relative, Relative)
     }
-    if single and sensor.has_points:
-        data = [item.data for item in frames if item.frame == sensor.data_frame]
-    else:
-        data = []
+    if not distinct_relatives or not sensor.has_points:
+        return {}
+    data = [item.data for item in frames if item.frame == sensor.data_frame]
     if not data:
         return {}
     packets = sensor.decode(data)
@@ -162,34 +165,40 @@ def _excluding_relatives(sensor: Sensor, frames: Sequence[Found]) -> dict[str, s
     fields = Fields(packets.batch())
     return {
         name: relative.difference
-        for name, relative in single.items()
+        for name, relative in distinct_relatives.items()
         if np.mean(np.asarray(relative.sends(fields))) > 0.5
     }
 
 
 def _keep_matching(
-    left: Sequence[Sensor],
-    why: Callable[[Sensor, Sequence[Found]], str],
+    candidates: Sequence[Sensor],
+    match: Callable[[Sensor, Sequence[Found]], str],
     frames: Mapping[str, Sequence[Found]],
 ) -> dict[str, str]:
-    """Select the sensors that match by one criterion: id -> reason.
+    """Return the sensors that match by one criterion: id -> evidence.
 
     Args:
-        why: returns the reason why a sensor matches, "" if it does not.
+        candidates: the possible sensors.
+        match: returns the evidence that a sensor matches; "" if it does not match.
+        frames: id of each candidate -> its frames.
 
     Returns:
-        An empty dict if no sensor matches, or if all of several match.
+        An empty dict if no sensor matches, or if several sensors match and no sensor does not.
     """
-    if len(left) == 1 and not left[0].relatives:
+    if len(candidates) == 1 and not candidates[0].relatives:
         return {}
-    reasons = {sensor.id: reason for sensor in left if (reason := why(sensor, frames[sensor.id]))}
-    if len(left) == 1 or len(reasons) < len(left):
-        return reasons
+    matching = {
+        sensor.id: evidence
+        for sensor in candidates
+        if (evidence := match(sensor, frames[sensor.id]))
+    }
+    if len(candidates) == 1 or len(matching) < len(candidates):
+        return matching
     return {}
 
 
 def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
-    """Return a reason if the clock in the frames has the pace of this sensor, else ""."""
+    """Return a text if the clock in the frames has the pace of a sensor, else ""."""
     if not sensor.has_points:
         return ""
     data = [item for item in frames if item.frame == sensor.data_frame]
@@ -205,18 +214,18 @@ def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
     if len(packets) < 3:
         return ""
     if sensor.clock.pace is None:
-        expected = _pace(sensor.id, sensor)
+        expected = _simulate_pace(sensor.id, sensor)
     else:
-        expected = _declared_pace(sensor.clock.pace, packets)
+        expected = _evaluate_pace(sensor.clock.pace, packets)
     if expected is None:
         return ""
     if sensor.datagrams:
         # Lost, repeated and reordered datagrams leave the median of the steps unchanged.
         step = float(np.median(np.diff(np.sort(packets.time_ns))))
-        grain = 0.0
+        uncertainty = 0.0
     else:
         # The clock may be coarse, which requires a mean. In a stream, gaps in the offsets show
-        # where frames were lost, and these steps are left out.
+        # where frames were lost, and these steps are omitted.
         follows = np.array(
             [
                 after.offset == item.offset + len(item.data)
@@ -229,18 +238,19 @@ def _match_clock(sensor: Sensor, frames: Sequence[Found]) -> str:
             return ""
         step = float(steps.mean())
         # The error of the mean, from the spread of the steps.
-        grain = min(float(np.ptp(steps)), expected) / (2 * len(steps) ** 0.5)
-    if abs(step - expected) > PACE_TOLERANCE * expected + grain:
+        uncertainty = min(float(np.ptp(steps)), expected) / (2 * len(steps) ** 0.5)
+    if abs(step - expected) > PACE_TOLERANCE * expected + uncertainty:
         return ""
     return f"its clock advances by {step / 1e6:.3g} ms per packet"
 
 
 @functools.lru_cache(maxsize=256)
-def _pace(sensor_id: str, sensor: Sensor) -> float | None:
-    """Return the simulated clock step per packet in ns, None if there is none.
+def _simulate_pace(sensor_id: str, sensor: Sensor) -> float | None:
+    """Return the clock step per packet of the simulated sensor, ns; None if unknown.
 
     Args:
-        sensor_id: not read; it is part of the key of the cache.
+        sensor_id: part of the key of the cache.
+        sensor: the sensor.
     """
     try:
         steps = np.diff(sensor.decode(simulate(sensor, SIMULATED_PACKETS)).time_ns)
@@ -252,31 +262,31 @@ def _pace(sensor_id: str, sensor: Sensor) -> float | None:
     return None
 
 
-def _declared_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
+def _evaluate_pace(pace: Callable[[Any], Any], packets: Packets) -> float:
     """Return the median of the declared clock steps per packet, ns."""
     return float(np.median(np.asarray(pace(Fields(packets.batch())), np.float64))) * 1e9
 
 
 def _match_name(sensor: Sensor, frames: Sequence[Found]) -> str:
-    """Return a reason if the frames name the model of this sensor, else ""."""
+    """Return a text if the frames name the model of a sensor, else ""."""
     return next(
         (
             f"{sensor.info['model']} is {text}"
-            for text in _models(sensor, frames)
-            if _plain(text) == _plain(sensor.model)
+            for text in _read_model_names(sensor, frames)
+            if _normalise(text) == _normalise(sensor.model)
         ),
         "",
     )
 
 
-def _models(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
-    """Return the models that the first frames with a model field name."""
+def _read_model_names(sensor: Sensor, frames: Sequence[Found]) -> list[str]:
+    """Return the model names in the first frames with the model field."""
     frame, _, path = sensor.info.get("model", "").partition(".")
     named_frames = (item for item in frames if item.frame == frame)
     names = []
     for item in itertools.islice(named_frames, MAX_NAMED_FRAMES):
         try:
-            names.append(_text(*_field(sensor, item, path)))
+            names.append(_describe_value(*_read_field(sensor, item, path)))
         except WireError:
             continue  # a related model may use the same frame name for another frame
     return [name for name in names if name]
@@ -286,14 +296,14 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     """Return the values of the sensor's `info` fields in the last frame of each type.
 
     Returns:
-        Role -> text, such as "serial" -> "A1234"; numbers have a unit.
+        Role -> text, for example "serial" -> "A1234"; numbers have a unit.
     """
     last = {item.frame: item for item in frames}
     texts = dict[str, str]()
     for role, path in sensor.info.items():
         frame, _, field_path = path.partition(".")
         if frame in last:
-            value, info = _field(sensor, last[frame], field_path)
+            value, info = _read_field(sensor, last[frame], field_path)
             if isinstance(value, list):
                 texts[role] = ".".join(map(str, value))  # a version
             elif isinstance(value, bytes):
@@ -303,7 +313,7 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
                 else:
                     texts[role] = value.hex()
             else:
-                texts[role] = _text(value, info) or (
+                texts[role] = _describe_value(value, info) or (
                     f"{info.physical(value):g} {info.unit}".rstrip()
                     if isinstance(value, int | float)
                     else f"{value}"
@@ -311,36 +321,38 @@ def read_info(sensor: Sensor, frames: Iterable[Found]) -> dict[str, str]:
     return {role: text for role, text in texts.items() if text}
 
 
-def _field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
+def _read_field(sensor: Sensor, item: Found, path: str) -> tuple[Any, FieldInfo]:
     """Return the raw value and the description of a field.
 
-    For a field of repeated parts the value is that of the first part with the field, or "".
+    If the field is in repeated parts, the value of the first part with the field is returned; "" if
+    no part has it.
     """
     fields = make_schema(sensor.frames[item.frame].tree)
     parsed = sensor.parse(item.data, item.frame)
     axis, _, rest = fields.within(path) or ("", "", path)
     if axis:
-        wholes = [part for part in _at(parsed, axis) if rest.partition(".")[0] in part]
+        parts = [part for part in _get_nested(parsed, axis) if rest.partition(".")[0] in part]
     else:
-        wholes = [parsed]
-    return next((_at(whole, rest) for whole in wholes), ""), fields.scan_names[path]
+        parts = [parsed]
+    return next((_get_nested(part, rest) for part in parts), ""), fields.scan_names[path]
 
 
-def _at(parsed: Any, path: str) -> Any:
-    return functools.reduce(lambda above, name: above[name], path.split("."), parsed)
+def _get_nested(parsed: Any, path: str) -> Any:
+    return functools.reduce(lambda container, name: container[name], path.split("."), parsed)
 
 
-def _text(value: Any, info: FieldInfo) -> str:
-    """Return the text of a field, or the documented meaning of its number."""
+def _describe_value(value: Any, info: FieldInfo) -> str:
+    """Return the text in a field, or the documented meaning of its value, or ""."""
     if isinstance(value, bytes):
         return value.split(b"\0")[0].decode("ascii", "replace")
-    meanings = {int(number, 0): text.strip() for number, text in _VALUE.findall(info.docs)} | dict(
-        info.labels
-    )
+    meanings = {
+        int(number, 0): text.strip() for number, text in _DOCUMENTED_VALUE.findall(info.docs)
+    }
+    meanings |= dict(info.labels)
     return str(meanings.get(value, ""))
 
 
-def _plain(text: str) -> str:
+def _normalise(text: str) -> str:
     return re.sub(r"[\W_]", "", text).lower()
 
 
@@ -350,10 +362,10 @@ class Score:
 
     Attributes:
         sensor: the sensor.
-        share: the share of the bytes that are in its frames.
-        data_frames: the number of its data frames.
-        found: all of its frames.
-        why: other evidence for this sensor.
+        share: the share of the bytes that are in frames of the sensor.
+        data_frames: number of data frames.
+        found: all frames.
+        why: further evidence for this sensor; "" if there is none.
     """
 
     sensor: Sensor
@@ -370,10 +382,10 @@ class Verdict:
     Attributes:
         sample: the bytes.
         scores: all sensors that fit, best first.
-        candidates: the sensors that remain possible.
-        others: related models, not installed, that are also possible: id -> difference. If
-            `candidates` is empty, one of them sent the bytes.
-        fault: a description of frames that fit a sensor except for their checksums, or "".
+        candidates: the sensors that remain possible after comparing related models.
+        others: possible related models without an installed plugin: id -> difference. If
+            `candidates` is empty, one of these models has sent the bytes.
+        fault: a text if the frames fit a sensor except for their checksums; otherwise "".
     """
 
     sample: SampleBytes
@@ -384,58 +396,64 @@ class Verdict:
 
     @property
     def sensor(self) -> Sensor | None:
-        """The sensor; None if no sensor or more than one is possible."""
+        """The only possible sensor; None if no sensor or several sensors are possible."""
         if len(self.candidates) == 1 and not self.others:
             return self.candidates[0].sensor
         return None
 
     @property
     def is_clear(self) -> bool:
-        """Whether the result is certain, so that no other baud rate has to be tried."""
-        return (
-            bool(self.scores) and self.scores[0].share >= CLEAR and self.scores[0].data_frames > 1
-        )
+        """Whether nearly all bytes are in frames, so that the baud rate is right."""
+        if not self.scores:
+            return False
+        best = self.scores[0]
+        return best.share >= CLEAR_SHARE and best.data_frames > 1
 
 
 def rate_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Score]:
-    """Return the scores of all installed sensors with at least one data frame, best first."""
-    candidates = _sensors_with_frames()
+    """Return the scores of the installed sensors with a data frame, best first.
+
+    Args:
+        chunks: datagrams, or pieces of a stream.
+        datagrams: whether the chunks are datagrams.
+    """
+    candidates = _list_sensors_with_frames()
     scores = _score_each(candidates, lambda sensor: _score(sensor, chunks, datagrams=datagrams))
-    if not any(score.share >= FITS for score in scores):
+    if not any(score.share >= FITTING_SHARE for score in scores):
         scores += _score_each(
             candidates, lambda sensor: _score_mid_stream(sensor, chunks, datagrams=datagrams)
         )
     return sorted(scores, key=lambda score: (-score.share, score.sensor.id))
 
 
-def _sensors_with_frames() -> list[Sensor]:
-    """Return the installed sensors that have incoming frames without any configuration."""
+def _list_sensors_with_frames() -> list[Sensor]:
+    """Return the installed sensors that have frames without a configuration."""
     return [sensor for sensor in sensors().values() if sensor.incoming]
 
 
 def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
-    """Describe frames that fit a sensor except for their checksums, all invalid.
+    """Return a text if frames fit a sensor, but all their checksums are invalid.
 
     Returns:
-        "" for all other bytes.
+        The text, with a checksum that fits; "" if the bytes are not of this kind.
     """
     unchecked = _score_each(
-        _sensors_with_frames(),
+        _list_sensors_with_frames(),
         lambda sensor: _score(sensor, chunks, datagrams=datagrams, sums=_stored_checksums),
     )
     matches = [
         score
         for score in unchecked
-        if score.share >= CLEAR and score.data_frames >= MIN_UNCHECKED_FRAMES
+        if score.share >= CLEAR_SHARE and score.data_frames >= MIN_UNCHECKED_FRAMES
     ]
     if not matches or _score(matches[0].sensor, chunks, datagrams=datagrams) is not None:
         return ""
-    kinds = [item.frame for item in matches[0].found]
-    most = max(set(kinds), key=kinds.count)
-    frames = [item.data for item in matches[0].found if item.frame == most]
+    names = [item.frame for item in matches[0].found]
+    name = max(set(names), key=names.count)
+    frames = [item.data for item in matches[0].found if item.frame == name]
     ids = " or ".join(score.sensor.id for score in matches)
     text = (
-        f"{len(frames)} {most} frames match {ids} in constants, lengths and rhythm, but all their"
+        f"{len(frames)} {name} frames match {ids} in constants, lengths and rhythm, but all their"
         " checksums are wrong"
     )
     match = next(iter(search(frames, quick=True)), None)
@@ -454,15 +472,22 @@ def find_wrong_checksums(chunks: Sequence[bytes], *, datagrams: bool) -> str:
 
 
 def _stored_checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64]:
-    """Return the checksums in the frames instead of computed ones, so that all are valid."""
+    """Return the stored instead of the computed checksums, so that all are valid."""
     return seal.load_stored(rows)
 
 
 def _score_each(
     candidates: Sequence[Sensor], rate: Callable[[Sensor], Score | None]
 ) -> list[Score]:
-    """Return the score of each sensor; sensors with identical frames are decoded only once."""
-    shared: dict[object, Score | None] = {}
+    """Return the scores of the sensors that have one.
+
+    Sensors with identical frames are decoded only once.
+
+    Args:
+        candidates: the sensors.
+        rate: returns the score of a sensor; None if it does not fit.
+    """
+    shared: dict[object, Score | None] = {}  # by identity of the frames, and by id of the sensor
     for sensor in candidates:
         frames = (
             sensor.fillers,
@@ -484,6 +509,11 @@ def _score_each(
 def _score(
     sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool, sums: Sums | None = None
 ) -> Score | None:
+    """Return the score of a sensor; None if the bytes contain no data frame.
+
+    Args:
+        sums: computes checksums; None for the declared algorithms.
+    """
     if sensor.recognise is not None and datagrams and (options := sensor.recognise(tuple(chunks))):
         sensor = sensor.configure(**options)
     decoder = Decoder(sensor, stream=not datagrams, sums=sums)
@@ -493,39 +523,36 @@ def _score(
     else:
         items = decoder.feed(b"".join(chunks))
     items += decoder.finish()
-    number = sum(decoder.stats.frames.get(name, 0) for name in sensor.main_frames)
-    if number:
-        return Score(
-            sensor, 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in, number, tuple(items)
-        )
-    return None
+    count = sum(decoder.stats.frames.get(name, 0) for name in sensor.main_frames)
+    if not count:
+        return None
+    share = 1 - decoder.stats.bytes_skipped / decoder.stats.bytes_in
+    return Score(sensor, share, count, tuple(items))
 
 
 def _score_mid_stream(sensor: Sensor, chunks: Sequence[bytes], *, datagrams: bool) -> Score | None:
-    """Score a sensor as if the frame that precedes its data frames had been seen already.
+    """Return the score of a sensor as if the frame before its data had been received.
 
-    This applies to data frames that are only valid after another frame, such as a reply. Returns
-    the best score of all such data frames.
+    Some data frames are valid only after another frame, for example a reply. If there are several,
+    the best score is returned. None if the sensor has no data frame of this kind, or none fits.
     """
-    answers = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
-    scored = [
-        _score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in answers
-    ]
+    names = [name for name in sensor.data_frames if sensor.frames[name].after is not None]
+    scores = [_score(sensor.configure(answer=name), chunks, datagrams=datagrams) for name in names]
     return max(
-        (score for score in scored if score is not None),
+        (score for score in scores if score is not None),
         key=lambda score: score.share,
         default=None,
     )
 
 
 def identify_sample(sample: SampleBytes) -> Verdict:
-    """Identify the sensor by frames, then by clocks and names, then by the baud rate."""
+    """Identify the sensor by frames, then by related models, then by the baud rate."""
     fitting = [
         score
         for score in rate_sensors(sample.chunks, datagrams=sample.datagrams)
-        if score.share >= FITS
+        if score.share >= FITTING_SHARE
     ]
-    best = [score for score in fitting if score.share >= fitting[0].share - AS_GOOD]
+    best = [score for score in fitting if score.share >= fitting[0].share - EQUAL_SHARE_TOLERANCE]
     if not best:
         return Verdict(
             sample, fault=find_wrong_checksums(sample.chunks, datagrams=sample.datagrams)
@@ -533,67 +560,75 @@ def identify_sample(sample: SampleBytes) -> Verdict:
     result = distinguish(
         [score.sensor for score in best], {score.sensor.id: score.found for score in best}
     )
-    alike = [
+    possible = [
         replace(score, why=result.candidates[score.sensor.id])
         for score in best
         if score.sensor.id in result.candidates
     ]
-    if len(alike) > 1 and sample.baud is not None:
+    if len(possible) > 1 and sample.baud is not None:
         why = f"it runs at {sample.baud} baud"
-        links = [(score, data_link(score.sensor, Serial)) for score in alike]
-        alike = [
+        links = [(score, data_link(score.sensor, Serial)) for score in possible]
+        possible = [
             replace(score, why=why) for score, link in links if link and sample.baud in link.bauds
-        ] or alike
-    alike = [
+        ] or possible
+    possible = [
         replace(
             score,
             why=score.why
             or ", ".join(f"{name}={value}" for name, value in score.sensor.options.items()),
         )
-        for score in alike
+        for score in possible
     ]
-    # List the vendor first that makes most of these sensors: it is the most likely one.
-    vendors = [score.sensor.vendor for score in alike]
-    alike.sort(key=lambda score: (-vendors.count(score.sensor.vendor), score.sensor.id))
-    ruled_out = [
-        score for score in fitting if score.sensor.id not in {one.sensor.id for one in alike}
-    ]
-    return Verdict(sample, (*alike, *ruled_out), tuple(alike), result.others)
+    # List the vendor of most of these sensors first, because it is the most likely vendor.
+    vendors = [score.sensor.vendor for score in possible]
+    possible.sort(key=lambda score: (-vendors.count(score.sensor.vendor), score.sensor.id))
+    possible_ids = {score.sensor.id for score in possible}
+    excluded = [score for score in fitting if score.sensor.id not in possible_ids]
+    return Verdict(sample, (*possible, *excluded), tuple(possible), result.others)
 
 
 def identify_senders(
-    source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore_progress
+    source: str | Path,
+    *,
+    seconds: float = LISTEN_S,
+    on_progress: Callable[[str], None] = ignore_progress,
 ) -> list[Verdict]:
-    """Identify the sensors that send to a source: one verdict for each sender.
+    """Identify the sensors that send to a source; return one verdict for each sender.
 
-    For a serial port, return the verdict of the baud rate that fits best.
+    For a serial port, only the verdict of the baud rate that fits best is returned.
 
     Args:
+        source: the source.
         seconds: time to listen at each baud rate.
-        tell: called with a description of the source before each time of listening.
+        on_progress: called with a description of the source before each attempt.
 
     Raises:
         SourceError: if the source cannot be opened.
     """
-    tried: list[Verdict] = []
-    for sample in read_samples(source, seconds=seconds, tell=tell):
-        tried.append(identify_sample(sample))
-        if sample.baud is not None and tried[-1].is_clear:
+    verdicts: list[Verdict] = []
+    for sample in read_samples(source, seconds=seconds, on_progress=on_progress):
+        verdicts.append(identify_sample(sample))
+        if sample.baud is not None and verdicts[-1].is_clear:
             break
-    if len({one.sample.baud for one in tried}) > 1:
-        return [select_best(tried)]
-    return tried
+    if len({verdict.sample.baud for verdict in verdicts}) > 1:
+        return [select_best(verdicts)]
+    return verdicts
 
 
-def select_best(tried: Sequence[Verdict]) -> Verdict:
-    """Return the verdict with the highest score, else the one on most bytes."""
-    return max(tried, key=lambda one: (one.scores[0].share if one.scores else 0.0, one.sample.size))
+def select_best(verdicts: Sequence[Verdict]) -> Verdict:
+    """Return the verdict with the highest share, or with the most bytes if none fits."""
+
+    def key(verdict: Verdict) -> tuple[float, int]:
+        share = verdict.scores[0].share if verdict.scores else 0.0
+        return share, verdict.sample.size
+
+    return max(verdicts, key=key)
 
 
 def detect(source: str | Path) -> Sensor:
     """Return the installed sensor that sends to a source.
 
-    A source that declares its sensor, such as a recording, is not searched for frames.
+    If the source declares its sensor, as a recording does, its bytes are not examined.
 
     Raises:
         CommandError: if a live source sends nothing.
@@ -607,7 +642,7 @@ def detect(source: str | Path) -> Sensor:
     verdicts = identify_senders(resolve(source))
     fitting = [verdict for verdict in verdicts if verdict.scores]
     if not fitting:
-        raise _no_sensor_error(str(source), verdicts)
+        raise _make_no_sensor_error(str(source), verdicts)
     if not any(verdict.candidates for verdict in fitting):
         raise suggest(
             WireError(f"{source}: {describe_unsupported_models(fitting[0])}"),
@@ -649,7 +684,7 @@ def verb_to_show(sensor: Sensor) -> str:
 
 
 def list_candidates(verdict: Verdict) -> list[str]:
-    """Return the ids of all possible sensors, and mark those that are not installed."""
+    """Return the ids of all possible sensors; ids without a plugin are marked."""
     return [
         *(score.sensor.id for score in verdict.candidates),
         *(f"{name} (not installed)" for name in verdict.others),
@@ -657,7 +692,7 @@ def list_candidates(verdict: Verdict) -> list[str]:
 
 
 def describe_unsupported_models(verdict: Verdict) -> str:
-    """Return a message for frames of models that are known but not installed."""
+    """Return a message for frames of related models without an installed plugin."""
     return (
         " or ".join(f"these are frames of {name} ({why})" for name, why in verdict.others.items())
         + ", which no installed plugin supports"
@@ -667,7 +702,7 @@ def describe_unsupported_models(verdict: Verdict) -> str:
 def find_declared_sensor(source: str | Path) -> Sensor | None:
     """Return the sensor that a source declares; None if it declares none.
 
-    Sources that declare a sensor are devices of `lidarspec.toml`, recordings and simulated sensors.
+    Devices of `lidarspec.toml`, recordings and simulated sources can declare a sensor.
 
     Raises:
         UsageError: for standard input.
@@ -695,24 +730,27 @@ def find_declared_sensor(source: str | Path) -> Sensor | None:
 
 
 def find_simulated_sensor(source: str | Path) -> Sensor | None:
-    """Return the sensor of a source "sim:ID", None for any other source."""
+    """Return the sensor of a source "sim:ID"; None for all other sources."""
     address = live_address(source)
     if address is None or address.scheme != "sim" or not address.location:
         return None
     return named_sensor(address.location)
 
 
-def _no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception:
-    """Return the error for a source for which no sensor fits."""
+def _make_no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception:
+    """Return the error for a source if no sensor fits."""
     largest = max(
-        (one.sample for one in verdicts), key=lambda one: one.size, default=SampleBytes(source)
+        (verdict.sample for verdict in verdicts),
+        key=lambda sample: sample.size,
+        default=SampleBytes(source),
     )
-    if fault := next((one.fault for one in verdicts if one.fault), ""):
+    if fault := next((verdict.fault for verdict in verdicts if verdict.fault), ""):
         return suggest(WireError(f"{source}: {fault}"), f"lidarspec crc {quote(str(source))}")
     if largest.size:
         kind = " in this text" if largest.is_text else ""
         error = WireError(
-            f"{source}: no frame of an installed sensor{kind}", data=largest.chunks[0][:SHOWN]
+            f"{source}: no frame of an installed sensor{kind}",
+            data=largest.chunks[0][:MAX_SHOWN_BYTES],
         )
         return suggest_installation(error, largest)
     if live_address(source) is None:
@@ -724,14 +762,14 @@ def _no_sensor_error(source: str, verdicts: Sequence[Verdict]) -> Exception:
     return suggest(CommandError(why), f"lidarspec doctor {quote(source)}")
 
 
-#: Smallest number of constant bits that have to be equal for bytes to resemble a frame type.
+#: Bytes resemble a frame type if at least this number of constant bits is equal.
 MIN_CONSTANT_BITS = 8
 
 
 def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Sensor]:
     """Return the installed sensors that fit some bytes, best first.
 
-    If all bytes together are exactly one frame of some sensors, only these are returned.
+    If all bytes together are exactly one frame, only the sensors with this frame are returned.
     """
     installed = list(sensors().values())
     data = b"".join(chunks)
@@ -743,23 +781,29 @@ def find_fitting_sensors(chunks: Sequence[bytes], *, datagrams: bool) -> list[Se
     if whole:
         return whole
     scores = rate_sensors(chunks, datagrams=datagrams) if data else []
-    return [score.sensor for score in scores if score.share >= max(scores[0].share - AS_GOOD, FITS)]
+    return [
+        score.sensor
+        for score in scores
+        if score.share >= max(scores[0].share - EQUAL_SHARE_TOLERANCE, FITTING_SHARE)
+    ]
 
 
 def find_nearest_fault(data: bytes) -> WireError | None:
     """Return the error of the installed sensor that parsed most of an invalid frame.
 
-    None if the bytes do not begin like a frame of any sensor.
+    None if no sensor has a frame that begins with the same bytes.
     """
-    faults = []
+    errors = []
     for sensor in sensors().values():
         try:
             identify(sensor, data)
-        except LidarSpecError as fault:
-            faults += [fault] if isinstance(fault, WireError) else []
+        except WireError as error:
+            errors.append(error)
+        except LidarSpecError:
+            continue
     return max(
-        (fault for fault in faults if _begins_like_frame(fault)),
-        key=lambda fault: fault.offset,
+        (error for error in errors if _begins_like_frame(error)),
+        key=lambda error: error.offset,
         default=None,
     )
 
@@ -782,7 +826,7 @@ def _is_frame(sensor: Sensor, name: str, data: bytes) -> bool:
 def _begins_like_frame(fault: WireError) -> bool:
     """Return whether invalid bytes have the constant bits at the start of a frame.
 
-    At least `MIN_CONSTANT_BITS` are required, since fewer may be equal by coincidence.
+    At least `MIN_CONSTANT_BITS` are required, because fewer bits may be equal by coincidence.
     """
     if not fault.frame:
         return False

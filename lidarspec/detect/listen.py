@@ -26,23 +26,23 @@ from lidarspec.transports.base import data_link
 from lidarspec.transports.open_url import live_address, open_live, open_transport
 from lidarspec.transports.protocol import Chunk, Disconnected, LiveTransport, endpoint, sender_names
 
-#: maximum number of datagrams read from a file.
-DATAGRAMS = 400
-#: number of bytes of a live source after which listening stops.
-PLENTY = 1 << 14
-#: time to listen to a live source, in seconds.
-LISTEN = 1.2
-#: maximum duration of one read while listening, in seconds.
-LOOK = 0.1
-#: time to wait for data of a device that has replied, in seconds: its motor may have to start.
-ANSWERED = 4.0
-#: time to wait for data of a device that has not replied, in seconds.
-UNANSWERED = 1.0
-#: maximum duration of one read while probing, in seconds; the line is idle if nothing arrives.
-TURN = 0.05
-#: time to wait for replies to the stop commands, in seconds.
-STOPPING = 2.0
-#: baud rate for a pseudo-terminal, at which it has no meaning, and for examples.
+#: maximum number of datagrams that are read from a file.
+MAX_FILE_DATAGRAMS = 400
+#: listening to a live source stops after this number of bytes.
+ENOUGH_BYTES = 1 << 14
+#: time to listen to a live source.
+LISTEN_S = 1.2
+#: maximum duration of one read while listening.
+LISTEN_READ_S = 0.1
+#: time to wait for data after a device has replied; its motor may have to start.
+DATA_TIMEOUT_S = 4.0
+#: time to wait for data if a device has not replied.
+UNCONFIRMED_DATA_TIMEOUT_S = 1.0
+#: maximum duration of one read while probing; the line is idle if nothing arrives.
+PROBE_READ_S = 0.05
+#: time to wait for replies to the stop commands.
+STOP_TIMEOUT_S = 2.0
+#: baud rate for a pseudo-terminal, which ignores it, and for examples.
 ANY_BAUD = 115_200
 #: UDP port for an example.
 EXAMPLE_PORT = 2368
@@ -67,21 +67,25 @@ def list_udp_ports() -> list[int]:
 
 
 def ignore_progress(_: str) -> None:
-    """Ignore a progress message: the default of `read_samples(tell=...)`."""
+    """Do nothing; the default of `read_samples(on_progress=...)`."""
 
 
 def read_samples(
-    source: str | Path, *, seconds: float = LISTEN, tell: Callable[[str], None] = ignore_progress
+    source: str | Path,
+    *,
+    seconds: float = LISTEN_S,
+    on_progress: Callable[[str], None] = ignore_progress,
 ) -> Iterator[SampleBytes]:
     """Yield the bytes of each sender of a source.
 
     A serial port without a baud rate is tried at each rate that installed sensors declare. If it
-    is silent at the most common, the lowest and the highest rate, the other rates are not tried:
-    data sent at another rate arrives as invalid bytes, but not as silence.
+    is silent at the most common, the lowest and the highest rate, the other rates are not tried,
+    because data that is sent at another rate arrives as invalid bytes, not as silence.
 
     Args:
+        source: the source.
         seconds: time to listen to a live source, for each baud rate.
-        tell: called before each attempt with a description of the source.
+        on_progress: called with a description of the source before each attempt.
 
     Raises:
         SourceError: if the source cannot be opened, or if it needs a baud rate or port and no
@@ -91,7 +95,7 @@ def read_samples(
     address = live_address(source)
     if address is not None and address.scheme == "serial" and "baud" not in address.options:
         if has_no_baud(address.location):
-            tell(text)
+            on_progress(text)
             yield from _read_sample(with_option(text, "baud", ANY_BAUD), seconds, None, text)
             return
         rates = list_bauds()
@@ -106,7 +110,7 @@ def read_samples(
         for baud in first_rates + other_rates:
             if is_silent and baud in other_rates:
                 return
-            tell(f"{text} at {baud} baud")
+            on_progress(f"{text} at {baud} baud")
             for sample in _read_sample(with_option(text, "baud", baud), seconds, baud, text):
                 is_silent = is_silent and not sample.size
                 yield sample
@@ -129,28 +133,28 @@ def read_samples(
 
 
 def has_no_baud(port: str) -> bool:
-    """Whether a port is a pseudo-terminal, at which every baud rate is the same."""
+    """Return whether a port is a pseudo-terminal, which ignores the baud rate."""
     return os.path.realpath(port).startswith("/dev/pts/")
 
 
 def _read_sample(source: str, seconds: float, baud: int | None, name: str) -> Iterator[SampleBytes]:
     with contextlib.closing(open_transport(source)) as opened:
-        number = DATAGRAMS if opened.datagrams else None
+        max_chunks = MAX_FILE_DATAGRAMS if opened.datagrams else None
         warnings: tuple[str, ...] = ()
         if isinstance(opened, LiveTransport):
             chunks = _read_chunks(opened, seconds)
             if not chunks:
-                warnings = _other_senders_warning(opened)
+                warnings = _warn_of_other_senders(opened)
         else:
-            chunks = read_beginning(opened, MAX_SAMPLE_BYTES, max_chunks=number)
+            chunks = read_beginning(opened, MAX_SAMPLE_BYTES, max_chunks=max_chunks)
             warnings = tuple(opened.warnings)
     yield from _split_by_sender(
         SampleBytes(name, (), opened.datagrams, baud, warnings=warnings), chunks
     )
 
 
-def _other_senders_warning(opened: LiveTransport) -> tuple[str, ...]:
-    """Return a warning if only other senders sent datagrams."""
+def _warn_of_other_senders(opened: LiveTransport) -> tuple[str, ...]:
+    """Return a warning if datagrams arrived from other senders only."""
     if opened.other_sender is None:
         return ()
     example = endpoint(opened.other_sender)
@@ -159,9 +163,9 @@ def _other_senders_warning(opened: LiveTransport) -> tuple[str, ...]:
 
 
 def _split_by_sender(sample: SampleBytes, chunks: Sequence[Chunk]) -> Iterator[SampleBytes]:
-    """Yield a copy of `sample` with the chunks of each sender.
+    """Yield a copy of `sample` for each sender, with the chunks of this sender.
 
-    If there is only one sender, its name is left empty.
+    If there is only one sender, `sender` is "".
     """
     names = sender_names((chunk.sender, chunk.receiver) for chunk in chunks)
     by_sender: dict[str, list[Chunk]] = {name: [] for name in names.values()} or {"": []}
@@ -177,14 +181,14 @@ def read_sensor_sample(source: str | Path, sensor: Sensor, seconds: float) -> li
     """Listen to a live source with the link settings of a sensor.
 
     Returns:
-        The bytes of each sender; [] if nothing arrives within `seconds`.
+        The bytes of each sender; an empty list if nothing arrives within `seconds`.
     """
     address = live_address(source)
     chunks = list[Chunk]()
     with contextlib.closing(open_transport(source, sensor)) as opened:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0 and isinstance(opened, LiveTransport):
-            chunks += opened.read(min(left, LOOK))
+            chunks += opened.read(min(left, LISTEN_READ_S))
     if address is not None and has_no_baud(address.location):
         baud = None
     else:
@@ -195,14 +199,15 @@ def read_sensor_sample(source: str | Path, sensor: Sensor, seconds: float) -> li
 
 
 def _read_chunks(opened: LiveTransport, seconds: float) -> list[Chunk]:
-    """Read chunks for some seconds, or until `PLENTY` bytes have arrived."""
+    """Read chunks for some seconds, or until `ENOUGH_BYTES` have arrived."""
     chunks: list[Chunk] = []
+    size = 0
     end = time.monotonic() + seconds
     with contextlib.suppress(Disconnected):
-        while (left := end - time.monotonic()) > 0 and sum(
-            len(chunk.data) for chunk in chunks
-        ) < PLENTY:
-            chunks += opened.read(min(left, LOOK))
+        while (left := end - time.monotonic()) > 0 and size < ENOUGH_BYTES:
+            arrived = opened.read(min(left, LISTEN_READ_S))
+            chunks += arrived
+            size += sum(len(chunk.data) for chunk in arrived)
     return chunks
 
 
@@ -217,9 +222,10 @@ def list_start_required() -> list[Sensor]:
 
 
 def probe(source: str | Path) -> Iterator[SampleBytes]:
-    """Start each sensor that must be started, at each of its baud rates, and yield its bytes.
+    """Start each sensor that needs a start command, and yield the bytes that arrive.
 
-    The stop commands of the sensor are sent afterwards.
+    Each baud rate of the sensor is tried, and its stop commands are sent afterwards. Only serial
+    sources are probed.
 
     Raises:
         SourceError: if the port cannot be opened.
@@ -228,21 +234,22 @@ def probe(source: str | Path) -> Iterator[SampleBytes]:
     tried = set[object]()
     if address is None or address.scheme != "serial":
         return
-    plain = has_no_baud(address.location)
+    ignores_baud = has_no_baud(address.location)
     for sensor in list_start_required():
         link = data_link(sensor, Serial)
         for baud in link.bauds if link else ():
-            requests = (None if plain else baud, *(sensor.command(name) for name in sensor.on_open))
-            if requests in tried or address.options.get("baud", str(baud)) != str(baud):
+            commands = [sensor.command(name) for name in sensor.on_open]
+            attempt = (None if ignores_baud else baud, *commands)
+            if attempt in tried or address.options.get("baud", str(baud)) != str(baud):
                 continue
-            tried.add(requests)
+            tried.add(attempt)
             if "baud" in address.options:
                 text = str(source)
             else:
                 text = with_option(source, "baud", baud)
             with contextlib.closing(open_live(text, sensor)) as opened:
                 chunks = _StartProbe(sensor, opened).run()
-            yield SampleBytes(str(source), tuple(chunks), baud=None if plain else baud)
+            yield SampleBytes(str(source), tuple(chunks), baud=None if ignores_baud else baud)
 
 
 class _StartProbe:
@@ -256,35 +263,36 @@ class _StartProbe:
         self._sample: list[bytes] = []
 
     def run(self) -> list[bytes]:
-        """Return all bytes received between start and stop."""
+        """Start and stop the sensor; return all bytes that arrived in between."""
         try:
             started = self._request(self._sensor.on_open)
-            self._turns(lambda: all(pending.done for pending in started), ANSWERED)
-            self._turns(
-                lambda: sum(map(len, self._sample)) >= PLENTY,
-                ANSWERED if any(map(_is_answered, started)) else UNANSWERED,
-            )
-            samples = list(self._sample)
+            self._exchange(lambda: all(pending.done for pending in started), DATA_TIMEOUT_S)
+            if any(map(_is_confirmed, started)):
+                timeout = DATA_TIMEOUT_S
+            else:
+                timeout = UNCONFIRMED_DATA_TIMEOUT_S
+            self._exchange(lambda: sum(map(len, self._sample)) >= ENOUGH_BYTES, timeout)
+            sample = list(self._sample)
             stopped = self._request(self._sensor.on_close)
-            self._turns(lambda: all(pending.done for pending in stopped), STOPPING)
+            self._exchange(lambda: all(pending.done for pending in stopped), STOP_TIMEOUT_S)
         except LidarSpecError:
             return self._sample
-        return samples
+        return sample
 
     def _request(self, names: tuple[str, ...]) -> list[PendingReply]:
         self._session.abandon("asked for something else")
         return [self._session.request(name, time.monotonic_ns()) for name in names]
 
-    def _turns(self, done: Callable[[], bool], seconds: float) -> None:
-        """Send and receive until `done` returns True, or the time is up."""
-        end = time.monotonic() + seconds
-        while not done() and time.monotonic() < end:
+    def _exchange(self, is_done: Callable[[], bool], timeout: float) -> None:
+        """Send and receive until `is_done` returns True, or for `timeout` seconds."""
+        end = time.monotonic() + timeout
+        while not is_done() and time.monotonic() < end:
             self._session.tick(time.monotonic_ns())
             for out in self._session.outgoing():
                 if out.lines:
                     self._opened.lines(**out.lines)
                 self._opened.write(out.data)
-            chunks = self._opened.read(TURN)
+            chunks = self._opened.read(PROBE_READ_S)
             if chunks:
                 frames = [item for chunk in chunks for item in self._decoder.feed(chunk.data)]
             else:
@@ -293,7 +301,7 @@ class _StartProbe:
             self._session.receive(frames, time.monotonic_ns())
 
 
-def _is_answered(pending: PendingReply) -> bool:
+def _is_confirmed(pending: PendingReply) -> bool:
     try:
         return pending.done and pending.result().confirmed
     except LidarSpecError:

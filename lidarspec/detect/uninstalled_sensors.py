@@ -1,9 +1,9 @@
-"""Recognize bytes of sensors that are not installed, by the table of known sensors.
+"""Recognize bytes of sensors that are not installed, with the table of known sensors.
 
-A plugin that is not installed cannot parse anything, so the evidence is weaker than that of
-`detect`: the constant bytes that a data frame begins with and its size, then the UDP ports. Several
-sensors of a vendor, and of related vendors, often share them. The result is good enough to name the
-distributions to install.
+The frames cannot be parsed without the plugin, so the evidence is weaker than in `identification`:
+the constant bytes at the start of a data frame and the frame size, then the UDP ports. Several
+sensors of a vendor often share them. The result is good enough to name the distributions to
+install.
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ from lidarspec.known_sensors import KnownSensor, Signature, install_command, kno
 from lidarspec.plugins import registry
 from lidarspec.sensor_operations import Sensor
 
-#: bytes at the beginning of a frame that a signature covers.
+#: maximum number of bytes at the start of a frame that a signature contains.
 MAX_SYNC_BYTES = 16
+#: minimum number of constant bytes of a signature.
 MIN_SYNC_BYTES = 2
-#: share of the datagrams, or of the bytes of a stream, that must match.
+#: share of the datagrams, or of the bytes of a stream, that has to match.
 MIN_MATCHING_SHARE = 0.2
-#: frames in a stream that must follow one another.
-MIN_FRAMES_IN_A_ROW = 3
-#: how often the sync bytes of frames of variable size must occur in a stream, and how much more
-#: often than by chance.
+#: minimum number of consecutive frames in a stream.
+MIN_CONSECUTIVE_FRAMES = 3
+#: minimum number of sync bytes in a stream, for frames of variable size.
 MIN_SYNC_COUNT = 8
-MIN_SYNC_COUNT_BY_CHANCE = 20
-#: sensors that a message lists.
-MAX_LISTED = 6
+#: minimum ratio of this number to the number that is expected by chance.
+MIN_RATIO_TO_CHANCE = 20
+#: maximum number of sensors in a message.
+MAX_LISTED_SENSORS = 6
 
 
 def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
-    """Return the signatures of the main frames of a sensor that have enough constant bytes."""
+    """Return the signatures of a sensor's main frames, if they have enough constants."""
     signatures = []
     for name in sensor.main_frames:
         engine = get_codec(sensor.frames[name])
@@ -43,13 +44,14 @@ def make_signatures(sensor: Sensor) -> tuple[Signature, ...]:
             for offset, (mask, value) in engine.prefix.items()
             if mask == 0xFF and offset < MAX_SYNC_BYTES
         }
-        signature = Signature(_sync_text(constant), engine.size or 0)
+        signature = Signature(_format_sync(constant), engine.size or 0)
         if len(constant) >= MIN_SYNC_BYTES and signature not in signatures:
             signatures.append(signature)
     return tuple(signatures)
 
 
-def _sync_text(constant: dict[int, int]) -> str:
+def _format_sync(constant: dict[int, int]) -> str:
+    """Return constant bytes (offset -> value) in hexadecimal, with ".." for others."""
     length = max(constant, default=-1) + 1
     return " ".join(
         f"{constant[offset]:02x}" if offset in constant else ".." for offset in range(length)
@@ -57,13 +59,13 @@ def _sync_text(constant: dict[int, int]) -> str:
 
 
 def recognize(sample: SampleBytes) -> list[KnownSensor]:
-    """Return the sensors of the table, not installed, that may have sent these bytes.
+    """Return the known sensors without a plugin that may have sent the bytes.
 
-    If no frame matches, these are the sensors with the destination port.
+    If no frame matches, all sensors that use the destination port are returned.
     """
     installed = set(registry().names())
     missing = [row for row in known_sensors() if row.id not in installed]
-    shares = [_matching_share(row, sample) if sample.size else 0.0 for row in missing]
+    shares = [_measure_share(row, sample) if sample.size else 0.0 for row in missing]
     best = max(shares, default=0.0)
     matching = []
     if best >= MIN_MATCHING_SHARE:
@@ -76,25 +78,27 @@ def _udp_ports(row: KnownSensor) -> set[int]:
     return {port for link in row.links.values() if link.kind == "udp" for port in link.numbers}
 
 
-def _matching_share(row: KnownSensor, sample: SampleBytes) -> float:
+def _measure_share(row: KnownSensor, sample: SampleBytes) -> float:
+    """Return the share of the sample that matches a signature of the sensor."""
     is_datagram = any(link.kind == "udp" for link in row.links.values())
     if is_datagram != sample.datagrams:
         return 0.0
     if sample.datagrams:
-        share = _share_of_datagrams
+        measure = _share_of_datagrams
     else:
-        share = _share_of_stream
-    return max((share(signature, sample) for signature in row.signatures), default=0.0)
+        measure = _share_of_stream
+    return max((measure(signature, sample) for signature in row.signatures), default=0.0)
 
 
-def _pattern(sync: str) -> bytes:
+def _make_pattern(sync: str) -> bytes:
+    """Return the regular expression for sync bytes as hexadecimal text."""
     return b"".join(
         b"." if byte == ".." else re.escape(bytes.fromhex(byte)) for byte in sync.split()
     )
 
 
 def _share_of_datagrams(signature: Signature, sample: SampleBytes) -> float:
-    begins = re.compile(_pattern(signature.sync), re.DOTALL)
+    begins = re.compile(_make_pattern(signature.sync), re.DOTALL)
     if signature.size:
         sizes = {signature.size}
     else:
@@ -109,26 +113,27 @@ def _share_of_stream(signature: Signature, sample: SampleBytes) -> float:
     data = sample.data
     offsets = [
         match.start()
-        for match in re.finditer(b"(?=" + _pattern(signature.sync) + b")", data, re.DOTALL)
+        for match in re.finditer(b"(?=" + _make_pattern(signature.sync) + b")", data, re.DOTALL)
     ]
     if not signature.size:
         constant_bytes = sum(byte != ".." for byte in signature.sync.split())
-        needed = max(MIN_SYNC_COUNT, MIN_SYNC_COUNT_BY_CHANCE * len(data) / 256**constant_bytes)
-        if len(offsets) >= needed:
+        count_by_chance = len(data) / 256**constant_bytes
+        min_count = max(MIN_SYNC_COUNT, MIN_RATIO_TO_CHANCE * count_by_chance)
+        if len(offsets) >= min_count:
             return MIN_MATCHING_SHARE
         return 0.0
     starts = set(offsets)
-    followed = sum(offset + signature.size in starts for offset in offsets)
-    count = followed + 1 if offsets else 0
+    has_next = sum(offset + signature.size in starts for offset in offsets)
+    count = has_next + 1 if offsets else 0
     is_whole = count * signature.size == len(data)
-    if count < MIN_FRAMES_IN_A_ROW and not is_whole:
+    if count < MIN_CONSECUTIVE_FRAMES and not is_whole:
         return 0.0
     return min(1.0, count * signature.size / len(data))
 
 
 def describe(sensors: Sequence[KnownSensor]) -> str:
     """Return the sentence that names the sensors and their distributions."""
-    ids = [row.id for row in sensors[:MAX_LISTED]]
+    ids = [row.id for row in sensors[:MAX_LISTED_SENSORS]]
     more = len(sensors) - len(ids)
     if more:
         listed = f"{', '.join(ids)} and {more} more"
@@ -140,7 +145,7 @@ def describe(sensors: Sequence[KnownSensor]) -> str:
 
 
 def suggest_installation(error: WireError, sample: SampleBytes) -> WireError:
-    """Add the distributions to install to the error for unknown bytes, if known."""
+    """Add the distributions to install, if known, to the error for unknown bytes."""
     missing = recognize(sample)
     if missing:
         error.add_note(describe(missing))

@@ -1,7 +1,7 @@
-"""Parse field=value of a frame, and the arguments of a command, as raw values.
+"""Parse field=value of a frame, and argument=value of a command.
 
-A bare number is the raw integer of a field, but an argument in the unit of its field; a number with
-a unit is converted.
+A number with a unit is converted. A number without a unit is the raw value of a field of a frame;
+for an argument, it is in the unit of the field.
 """
 
 from __future__ import annotations
@@ -27,21 +27,30 @@ _STEP = r"\w+(?:\[(?:\d+|\*)\])*"
 _PATH = re.compile(rf"{_STEP}(?:\.{_STEP})*")
 
 
-def values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, Any]:
-    """Return the raw values, nested as in the struct.
+def parse_values(table: Schema, assignments: Sequence[str], place: str) -> dict[str, Any]:
+    """Return the raw values of assignments "field=value", nested as in the struct.
+
+    Args:
+        table: the fields of the frame.
+        assignments: the texts.
+        place: the sensor and the frame, for messages.
 
     Raises:
         UsageError: for an invalid assignment, an unknown field, or a value that its field cannot
-            hold.
+            have.
     """
-    parsed = [_assignment(table, text, place) for text in assignments]
+    parsed = [_parse_assignment(table, text, place) for text in assignments]
     raw_values: dict[str, Any] = {}
+    # Elements of arrays come last, because count fields may determine the lengths.
     for names, value in sorted(parsed, key=lambda item: any(is_index(step) for step in item[0])):
-        put_value(raw_values, names, value, lambda path: _length(table, raw_values, path, place))
+        put_value(
+            raw_values, names, value, lambda path: _find_length(table, raw_values, path, place)
+        )
     return raw_values
 
 
-def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
+def _parse_assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
+    """Return the path and the raw value of an assignment."""
     path, equals, value = text.partition("=")
     if not equals or not _PATH.fullmatch(path):
         raise UsageError(f"{place}: {text!r} is not field=value")
@@ -51,28 +60,28 @@ def _assignment(table: Schema, text: str, place: str) -> tuple[Steps, Any]:
     if info is None:
         raise UnknownField(path, table.all_fields, place=place)
     arrays = len(info.axes) - (info.kind == "bytes")
-    given = sum(map(is_index, names))
-    if given != arrays:
+    indices = sum(map(is_index, names))
+    if indices != arrays:
         raise UsageError(
-            f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, but {path!r} has {given}"
-            f" ind{'ex' if given == 1 else 'ices'}"
+            f"{place}: {plain} is in {arrays} array{'s' * (arrays != 1)}, but {path!r} has"
+            f" {indices} ind{'ex' if indices == 1 else 'ices'}"
         )
-    return names, _raw(info, value.strip(), path, place)
+    return names, _parse_raw(info, value.strip(), path, place)
 
 
-def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
-    """Return the raw value of a text.
+def _parse_raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
+    """Return the raw value for a text.
 
-    It is hexadecimal for bytes, a label, a number, or a number with a unit.
+    The text is hexadecimal for bytes; otherwise it is a label, or a number with or without a unit.
     """
     if info.kind == "bytes":
-        return _octets(text, f"{place}: {path}")
+        return _parse_bytes(text, f"{place}: {path}")
     for raw, label in info.labels.items():
         if text == label:
             return raw
-    number, unit = _number(text, info.unit, f"{place}: {path}", "a number")
+    number, unit = _parse_number(text, info.unit, f"{place}: {path}", "a number")
     if unit:
-        return _nearest(info, number, path, place)
+        return _to_raw(info, number, path, place)
     if number.denominator == 1 and info.kind != "float":
         return int(number)
     if info.kind == "int":
@@ -83,15 +92,20 @@ def _raw(info: FieldInfo, text: str, path: str, place: str) -> Any:
     return float(number)
 
 
-def _octets(text: str, place: str) -> bytes:
+def _parse_bytes(text: str, place: str) -> bytes:
     try:
         return parse_hex(text)
     except ValueError:
         raise UsageError(f"{place}: expected bytes in hexadecimal, got {text!r}") from None
 
 
-def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, str]:
-    """Return a number, converted to `unit` if it has a unit, and its own unit."""
+def _parse_number(text: str, unit: str, place: str, expected: str) -> tuple[Fraction, str]:
+    """Return a number, and the unit in its text; "" if it has no unit.
+
+    Args:
+        unit: if the text has a unit, the number is converted to this unit.
+        expected: the expected content in words, for the message.
+    """
     digits, unit_text = split_unit(text)
     if unit_text:
         per_unit = factor(unit_text, unit)
@@ -107,26 +121,26 @@ def _number(text: str, unit: str, place: str, wanted: str) -> tuple[Fraction, st
         else:
             number = Fraction(digits)
     except ValueError:
-        raise UsageError(f"{place}: expected {wanted}, got {text!r}") from None
+        raise UsageError(f"{place}: expected {expected}, got {text!r}") from None
     return number * per_unit, unit_text
 
 
-def _nearest(info: FieldInfo, number: Fraction, path: str, place: str) -> int | float:
-    """Return the raw value nearest to a physical one."""
+def _to_raw(info: FieldInfo, number: Fraction, path: str, place: str) -> int | float:
+    """Return the raw value nearest to a physical value."""
     raw: int | float = info.raw(number)
     if info.kind != "int":
         return float(raw)
     low, high = info.limits
     if not low <= raw <= high:
-        edges = [float(info.physical(Fraction(edge))) for edge in (low, high)]
-        raise OutOfRange(path, float(number), *edges, unit=info.unit, place=place)
+        limits = [float(info.physical(Fraction(limit))) for limit in (low, high)]
+        raise OutOfRange(path, float(number), *limits, unit=info.unit, place=place)
     return raw
 
 
-def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
+def _find_length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> int:
     """Return the length of an array: declared, or from the given count fields.
 
-    Returns 0 if it follows from single elements that are given.
+    Returns 0 if single elements of the array are given, which determine the length.
     """
     declared = table.arrays.get(path)
     if isinstance(declared, int):
@@ -148,11 +162,11 @@ def _length(table: Schema, given: Mapping[str, Any], path: str, place: str) -> i
         ) from None
 
 
-def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, Any]:
-    """Return the arguments of a command.
+def parse_arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str, Any]:
+    """Return the arguments of a command from texts "argument=value".
 
-    Numbers are in the units of their fields, texts and addresses are unchanged, bytes come from
-    hexadecimal digits.
+    Numbers are converted to the units of their fields, and hexadecimal digits to bytes. Texts and
+    addresses are unchanged.
 
     Raises:
         UsageError: for an unknown command or argument, or an invalid value.
@@ -173,10 +187,10 @@ def arguments(sensor: Sensor, name: str, assignments: Sequence[str]) -> dict[str
         place = f"{sensor.id} {name}: {argument}"
         if isinstance(kind, Range):
             unit = slot.info.unit
-            number, _ = _number(
+            number, _ = _parse_number(
                 value.strip(), unit, place, f"a number in {unit}" if unit else "a number"
             )
             given[argument] = int(number) if number.denominator == 1 else float(number)
         else:
-            given[argument] = _octets(value, place) if isinstance(kind, Octets) else value
+            given[argument] = _parse_bytes(value, place) if isinstance(kind, Octets) else value
     return given

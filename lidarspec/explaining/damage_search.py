@@ -1,9 +1,9 @@
-"""Find the single change of a damaged frame that explains the damage.
+"""Find the single change of a frame that explains its damage.
 
-Each bit is flipped back, each byte removed, and every byte value inserted at every offset, and the
-engine decides which of these give one valid frame of the type. So this module needs no knowledge of
-checksums and lengths. With a short checksum several changes may match by chance: if there are
-many, only their kind is reported.
+This tries to flip each bit back, to remove each byte, and to insert every byte value at every
+offset. The engine decides which of these candidates are one valid frame of the type, so that this
+module needs no knowledge of checksums and lengths. If the checksum is short, several candidates may
+be valid by chance. If there are many, only the kind of change is reported.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from lidarspec.framing.results import VALID
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import formulas, nodes, refs
 
-#: Bytes of candidates that are tried at once; the longest frame, read by plain construct, that is
-#: tried; the longest frame in which lost bytes are searched, with 256 candidates for each offset;
-#: and the maximum number of fields that its layout may depend on for that, since otherwise nearly
-#: each candidate has a layout of its own.
-BLOCK = 1 << 20
-INTERPRETED = 128
-SEARCHED = 512
-HEADED = 4
-#: Maximum number of changes to report one by one.
-TOLD = 3
-#: Kinds of damage, the likeliest first -> number of bytes that it adds to the frame, and number of
-#: candidates for each offset.
+#: Number of bytes of candidates that are tried at once.
+BATCH_BYTES = 1 << 20
+#: Longest frame that is searched if plain construct parses it.
+MAX_PLAIN_FRAME_BYTES = 128
+#: Longest frame that is searched for lost bytes, with 256 candidates for each offset.
+MAX_LOST_BYTE_FRAME_BYTES = 512
+#: Lost bytes are searched only if the layout of the frame depends on at most this number of fields.
+#: With more fields, nearly each candidate has a different layout.
+MAX_LAYOUT_FIELDS = 4
+#: Maximum number of changes that are described separately.
+MAX_DESCRIBED_CHANGES = 3
+#: Kinds of damage, the likeliest first -> number of bytes that the damage adds to the frame, and
+#: number of candidates for each offset.
 KINDS = {"flipped bit": (0, 8), "inserted byte": (1, 1), "lost byte": (-1, 256)}
 
 
@@ -43,9 +44,9 @@ class FrameChange(NamedTuple):
 
     Attributes:
         kind: "flipped bit", "inserted byte" or "lost byte".
-        offset: the byte of the damaged frame that was changed or inserted, or before which one was
-            lost.
-        value: number of the bit, 0 the lowest; or the byte.
+        offset: offset in the damaged frame: of the changed or inserted byte, or of the byte after
+            the lost byte.
+        value: the index of the flipped bit, 0 for the lowest; or the inserted or lost byte.
     """
 
     kind: str
@@ -53,7 +54,7 @@ class FrameChange(NamedTuple):
     value: int
 
     def repair(self, data: bytes) -> bytes:
-        """Return the bytes before the change."""
+        """Return the damaged bytes with the change undone."""
         before = data[: self.offset]
         after = data[self.offset :]
         if self.kind == "inserted byte":
@@ -66,12 +67,15 @@ class FrameChange(NamedTuple):
 def find_changes(
     frame: Frame, data: bytes, kinds: Iterable[str] = KINDS, *, offsets: Sequence[int] | None = None
 ) -> list[FrameChange]:
-    """Return every single change that would explain the damage, of the likeliest kind.
+    """Return all single changes that explain the damage, of the likeliest kind only.
 
-    Undoing such a change gives one valid and plausible frame of this type.
+    If the change is undone, the bytes are one valid and plausible frame of the type.
 
     Args:
-        offsets: the bytes at which changes are tried; by default all.
+        frame: the frame type.
+        data: the damaged frame.
+        kinds: the kinds of change to try.
+        offsets: the offsets at which changes are tried; None for all.
     """
     engine = get_codec(frame)
     for kind in kinds if data else ():
@@ -80,106 +84,114 @@ def find_changes(
         fits = engine.size in (None, size) and max(engine.prefix, default=-1) < size
         if (
             fits
-            and 0 < size <= _most(engine, values)
-            and (matching := list(_found(kind, values, data, size, engine, offsets)))
+            and 0 < size <= _find_max_size(engine, values)
+            and (matching := list(_iter_changes(kind, values, data, size, engine, offsets)))
         ):
             return matching
     return []
 
 
-def _most(engine: Codec, values: int) -> int:
-    """Return the maximum length of a frame for which every candidate is tried."""
+def _find_max_size(engine: Codec, values: int) -> int:
+    """Return the length of the longest frame for which all candidates are tried.
+
+    Args:
+        values: number of candidates for each offset.
+    """
     is_compiled = isinstance(engine, CompiledCodec)
     if values > 8:
-        if is_compiled and _deciding(engine.frame) <= HEADED:
-            return SEARCHED
+        if is_compiled and _count_layout_fields(engine.frame) <= MAX_LAYOUT_FIELDS:
+            return MAX_LOST_BYTE_FRAME_BYTES
         return 0
     if is_compiled:
         return engine.frame.max_length
-    return INTERPRETED
+    return MAX_PLAIN_FRAME_BYTES
 
 
 @functools.cache
-def _deciding(frame: Frame) -> int:
-    """Return the number of fields that decide the layout of a frame."""
+def _count_layout_fields(frame: Frame) -> int:
+    """Return the number of fields that determine the layout of a frame."""
     used = (formula for node in nodes(frame.tree) for formula in formulas(node))
     return len({ref.path for formula in used for ref in refs(formula)})
 
 
-def _found(
+def _iter_changes(
     kind: str, values: int, data: bytes, size: int, engine: Codec, chosen: Sequence[int] | None
 ) -> Iterator[FrameChange]:
-    places = np.arange(max(len(data), size))
-    old = np.frombuffer(data, np.uint8)
+    """Yield the changes of one kind that explain the damage.
+
+    Args:
+        values: number of candidates for each offset.
+        size: length of the undamaged frame.
+        chosen: the offsets at which changes are tried; None for all.
+    """
+    tried_offsets = np.arange(max(len(data), size))
+    damaged = np.frombuffer(data, np.uint8)
     if kind == "inserted byte":
-        places = places[
-            np.diff(old, prepend=~old[:1]) != 0
-        ]  # the first of a run of equal bytes represents them all
+        # Removing any byte of a run of equal bytes gives the same result: try only the first.
+        tried_offsets = tried_offsets[np.diff(damaged, prepend=~damaged[:1]) != 0]
     if chosen is not None:
-        places = places[np.isin(places, chosen)]
-    offsets = np.repeat(places, values)
+        tried_offsets = tried_offsets[np.isin(tried_offsets, chosen)]
+    offsets = np.repeat(tried_offsets, values)
     if values == 1:
-        numbers = old[places]
+        changes = damaged[tried_offsets]
     else:
-        numbers = np.tile(np.arange(values, dtype=np.uint8), len(places))
+        changes = np.tile(np.arange(values, dtype=np.uint8), len(tried_offsets))
     if kind == "lost byte":
-        is_new = numbers != old[offsets - 1]  # not the same byte again before an equal one
+        # Inserting a byte before or after an equal byte gives the same result.
+        is_new = changes != damaged[offsets - 1]
         is_new[offsets == 0] = True
         offsets = offsets[is_new]
-        numbers = numbers[is_new]
-    step = max(1, BLOCK // size)
+        changes = changes[is_new]
+    step = max(1, BATCH_BYTES // size)
     for first in range(0, len(offsets), step):
         part = slice(first, first + step)
-        rows = _rows(kind, old, offsets[part], numbers[part], size)
+        rows = _undo_changes(kind, damaged, offsets[part], changes[part], size)
         fits = np.ones(len(rows), np.bool_)
         for offset, (mask, value) in engine.prefix.items():
             fits &= rows[:, offset] & mask == value
         which = np.flatnonzero(fits)
         if len(which):
             survey = engine.survey(rows.reshape(-1), which * size)
-        else:
-            survey = None
-        if survey is not None:
-            right = which[(survey.status == VALID) & (survey.sizes == size)]
-        else:
-            right = which
-        yield from (
-            FrameChange(kind, int(offsets[first + one]), int(numbers[first + one]))
-            for one in right.tolist()
-        )
+            which = which[(survey.status == VALID) & (survey.sizes == size)]
+        for index in which.tolist():
+            yield FrameChange(kind, int(offsets[first + index]), int(changes[first + index]))
 
 
-def _rows(
+def _undo_changes(
     kind: str,
-    old: NDArray[np.uint8],
+    damaged: NDArray[np.uint8],
     offsets: NDArray[np.intp],
-    numbers: NDArray[np.uint8],
+    changes: NDArray[np.uint8],
     size: int,
 ) -> NDArray[np.uint8]:
-    """Return the bytes with each change undone, one per row."""
+    """Return the damaged bytes with each change undone, (changes, size)."""
     columns = count_up(size)
-    places = offsets[:, None]
+    change_columns = offsets[:, None]
     if kind == "inserted byte":
-        return old[columns + (columns >= places)]
+        return damaged[columns + (columns >= change_columns)]
     if kind == "lost byte":
-        rows = old[np.minimum(columns - (columns > places), len(old) - 1)]
-        rows[np.arange(len(rows)), offsets] = numbers
+        rows = damaged[np.minimum(columns - (columns > change_columns), len(damaged) - 1)]
+        rows[np.arange(len(rows)), offsets] = changes
         return rows
-    rows = np.tile(old, (len(offsets), 1))
-    rows[np.arange(len(rows)), offsets] ^= np.uint8(1) << numbers
+    rows = np.tile(damaged, (len(offsets), 1))
+    rows[np.arange(len(rows)), offsets] ^= np.uint8(1) << changes
     return rows
 
 
 def describe_damage(
     frame: Frame, data: bytes, values: Callable[[bytes], Mapping[str, FieldValue]]
 ) -> Iterator[str]:
-    """Yield a sentence for each single change that would explain the damage.
+    """Yield a sentence for each single change that explains the damage.
+
+    If there are many, one sentence gives their kind and number.
 
     Args:
+        frame: the frame type.
+        data: the damaged frame.
         values: returns the values of a frame by path.
     """
     matching = find_changes(frame, data)
-    if len(matching) > TOLD:
+    if len(matching) > MAX_DESCRIBED_CHANGES:
         yield (f"one {matching[0].kind} would explain it, at any of {len(matching)} places")
         return
     before = values(data) if matching else {}
@@ -188,10 +200,10 @@ def describe_damage(
             f"{'one' if len(matching) == 1 else 'an' if change.kind[0] in 'aeiou' else 'a'}"
             f" {change.kind} would explain it"
         )
-        yield f"{explains}: {_place(change, before, values(change.repair(data)))}"
+        yield f"{explains}: {_describe_change(change, before, values(change.repair(data)))}"
 
 
-def _place(
+def _describe_change(
     change: FrameChange, before: Mapping[str, FieldValue], after: Mapping[str, FieldValue]
 ) -> str:
     kind, offset, value = change
@@ -200,8 +212,9 @@ def _place(
     path = next(
         (
             path
-            for path, there in after.items()
-            if there.holds(offset, value) or (kind == "lost byte" and there.covers(offset))
+            for path, field in after.items()
+            if field.contains_bit(offset, value)
+            or (kind == "lost byte" and field.covers_byte(offset))
         ),
         "",
     )

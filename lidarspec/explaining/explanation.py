@@ -1,8 +1,8 @@
 """Explain one frame byte by byte: fields and values, the first fault, differences to another frame.
 
-`FrameRows` reads the fields of the frame by its layout, up to the end of the bytes. For a damaged
-frame, the explanation has the single change that would explain the damage. For a valid data frame,
-it has the points.
+`FrameRows` reads the fields of the frame by its layout, up to the end of the bytes. The explanation
+of a damaged frame contains the single change that explains the damage, if there is one. The
+explanation of a valid data frame contains the points.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Explanation:
         sensor: the id of the sensor.
         frame: the frame type; "" for bytes that are not in a frame.
         data: the bytes.
-        rows: one for each field, bit block or array element.
-        fault: the first fault of the frame; None if it is valid.
+        rows: the rows, for each field, bit block or array element.
+        fault: the first fault of the frame; None if the frame is valid.
         notes: remarks on the whole frame.
     """
 
@@ -76,27 +76,27 @@ class Explanation:
 
     @property
     def fields(self) -> dict[str, FieldValue]:
-        """All values in wire order, by path with array indices, e.g. "points[1].intensity"."""
+        """All values in wire order, by path with array indices ("points[1].intensity")."""
         return {value.path: value for row in self.rows for value in row.values}
 
     @property
     def verdict(self) -> str:
-        """The first fault of the frame in one sentence; "valid" if there is none."""
+        """The first fault of the frame in one sentence; "valid" for a valid frame."""
         if self.fault is None:
             return "valid"
         return self.fault.reason
 
     @property
     def is_filler(self) -> bool:
-        """Whether it is not a frame, only filler bytes that the sensor sends between frames."""
+        """Whether the bytes are only fillers, which the sensor sends between frames."""
         return not self.frame and all(row.right for row in self.rows)
 
     def path_of(self, number: int, part: int = 0) -> str | None:
-        """Return the path of the row that contains a point, None if no row does.
+        """Return the path of the row that contains a point; None if no row does.
 
         Args:
-            number: of the point in its part.
-            part: number of the part of the frame; 0 if the points are not in parts.
+            number: index of the point in its part.
+            part: index of the part of the frame; 0 if the points are not in parts.
         """
         return next((row.path for row in self.rows if (part, number) in row.numbers), None)
 
@@ -104,7 +104,7 @@ class Explanation:
         """Return the lines of the listing, as text with roles.
 
         Args:
-            every: True draws the bits of all elements of an array; by default of the first only.
+            every: whether to draw the bits of all elements of an array, not only of the first.
         """
         return [
             *Listing(self.rows, every=every).lines(),
@@ -157,10 +157,12 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
     A damaged or truncated frame is explained as far as possible, with its first fault.
 
     Args:
-        frame: the frame type; by default the one that fits, or the closest.
+        data: the bytes.
+        sensor: the sensor.
+        frame: the frame type; by default the type that fits best.
 
     Raises:
-        WireError: if the bytes do not even begin like a frame of this sensor.
+        WireError: if no frame type of the sensor begins like the bytes.
         UnknownFrame: if the sensor has no such frame type.
     """
     data = bytes(data)
@@ -172,26 +174,26 @@ def explain(data: bytes, sensor: Sensor, frame: str | None = None) -> Explanatio
         name = error.frame or frame or ""
         if not name:
             raise
-    listed_rows = FrameRows(sensor.frames[name], data, fault)
-    rows = (*listed_rows.rows(), *listed_rows.rest(fault))
-    if fault is not None and not is_valid_frame(sensor, data[: listed_rows.after], name):
+    frame_rows = FrameRows(sensor.frames[name], data, fault)
+    rows = (*frame_rows.iter_rows(), *frame_rows.iter_rest(fault))
+    if fault is not None and not is_valid_frame(sensor, data[: frame_rows.after], name):
         guesses = describe_damage(
             sensor.frames[name], data, lambda candidate: values(candidate, sensor, name)
         )
         return Explanation(sensor.id, name, data, rows, fault, tuple(guesses))
-    rows, notes = _add_points(sensor, name, data[: listed_rows.after], rows)
+    rows, notes = _add_points(sensor, name, data[: frame_rows.after], rows)
     return Explanation(sensor.id, name, data, rows, fault, notes)
 
 
 def values(data: bytes, sensor: Sensor, frame: str) -> dict[str, FieldValue]:
-    """Return all values of one frame of this type in wire order, by path with array indices."""
+    """Return all values of a frame in wire order, by path with array indices."""
     return FrameRows(sensor.frames[frame], data).values()
 
 
 def describe_reply(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, str, str]]]:
     """Return the result of a command in one sentence, and the fields of the reply.
 
-    Each field is (path, value, meaning).
+    Each field is a tuple (path, value, documentation).
     """
     if not reply.confirmed or reply.frame is None:
         return "sent; no reply is documented, so the result is unknown", []
@@ -204,7 +206,7 @@ def describe_reply(sensor: Sensor, reply: Reply) -> tuple[str, list[tuple[str, s
 
 
 def reply_text(sensor: Sensor, reply: Reply) -> str:
-    """Return the result of a command, and a line for each field of the reply."""
+    """Return the result of a command as text, with a line for each field of the reply."""
     result, rows = describe_reply(sensor, reply)
     return "\n".join([result, *(f"{path}: {value}" for path, value, _ in rows)])
 
@@ -274,7 +276,7 @@ def _add_points(
 def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]:
     """Return the paths of the parts that contain the points, e.g. "segments[0]".
 
-    Returns an empty list if the points are not in parts.
+    Empty if the points are not in parts.
     """
     frame = sensor.frames[name]
     path = sensor.parts_with("points", name)
@@ -292,15 +294,15 @@ def _find_parts_with_points(sensor: Sensor, name: str, data: bytes) -> list[str]
 def _find_point_numbers(
     path: str, chain: tuple[str, ...], axes: tuple[str | None, ...], numbers: Any
 ) -> list[int]:
-    """Return the numbers of the points in a row.
+    """Return the indices of the points in a row.
 
-    Only the rows of the innermost array with points have any.
+    Only rows of the innermost array with points have points.
 
     Args:
         path: the path of the row.
         chain: the axes of the nested arrays with the points, outermost first.
-        axes: the axes of `numbers`, None for an axis that is not an array of the frame.
-        numbers: the number of each point, -1 if there is none.
+        axes: the axes of `numbers`; None for an axis that is not an array of the frame.
+        numbers: the index of each point; -1 for elements without a point.
     """
     indices = [int(part.partition("]")[0]) for part in path.split("[")[1:]]
     if not chain:

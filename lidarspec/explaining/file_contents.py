@@ -1,7 +1,7 @@
 """Describe the contents of a file: kind, senders, sensors, times, and losses.
 
-Only the beginning of a long file is read; then all counts refer to that part. The last time is
-determined if that is possible without reading the whole file.
+If a file is long, only its beginning is read, and all counts refer to this part. The last time is
+read as well, if the file can seek to its end.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from lidarspec.transports.robotics_logs import BagTransport
 from lidarspec.view.live_frames import open_live
 from lidarspec.view.rate_meter import MeterReading
 
-#: Maximum number of bytes and of packets to read from the beginning of a file, and of bytes of a
-#: sensor to decode.
+#: Maximum number of bytes and of packets to read from the beginning of a file.
 MAX_BEGINNING_BYTES = 1 << 26
-PACKETS = 1 << 18
-DECODED = 1 << 24
+MAX_BEGINNING_PACKETS = 1 << 18
+#: Maximum number of bytes to decode.
+MAX_DECODED_BYTES = 1 << 24
 #: Maximum number of senders to list.
-FLOWS = 6
-#: Later than any arrival, ns since 1970.
-_END = (1 << 63) - 1
+MAX_LISTED_FLOWS = 6
+#: A time after all arrivals, ns since 1970.
+_END_NS = (1 << 63) - 1
 KINDS: Mapping[type[Transport], str] = {
     RecordingTransport: "a recording",
     CaptureTransport: "a capture",
@@ -59,10 +59,13 @@ KINDS: Mapping[type[Transport], str] = {
 
 @dataclass
 class PacketFlow:
-    """The packets from one sender to one receiver; an unknown address is None.
+    """The packets from one sender to one receiver.
 
     Attributes:
-        packets, bytes: number of them in the part that was read.
+        sender: address and port of the sender; None if unknown.
+        receiver: address and port of the receiver; None if unknown.
+        packets: number of packets in the part that was read.
+        bytes: number of bytes in the part that was read.
     """
 
     sender: Sender | None
@@ -76,13 +79,13 @@ class SensorContent:
     """The data of one sensor in a file.
 
     Attributes:
-        source: the source that opens it.
-        sensors: ids of the matching sensors.
-        share: share of the bytes that are in its frames, from 0 to 1; None if the file names the
+        source: the SOURCE that selects this data.
+        sensors: ids of the sensors that match.
+        share: share of the bytes that are in frames, from 0 to 1; None if the file names the
             sensor.
-        options: command-line options to read it, "" if the file names the sensor.
-        reading: statistics of the part that was decoded.
-        verb: the verb of the command line that shows it.
+        options: command-line options that select the sensor; "" if the file names the sensor.
+        reading: statistics of the part that was decoded; None if there are none.
+        verb: the verb of the command line that shows the data.
     """
 
     source: str
@@ -94,7 +97,7 @@ class SensorContent:
 
     @property
     def command(self) -> str:
-        """The command that shows it."""
+        """The command that shows the data."""
         return f"lidarspec {self.verb} {quote(self.source)} {self.options}".rstrip()
 
 
@@ -103,12 +106,15 @@ class FileContents:
     """The contents of a file.
 
     Attributes:
-        path, kind, size: of the file: name, kind in words, size in bytes.
-        header: the header of a recording.
-        flows: senders and receivers, most bytes first; one for a byte stream.
-        first_ns, last_ns: arrival of the first and the last packet, ns since 1970; None if unknown.
-        last_read_ns: arrival of the last packet that was read.
-        whole: whether all of the file was read; otherwise counts are of its beginning.
+        path: the name of the file.
+        kind: the kind of the file in words.
+        size: the size of the file, in bytes.
+        header: the header of a recording; None for other files.
+        flows: senders and receivers, most bytes first; a byte stream has one flow.
+        first_ns: arrival time of the first packet, ns since 1970; None if unknown.
+        last_ns: arrival time of the last packet, ns since 1970; None if unknown.
+        last_read_ns: arrival time of the last packet that was read; None if unknown.
+        whole: whether the whole file was read; otherwise all counts refer to its beginning.
         contents: the data of each sensor.
         warnings: warnings about the file.
     """
@@ -127,24 +133,24 @@ class FileContents:
 
     @property
     def packets(self) -> int:
-        """Number of packets, or chunks of a stream, in the part that was read."""
+        """The number of packets, or chunks of a stream, in the part that was read."""
         return sum(flow.packets for flow in self.flows)
 
     @property
     def bytes(self) -> int:
-        """Number of their bytes."""
+        """The number of bytes of all packets in the part that was read."""
         return sum(flow.bytes for flow in self.flows)
 
     @property
     def seconds(self) -> float | None:
-        """Seconds from the first packet to the last; None if times are unknown."""
+        """The seconds from the first packet to the last; None if times are unknown."""
         if self.first_ns is None or self.last_ns is None:
             return None
         return (self.last_ns - self.first_ns) * 1e-9
 
     @property
     def read_seconds(self) -> float | None:
-        """Duration in seconds of the part that was read; None if times are unknown."""
+        """The duration of the part that was read, in seconds; None if unknown."""
         if self.first_ns is None or self.last_read_ns is None:
             return None
         return (self.last_read_ns - self.first_ns) * 1e-9
@@ -216,53 +222,50 @@ def read_contents(path: str | Path) -> FileContents:
             header = opened.header
         else:
             header = None
-        described = FileContents(str(path), kind, _size(Path(file)), header)
-        _count(described, opened)
-        described.warnings += opened.warnings
-    described.contents += _find_sensors(described) if described.bytes else []
-    return described
+        contents = FileContents(str(path), kind, _measure_size(Path(file)), header)
+        _count_packets(contents, opened)
+        contents.warnings += opened.warnings
+    if contents.bytes:
+        contents.contents += _find_sensors(contents)
+    return contents
 
 
 def measure_duration(path: str | Path) -> float | None:
     """Return the seconds from the first packet of a file to the last.
 
-    Returns None if that would require reading all of a long file.
+    None if times are unknown, or if a long file would have to be read to its end.
 
     Raises:
         SourceError: if the file cannot be opened.
     """
     with contextlib.closing(open_transport(path)) as opened:
-        described = FileContents(str(path), "", 0)
-        _count(described, opened)
-    return described.seconds
+        contents = FileContents(str(path), "", 0)
+        _count_packets(contents, opened)
+    return contents.seconds
 
 
-def _size(path: Path) -> int:
+def _measure_size(path: Path) -> int:
     if path.is_dir():
         return sum(part.stat().st_size for part in path.rglob("*"))
     return path.stat().st_size
 
 
-def _count(contents: FileContents, opened: Transport) -> None:
-    """Count the beginning of the file, and find the last time."""
+def _count_packets(contents: FileContents, opened: Transport) -> None:
+    """Count the packets at the beginning of a file, and find the first and last time."""
     flows = dict[tuple[Sender | None, Sender | None], PacketFlow]()
-    left = MAX_BEGINNING_BYTES
+    bytes_left = MAX_BEGINNING_BYTES
     chunks = opened.chunks()
-    for number, chunk in enumerate(chunks):
+    for index, chunk in enumerate(chunks):
         flow = flows.setdefault(
             (chunk.sender, chunk.receiver), PacketFlow(chunk.sender, chunk.receiver)
         )
-        flow.packets, flow.bytes, left = (
-            flow.packets + 1,
-            flow.bytes + len(chunk.data),
-            left - len(chunk.data),
-        )
+        flow.packets += 1
+        flow.bytes += len(chunk.data)
+        bytes_left -= len(chunk.data)
         if contents.first_ns is None:
             contents.first_ns = chunk.at
-        else:
-            contents.first_ns = contents.first_ns
         contents.last_read_ns = contents.last_ns = chunk.at or contents.last_ns
-        if left <= 0 or number >= PACKETS:
+        if bytes_left <= 0 or index >= MAX_BEGINNING_PACKETS:
             contents.last_ns = _find_last_time(opened, chunks)
             contents.whole = False
             break
@@ -270,9 +273,9 @@ def _count(contents: FileContents, opened: Transport) -> None:
 
 
 def _find_last_time(opened: Transport, chunks: Iterator[Chunk]) -> int | None:
-    """Return the time of the last packet, None if that requires reading everything."""
+    """Return the time of the last packet; None if the file cannot seek."""
     last = None
-    for chunk in chunks if opened.skip_until(_END) else ():
+    for chunk in chunks if opened.skip_until(_END_NS) else ():
         last = chunk.at or last
     return last
 
@@ -281,52 +284,53 @@ def _find_sensors(contents: FileContents) -> list[SensorContent]:
     """Return the data of each sensor."""
     try:
         if (declared := find_declared_sensor(contents.path)) is not None:
-            reading = _reading(contents.path, declared)
+            reading = _measure_rates(contents.path, declared)
             verb = verb_to_show(declared)
             return [SensorContent(contents.path, (declared.id,), None, "", reading, verb)]
     except LidarSpecError as error:
         contents.warnings.append(str(error))
-    judged = identify_senders(contents.path)
-    if any(one.sample.is_text for one in judged) and not any(one.candidates for one in judged):
+    verdicts = identify_senders(contents.path)
+    has_text = any(verdict.sample.is_text for verdict in verdicts)
+    if has_text and not any(verdict.candidates for verdict in verdicts):
         contents.kind = "text"
-    return [_content(contents.path, one) for one in judged]
+    return [_make_content(contents.path, verdict) for verdict in verdicts]
 
 
-def _content(path: str, one: Verdict) -> SensorContent:
-    if one.sample.sender and "?" not in path:
-        source = f"{path}?src={one.sample.sender}"
+def _make_content(path: str, verdict: Verdict) -> SensorContent:
+    if verdict.sample.sender and "?" not in path:
+        source = f"{path}?src={verdict.sample.sender}"
     else:
         source = path
-    if not one.candidates:
-        return SensorContent(source, tuple(list_candidates(one)))
-    best = one.candidates[0]
+    if not verdict.candidates:
+        return SensorContent(source, tuple(list_candidates(verdict)))
+    best = verdict.candidates[0]
     return SensorContent(
         source,
-        tuple(list_candidates(one)),
+        tuple(list_candidates(verdict)),
         best.share,
         format_sensor_options(best.sensor),
-        _reading(source, best.sensor),
+        _measure_rates(source, best.sensor),
         verb_to_show(best.sensor),
     )
 
 
-def _reading(source: str, sensor: Sensor) -> MeterReading | None:
+def _measure_rates(source: str, sensor: Sensor) -> MeterReading | None:
     """Return the statistics of a sensor at the beginning of a file.
 
-    Returns None if its frames cannot be read.
+    None if the frames cannot be read.
     """
     try:
         with Device(source, sensor) as device:
-            feed = open_live(device)
-            while not feed.ended and device.stats.bytes_in < DECODED:
-                feed.read(0.0)
-            return feed.meter.summary(device.stats)
+            live = open_live(device)
+            while not live.ended and device.stats.bytes_in < MAX_DECODED_BYTES:
+                live.read(0.0)
+            return live.meter.summary(device.stats)
     except LidarSpecError:
         return None
 
 
 def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
-    """Return the description of a file as lines of (word, text)."""
+    """Return the description of a file as (label, text) of each line."""
     lines = list[tuple[str, str]]()
     if (header := contents.header) is not None:
         lines.append(("recorded", f"{header.created} from {header.source or 'an unknown source'}"))
@@ -348,7 +352,7 @@ def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
     else:
         unit = "pieces"
     lines.append(("holds", f"{contents.packets} {unit}, {contents.bytes} bytes{rate}"))
-    for flow in contents.flows[:FLOWS]:
+    for flow in contents.flows[:MAX_LISTED_FLOWS]:
         if flow.sender is not None:
             if flow.receiver is not None:
                 to = f" to {endpoint(flow.receiver)}"
@@ -357,7 +361,7 @@ def format_contents(contents: FileContents) -> Sequence[tuple[str, str]]:
             lines.append(
                 ("from", f"{endpoint(flow.sender)}{to}: {flow.packets} packets, {flow.bytes} bytes")
             )
-    if further := contents.flows[FLOWS:]:
+    if further := contents.flows[MAX_LISTED_FLOWS:]:
         lines.append(
             ("from", f"{len(further)} others: {sum(flow.packets for flow in further)} packets")
         )

@@ -14,9 +14,9 @@ from lidarspec.spec.arguments import Range, Taken
 if TYPE_CHECKING:
     from lidarspec.points.cloud import PointCloud
 
-#: Bytes in a line of a hexdump.
+#: Number of bytes in a line of a hexdump.
 HEXDUMP_LINE_BYTES = 16
-#: Lines of a hexdump before the marked line.
+#: Number of lines of a hexdump before the marked line.
 HEXDUMP_LINES_BEFORE = 2
 DEGREES_PER_TURN = 360
 
@@ -35,7 +35,7 @@ class TextSpan(NamedTuple):
 class ExplainedPoint(NamedTuple):
     """One point of a cloud, in metres and degrees.
 
-    Without a return, x, y and z are nan and the range is inf or nan.
+    A point without a valid return has x, y and z nan, and the range inf (no return) or nan.
     """
 
     x: float
@@ -81,15 +81,16 @@ class FieldValue:
     """One field of a row.
 
     Attributes:
-        path: with array indices, e.g. "points[1].intensity".
+        path: the path with array indices, e.g. "points[1].intensity".
         raw: the raw value, a number or bytes.
-        physical: the number in `unit`; None if the value is not a number.
-        digits: the decimals that show every step of the value; None for a float field.
-        label: the name of the raw value, "" without one.
-        bits: the bits that it has in the bytes of the row, as text; "" for whole bytes.
+        physical: the value in `unit`; None if the value is not a number.
+        unit: the unit; "" if the field has none.
+        digits: number of decimals that show every step of the value; None for a float field.
+        label: the label of the raw value; "" if it has none.
+        bits: the bits of the row's bytes that belong to the field, as text; "" for whole bytes.
         docs: the documentation of the field.
-        start: the offset of its first byte in the frame.
-        masks: a mask for each of its bytes, with its own bits set.
+        start: offset of the first byte in the frame.
+        masks: a mask for each byte, in which the bits of the field are set.
     """
 
     path: str
@@ -108,14 +109,19 @@ class FieldValue:
         """The last part of the path."""
         return self.path.rpartition(".")[2]
 
-    def holds(self, offset: int, bit: int) -> bool:
-        """Return whether it contains a bit of the frame."""
+    def contains_bit(self, offset: int, bit: int) -> bool:
+        """Return whether a bit of the frame belongs to the field.
+
+        Args:
+            offset: offset of the byte in the frame.
+            bit: index of the bit, 0 for the lowest.
+        """
         index = offset - self.start
         return 0 <= index < len(self.masks) and bool(self.masks[index] >> bit & 1)
 
-    def covers(self, offset: int) -> bool:
-        """Return whether it has bits in a byte of the frame."""
-        return any(self.holds(offset, bit) for bit in range(8))
+    def covers_byte(self, offset: int) -> bool:
+        """Return whether any bit of a byte of the frame belongs to the field."""
+        return any(self.contains_bit(offset, bit) for bit in range(8))
 
     def __str__(self) -> str:
         if self.physical is None:
@@ -138,8 +144,8 @@ class FieldValue:
     def to_dict(self) -> dict[str, Any]:
         """Return the value as a dict for JSON.
 
-        Bytes and masks are hexadecimal text, nan and infinity are None. Empty attributes are left
-        out.
+        Bytes and masks are hexadecimal text, nan and infinity are None. Empty attributes are
+        omitted.
         """
         if isinstance(self.raw, bytes | bytearray):
             raw = self.raw.hex(" ")
@@ -161,18 +167,17 @@ class FieldValue:
 
 @dataclass(frozen=True)
 class ExplainedRow:
-    """Some bytes of a frame: one field, one bit block, or one element of an array of structs.
+    """A row of a frame: one field, one bit block, or one element of an array.
 
     Attributes:
-        offset: of the first byte in the frame.
+        offset: offset of the first byte in the frame.
         data: the bytes.
-        path: the field or element; "" for bytes in no field.
+        path: the path of the field or element; "" for bytes that are not in a field.
         values: the fields in these bytes.
         remarks: remarks on constants, checksums and missing bytes.
         right: False if the bytes do not match the spec.
         points: the points in this element.
-        numbers: for each point (number of the part of the frame, number of the point in the part),
-            from 0.
+        numbers: for each point: index of the part of the frame, and index of the point in the part.
     """
 
     offset: int
@@ -186,15 +191,14 @@ class ExplainedRow:
 
     @property
     def meaning(self) -> str:
-        """Values in their units, remarks, documentation and points, in one line."""
+        """Values with units, remarks, documentation and points, in one line."""
         return "".join(text for text, _ in self.spans())
 
     def spans(self, *, drawn: bool = False) -> list[TextSpan]:
-        """Return the meaning in pieces with their roles.
+        """Return the parts of `meaning` with their roles.
 
         Args:
-            drawn: True leaves out the values, because the listing draws them bit by bit below the
-                row.
+            drawn: whether to omit the values, because the listing draws their bits below the row.
         """
         alone = len(self.values) == 1 and not self.values[0].bits
         values = [] if drawn else self._format_values(alone=alone)
@@ -217,16 +221,17 @@ class ExplainedRow:
 
     @property
     def first(self) -> bool:
-        """Whether it is in the first element of every array around it.
+        """Whether the row is in the first element of each array that contains it.
 
-        Texts that are the same in all elements are only shown there.
+        Texts that are equal in all elements are shown only there.
         """
         return set(re.findall(r"\[(\d+)\]", self.path)) <= {"0"}
 
     def _format_values(self, *, alone: bool) -> list[str]:
-        """Return each value as text, with its name unless its unit is unique in the row.
+        """Return each value as text.
 
-        The first element of an array also shows the bits of each value.
+        The name of a field is omitted if no other value of the row has its unit. The first element
+        of an array also shows the bits of each value.
         """
         if alone and self.remarks:
             return []
@@ -271,11 +276,11 @@ class FieldDifference:
     """A field that differs between two frames.
 
     Attributes:
-        path: with array indices.
-        before: its value in the first frame; None if that frame lacks the field.
-        after: its value in the second frame; None if that frame lacks the field.
-        first: its bytes in the first frame.
-        second: its bytes in the second frame.
+        path: the path with array indices.
+        before: the value in the first frame; None if the frame does not have the field.
+        after: the value in the second frame; None if the frame does not have the field.
+        first: the bytes of the field in the first frame.
+        second: the bytes of the field in the second frame.
     """
 
     path: str
@@ -295,7 +300,7 @@ class FieldDifference:
 
     @property
     def masks(self) -> bytes:
-        """The bits of the field that differ, for the bytes that both frames have."""
+        """The bits of the field that differ: a mask for each byte that both frames have."""
         own = self.before.masks if self.before else b""
         return bytes(
             (a ^ b) & mask for a, b, mask in zip(self.first, self.second, own, strict=False)
@@ -303,7 +308,7 @@ class FieldDifference:
 
     @property
     def change(self) -> str:
-        """The signed change of the physical value as text; "" if it is not a number."""
+        """The signed change of the physical value as text; "" if there is no number."""
         if (
             not self.before
             or not self.after
@@ -353,9 +358,9 @@ def number(value: Any) -> Any:
 
 
 def format_fixed(value: float, digits: int | None) -> str:
-    """Format a number with `digits` decimals, without a minus sign if the result is zero.
+    """Format a number with `digits` decimals, and zero without a minus sign.
 
-    Without `digits`, it has seven significant digits.
+    If `digits` is None, the text has seven significant digits.
     """
     if digits is None:
         text = f"{value:.7g}"
@@ -367,23 +372,23 @@ def format_fixed(value: float, digits: int | None) -> str:
 
 
 def limits(low: float, high: float, between: str = "..") -> str:
-    """Format a range of numbers, with all digits of integers, e.g. "0..4294967295"."""
+    """Format a range of numbers, e.g. "0..4294967295"; integers with all digits."""
     return between.join(
         f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (low, high)
     )
 
 
 def format_argument_type(kind: Taken, between: str = "..") -> str:
-    """Format the type of a command argument: its range if it is a number, else its name."""
+    """Format the type of a command argument: the range of a number, or a name."""
     if isinstance(kind, Range):
         return limits(kind.low, kind.high, between)
     return kind.words(None)
 
 
 def ascii_text(data: bytes | bytearray) -> str:
-    """Return printable ASCII in quotes, without trailing zero bytes; "" for other bytes.
+    """Return bytes as text in quotes, without trailing zero bytes.
 
-    Texts of up to three characters also return "".
+    Returns "" if the bytes are not printable ASCII, or have fewer than four characters.
     """
     text = bytes(data).rstrip(b"\0").decode("ascii", "replace")
     if len(text) > 3 and text.isascii() and text.isprintable():
@@ -392,9 +397,9 @@ def ascii_text(data: bytes | bytearray) -> str:
 
 
 def hexdump(error: WireError) -> str:
-    """Return a hexdump of the bytes around an error, "" if the error has no bytes.
+    """Return a hexdump of the bytes around an error; "" if the error has no bytes.
 
-    A line below them marks the invalid bytes and names their field.
+    The last line marks the invalid bytes and names their field.
     """
     size = _count_marked_bytes(error)
     first = min(error.offset, len(error.data)) // HEXDUMP_LINE_BYTES * HEXDUMP_LINE_BYTES
@@ -427,7 +432,7 @@ def _count_marked_bytes(error: WireError) -> int:
 
 
 def describe_losses(sensor: Sensor) -> str:
-    """Return how lost packets are counted, or why they are not."""
+    """Return a text about how lost packets are counted, or why they are not."""
     if sensor.sequence is not None:
         return f"counted by `{sensor.sequence.field}`"
     if sensor.counts_losses:

@@ -1,4 +1,4 @@
-"""One frame as rows of values: every byte is in exactly one row, also of a truncated frame."""
+"""One frame as rows of values: every byte is in exactly one row, even if the frame is truncated."""
 
 from __future__ import annotations
 
@@ -20,19 +20,23 @@ from lidarspec.frames.wire_table import bit_text, format_hex
 from lidarspec.spec import Frame
 from lidarspec.spec.tree import UNNAMED, FieldInfo, format_values, to_exact
 
-#: Maximum number of decimals to distinguish steps, and of decimals to add to show a step in full.
+#: Maximum number of decimals that are used to distinguish all values of a field.
 MAX_DIGITS = 12
-MAX_SPARE_DIGITS = 2
+#: Maximum number of decimals that are added to show each step exactly.
+MAX_EXTRA_DIGITS = 2
 
 
 class FrameRows:
-    """The rows of one frame, as far as its bytes go.
+    """The rows of one frame, up to the end of its bytes.
 
     Args:
-        fault: the fault of the frame, which is reported at its row.
+        frame: the frame type.
+        data: the bytes.
+        fault: the fault of the frame, which is reported in the row of its field; None if the frame
+            is valid.
 
     Attributes:
-        after: the byte after the frame.
+        after: the offset after the frame.
     """
 
     def __init__(self, frame: Frame, data: bytes, fault: WireError | None = None) -> None:
@@ -40,67 +44,76 @@ class FrameRows:
         self._schema = make_schema(frame.tree)
         self._fault = fault
         self._has_form = frame.wire is not None
-        self._axes = self._array_axes()
+        self._axes = self._find_array_axes()
         decoded = frame_coder(frame).decode(data)
         #: Offset in the frame of each byte of its struct.
         self._offsets = decoded.offsets
         self._verdicts: dict[str, tuple[str, bool]] = {}
         fields = self._read_fields(frame, decoded.struct)
-        self._is_cut_off = fields is None or any(each.raw is None for each in fields)
-        self._fields = [self._place_on_wire(each) for each in fields or () if each.raw is not None]
-        blocks = [each.block for each in self._fields if each.bits is not None]
+        self._is_cut_off = fields is None or any(field.raw is None for field in fields)
+        self._fields = [
+            self._convert_offsets(field) for field in fields or () if field.raw is not None
+        ]
+        blocks = [field.block for field in self._fields if field.bits is not None]
         self._blocks = {without_indices(path)[0] for path in blocks}
         self._first = self._offsets[0]
-        self._end = max((each.end for each in self._fields), default=self._first)
+        self._end = max((field.end for field in self._fields), default=self._first)
         self._is_whole_text = self._has_form and not self._is_cut_off and decoded.problem is None
         self.after = len(data) if self._is_whole_text else self._end
 
-    def _array_axes(self) -> list[str]:
-        """Return the axes of all arrays, those of byte strings left out."""
+    def _find_array_axes(self) -> list[str]:
+        """Return the axes of all arrays except byte strings."""
         axes: list[str] = []
         for info in self._schema.all_fields.values():
             axes += info.axes[:-1] if info.kind == "bytes" else info.axes
         return axes
 
     def _read_fields(self, frame: Frame, struct: bytes) -> list[WireField] | None:
-        """Return the fields of the frame, the last one maybe cut off; None if it has no end."""
+        """Return the fields of the frame; the last field may be truncated.
+
+        None if the end of the frame is unknown.
+        """
         if isinstance(frame_layouts(frame), NotCompilableError):
             return plain_fields(frame, struct)
         examined = examine(frame.tree, struct, frame.room)
         with contextlib.suppress(Exception):  # a plugin's checksum; `fault` has the exception
-            self._verdicts = {seal.path: _verdict(seal) for seal in examined.seals()}
+            self._verdicts = {seal.path: _describe_checksum(seal) for seal in examined.seals()}
         fields = list(examined.fields())
-        if examined.layout is None and all(each.raw is not None for each in fields):
+        if examined.layout is None and all(field.raw is not None for field in fields):
             cut_off = WireField("", "", FieldInfo(""), len(struct), len(struct), None, None)
             fields.append(cut_off)
         return fields
 
-    def _place_on_wire(self, each: WireField) -> WireField:
-        """Return a field with its place on the wire."""
+    def _convert_offsets(self, field: WireField) -> WireField:
+        """Return a field with its offsets on the wire instead of in the struct."""
         if not self._has_form:
-            return each
+            return field
         return replace(
-            each, start=self._offsets[each.start], end=self._offsets[each.end], bits=None
+            field, start=self._offsets[field.start], end=self._offsets[field.end], bits=None
         )
 
-    def rows(self) -> Iterator[ExplainedRow]:
-        """Return a row for each field or bit block, and for the marks of a wire form.
+    def iter_rows(self) -> Iterator[ExplainedRow]:
+        """Yield a row for each field or bit block, and for start and end of a wire form.
 
-        The fields of an array element are one row if it holds no further array.
+        All fields of an array element are one row if the element contains no further array.
         """
         if self._first:
             yield ExplainedRow(0, self._data[: self._first], "(start)", (), (), right=True)
-        for path, group in itertools.groupby(self._fields, lambda each: self._row_path(each.block)):
-            yield self._row(path, list(group))
+        rows = itertools.groupby(self._fields, lambda field: self._find_row_path(field.block))
+        for path, group in rows:
+            yield self._make_row(path, list(group))
         if self._is_whole_text and self._end < len(self._data):
             yield ExplainedRow(self._end, self._data[self._end :], "(end)", (), (), right=True)
 
     def values(self) -> dict[str, FieldValue]:
-        """Return every value by its path."""
-        return {value.path: value for row in self.rows() for value in row.values}
+        """Return all values by path."""
+        return {value.path: value for row in self.iter_rows() for value in row.values}
 
-    def rest(self, fault: WireError | None) -> Iterator[ExplainedRow]:
-        """Return the bytes in no field: those of one that is cut off, or after the frame."""
+    def iter_rest(self, fault: WireError | None) -> Iterator[ExplainedRow]:
+        """Yield the row of the bytes after the last field, if there are any.
+
+        They are the bytes of a truncated field, or bytes after the frame.
+        """
         left = self._data[self.after :]
         if self._is_cut_off and fault is not None:
             yield ExplainedRow(self.after, left, fault.path, (), (fault.reason,), right=False)
@@ -111,8 +124,12 @@ class FrameRows:
                 self.after, left, "", (), ("after the end of the frame",), right=False
             )
 
-    def _row_path(self, path: str) -> str:
-        """Return the innermost array element that contains a field, or the field itself."""
+    def _find_row_path(self, path: str) -> str:
+        """Return the path of the row of a field.
+
+        It is the innermost array element that contains the field, or the field itself if it is not
+        in an array, or if the element contains further arrays.
+        """
         head, bracket, _ = path.rpartition("]")
         array = without_indices(head + bracket)[0]
         in_blocks = tuple(f"{block}." for block in self._blocks)
@@ -123,84 +140,84 @@ class FrameRows:
             return path
         return head + bracket
 
-    def _row(self, path: str, group: Sequence[WireField]) -> ExplainedRow:
+    def _make_row(self, path: str, group: Sequence[WireField]) -> ExplainedRow:
         start = group[0].start
         end = group[-1].end
         values: list[FieldValue] = []
         remarks: list[str] = []
         right = True
-        for each in group:
-            info = self._info(each)
-            values.append(_value(each, info))
-            wrong = self._remark(each, info)
+        for field in group:
+            info = self._find_info(field)
+            values.append(_make_value(field, info))
+            wrong = self._find_fault(field, info)
             if wrong:
                 remarks.append(wrong)
                 right = False
-            if each.path in self._verdicts:
-                text, is_right = self._verdicts[each.path]
+            if field.path in self._verdicts:
+                text, is_right = self._verdicts[field.path]
                 remarks.append(text)
                 right = right and is_right
         return ExplainedRow(
             start, self._data[start:end], path, tuple(values), tuple(remarks), right
         )
 
-    def _info(self, each: WireField) -> FieldInfo:
-        docs = "constant" if each.path.endswith(UNNAMED) else ""
-        unknown = replace(each.info, path=without_indices(each.path)[0], docs=docs)
-        info: FieldInfo = self._schema.all_fields.get(without_indices(each.path)[0], unknown)
+    def _find_info(self, field: WireField) -> FieldInfo:
+        docs = "constant" if field.path.endswith(UNNAMED) else ""
+        unknown = replace(field.info, path=without_indices(field.path)[0], docs=docs)
+        info: FieldInfo = self._schema.all_fields.get(without_indices(field.path)[0], unknown)
         return info
 
-    def _remark(self, each: WireField, info: FieldInfo) -> str:
-        """Return the fault of a value; "" if there is none."""
-        if info.const is not None and each.raw != info.const:
-            shown = format_hex(each.raw, info.bits)
+    def _find_fault(self, field: WireField, info: FieldInfo) -> str:
+        """Return a text if the value of a field is wrong, else ""."""
+        if info.const is not None and field.raw != info.const:
+            shown = format_hex(field.raw, info.bits)
             return f"wrong: {shown}, expected {format_hex(info.const, info.bits)}"
-        if info.allowed is not None and each.raw not in info.allowed:
-            return f"wrong: {each.raw}, expected {format_values(info.allowed)}"
-        if info.held and self._fault is not None and self._fault.path == each.path:
-            return f"wrong: {each.raw}, expected {self._fault.expected}"
+        if info.allowed is not None and field.raw not in info.allowed:
+            return f"wrong: {field.raw}, expected {format_values(info.allowed)}"
+        if info.held and self._fault is not None and self._fault.path == field.path:
+            return f"wrong: {field.raw}, expected {self._fault.expected}"
         return ""
 
 
-def _value(each: WireField, info: FieldInfo) -> FieldValue:
-    size = each.end - each.start
-    is_number = isinstance(each.raw, int | float)
+def _make_value(field: WireField, info: FieldInfo) -> FieldValue:
+    size = field.end - field.start
+    is_number = isinstance(field.raw, int | float)
     return FieldValue(
-        each.path,
-        each.raw,
-        float(info.physical(each.raw)) if is_number else None,
+        field.path,
+        field.raw,
+        float(info.physical(field.raw)) if is_number else None,
         info.unit,
-        None if info.kind == "float" else _digits(info.scale, info.offset),
-        info.labels.get(each.raw, "") if isinstance(each.raw, int) else "",
-        "" if each.bits is None else bit_text(each.bits),
+        None if info.kind == "float" else _count_digits(info.scale, info.offset),
+        info.labels.get(field.raw, "") if isinstance(field.raw, int) else "",
+        "" if field.bits is None else bit_text(field.bits),
         info.docs,
-        each.start,
-        b"\xff" * size if each.bits is None else each.bits.masks(size),
+        field.start,
+        b"\xff" * size if field.bits is None else field.bits.masks(size),
     )
 
 
 @functools.lru_cache
-def _digits(scale: float, offset: float) -> int:
-    """Return the decimals that distinguish all values of a field.
+def _count_digits(scale: float, offset: float) -> int:
+    """Return the number of decimals that distinguish all values of a field.
 
-    A few more are added if they show each step in full.
+    Up to `MAX_EXTRA_DIGITS` more are added if they show each step exactly.
     """
     steps = (to_exact(scale), to_exact(offset))
-    apart = next(
+    distinguishing = next(
         (digits for digits in range(MAX_DIGITS) if abs(steps[0]) * 10**digits >= 1), MAX_DIGITS
     )
     return next(
         (
             digits
-            for digits in range(apart, apart + MAX_SPARE_DIGITS + 1)
+            for digits in range(distinguishing, distinguishing + MAX_EXTRA_DIGITS + 1)
             if all(step * 10**digits % 1 == 0 for step in steps)
         ),
-        apart,
+        distinguishing,
     )
 
 
-def _verdict(seal: PlacedSeal) -> tuple[str, bool]:
-    """Return the text of a checksum, and whether it is right."""
+def _describe_checksum(seal: PlacedSeal) -> tuple[str, bool]:
+    """Return a text about a checksum, and whether the checksum is right."""
     algorithm = seal.seal.algorithm
     count = sum(end - start for start, end in seal.seal.spans)
     plural = "s" if count != 1 else ""

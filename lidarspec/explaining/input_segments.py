@@ -1,9 +1,9 @@
 """Split an input into pieces: valid frames, damaged frames, and the bytes between them.
 
-The decoder finds the valid frames, and `iter_pieces` yields them as soon as it does.
-`explain_piece` searches the bytes between them for damaged frames. A damaged frame begins at
-constants that look like the start of a frame. It ends after the size of the frame, or one byte
-before or after that if another frame begins there, or at the start of the next frame.
+The decoder finds the valid frames, and `iter_pieces` yields each frame as soon as it is found.
+`explain_piece` searches the bytes between them for damaged frames. A damaged frame begins with the
+constants at the start of a frame type. It ends after the size of the frame, or one byte before or
+after if another frame begins there, or at the start of the next frame.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from lidarspec.spec import Sensor
 from lidarspec.spec.sensor import with_frames
 from lidarspec.transports.protocol import Chunk
 
-#: Minimum number of constant bytes at the start of a frame type that is searched for.
+#: Frame types that begin with fewer constant bytes are not searched for.
 MIN_SYNC_BYTES = 2
-#: Number of bytes without a frame that are collected before they are yielded as a piece.
+#: If more bytes without a frame have arrived, they are yielded as a piece.
 MAX_HELD_BYTES = 1 << 16
 #: Placeholder for the frame type of a whole input that may be one damaged frame.
 NEAREST = "?"
@@ -35,13 +35,13 @@ NEAREST = "?"
 
 @dataclass(frozen=True)
 class InputPiece:
-    """A frame of the input, or bytes that are in no frame.
+    """A frame of the input, or bytes that are not in a frame.
 
     Attributes:
         offset: offset of the first byte in the input.
         data: the bytes.
-        frame: the frame type, "" for bytes in no frame, or `NEAREST`.
-        datagram: True for bytes of a datagram that are in no frame.
+        frame: the frame type; "" for bytes that are not in a frame; or `NEAREST`.
+        datagram: whether the bytes are a datagram, or a part of one, that is not in a frame.
     """
 
     offset: int
@@ -51,31 +51,33 @@ class InputPiece:
 
     @property
     def is_valid(self) -> bool:
-        """Whether it is a valid frame."""
+        """Whether the piece is a valid frame."""
         return self.frame not in ("", NEAREST)
 
     @property
     def end(self) -> int:
-        """The offset after its last byte."""
+        """The offset after the last byte."""
         return self.offset + len(self.data)
 
     def part(self, start: int, end: int, frame: str = "") -> InputPiece:
-        """Return the bytes from `start` to `end` as a piece of the input."""
+        """Return the bytes from `start` to `end` of the piece as a new piece."""
         return InputPiece(self.offset + start, self.data[start:end], frame)
 
 
 def iter_pieces(
     sensor: Sensor, chunks: Iterable[Chunk], *, datagrams: bool, frame: str | None = None
 ) -> Iterator[InputPiece]:
-    """Yield the frames of the input and the bytes between them, in order, as they are found.
+    """Yield the frames of the input and the bytes between them, in order, when found.
 
-    A datagram that is not a frame is a piece of its own. An input that is not longer than a frame
-    and contains none is one piece of the type `NEAREST`.
+    If a datagram is not a frame, it is a separate piece. If a whole input is not longer than a
+    frame, and contains no valid frame, it is one piece of the type `NEAREST`.
 
     Args:
-        datagrams: True if each chunk is a datagram, False for a stream.
-        frame: prefer this frame type if several types match the same bytes, and find it without
-            the frame that it must follow. Frames of other types are yielded too.
+        sensor: the sensor.
+        chunks: the input.
+        datagrams: whether each chunk is a datagram, not a piece of a stream.
+        frame: the preferred frame type if several types match the same bytes. It is also found
+            without the frame that it has to follow. Frames of other types are yielded as well.
 
     Raises:
         UnknownFrame: if the sensor has no such frame type.
@@ -112,7 +114,7 @@ def iter_pieces(
 
 
 def _prefer_frame(sensor: Sensor, frame: str) -> Sensor:
-    """Return the sensor with one frame type as the first and incoming one, not after another."""
+    """Return the sensor with a frame type first, incoming, and without `after`."""
     first = replace(sensor.frames[frame], direction="in", after=None)
     return with_frames(
         sensor,
@@ -156,13 +158,15 @@ def explain_piece(
 ) -> Iterator[tuple[InputPiece, Explanation]]:
     """Yield a piece with its explanation.
 
-    A piece without a frame is split into damaged frames and the bytes between them.
+    If the piece is not a frame, it is split into damaged frames and the bytes between them.
 
     Args:
-        frame: the frame type for `NEAREST`; by default the closest.
+        sensor: the sensor.
+        piece: the piece.
+        frame: the frame type for `NEAREST`; by default the type that fits best.
 
     Raises:
-        WireError: if the piece is `NEAREST` and does not even begin like a frame.
+        WireError: if the piece is `NEAREST`, and no frame type begins like its bytes.
     """
     if piece.frame:
         yield piece, explain(piece.data, sensor, piece.frame if piece.is_valid else frame)
@@ -192,7 +196,9 @@ def _iter_damaged(sensor: Sensor, piece: InputPiece) -> Iterator[InputPiece]:
     """Yield the damaged frames in the bytes of a piece, in order."""
     data = piece.data
     end = 0
-    starts = [start for start in likely_starts(sensor, data) if not piece.datagram or start == 0]
+    starts = find_likely_starts(sensor, data)
+    if piece.datagram:
+        starts = [start for start in starts if start == 0]
     for start in [*starts, len(data)]:
         if start > end and (name := _find_headless_type(sensor, data[end:start])):
             yield piece.part(end, start, name)
@@ -205,11 +211,12 @@ def _iter_damaged(sensor: Sensor, piece: InputPiece) -> Iterator[InputPiece]:
             yield piece.part(start, end, name)
 
 
-def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
+def find_likely_starts(sensor: Sensor, data: bytes) -> list[int]:
     """Return the offsets at which a frame may begin, in ascending order.
 
-    There, the bytes match the first constants of an incoming frame type, and at least one more
-    byte follows. Types that begin with fewer than `MIN_SYNC_BYTES` constants are not searched for.
+    At these offsets, the bytes match the constants at the start of an incoming frame type, and at
+    least one more byte follows. Types that begin with fewer than `MIN_SYNC_BYTES` constants are not
+    searched for.
     """
     starts: set[int] = set()
     for frame in sensor.incoming.values():
@@ -226,7 +233,7 @@ def likely_starts(sensor: Sensor, data: bytes) -> list[int]:
 
 
 def _find_nearest_type(sensor: Sensor, data: bytes) -> str:
-    """Return the frame type that the bytes begin like, "" if there is none."""
+    """Return the frame type that begins like the bytes; "" if there is none."""
     try:
         return identify(sensor, data[: _find_max_length(sensor)])
     except WireError as fault:
@@ -234,9 +241,9 @@ def _find_nearest_type(sensor: Sensor, data: bytes) -> str:
 
 
 def _find_headless_type(sensor: Sensor, data: bytes) -> str:
-    """Return the type of a damaged frame that does not begin like a frame.
+    """Return the type of a frame that is damaged at its start.
 
-    Returns "" if no single change makes the bytes a valid frame.
+    Returns "" if no single change explains the damage.
     """
     return next((name for name, frame in sensor.incoming.items() if find_changes(frame, data)), "")
 
@@ -244,10 +251,13 @@ def _find_headless_type(sensor: Sensor, data: bytes) -> str:
 def _find_end(sensor: Sensor, data: bytes, start: int, name: str, ends: list[int]) -> int:
     """Return the offset at which a damaged frame ends.
 
-    This is the start of another frame at the expected end, or one byte before or after it.
-    Otherwise it is the expected end or the next start, whichever comes first.
+    If another frame begins at the expected end, or one byte before or after it, the frame ends
+    there. Otherwise it ends at the expected end or the next start, whichever comes first.
 
     Args:
+        data: the bytes.
+        start: the start of the damaged frame.
+        name: its type.
         ends: the offsets at which another frame may begin, and the end of the data.
     """
     following = [end for end in ends if end > start]

@@ -1,8 +1,8 @@
 """List an explained frame, and differences between frames, as lines.
 
-There is a line for each part, indented as the struct is nested, with bit fields drawn below. Lines
-consist of spans with roles, which a terminal can colour; their texts alone are complete.
-Differences are listed field by field and down to the bit.
+A frame has a line for each row, indented by the nesting of the struct, with the bits of bit fields
+below. Lines consist of spans with roles, which a terminal can colour. Differences have a line for
+each field, with the bits that differ.
 """
 
 from __future__ import annotations
@@ -21,18 +21,20 @@ from lidarspec.explaining.formatting import (
 )
 from lidarspec.frames.wire_table import format_hex
 
-#: Bytes in a line, spaces of a level of nesting, and the maximum widths of the columns of bits and
-#: of names.
-LINED = 8
-LEVEL = 2
-PICTURES = 35
-NAMES = 36
-
-#: Bytes of a field in a line of its differences.
-COMPARED = 4
-#: Number of spans of a line that are columns, and the minimum width beside them for folding.
-FIXED = 3
-FOLDED = 24
+#: Maximum number of bytes in a line.
+LINE_BYTES = 8
+#: Number of spaces for each level of nesting.
+INDENT = 2
+#: Maximum width of the column with bytes and bits.
+MAX_BITS_WIDTH = 35
+#: Maximum width of the column with names.
+MAX_NAME_WIDTH = 36
+#: Number of bytes of a field in a line of its differences.
+DIFFERENCE_LINE_BYTES = 4
+#: Number of spans at the start of a line that are columns.
+COLUMN_COUNT = 3
+#: Minimum width beside the columns; lines are not folded if there is less.
+MIN_FOLDED_WIDTH = 24
 
 Line = tuple[TextSpan, ...]
 
@@ -45,14 +47,14 @@ def join_text(line: Line) -> str:
 def fold(line: Line, width: int) -> Line:
     """Return a line with line breaks if it is wider than `width`.
 
-    Continuation lines start below the text.
+    Continuation lines are indented to the end of the columns.
     """
-    indent = sum(len(span.text) for span in line[:FIXED])
-    if len(join_text(line)) <= width or indent + FOLDED > width:
+    indent = sum(len(span.text) for span in line[:COLUMN_COUNT])
+    if len(join_text(line)) <= width or indent + MIN_FOLDED_WIDTH > width:
         return line
-    spans = list(line[:FIXED])
+    spans = list(line[:COLUMN_COUNT])
     column = indent
-    for span in line[FIXED:]:
+    for span in line[COLUMN_COUNT:]:
         for word in re.findall(r"\s*\S+", span.text):
             breaks = column + len(word) > width and column > indent
             part = f"\n{' ' * indent}{word.lstrip()}" if breaks else word
@@ -65,7 +67,7 @@ def fold(line: Line, width: int) -> Line:
 
 
 def parents(path: str) -> list[str]:
-    """Return the structs and elements in a path, outermost first.
+    """Return the paths of the structs that contain a field, outermost first.
 
     "a[0].b.c" is in "a[0]" and "a[0].b".
     """
@@ -77,7 +79,8 @@ class Listing:
     """The lines of the rows of a frame, in columns.
 
     Args:
-        every: draw the bits of all elements of an array, not only of the first.
+        rows: the rows.
+        every: whether to draw the bits of all elements of an array, not only of the first.
     """
 
     def __init__(self, rows: Sequence[ExplainedRow], *, every: bool) -> None:
@@ -85,43 +88,43 @@ class Listing:
         self._drawn = [
             any(value.bits for value in row.values) and (every or row.first) for row in rows
         ]
-        self._bytes = min(max([1, *(len(row.data) for row in rows)]), LINED)
+        self._bytes = min(max([1, *(len(row.data) for row in rows)]), LINE_BYTES)
         pictures = [
             bit_picture(*part)
             for row, drawn in zip(rows, self._drawn, strict=True)
             if drawn
-            for part in _bits(row)
+            for part in _split_bits(row)
         ]
         self._left = max(
             [
                 3 * self._bytes - 1,
-                *(len(picture) for picture in pictures if len(picture) <= PICTURES),
+                *(len(picture) for picture in pictures if len(picture) <= MAX_BITS_WIDTH),
             ]
         )
         self._paths = min(
             max(
                 (len(name) for index in range(len(rows)) for name in self._names(index)), default=0
             ),
-            NAMES,
+            MAX_NAME_WIDTH,
         )
 
     def lines(self) -> Iterator[Line]:
-        """Yield the lines; structs and elements come before their contents."""
-        above: list[str] = []
+        """Yield the lines; the line of a struct comes before its contents."""
+        previous: list[str] = []
         for index, row in enumerate(self._rows):
-            around = parents(row.path)
-            for depth, path in enumerate(around):
-                if path not in above[depth : depth + 1]:
-                    yield self._line(row.offset, TextSpan(""), _indent_path(path, depth), [])
-            above = around
-            yield from self._row(row, len(around), drawn=self._drawn[index])
+            containers = parents(row.path)
+            for depth, path in enumerate(containers):
+                if path not in previous[depth : depth + 1]:
+                    yield self._make_line(row.offset, TextSpan(""), _indent_path(path, depth), [])
+            previous = containers
+            yield from self._iter_row_lines(row, len(containers), drawn=self._drawn[index])
 
-    def _row(self, row: ExplainedRow, depth: int, *, drawn: bool) -> Iterator[Line]:
+    def _iter_row_lines(self, row: ExplainedRow, depth: int, *, drawn: bool) -> Iterator[Line]:
         parts = [
             row.data[start : start + self._bytes] for start in range(0, len(row.data), self._bytes)
         ] or [b""]
         role = "hex" if row.right else "bad"
-        yield self._line(
+        yield self._make_line(
             row.offset,
             TextSpan(parts[0].hex(" "), role),
             _indent_path(row.path, depth),
@@ -132,7 +135,7 @@ class Listing:
                 TextSpan(f"{row.offset + row_number * self._bytes:04x}  ", "offset"),
                 TextSpan(part.hex(" "), role),
             )
-        for value, picture in zip(row.values, _bits(row), strict=True) if drawn else ():
+        for value, picture in zip(row.values, _split_bits(row), strict=True) if drawn else ():
             words = [TextSpan(str(value) or value.raw.hex(" "))]
             words += [TextSpan(f" ({value.bits})", "docs")] * (
                 len(value.masks) - value.masks.count(0) > 1 and bool(value.bits)
@@ -142,14 +145,14 @@ class Listing:
                 drawing = TextSpan(bit_picture(*picture), "bits")
             else:
                 drawing = TextSpan(picture[0].hex(" "), role)
-            yield self._line(
+            yield self._make_line(
                 value.start,
                 drawing,
-                " " * LEVEL * (depth + 1) + value.path.removeprefix(f"{row.path}."),
+                " " * INDENT * (depth + 1) + value.path.removeprefix(f"{row.path}."),
                 words,
             )
 
-    def _line(self, offset: int, left: TextSpan, name: str, words: Sequence[TextSpan]) -> Line:
+    def _make_line(self, offset: int, left: TextSpan, name: str, words: Sequence[TextSpan]) -> Line:
         padded = TextSpan(f"{left.text:<{self._left}}  ", left.role)
         return (
             TextSpan(f"{offset:04x}  ", "offset"),
@@ -164,13 +167,13 @@ class Listing:
         yield from (_indent_path(path, depth) for depth, path in enumerate([*around, row.path]))
         if self._drawn[index]:
             yield from (
-                " " * LEVEL * (len(around) + 1) + value.path.removeprefix(f"{row.path}.")
+                " " * INDENT * (len(around) + 1) + value.path.removeprefix(f"{row.path}.")
                 for value in row.values
             )
 
 
-def _bits(row: ExplainedRow) -> list[tuple[bytes, bytes]]:
-    """Return the bytes and the bit masks of each value."""
+def _split_bits(row: ExplainedRow) -> list[tuple[bytes, bytes]]:
+    """Return the bytes and the bit masks of each value of a row."""
     return [
         (row.data[value.start - row.offset :][: len(value.masks)], value.masks)
         for value in row.values
@@ -178,21 +181,22 @@ def _bits(row: ExplainedRow) -> list[tuple[bytes, bytes]]:
 
 
 def _indent_path(path: str, depth: int) -> str:
-    return " " * LEVEL * depth + path.rpartition(".")[2]
+    return " " * INDENT * depth + path.rpartition(".")[2]
 
 
 def list_differences(differences: list[FieldDifference], sizes: tuple[int, int]) -> Iterator[Line]:
-    """Yield the differences of two frames: each field with both values and its bits.
+    """Yield lines with the differences of two frames, and a summary.
 
     Args:
-        sizes: the sizes of the frames in bytes.
+        differences: the fields that differ.
+        sizes: the sizes of the frames, in bytes.
     """
     for missing, group in groupby(differences, lambda difference: difference.missing):
         if missing:
-            yield _missing(list(group), missing)
+            yield _make_missing_line(list(group), missing)
             continue
         for difference in group:
-            yield from _lines(difference)
+            yield from _iter_difference_lines(difference)
     length = f"{' and '.join(map(str, dict.fromkeys(sizes)))} bytes"
     bits = sum(mask.bit_count() for difference in differences for mask in difference.masks)
     fields = len(differences)
@@ -202,7 +206,7 @@ def list_differences(differences: list[FieldDifference], sizes: tuple[int, int])
     yield (TextSpan(differing if fields else f"{length}, all identical", "note"),)
 
 
-def _lines(difference: FieldDifference) -> Iterator[Line]:
+def _iter_difference_lines(difference: FieldDifference) -> Iterator[Line]:
     old = difference.before
     new = difference.after
     assert old is not None
@@ -222,8 +226,8 @@ def _lines(difference: FieldDifference) -> Iterator[Line]:
         TextSpan(values),
     )
     masks = difference.masks
-    for start in range(0, len(masks), COMPARED):
-        part = slice(start, start + COMPARED)
+    for start in range(0, len(masks), DIFFERENCE_LINE_BYTES):
+        part = slice(start, start + DIFFERENCE_LINE_BYTES)
         if any(masks[part]):
             for sign, data, role in (
                 ("-", difference.first, "bad"),
@@ -232,12 +236,17 @@ def _lines(difference: FieldDifference) -> Iterator[Line]:
                 bits = bit_picture(data[part], masks[part])
                 yield (
                     TextSpan(f"{'':6}{sign} "),
-                    TextSpan(f"{data[part].hex(' '):<{3 * COMPARED - 1}}  ", "hex"),
+                    TextSpan(f"{data[part].hex(' '):<{3 * DIFFERENCE_LINE_BYTES - 1}}  ", "hex"),
                     TextSpan(bits, role),
                 )
 
 
-def _missing(group: list[FieldDifference], which: str) -> Line:
+def _make_missing_line(group: list[FieldDifference], which: str) -> Line:
+    """Return a line for consecutive fields that only one frame has.
+
+    Args:
+        which: "first" or "second", the frame that has them.
+    """
     paths = [difference.path for difference in group]
     if len(paths) == 1:
         names = paths[0]

@@ -398,6 +398,6 @@ def test_detect_exits_with_5_if_live_sources_are_silent(
     monkeypatch.setattr("lidarspec.cli.finding._detect_all_ports", lambda duration, start: iter([]))
     monkeypatch.setattr(
         "lidarspec.cli.finding._detect_source",
-        lambda source, duration, start, tell: [Verdict(SampleBytes(source))],
+        lambda source, duration, start, on_progress: [Verdict(SampleBytes(source))],
     )
     assert ran("detect", *source, code=5).stderr.startswith("no data received\n")

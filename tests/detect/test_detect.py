@@ -501,7 +501,7 @@ def test_a_line_that_is_silent_at_three_rates_is_not_listened_to_at_others(
         port(tmp_path) as made,
         working(lambda stop: _noise(made, random.Random(4), stop) if sends else None) as stop,
     ):
-        heard = list(read_samples(made.name, seconds=0.1, tell=told.append))
+        heard = list(read_samples(made.name, seconds=0.1, on_progress=told.append))
         stop.set()
         made.discard()
     assert len(heard) == len(told) == (listened or len(list_bauds()))

@@ -30,7 +30,7 @@ from std_srvs.srv import Trigger
 
 from lidarspec.device.device import Device
 from lidarspec.errors import LidarSpecError, UsageError, did_you_mean, suggestion
-from lidarspec.explaining.assignments import arguments
+from lidarspec.explaining.assignments import parse_arguments
 from lidarspec.explaining.explanation import reply_text
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading
@@ -342,7 +342,7 @@ class LidarNode(LifecycleNode):
             words = [
                 f"{argument}={value}" for argument, value in given.items() if value is not None
             ]
-            reply = device.send(name, **arguments(device.sensor, name, words))
+            reply = device.send(name, **parse_arguments(device.sensor, name, words))
         except LidarSpecError as error:
             response.success, response.message = False, str(error)
         else:

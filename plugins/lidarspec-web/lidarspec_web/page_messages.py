@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from lidarspec import LidarSpecError, UsageError, __version__, explain
-from lidarspec.explaining.assignments import arguments
+from lidarspec.explaining.assignments import parse_arguments
 from lidarspec.explaining.explanation import Explanation, reply_text
 from lidarspec.explaining.file_contents import measure_duration
 from lidarspec.points.appearance import is_flat
@@ -171,7 +171,7 @@ class PageMessages:
             UsageError: if an argument is missing or invalid.
         """
         sensor = self.broadcast.device.sensor
-        data = sensor.command(name, **arguments(sensor, name, _assignments(texts)))
+        data = sensor.command(name, **parse_arguments(sensor, name, _assignments(texts)))
         explanation = None
         if data:
             explanation = explain(data, sensor, sensor.commands[name].frame).to_dict()
@@ -187,7 +187,7 @@ class PageMessages:
         if self.why_no_control:
             raise UsageError(self.why_no_control)
         device = self.broadcast.device
-        values = arguments(device.sensor, name, _assignments(texts))
+        values = parse_arguments(device.sensor, name, _assignments(texts))
         reply = device.send(name, **values)
         return {
             "is": "replied",

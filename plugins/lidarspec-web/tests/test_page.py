@@ -164,7 +164,7 @@ def check_bytes(visit: Visit, explained: Any) -> None:
     assert offsets
     for offset in offsets:
         visit.page.locator(f".hex i[data-offset='{offset}']").hover()
-        names = [value.path for value in explained.fields.values() if value.covers(offset)]
+        names = [value.path for value in explained.fields.values() if value.covers_byte(offset)]
         said = visit.page.locator(".said b").all_inner_texts()
         assert said == names, f"byte {offset}"
     path = visit.page.locator(".branch[data-path]").last.get_attribute("data-path")
@@ -179,7 +179,7 @@ def check_bytes(visit: Visit, explained: Any) -> None:
         if f"{value.path}.".startswith((f"{path}.", f"{path}["))
     ]
     assert marked
-    assert all(any(value.covers(offset) for value in inside) for offset in marked)
+    assert all(any(value.covers_byte(offset) for value in inside) for offset in marked)
 
 
 @pytest.fixture(scope="module")

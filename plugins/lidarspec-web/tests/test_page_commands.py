@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import lidarspec as ls
-from lidarspec.explaining.assignments import arguments
+from lidarspec.explaining.assignments import parse_arguments
 from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.transports.destinations import make_simulated_outlet
 from lidarspec.transports.serving import Served
@@ -49,7 +49,7 @@ def test_the_bytes_are_seen_before_they_are_sent(tmp_path: Path) -> None:
     sensor = ls.sensor(SPINNING)
     with Station(f"sim:{SPINNING}", tmp_path) as station, station.page() as page:
         composed = page.request("compose", command="set_speed", arguments={"speed": "6 Hz"})
-        given = arguments(sensor, "set_speed", ["speed=6 Hz"])
+        given = parse_arguments(sensor, "set_speed", ["speed=6 Hz"])
         assert composed["hex"] == sensor.command("set_speed", **given).hex()
         assert composed["explanation"]["fault"] is None
         assert station.broadcast.device.stats.frames.get("reply", 0) == 0  # nothing was sent
