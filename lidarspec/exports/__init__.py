@@ -126,7 +126,7 @@ def messages(sensor: Sensor, *, on_wire: bool = True) -> tuple[ExportedFrame, ..
     if not sensor.frames:
         raise ExportError(f"{sensor.id} has no frames until it is configured")
     formed = [
-        f"{name} in {frame.wire}"
+        f"{name} in {type(frame.wire).__name__}"
         for name, frame in sensor.frames.items()
         if frame.wire is not None and on_wire
     ]

@@ -22,7 +22,15 @@ from lidarspec.frames.layout import Bytes2D, Layout, LayoutRefusal, Leaf
 from lidarspec.frames.layout_tree import HeaderNode, HeaderTree, find_prefix, frame_layouts
 from lidarspec.frames.parts import PartsSize
 from lidarspec.spec.description import Frame
-from lidarspec.spec.wire_forms import Decoded, NumberRun, Problem, Run, TextRun, WireForm
+from lidarspec.spec.wire_forms import (
+    Decoded,
+    DrawsValues,
+    NumberRun,
+    Problem,
+    Run,
+    TextRun,
+    WireForm,
+)
 
 #: The name under which a parsed frame keeps its bytes, if `encode` would write others.
 SPELLING = "_wire"
@@ -205,8 +213,10 @@ class FormCoder(Coder):
                     [self.form.largest(size) for size in run.sizes.tolist()], np.uint64
                 )
                 for row in part:
-                    values = run.from_bytes(row.tobytes())
-                    row[:] = np.frombuffer(run.to_bytes(_within(values, largest)), np.uint8)
+                    values = _within(run.from_bytes(row.tobytes()), largest)
+                    if isinstance(self.form, DrawsValues):
+                        values = self.form.writable(run, values)
+                    row[:] = np.frombuffer(run.to_bytes(values), np.uint8)
             elif self.form.is_text:
                 part[:] = part % 26 + ord("A")
 
@@ -308,7 +318,8 @@ def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[R
             runs.append(TextRun(sizes.item(part[0])))
         else:
             fields = owners[part]
-            runs.append(NumberRun(sizes[part], all_kinds[fields], all_little[fields]))
+            paths = [leaves[owner].info.path for owner in fields.tolist()]
+            runs.append(NumberRun(sizes[part], all_kinds[fields], all_little[fields], paths))
         reached = ends.item(part[-1])
     if reached < end:
         runs.append(TextRun(end - reached))

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.errors import SpecError
+from lidarspec.spec.checksums import Checksum, Xor
 
 Offsets = NDArray[np.intp]
 Values = NDArray[np.uint64]
@@ -33,6 +34,11 @@ NO_END = 0
 NO_FRAME = -1
 #: Most digits of a number in a token.
 MAX_DIGITS = 16
+#: Most characters of a decimal fraction, and its form.
+MAX_DECIMAL_CHARACTERS = 40
+_DECIMAL = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)")
+#: Bytes of a float -> the number of decimal digits that it always keeps.
+EXACT_DIGITS = {2: 3, 4: 6, 8: 15}
 #: The largest value of each number of bytes.
 LARGEST_OF_BYTES = np.array([256**size - 1 for size in range(9)], np.uint64)
 #: Bits of a character of `SixBits`.
@@ -69,14 +75,22 @@ class NumberRun:
         sizes: the bytes of each number in the struct, (n,).
         kinds: "u", "i" or "f" for each, as in `numpy.dtype.kind`, (n,).
         is_little: whether the bytes of each are in little-endian order, (n,).
+        paths: the path of the field of each, n.
     """
 
     sizes: Offsets
     kinds: NDArray[np.str_]
     is_little: NDArray[np.bool_]
+    paths: Sequence[str]
 
     def __len__(self) -> int:
         return len(self.sizes)
+
+    @cached_property
+    def float_indices(self) -> Sequence[int]:
+        """The indices of the floats."""
+        indices: Sequence[int] = np.flatnonzero(self.kinds == "f").tolist()
+        return indices
 
     @cached_property
     def ends(self) -> Offsets:
@@ -234,6 +248,14 @@ class BulkEnds(Protocol):
         """
 
 
+@runtime_checkable
+class DrawsValues(Protocol):
+    """A wire form that cannot write every value of a number, even if it is small enough."""
+
+    def writable(self, run: NumberRun, values: Values) -> Values:
+        """Return values that can be written, (n,), for random bits, (n,)."""
+
+
 def find_ends(
     form: WireForm, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets
 ) -> Offsets:
@@ -309,22 +331,64 @@ def _digit_weights(base: int) -> Values:
 
 
 @dataclass(frozen=True)
+class HexCheck:
+    """A checksum in hexadecimal digits behind a mark, as ``*5B`` of NMEA 0183.
+
+    It covers the bytes between the first byte of the frame and the mark.
+
+    Args:
+        algorithm: whose width gives the number of digits.
+        mark: one byte.
+
+    Raises:
+        SpecError: for a mark that is not one byte.
+    """
+
+    algorithm: Checksum = field(default_factory=Xor)
+    mark: bytes = b"*"
+
+    def __post_init__(self) -> None:
+        if len(self.mark) != 1:
+            raise SpecError("the mark before a checksum must be one byte", path="wire")
+
+    @property
+    def size(self) -> int:
+        """The number of bytes of mark and digits."""
+        return 1 + -(-self.algorithm.width // 4)
+
+    def write(self, content: bytes) -> bytes:
+        """Return the mark and the digits for some content."""
+        return self.mark + b"%0*X" % (self.size - 1, self.algorithm(content))
+
+
+@dataclass(frozen=True)
 class Tokens:
     """Text in tokens: numbers in digits, each followed by a separator or the end; bytes of a struct
     as their characters.
 
     A number may have zeros in front, small letters, or a sign, which makes it decimal whatever the
-    base; signed and float fields without a sign are the digits of their bits. A field of bytes is a
-    token of just so many characters, which may contain the separator.
+    base; signed fields without a sign are the digits of their bits. A float is the digits of its
+    bits in base 16. In base 10 it is a decimal fraction, and nan if the token is empty. A field of
+    bytes is a token of exactly as many characters, which may contain the separator.
 
     Args:
-        start, sep, end: one byte each, that the frame begins with, that separates tokens, and that
-            it ends with.
+        start, sep: one byte each, that the frame begins with, and that separates tokens.
+        end: the bytes that the frame ends with.
         base: of the digits, 10 or 16.
         width: digits that are written at least; others are read as well.
+        check: the checksum before the end; None if there is none.
+        formats: path of a number -> the digits that are written at least, as manuals show them:
+            "hhmmss.ss" is six digits, and two behind the point.
+        joined: the number of fields of bytes that form the first token.
+        padded: whether a token of bytes may be shorter than its field, which zero bytes then fill.
+        optional: the number of fields of bytes at the end whose tokens may be missing; requires
+            `padded`.
+        rest: whether the field of bytes after the first token is all the rest of the frame,
+            separators included; requires `padded`.
 
     Raises:
-        SpecError: for marks that are not one byte, or alike, and other bases.
+        SpecError: for a start or separator that is not one byte, or that begins the end, and for
+            other bases.
     """
 
     is_text: ClassVar[bool] = True
@@ -333,49 +397,104 @@ class Tokens:
     end: bytes = b"\x03"
     base: int = 16
     width: int = 0
+    check: HexCheck | None = None
+    formats: Mapping[str, str] = field(default_factory=dict, hash=False)
+    joined: int = 1
+    padded: bool = False
+    optional: int = 0
+    rest: bool = False
 
     def __post_init__(self) -> None:
-        marks = (self.start, self.sep, self.end)
-        if any(len(mark) != 1 for mark in marks) or len(set(marks)) < 3:
+        if len(self.start) != 1 or len(self.sep) != 1 or not self.end:
             raise SpecError(
-                "start, separator and end of tokens must be three different bytes",
+                "start and sep of tokens must be one byte, and end at least one",
                 path="wire",
             )
+        if len({self.start, self.sep, self.end[:1]}) < 3:
+            raise SpecError("start, separator and end of tokens must differ", path="wire")
         if self.base not in (10, 16):
             raise SpecError(f"base must be 10 or 16, not {self.base}", path="wire")
 
     def begins(self, texts: Sequence[Characters]) -> Characters:
-        tokens = [[*text, self.sep[0]] for text in texts if len(text)]
-        return [*self.start, *itertools.chain(*tokens)][: None if not tokens else -1]
+        first = list(itertools.chain(*texts[: self.joined]))
+        characters = [*self.start]
+        if len(texts) < self.joined:
+            return [*characters, *first]
+        tokens = [token for token in (first, *texts[self.joined :]) if len(token)]
+        for number, token in enumerate(tokens):
+            if self.padded and number > 0 and None in token:
+                return characters  # it may be shorter
+            characters += [*token, self.sep[0]]
+        return characters[: -1 if tokens else None]
 
     def find_end(self, data: bytes) -> int:
         end = data.find(self.end, 1)
         if data.find(self.start, 1, end if end > 0 else len(data)) > 0:
             return NO_FRAME
         if end > 0:
-            return end + 1
+            return end + len(self.end)
         return NO_END
 
     def find_ends(self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets) -> Offsets:
         none = len(buffer)
-        ends = next_places(np.flatnonzero(buffer == self.end[0]), offsets + 1, none)
+        is_end = buffer == self.end[0]
+        for distance, byte in enumerate(self.end[1:], 1):
+            is_end[:-distance] &= buffer[distance:] == byte
+            is_end[-distance:] = False
+        ends = next_places(np.flatnonzero(is_end), offsets + 1, none)
         starts = next_places(np.flatnonzero(buffer == self.start[0]), offsets + 1, none)
-        sizes = np.where(ends < stops, ends + 1 - offsets, NO_END)
+        sizes = np.where(ends + len(self.end) <= stops, ends + len(self.end) - offsets, NO_END)
         sizes[starts < np.minimum(ends, stops)] = NO_FRAME
         return sizes
 
     def decode(self, data: bytes, next_runs: NextRuns) -> Decoded:
-        size = len(data) if data.endswith(self.end) else None
-        return decode_runs(_TokenReader(self, data), next_runs, size)
+        stop, problem = self._find_stop(data)
+        if stop is None:
+            return decode_runs(_TokenReader(self, data, None), next_runs, None)
+        decoded = decode_runs(_TokenReader(self, data[:stop], stop), next_runs, stop + 1)
+        if problem is None:
+            return decoded
+        return replace(decoded, problem=problem)
+
+    def _find_stop(self, data: bytes) -> tuple[int | None, Problem | None]:
+        """Return the offset after the last token, None if that is missing, and what is wrong with
+        the checksum.
+        """
+        if not data.endswith(self.end):
+            return None, None
+        stop = len(data) - len(self.end)
+        if self.check is None:
+            return stop, None
+        begin = stop - self.check.size
+        if data[begin : begin + 1] != self.check.mark or begin < 1:
+            reason = f"there is no {self.check.mark.decode()} and checksum before the end"
+            return stop, Problem(stop, reason, is_checksum=True)
+        got = data[begin:stop]
+        expected = self.check.write(data[1:begin])
+        if got.upper() == expected:
+            return begin, None
+        reason = f"the checksum is {got!r}, expected {expected!r}"
+        return begin, Problem(begin, reason, is_checksum=True, expected=expected, got=got)
 
     def encode(self, struct: bytes, runs: Sequence[Run]) -> bytes:
         tokens = list[bytes]()
         offset = 0
+        text_count = 0
         for run in runs:
             part = struct[offset : offset + int(run.sizes.sum())]
             offset += len(part)
-            tokens += [part] if isinstance(run, TextRun) else self._number_tokens(run, part)
-        return self.start + self.sep.join(tokens) + self.end
+            if isinstance(run, NumberRun):
+                tokens += self._number_tokens(run, part)
+                continue
+            text = part.rstrip(b"\x00") if self.padded else part
+            text_count += 1
+            if 1 < text_count <= self.joined:
+                tokens[-1] += text
+            else:
+                tokens.append(text)
+        content = self.sep.join(tokens)
+        check = b"" if self.check is None else self.check.write(content)
+        return self.start + content + check + self.end
 
     def _number_tokens(self, run: NumberRun, data: bytes) -> list[bytes]:
         values = run.from_bytes(data)
@@ -384,24 +503,79 @@ class Tokens:
         is_negative = (run.kinds == "i") & (values > run.highest)
         magnitudes = np.where(is_negative, run.largest - values + np.uint64(1), values)
         signs = np.where(is_negative, "-", "")
-        pairs = zip(signs.tolist(), magnitudes.tolist(), strict=True)
-        return [f"{sign}{value:0{self.width}d}".encode() for sign, value in pairs]
+        widths = [len(self.formats.get(path, "")) or self.width for path in run.paths]
+        triples = zip(signs.tolist(), magnitudes.tolist(), widths, strict=True)
+        tokens = [f"{sign}{value:0{width}d}".encode() for sign, value, width in triples]
+        for index in run.float_indices:
+            value = _float_of_bits(values[index], run.sizes.item(index))
+            tokens[index] = _write_decimal(value, self.formats.get(run.paths[index], ""))
+        return tokens
 
     def largest(self, size: int) -> int:
         return int(256**size - 1)
 
+    def writable(self, run: NumberRun, values: Values) -> Values:
+        """Return values for random bits that can be written: fractions of few digits."""
+        if self.base == 16:
+            return values
+        drawn = values.copy()
+        for index in run.float_indices:
+            whole, _, fraction = self.formats.get(run.paths[index], "000.000").partition(".")
+            size = run.sizes.item(index)
+            digits = min(len(whole) + len(fraction), EXACT_DIGITS[size])
+            number = int(values[index]) % 10**digits / 10 ** len(fraction)
+            drawn[index] = _bits_of_float(number, size)
+        return drawn
+
+
+def _float_of_bits(bits: np.uint64, size: int) -> np.floating[Any]:
+    """Return the float of some bytes that has these bits."""
+    return np.array([bits]).astype(f"u{size}").view(f"f{size}")[0]  # type: ignore[no-any-return]
+
+
+def _bits_of_float(value: float, size: int) -> int:
+    """Return the bits of a number as a float of some bytes."""
+    with np.errstate(over="ignore"):
+        return int(np.array(value).astype(f"f{size}").view(f"u{size}"))
+
+
+def _write_decimal(value: np.floating[Any], form: str) -> bytes:
+    """Return a float as a decimal fraction: all its digits, and at least those of a format.
+
+    A missing value (nan) is an empty text.
+    """
+    if not np.isfinite(value):
+        return b""
+    whole, _, fraction = form.partition(".")
+    text = np.format_float_positional(abs(value), trim="-")
+    before, _, after = text.partition(".")
+    after = after.ljust(len(fraction), "0")
+    sign = "-" if np.signbit(value) else ""
+    point = "." if after else ""
+    return f"{sign}{before.rjust(len(whole), '0')}{point}{after}".encode()
+
 
 class _TokenReader:
-    """Reads the tokens of one frame; all numbers are converted when it is made."""
+    """Reads the tokens of one frame; all numbers are converted when it is made.
 
-    def __init__(self, form: Tokens, data: bytes) -> None:
+    Args:
+        data: the frame, up to the end of the last token.
+        stop: the offset of that end; None if it is missing.
+    """
+
+    def __init__(self, form: Tokens, data: bytes, stop: int | None) -> None:
         self._form = form
         self._data = data
+        self._stop = stop
+        self._text_count = 0
+        self._optional_left = form.optional
         self.position = 1
-        characters = np.frombuffer(data, np.uint8)
-        is_mark = (characters == form.sep[0]) | (characters == form.end[0])
+        # One more separator, for the end behind the last token.
+        characters = np.frombuffer(data + form.sep, np.uint8)
+        is_mark = characters == form.sep[0]
         is_mark[:1] = False
-        #: Offset of the mark behind each token.
+        is_mark[-1] = stop is not None
+        #: Offset of the separator or the end behind each token.
         self._marks = is_mark.nonzero()[0]
         self._begins = np.append(1, self._marks + 1)[: len(self._marks)]
         self._magnitudes = np.zeros(len(self._marks), np.uint64)
@@ -435,17 +609,47 @@ class _TokenReader:
                 self._is_number[index] = True
 
     def read(self, run: Run) -> tuple[bytes, Offsets]:
-        if isinstance(run, TextRun):
-            return self._read_text(run)
-        return self._read_numbers(run)
+        if isinstance(run, NumberRun):
+            return self._read_numbers(run)
+        self._text_count += 1
+        if self._text_count < self._form.joined:
+            return self._read_joined(run)
+        if self._form.padded:
+            return self._read_padded(run)
+        return self._read_text(run)
 
     def _read_text(self, run: TextRun) -> tuple[bytes, Offsets]:
         begin = self.position
         end = begin + run.size
-        if self._data[end : end + 1] not in (self._form.sep, self._form.end):
+        if end != self._stop and self._data[end : end + 1] != self._form.sep:
             return b"", np.zeros(0, np.intp)
         self.position = end + 1
         return self._data[begin:end], np.array([begin])
+
+    def _read_joined(self, run: TextRun) -> tuple[bytes, Offsets]:
+        """Read a field that the next one follows without a separator."""
+        begin = self.position
+        text = self._data[begin : begin + run.size]
+        if len(text) < run.size or self._form.sep in text:
+            return b"", np.zeros(0, np.intp)
+        self.position += run.size
+        return text, np.array([begin])
+
+    def _read_padded(self, run: TextRun) -> tuple[bytes, Offsets]:
+        """Read a token that may be shorter than its field, or missing at the end."""
+        begin = self.position
+        token = int(self._marks.searchsorted(begin))
+        if token == len(self._marks):
+            if self._stop is None or not self._optional_left:
+                return b"", np.zeros(0, np.intp)
+            self._optional_left -= 1
+            return bytes(run.size), np.array([self._stop])
+        is_rest = self._form.rest and self._text_count > self._form.joined
+        end = self._marks.item(-1 if is_rest else token)
+        if end - begin > run.size:
+            return b"", np.zeros(0, np.intp)
+        self.position = end + 1
+        return self._data[begin:end].ljust(run.size, b"\x00"), np.array([begin])
 
     def _read_numbers(self, run: NumberRun) -> tuple[bytes, Offsets]:
         first = int(self._marks.searchsorted(self.position))
@@ -459,11 +663,30 @@ class _TokenReader:
             fits = np.where(is_negative, values <= run.lowest[:count], fits)
             values = np.where(is_negative, ~values + np.uint64(1), values)
         fits &= self._is_number[tokens]
+        if self._form.base == 10:
+            values = values.copy()
+            for index in run.float_indices:
+                if index < count:
+                    bits = self._read_decimal(first + index, run.sizes.item(index))
+                    fits[index] = bits is not None
+                    values[index] = bits or 0
         if not fits.all():
             count = int(fits.argmin())
         if count:
             self.position = self._marks.item(first + count - 1) + 1
         return run.to_bytes(values[:count]), self._begins[first : first + count]
+
+    def _read_decimal(self, token: int, size: int) -> int | None:
+        """Return the bits of a decimal fraction as a float, nan if empty; None if it is neither."""
+        text = self._data[self._begins[token] : self._marks[token]]
+        if not text:
+            return _bits_of_float(np.nan, size)
+        if len(text) > MAX_DECIMAL_CHARACTERS or not _DECIMAL.fullmatch(text):
+            return None
+        bits = _bits_of_float(float(text), size)
+        if np.isinf(_float_of_bits(np.uint64(bits), size)):
+            return None
+        return bits
 
 
 @dataclass(frozen=True)

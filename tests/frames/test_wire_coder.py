@@ -5,12 +5,26 @@ be either.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
-from construct import Array, Bytes, Const, Int8ub, Int16sb, Int16ub, Int24ub, Int32ub, Struct, this
+from construct import (
+    Array,
+    Bytes,
+    Const,
+    Float32l,
+    Float64b,
+    Int8ub,
+    Int16sb,
+    Int16ub,
+    Int24ub,
+    Int32ub,
+    Struct,
+    this,
+)
 
 from lidarspec import Sensor, SpecError, UsageError, WireError, explain, export
-from lidarspec.spec import Echoes, Escaped, Frame, Lines, Scip, SixBits, Tokens
+from lidarspec.spec import Echoes, Escaped, Frame, HexCheck, Lines, Scip, SixBits, Tokens
 from tests.shapes import SHAPES
 
 TOKENS, LINES, JOINED, ESCAPED = (
@@ -72,6 +86,121 @@ def test_decimal_tokens_have_signs_and_a_width() -> None:
     assert decimal.build("data", a=65_535, b=-32_768) == b"$65535,-32768\n"
     assert decimal.build("data", a=7, b=-1) == b"$0007,-0001\n"
     assert decimal.parse(b"$7,-1\n") == decimal.parse(b"$0007,-0001\n")
+
+
+LINE = sensor(
+    Struct(
+        "talker" / Bytes(2),
+        "kind" / Const(b"RMC"),
+        "time" / Float64b,
+        "status" / Bytes(1),
+        "speed" / Float32l,
+        "number" / Int8ub,
+        "mode" / Bytes(2),
+        "extra" / Bytes(1),
+    ),
+    Tokens(
+        start=b"$",
+        sep=b",",
+        end=b"\r\n",
+        base=10,
+        check=HexCheck(),
+        formats={"time": "hhmmss.ss", "number": "00"},
+        joined=2,
+        padded=True,
+        optional=1,
+    ),
+)
+
+
+def line(content: bytes) -> bytes:
+    """Return a sentence with the XOR of its content, worked out here."""
+    check = 0
+    for byte in content:
+        check ^= byte
+    return b"$%b*%02X\r\n" % (content, check)
+
+
+@pytest.mark.parametrize(
+    ("number", "value"),
+    [
+        (b"083559.00", 83559.0),
+        (b"1", 1.0),
+        (b"-12.5", -12.5),
+        (b"+0.004", 0.004),
+        (b".5", 0.5),
+        (b"5.", 5.0),
+        (b"4717.11437891", 4717.11437891),
+    ],
+)
+def test_a_decimal_fraction_is_a_float(number: bytes, value: float) -> None:
+    data = line(b"GPRMC,%b,A,0.25,07,D,V" % number)
+    values = LINE.parse(data)
+    assert (values.time, values.speed, values.number) == (value, 0.25, 7)
+    assert LINE.build("data", values) == data
+
+
+@pytest.mark.parametrize(
+    "number", [b"1e5", b"nan", b"inf", b"1_0", b" 1", b"1.2.3", b"-", b".", b"0x1", b"1" * 41]
+)
+def test_other_texts_are_no_decimal_fraction(number: bytes) -> None:
+    with pytest.raises(WireError, match="time"):
+        LINE.parse(line(b"GPRMC,%b,A,0.25,07,D,V" % number))
+
+
+def test_a_fraction_is_written_with_the_digits_of_its_format_and_more_if_it_has_more() -> None:
+    values = {"talker": b"GP", "status": b"A", "speed": 0.1, "number": 7, "mode": b"D\0"}
+    values |= {"extra": b"V"}
+    data = LINE.build("data", values, time=61.5)
+    assert data == line(b"GPRMC,000061.50,A,0.1,07,D,V")
+    assert LINE.build("data", values, time=0.0625) == line(b"GPRMC,000000.0625,A,0.1,07,D,V")
+    with pytest.raises(UsageError):
+        LINE.build("data", values, time=float("inf"))
+    with pytest.raises(UsageError):
+        LINE.build("data", values | {"mode": b",,"}, time=1)
+
+
+def test_empty_and_missing_tokens_are_nan_and_zero_bytes() -> None:
+    for ending, extra in ((b",", b"\x00"), (b"", b"\x00"), (b",V", b"V")):
+        data = line(b"GPRMC,,,,00,D" + ending)
+        values = LINE.parse(data)
+        assert math.isnan(values.time)
+        assert math.isnan(values.speed)
+        assert (values.status, values.mode, values.extra) == (b"\x00", b"D\x00", extra)
+        assert LINE.build("data", values) == data
+    for content in (b"GPRMC,,,,00", b"GPRMC,,,,,D,V", b"GPRMC,,AB,,00,D", b"GPRMC,,,,00,D,V,"):
+        with pytest.raises(WireError):
+            LINE.parse(line(content))
+
+
+def test_a_wrong_checksum_in_digits_is_counted_as_one() -> None:
+    good = line(b"GPRMC,1,A,0.25,07,D,V")
+    assert LINE.parse(good.replace(good[-4:-2], good[-4:-2].lower())).number == 7
+    for bad in (good.replace(b"0.25", b"0.24"), good.replace(b"*", b",")):
+        with pytest.raises(WireError, match="checksum"):
+            LINE.parse(bad)
+        stats = LINE.decode(bad + good).stats
+        assert (stats.bad_checksum, stats.frames, stats.bytes_skipped) == (1, {"data": 1}, len(bad))
+
+
+def test_the_first_token_has_two_fields() -> None:
+    assert LINE.parse(line(b"GNRMC,1,A,0.25,07,D,V")).talker == b"GN"
+    for content in (b"GPGGA,1,A,0.25,07,D,V", b"G,RMC,1,A,0.25,07,D,V", b"GPSRMC,1,A,0.25,07,D,V"):
+        with pytest.raises(WireError):
+            LINE.parse(line(content))
+
+
+def test_the_rest_of_a_frame_may_be_one_field() -> None:
+    other = sensor(
+        Struct("address" / Bytes(5), "content" / Bytes(20)),
+        Tokens(
+            start=b"$", sep=b",", end=b"\r\n", base=10, check=HexCheck(), padded=True, rest=True
+        ),
+    )
+    data = line(b"PUBX,1,,two words")
+    values = other.parse(data)
+    assert (values.address, values.content) == (b"PUBX\x00", b"1,,two words".ljust(20, b"\x00"))
+    assert other.build("data", values) == data
 
 
 def test_characters_of_six_bits_are_those_of_the_specification() -> None:
