@@ -26,6 +26,7 @@ from lidarspec.detect.identification import (
     identify_senders,
     list_candidates,
     select_best,
+    verb_to_show,
 )
 from lidarspec.detect.listen import (
     LISTEN_S,
@@ -519,9 +520,12 @@ def _find_uninstalled(verdicts: Sequence[Verdict]) -> list[KnownSensor]:
 
 
 def _verb(verdict: Verdict) -> str:
-    if live_address(verdict.sample.source) is None:
+    verb = "view"
+    if verdict.candidates:
+        verb = verb_to_show(verdict.candidates[0].sensor)
+    if verb == "view" and live_address(verdict.sample.source) is None:
         return "read"
-    return "view"
+    return verb
 
 
 def _following(source: str | None, unknown: FrameStructure | None) -> str:

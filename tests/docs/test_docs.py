@@ -97,7 +97,7 @@ def test_the_readme_counts_the_models_of_each_vendor_by_status() -> None:
     totals = sum(statuses.values(), Counter())
     total = f"{totals['capture']} / {totals['vectors']} / {totals['manual']}"
     assert f"In total {totals.total()} models: {total}." in text
-    assert f"{totals.total()} lidars are described" in " ".join(text.split())
+    assert f"{totals.total()} sensors are described" in " ".join(text.split())
 
 
 HOOKS = {

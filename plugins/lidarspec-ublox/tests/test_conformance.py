@@ -1,0 +1,14 @@
+"""Each u-blox receiver conforms: what `lidarspec check` checks, in one test for each."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.installed import assert_installed_conformance, conformance_cases
+
+DISTRIBUTION = "lidarspec-ublox"
+
+
+@pytest.mark.parametrize("sensor_id", conformance_cases(DISTRIBUTION))
+def test_sensor_conforms(sensor_id: str) -> None:
+    assert_installed_conformance(DISTRIBUTION, sensor_id)
