@@ -1,11 +1,11 @@
 """Count losses among packets that always arrive in order.
 
-They are packets of byte streams, and datagrams without a counter and a clock.
+These are packets of byte streams, and datagrams without a counter and without a clock.
 
 `ArrivalOrder` numbers the packets as they arrive and leaves out as many numbers as packets are
 missing. Skipped bytes count as packets of the largest size so far. A step of the clock that is
-longer than the declared pace counts as lost packets. A clock whose steps are as long as a packet
-takes, or longer, shows only long gaps, so then the larger of both counts applies.
+longer than the declared pace counts as lost packets. If the resolution of the clock is coarser
+than half a packet, it shows only long gaps, and the larger of both counts applies.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ MAX_STEP_NS = 3600 * 10**9
 
 
 class ArrivalOrder:
-    """Judges the packets of one stream, which are all numbered in the order of their arrival.
+    """The index and losses of the packets of one stream, in the order of arrival.
 
     Args:
-        stats: counts what is lost.
-        clock: of the packets; None to judge by skipped bytes alone.
+        stats: counts the lost packets.
+        clock: the clock of the packets; None to find losses by skipped bytes alone.
         grain_ns: the step of the clock; 0 if it is fine or computed by a function.
     """
 
@@ -47,12 +47,12 @@ class ArrivalOrder:
     def push(
         self, batch: Batch, times: Times | None, skipped: NDArray[np.int64]
     ) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet, (n,), and whether there is a break before it, (n,).
+        """Return the index of each packet, (n,), and the breaks before packets, (n,).
 
         Args:
-            batch: the packets; `breaks` are those at skipped bytes, and further ones are marked.
-            times: by the sensor's clock, (n,) ns; None if it has none.
-            skipped: bytes in no frame before each packet, (n,).
+            batch: the packets; `breaks` marks skipped bytes, and further breaks are added to it.
+            times: times by the sensor's clock, (n,) ns; None without a clock.
+            skipped: number of bytes outside frames before each packet, (n,).
         """
         count = len(batch)
         first = self._index + 1
@@ -71,7 +71,7 @@ class ArrivalOrder:
             return range(first, first + count), batch.breaks
         batch.breaks[rows] |= missing > 0
         self._index += count + int(missing.sum())
-        return partial(_index_with_gaps, first, count, rows, missing), batch.breaks
+        return partial(_make_index_with_gaps, first, count, rows, missing), batch.breaks
 
     def forget(self) -> None:
         """Ignore the clock at the next packet: time has passed that no packet shows."""
@@ -80,7 +80,10 @@ class ArrivalOrder:
     def _count_skipped(
         self, batch: Batch, skipped: NDArray[np.int64]
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
-        """Return the rows that have skipped bytes before them, and the packets these would be."""
+        """Return the rows that have skipped bytes before them, and the packets lost there.
+
+        The number of lost packets is the skipped bytes divided by the size of a packet.
+        """
         sizes = batch.table.sizes
         size = broadcast_value(sizes)
         rows = np.empty(0, np.intp)
@@ -131,10 +134,15 @@ class ArrivalOrder:
         return rows, missing
 
 
-def _index_with_gaps(
+def _make_index_with_gaps(
     first: int, count: int, rows: NDArray[np.intp], missing: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return consecutive numbers from `first` on, (count,), without those missing before rows."""
+    """Return consecutive indices from `first` on, (count,), with gaps for losses.
+
+    Args:
+        rows: the packets that have a gap before them.
+        missing: the number of packets missing in each gap.
+    """
     index = np.ones(count, np.int64)
     index[:1] = first
     index[rows] += missing

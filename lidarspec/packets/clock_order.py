@@ -1,19 +1,20 @@
-"""Order of datagrams that have a clock and no counter.
+"""Order of datagrams that have a clock but no counter.
 
-`ClockOrder` judges datagrams as they arrive: each is the next one, or late, or doubled, or the
-first one after a gap or after the clock was set. It remembers the newest packets in the order of
-their times. A packet with the time and the bytes of one of them is a double; bytes are compared by
-their CRC-32. A late packet is placed between its neighbours, and the number of packets that are
-missing there is counted anew. So the counters end up as if the packets had arrived in order.
+`ClockOrder` judges datagrams as they arrive. A datagram follows the newest one, or is late, or is a
+duplicate, or comes after a gap or after the clock was set. The newest packets are remembered in the
+order of their times. A packet with the time and the bytes of a remembered packet is a duplicate;
+bytes are compared by their CRC-32. A late packet is inserted between its neighbours, and the
+packets missing there are counted again. So the counters end up as if the packets had arrived in
+order.
 
-Each packet gets an index and an order. The index runs on over what is missing. The order is the
-time of the packet in nanoseconds, from the first packet on; it differs for packets of one time that
-are no doubles, and leaps by `2 * MAX_STEP_NS` where the clock was set or the sensor started again.
-Packets sorted by it and judged by another `ClockOrder` give the index and the breaks that they
-would have got without any disorder.
+Each packet gets an index and an order. The index also counts missing packets. The order is the time
+of the packet since the first packet, in nanoseconds. Packets of equal time that are not duplicates
+get different orders. If the clock was set or the sensor restarted, the order leaps by
+`2 * MAX_STEP_NS`. Packets sorted by order and judged by another `ClockOrder` get the index and the
+breaks that they would have got had they arrived in order.
 
-If the pace of the clock is not declared, order and duplicates are known, but not what is missing:
-the index then runs on without gaps. A gap at a masked sector (`masked_sector`) is no loss.
+If the pace of the clock is not declared, order and duplicates are known, but not losses: the index
+then has no gaps. A gap at a masked sector (`masked_sector`) is not a loss.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ from lidarspec.packets.masked_sector import MaskedGaps
 from lidarspec.packets.pace import Paces, read_paces, shortest_pace
 from lidarspec.spec.timing import Clock
 
-#: places that a packet may be late; a clock that goes back further was set, or the sensor started
-#: again.
+#: the number of places that a packet may be late. If the clock goes back further, it was set or the
+#: sensor restarted.
 MAX_PLACES_LATE = 64
-#: the same in time, if the pace is unknown.
+#: the time that a packet may be late if the pace is unknown.
 MAX_LATE_NS = 10**9
-#: a clock that advances by more from one packet to the next was set.
+#: if the clock advances by more from one packet to the next, it was set.
 MAX_STEP_NS = 3600 * 10**9
-#: packets of which a checksum is remembered; an older one with the same time counts as the same
-#: packet.
+#: the number of packets with a remembered checksum. An older packet with the same time counts as a
+#: duplicate without comparing bytes.
 REMEMBERED_CHECKSUMS = 16
 
 _time_of = attrgetter("time")
@@ -53,10 +54,12 @@ class RecentPacket:
     """One of the newest packets.
 
     Attributes:
-        missing: packets that are missing between it and the one before it in time.
-        checksum: of its bytes; None if it is no longer remembered.
-        angle: at which it begins, in turns; nan if unknown.
-        masked: packets that a masked sector leaves out before it.
+        time: the time by the sensor's clock, ns.
+        order, index: see the module.
+        missing: the number of packets missing between it and the packet before it in time.
+        checksum: the CRC-32 of its bytes; None if it is no longer remembered.
+        angle: the angle at which it begins, in turns; nan if unknown.
+        masked: the number of packets that a masked sector leaves out before it.
     """
 
     time: int
@@ -69,12 +72,12 @@ class RecentPacket:
 
 
 class ClockOrder:
-    """Judges the datagrams of one stream by their clock.
+    """Order, losses and duplicates of the datagrams of one stream, by their clock.
 
     Args:
-        stats: counts what is lost, late and doubled.
-        clock: of the packets.
-        gaps: tells masked sectors from losses; None to count them as losses.
+        stats: counts lost, late and duplicate packets.
+        clock: the clock of the packets.
+        gaps: finds gaps at masked sectors; None to count all gaps as losses.
     """
 
     def __init__(self, stats: Counters, clock: Clock, gaps: MaskedGaps | None = None) -> None:
@@ -82,20 +85,19 @@ class ClockOrder:
         self._clock = clock
         self._arrived: int | None = None  # time of the packet that arrived last, ns
         self._newest: RecentPacket | None = None
-        self._neighbours = list[RecentPacket]()  # by their times
-        self._offset = 0  # from a time to an order
+        self._neighbours = list[RecentPacket]()  # in the order of their times
+        self._offset = 0  # added to a time to get an order
         self._gaps = gaps
         self._leap: tuple[int, RecentPacket] | None = (
-            None  # the time before the clock leapt, ns, and the packet after
+            None  # the time before the clock's last leap, ns, and the packet after it
         )
 
     def push(self, batch: Batch, times: Times) -> tuple[Numbers, NDArray[np.int64]]:
-        """Return the index and the order of each packet, (n,).
-
-        Breaks before packets are marked in `batch.breaks`.
+        """Return the index and the order of each packet, (n,), and mark the breaks.
 
         Args:
-            times: by the sensor's clock, (n,) ns.
+            batch: the packets; breaks are marked in `batch.breaks`.
+            times: times by the sensor's clock, (n,) ns.
         """
         paces = read_paces(self._clock, batch)
         if self._gaps is not None:
@@ -131,7 +133,7 @@ class ClockOrder:
     def forget(self) -> None:
         """Treat the next packet as the first one after the clock was set.
 
-        The time until then is not known.
+        This is called after lost input, when the time that has passed is unknown.
         """
         self._arrived = None
         self._neighbours.clear()
@@ -139,7 +141,7 @@ class ClockOrder:
             self._gaps.forget()
 
     def _find_odd(self, times: Times, paces: Paces) -> list[int]:
-        """Return the packets that do not follow the one that arrived before them."""
+        """Return the rows of packets that do not follow the packet that arrived before."""
         passed = np.empty(len(times), np.int64)
         passed[0] = 1 if self._arrived is None else times.item(0) - self._arrived
         np.subtract(times[1:], times[:-1], out=passed[1:])
@@ -156,7 +158,11 @@ class ClockOrder:
         return 0 < passed <= MAX_STEP_NS and not passed > 1.5 * pace
 
     def _add_run(self, batch: Batch, times: Times, start: int, stop: int) -> int:
-        """Add packets that follow one another after the newest; return the index of the first."""
+        """Append consecutive packets to the newest ones, and return the first index.
+
+        Args:
+            start, stop: the rows of the packets.
+        """
         assert self._newest is not None
         first = self._newest.index + 1
         for row in range(max(start, stop - MAX_PLACES_LATE), stop):
@@ -172,7 +178,7 @@ class ClockOrder:
         return first
 
     def _place(self, batch: Batch, row: int, time: int, pace: float) -> RecentPacket:
-        """Return the place of a packet that does not follow the newest one."""
+        """Place a packet that does not follow the newest one, and count losses."""
         checksum = crc32(batch.table.frame(row))
         if self._newest is None or not self._neighbours:
             return self._begin(batch, row, time, checksum)
@@ -219,17 +225,17 @@ class ClockOrder:
 
     @property
     def _places_late(self) -> int:
-        """The places that a packet may be late."""
+        """The number of places that a packet may be late."""
         return MAX_PLACES_LATE + (0 if self._gaps is None else self._gaps.masked)
 
     def _leaps_back(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock leaps to where it was before it leapt last."""
+        """Return whether the clock leaps back to its value before the last leap."""
         assert self._leap is not None
         reach = self._places_late * pace
         return abs(passed) > reach and 0 < time - self._leap[0] <= reach
 
     def _is_too_early(self, time: int, passed: int, pace: float) -> bool:
-        """Return whether the clock has gone back further than by a late packet."""
+        """Return whether the clock goes back further than a late packet explains."""
         if pace > 0:
             return passed < -self._places_late * pace
         is_full = len(self._neighbours) >= MAX_PLACES_LATE
@@ -261,9 +267,10 @@ class ClockOrder:
     def _insert(
         self, position: int, row: int, time: int, pace: float, checksum: int
     ) -> RecentPacket:
-        """Insert a late packet before a neighbour.
+        """Insert a late packet before a neighbour, and recount the losses on both sides.
 
-        The missing packets on both sides of it are counted again.
+        Args:
+            position: the index of the neighbour after it in time.
         """
         self._stats.late += 1
         after = self._neighbours[position]
@@ -298,7 +305,7 @@ class ClockOrder:
 
 
 def _count_missing(passed: int, pace: float) -> int:
-    """Return how many packets are missing in a step of the clock."""
+    """Return the number of packets missing in a step of the clock."""
     if not pace > 0:
         return 0
     return max(math.ceil(passed / pace - 0.5), 1) - 1

@@ -1,4 +1,4 @@
-"""Read the sensor's clock as integer nanoseconds, and unwrap it."""
+"""Read the sensor's clock as integer nanoseconds, unwrap it, and date it."""
 
 from __future__ import annotations
 
@@ -22,48 +22,58 @@ from lidarspec.spec.tree import to_exact
 
 Times = NDArray[np.int64]
 
-#: no clock reads more nanoseconds than this (285 years): damaged readings must not overflow.
-_FURTHEST = 9 * 10**18
+#: larger readings (over 285 years) are clipped, so that damaged readings do not overflow.
+_MAX_READING_NS = 9 * 10**18
 
 
 class Unwrapper:
-    """Unwrap a clock that starts again at `wraps_at` seconds.
+    """A clock that starts again after `wraps_at` seconds, unwrapped.
 
     The result is exact over any number of wraps.
 
-    The shorter way round decides between forward and backward, so late packets go back in time.
-    Where the host's times say that more than most of a turn has passed, they decide how many turns
-    it was; from half a turn on, whether it was forward.
+    A step of more than half a wrap period counts as a step backward, so late packets go back in
+    time. Arrival times decide in two cases: after a pause of more than three quarters of a period
+    they give the number of wraps, and after more than half a period they can show that the step was
+    forward.
     """
 
     def __init__(self, wraps_at: float | None) -> None:
-        self._turn = _turn(wraps_at) if wraps_at else 0
+        self._period_ns = _to_exact_ns(wraps_at) if wraps_at else 0
         self._last: tuple[int, int, int] | None = None
 
     def push(self, ns: Times, host: Times) -> Times:
-        """Return the readings of the next packets, (n,), as times that run on from those before."""
-        if not self._turn or not len(ns):
+        """Return the readings of the next packets, unwrapped, (n,) ns.
+
+        Args:
+            ns: the readings, (n,) ns.
+            host: arrival times, (n,) ns; 0 if unknown.
+        """
+        if not self._period_ns or not len(ns):
             return ns
         raw, time, at = self._last or (int(ns[0]), int(ns[0]), int(host[0]))
-        half = self._turn // 2
-        steps = _steps(ns, raw)
-        over = np.flatnonzero((steps < -half) | (steps >= self._turn - half))
+        half = self._period_ns // 2
+        steps = _compute_steps(ns, raw)
+        over = np.flatnonzero((steps < -half) | (steps >= self._period_ns - half))
         if not len(over) and broadcast_value(host) == 0:
             times = ns if time == raw else ns + (time - raw)
             self._last = (ns.item(-1), times.item(-1), 0)
             return times
         if len(over):
-            steps[over] = (steps[over] + half) % self._turn - half
+            steps[over] = (steps[over] + half) % self._period_ns - half
         if (
-            self._turn >= 10**9
+            self._period_ns >= 10**9
             and int(host.max()) - min(int(host.min()), at or int(host.max())) > half
         ):
             before = np.concatenate([[at], host[:-1]])
             passed = np.where((host > 0) & (before > 0), host - before, 0)
-            forward = (passed > half) & (np.abs(steps + self._turn - passed) < self._turn // 4)
-            late = forward | (passed > self._turn * 3 // 4)
+            forward = (passed > half) & (
+                np.abs(steps + self._period_ns - passed) < self._period_ns // 4
+            )
+            late = forward | (passed > self._period_ns * 3 // 4)
             if late.any():
-                steps += np.where(late, (passed - steps + half) // self._turn, 0) * self._turn
+                steps += (
+                    np.where(late, (passed - steps + half) // self._period_ns, 0) * self._period_ns
+                )
         steps[0] += time
         times = np.cumsum(steps)
         self._last = (int(ns[-1]), int(times[-1]), int(host[-1]))
@@ -72,14 +82,14 @@ class Unwrapper:
 
 @dataclass(frozen=True)
 class ClockReference:
-    """The turn of a clock as a frame told it (`Clock.reference`).
+    """A clock reading and the date that a frame reported for it (`Clock.reference`).
 
     It is found before the packets that it applies to.
 
     Attributes:
-        reading_ns: what the clock read in the frame.
-        reported_s: the seconds since 1970 that the frame told.
-        host_ns: when it arrived, ns since 1970; 0 if unknown.
+        reading_ns: the reading of the clock in that frame.
+        reported_s: the seconds since 1970 that the frame reported.
+        host_ns: the arrival time of the frame, ns since 1970; 0 if unknown.
     """
 
     reading_ns: int
@@ -88,16 +98,19 @@ class ClockReference:
 
 
 class ClockEpoch:
-    """The turn of a clock, by what other frames tell, see `Clock.reference`.
+    """The offset from unwrapped times to times since 1970.
+
+    Frames of another type report the date (see `Clock.reference`).
 
     Args:
-        sensor: with the clock of the packets.
-        reference: applies from the first packet on; None if the turn is unknown until a frame tells
-            it.
+        sensor: the sensor that declares the clock.
+        clock: that clock.
+        reference: applies from the first packet on; None if the offset is unknown until a frame
+            reports the date.
 
     Attributes:
-        frame: the type of the frames that tell it.
-        ns: nanoseconds that make the times of an `Unwrapper` complete; None before it was told.
+        frame: the type of the frames that report the date.
+        ns: the offset, ns, to add to the times of an `Unwrapper`; None while it is unknown.
     """
 
     def __init__(
@@ -109,25 +122,27 @@ class ClockEpoch:
         self.ns: int | None = None
         self._sensor = sensor
         self._clock = clock
-        self._turn = _turn(clock.wraps_at)
+        self._period_ns = _to_exact_ns(clock.wraps_at)
         self._reference = reference
 
     def push(
         self, batch: Batch, readings: Times, times: Times, host: Times, *, whole: bool = False
     ) -> Times:
-        """Return what completes the times of packets, (n,).
+        """Return the offset to add to the times of packets, (n,) ns.
 
-        It is 0 for packets before the first frame that tells the turn, unless that one applies from
-        the start.
+        It is 0 for packets before the first frame that reports the date, unless that date applies
+        to all packets.
 
         Args:
-            readings, times: (n,), what the clock reads in the packets, and as times that run on.
-            host: (n,), when the packets arrived, ns; 0 if unknown.
-            whole: the packets are a whole input: the first frame that tells the turn applies to
-                those before it too.
+            batch: the packets.
+            readings: the readings of the clock, (n,) ns.
+            times: the same readings, unwrapped, (n,) ns.
+            host: arrival times, (n,) ns; 0 if unknown.
+            whole: whether the packets are a whole input: the first date then applies to all
+                packets.
         """
         if self.ns is None and self._reference is not None:
-            self.ns = self._ns_by_reference(
+            self.ns = self._find_offset(
                 self._reference, readings.item(0), times.item(0), host.item(0)
             )
         if self.ns is not None:
@@ -143,32 +158,34 @@ class ClockEpoch:
         row = int(np.isfinite(seconds).argmax())
         first = int(np.searchsorted(which, rows[row]))
         reading = reference_readings(self._sensor, frames).item(row)
-        complete = self._complete(reading, seconds.item(row))
-        self.ns = complete - times.item(first) - self._short(reading - readings.item(first))
+        time_ns = self._find_nearest_time(reading, seconds.item(row))
+        self.ns = time_ns - times.item(first) - self._fold_step(reading - readings.item(first))
         if whole or not first:
             return repeat(self.ns, len(times))
         return np.where(np.arange(len(times)) < first, 0, self.ns)
 
-    def _ns_by_reference(
-        self, reference: ClockReference, reading: int, time: int, host: int
-    ) -> int:
-        """Return the offset of times, from readings in a packet and the reference."""
-        passed = self._short(reference.reading_ns - reading)
+    def _find_offset(self, reference: ClockReference, reading: int, time: int, host: int) -> int:
+        """Return the offset that follows from the reference and one packet.
+
+        Args:
+            reading, time, host: the reading, the unwrapped time and the arrival time of the packet.
+        """
+        passed = self._fold_step(reference.reading_ns - reading)
         if host and reference.host_ns:
-            passed += round((reference.host_ns - host - passed) / self._turn) * self._turn
-        return self._complete(reference.reading_ns, reference.reported_s) - time - passed
+            passed += round((reference.host_ns - host - passed) / self._period_ns) * self._period_ns
+        return self._find_nearest_time(reference.reading_ns, reference.reported_s) - time - passed
 
-    def _complete(self, reading: int, seconds: float) -> int:
-        """Return the reading in the turn that is nearest to the seconds told."""
-        return reading + round((round(seconds * 1e9) - reading) / self._turn) * self._turn
+    def _find_nearest_time(self, reading: int, seconds: float) -> int:
+        """Return the time that has a reading and is nearest to some seconds since 1970."""
+        return reading + round((round(seconds * 1e9) - reading) / self._period_ns) * self._period_ns
 
-    def _short(self, step: int) -> int:
-        """Return a step of the clock, the shorter way round."""
-        return (step + self._turn // 2) % self._turn - self._turn // 2
+    def _fold_step(self, step: int) -> int:
+        """Return a step of the clock, folded to at most half a wrap period."""
+        return (step + self._period_ns // 2) % self._period_ns - self._period_ns // 2
 
 
 def reported_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
-    """Return the seconds since 1970 that frames tell, (n,); nan where they tell none."""
+    """Return the seconds since 1970 that frames report, (n,); nan if not reported."""
     assert clock.reference is not None
     frames = Batch(table, np.zeros(len(table), np.bool_))
     seconds = np.asarray(clock.reference[1](Fields(frames)), np.float64)
@@ -176,15 +193,15 @@ def reported_seconds(clock: Clock, table: Table) -> NDArray[np.float64]:
 
 
 def reference_readings(sensor: SensorDescription, table: Table) -> Times:
-    """Return what the clock reads in frames that tell its turn, (n,) ns."""
+    """Return the readings of the clock in frames that report the date, (n,) ns."""
     return clock_ns(sensor, Batch(table, np.zeros(len(table), np.bool_)))
 
 
 def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
-    """The sensor's own clock in each packet, (n,) int64 nanoseconds, as it stands on the wire.
+    """Return the clock reading of each packet, (n,) int64 ns, not unwrapped.
 
-    Where it stands in the parts of a frame, it is that of the first one; in a frame without any
-    that of the frame before.
+    If the clock is in the parts of a frame, the reading of the first part counts. A frame without
+    parts has the reading of the frame before.
     """
     which, readings = read_clock(sensor, batch)
     if which is None:
@@ -193,20 +210,20 @@ def clock_ns(sensor: SensorDescription, batch: Batch) -> Times:
 
 
 def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp] | None, Times]:
-    """Return the packets that have the clock (None: all), and its readings.
+    """Return the packets that have a clock reading (None: all), and the readings.
 
     If the clock is in parts, the first part counts.
     """
     assert sensor.clock is not None
-    fields = paths(sensor.clock)
+    fields = clock_fields(sensor.clock)
     place = clock_parts(fields, batch.table.schema)
     source = sensor.clock.source
     if place is not None:
         table, which = batch.table.parts(*place)
         frames, first = np.unique(which, return_index=True)
-        return frames, _in_parts(sensor, place, table.take(first))
+        return frames, _read_parts(sensor, place, table.take(first))
     if callable(source):
-        terms = header_function(source, batch.table.schema, _nanoseconds)(batch)
+        terms = header_function(source, batch.table.schema, _to_ns)(batch)
         return None, sum(terms, np.zeros(len(batch), np.int64))
     return None, _sum_fields(fields, batch.table, sensor.id)
 
@@ -214,7 +231,10 @@ def read_clock(sensor: SensorDescription, batch: Batch) -> tuple[NDArray[np.intp
 def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
     """Return the times of some packets, each held until the next of them, (n,).
 
-    Packets before the first of them have the times `before`, (n,).
+    Args:
+        which: the packets that have a time, ascending, (k,).
+        times: their times, (k,).
+        before: the times of packets before the first of them, (n,).
     """
     positions = np.searchsorted(which, np.arange(len(before)), side="right") - 1
     if len(times):
@@ -223,17 +243,17 @@ def hold_values(which: NDArray[np.intp], times: Times, before: Times) -> Times:
 
 
 def _sum_fields(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
-    """Return the nanoseconds that some fields add up to, (n,)."""
+    """Return the sum of some fields in nanoseconds, (n,)."""
     total: Times | None = None
-    for path, step, zero, furthest in clock_terms(fields, table.schema, sensor):
+    for path, step, zero, max_raw in clock_terms(fields, table.schema, sensor):
         raw = table.raw(path)
-        if furthest and raw.dtype.kind in "ui":
-            part = _within(raw, furthest)
+        if max_raw and raw.dtype.kind in "ui":
+            part = _clip(raw, max_raw)
             part *= step
             if zero:
                 part += zero
         else:
-            part = _nanoseconds(
+            part = _to_ns(
                 raw.astype(np.float64) * float(step / 10**9) + float(zero / 10**9), len(table)
             )
         if total is None:
@@ -247,7 +267,7 @@ def _sum_fields(fields: tuple[str, ...], table: Table, sensor: str) -> Times:
 
 @lru_cache(maxsize=256)
 def clock_parts(fields: tuple[str, ...], schema: Schema) -> tuple[str, str] | None:
-    """Return the parts of a frame that have the fields of a clock, and their kind.
+    """Return the axis and the kind of the parts that have the fields of a clock.
 
     Returns None if the frame itself has them.
     """
@@ -271,49 +291,50 @@ def part_times(
     which: NDArray[np.intp],
     times: Times,
 ) -> Times:
-    """Return the times of parts, (k,), where they have a clock of their own.
+    """Return the times of parts, (k,); each has its own time if parts have the clock.
 
     Args:
-        place: where they stand.
-        which: the frame of each.
-        times: of these frames, for each part: that of their first part, where the clock stands in
-            it.
+        place: the axis and the kind of the parts.
+        table: the parts.
+        which: the row of the frame of each part, (k,).
+        times: the time of the frame of each part, (k,). If parts have the clock, it is the time of
+            the first part.
     """
-    if not len(which) or sensor.clock is None or not _stands_in(sensor.clock, place):
+    if not len(which) or sensor.clock is None or not _is_in_parts(sensor.clock, place):
         return times
-    readings = _in_parts(sensor, place, table)
+    readings = _read_parts(sensor, place, table)
     first = np.searchsorted(which, which)
     steps = readings - readings[first]
     if sensor.clock.wraps_at:
-        turn = _turn(sensor.clock.wraps_at)
+        period_ns = _to_exact_ns(sensor.clock.wraps_at)
     else:
-        turn = 0
-    return times + ((steps + turn // 2) % turn - turn // 2 if turn else steps)
+        period_ns = 0
+    return times + ((steps + period_ns // 2) % period_ns - period_ns // 2 if period_ns else steps)
 
 
-def _stands_in(clock: Clock, place: tuple[str, str]) -> bool:
-    return any(path.startswith(f"{_prefix(place)}.") for path in paths(clock))
+def _is_in_parts(clock: Clock, place: tuple[str, str]) -> bool:
+    return any(path.startswith(f"{_prefix(place)}.") for path in clock_fields(clock))
 
 
 def _prefix(place: tuple[str, str]) -> str:
     return ".".join(filter(None, place))
 
 
-def _in_parts(sensor: SensorDescription, place: tuple[str, str], table: Table) -> Times:
-    """Return the clock that stands in parts, in each of them."""
+def _read_parts(sensor: SensorDescription, place: tuple[str, str], table: Table) -> Times:
+    """Return the reading of the clock in each part, (k,) ns."""
     assert sensor.clock is not None
-    own = tuple(path.removeprefix(f"{_prefix(place)}.") for path in paths(sensor.clock))
+    own = tuple(path.removeprefix(f"{_prefix(place)}.") for path in clock_fields(sensor.clock))
     return _sum_fields(own, table, sensor.id)
 
 
 @lru_cache(maxsize=256)
-def _turn(seconds: float) -> int:
-    """Return seconds as nanoseconds, rounded as the number is written."""
+def _to_exact_ns(seconds: float) -> int:
+    """Return seconds as nanoseconds, exact for the decimal number as written."""
     return int(to_exact(seconds) * 10**9)
 
 
-def paths(clock: Clock) -> tuple[str, ...]:
-    """Return the fields that add up to a clock; none where a function computes it."""
+def clock_fields(clock: Clock) -> tuple[str, ...]:
+    """Return the fields that add up to a clock; none if a function computes it."""
     if isinstance(clock.source, str):
         return (clock.source,)
     if callable(clock.source):
@@ -327,17 +348,17 @@ def clock_terms(
 ) -> list[tuple[str, Any, Any, int]]:
     """Return the fields that add up to a clock.
 
-    Each has path, nanoseconds in one step and at zero, and furthest reading (0 if these are
-    fractions).
+    Each is a tuple: the path, the nanoseconds of one step, the nanoseconds at 0, and the largest
+    raw value that cannot overflow (0 if the nanoseconds are fractions).
 
     Raises:
-        SpecError: for one that is no time, or not one of each packet.
+        SpecError: if a field has no unit of time, or does not have one value in each packet.
     """
     terms = []
     for path in fields:
         info = schema.fields.get(path)
         if info:
-            scaling = _scaling(info.unit, info.scale, info.offset)
+            scaling = _find_scaling(info.unit, info.scale, info.offset)
         else:
             scaling = None
         if info is None or scaling is None or info.axes:
@@ -349,14 +370,17 @@ def clock_terms(
             )
         step, zero = scaling
         whole = isinstance(step, int) and isinstance(zero, int)
-        terms.append((path, step, zero, _FURTHEST // len(fields) // max(step, 1) if whole else 0))
+        terms.append(
+            (path, step, zero, _MAX_READING_NS // len(fields) // max(step, 1) if whole else 0)
+        )
     return terms
 
 
-def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
-    """Return the nanoseconds in one step of a field and at its zero.
+def _find_scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
+    """Return the nanoseconds of one step of a field, and at its zero.
 
-    They are integers if both are whole, else fractions. Returns None if the unit is no time.
+    They are integers if both are whole, else fractions. Returns None if the unit is not a unit of
+    time.
     """
     per_unit = factor(unit, "s")
     if per_unit is None:
@@ -367,26 +391,30 @@ def _scaling(unit: str, scale: float, offset: float) -> tuple[Any, Any] | None:
     return step, zero
 
 
-def _steps(values: NDArray[np.int64], before: int) -> NDArray[np.int64]:
-    """Differences from one to the next, (n,), the first one to `before`."""
+def _compute_steps(values: NDArray[np.int64], before: int) -> NDArray[np.int64]:
+    """Return the difference of each value from the value before it, (n,).
+
+    Args:
+        before: the value before the first.
+    """
     steps = np.empty(len(values), np.int64)
     steps[0] = values[0] - before
     np.subtract(values[1:], values[:-1], out=steps[1:])
     return steps
 
 
-def _within(raw: NDArray[Any], furthest: int) -> Times:
-    if raw.dtype.itemsize * 8 - (raw.dtype.kind == "i") < furthest.bit_length():
+def _clip(raw: NDArray[Any], max_raw: int) -> Times:
+    if raw.dtype.itemsize * 8 - (raw.dtype.kind == "i") < max_raw.bit_length():
         return raw.astype(np.int64)
     edges = np.iinfo(raw.dtype)
     return np.asarray(
-        np.clip(raw, max(int(edges.min), -furthest), min(int(edges.max), furthest)), np.int64
+        np.clip(raw, max(int(edges.min), -max_raw), min(int(edges.max), max_raw)), np.int64
     )
 
 
-def _nanoseconds(seconds: Any, number: int) -> Times:
-    if np.size(seconds) in (1, number):
-        flat = np.broadcast_to(np.asarray(seconds, np.float64).reshape(-1), (number,))
+def _to_ns(seconds: Any, count: int) -> Times:
+    if np.size(seconds) in (1, count):
+        flat = np.broadcast_to(np.asarray(seconds, np.float64).reshape(-1), (count,))
     else:
         flat = None
     if flat is None:

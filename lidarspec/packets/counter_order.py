@@ -1,14 +1,15 @@
 """Losses, duplicates and order of packets that have a counter (`PacketCounter`).
 
-`CounterOrder` gives each packet an index, which is the counter made to run on: it leaves out as
-many numbers as packets are missing, and late packets get the number that was left out. Lost, late
-and duplicated packets and the completeness of scans follow from it.
+`CounterOrder` gives each packet an index: the counter, unwrapped. The index leaves out as many
+numbers as packets are missing, and a late packet gets the number that was left out for it. Lost,
+late and duplicate packets and the completeness of scans follow from the index.
 
-A clock with a declared pace answers two questions that the counter leaves open: how often a counter
-has wrapped in a gap, and whether a number that jumps is damaged. Without such a clock, a gap of
-a whole turn of the counter is not seen, and a single damaged number makes two breaks, but no loss.
+A clock with a declared pace answers two questions that the counter alone cannot: how often the
+counter wrapped in a gap, and whether a jump of the counter is damage. Without a pace, a gap of
+a whole period of the counter is not seen, and a single damaged number makes two breaks, but no
+loss.
 
-A gap at a masked sector (`masked_sector`) is no loss.
+A gap at a masked sector (`masked_sector`) is not a loss.
 """
 
 from __future__ import annotations
@@ -31,18 +32,18 @@ from lidarspec.packets.packets import Index
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock, Sequence
 
-#: places that a packet may be late; if it is further back, the sensor has started again.
+#: the number of places that a packet may be late; if it is further back, the sensor restarted.
 MAX_PLACES_LATE = 64
-#: the same for a packet that would come before the first one, where a wrap of the counter during
+#: the same for a packet that would come before the first one: there a wrap of the counter during
 #: a loss is more likely.
 MAX_PLACES_EARLY = 10
-#: a counter with at least so many values starts again at 0 only if the sensor does.
+#: a counter with at least this many values is reset to 0 only if the sensor restarts.
 LONG_PERIOD = 1 << 16
-#: a counter with more values fills 64 bits: its differences wrap by themselves.
+#: a counter with more values fills 64 bits: differences then wrap without a modulo.
 MAX_SIGNED_PERIOD = 1 << 63
-#: an index starts below this, and advances by less, so that it fits 64 bits for any counter.
+#: limit of the first index and of its steps, so that it fits 64 bits for any counter.
 MAX_INDEX_STEP = 1 << 32
-#: a clock that advances by more from one packet to the next was set.
+#: if the clock advances by more from one packet to the next, it was set.
 MAX_STEP_NS = 3600 * 10**9
 
 
@@ -51,12 +52,12 @@ class CounterReadings:
     """The counter and the clock in the packets of a batch.
 
     Attributes:
-        numbers: the counter, (n,).
-        periods: the number of values that the counter takes, one for all packets or (n,).
+        numbers: the values of the counter, (n,).
+        periods: the number of values before the counter wraps, an integer for all packets or (n,).
         has_counter: whether each packet has the counter, (n,); None if all have it.
         times: (n,) ns; None without a clock that has a declared pace.
-        steps: from the packet that arrived before to each, (n,) ns; None without such a clock.
-        paces: (n,) ns.
+        steps: the time since the packet that arrived before, (n,) ns; None if `times` is None.
+        paces: the time that each packet takes, (n,) ns; nan if unknown.
     """
 
     numbers: NDArray[Any]
@@ -67,19 +68,19 @@ class CounterReadings:
     paces: Paces
 
     def number(self, row: int) -> int | None:
-        """Return the counter of a packet."""
+        """Return the counter of a packet; None if the packet does not have it."""
         if self.has_counter is not None and not self.has_counter[row]:
             return None
         return int(self.numbers.item(row))
 
     def time(self, row: int) -> int | None:
-        """Return the time of a packet, ns."""
+        """Return the time of a packet, ns; None without a clock."""
         if self.times is None:
             return None
         return self.times.item(row)
 
     def period(self, row: int) -> int:
-        """Return the number of values that the counter of a packet takes."""
+        """Return the number of values before the counter of a packet wraps."""
         if isinstance(self.periods, int):
             period = self.periods
         else:
@@ -89,9 +90,9 @@ class CounterReadings:
 
 @dataclass
 class CountedLoss:
-    """Packets that are missing by the counter, and those in a masked sector.
+    """A gap of the counter, as the number of lost and of masked packets.
 
-    See `masked_sector.Loss`.
+    See `masked_sector.GapLoss`.
     """
 
     missing: int
@@ -100,11 +101,11 @@ class CountedLoss:
 
 @dataclass(frozen=True)
 class CounterJump:
-    """A jump of the counter, which one damaged number may have caused.
+    """A jump of the counter that one damaged number may have caused.
 
     Attributes:
-        number: of the packet before it.
-        loss: that was counted for it; None if the sensor seemed to have started again.
+        number: the counter of the packet before the jump.
+        loss: the loss counted for the jump; None if the sensor seemed to have restarted.
     """
 
     number: int
@@ -112,12 +113,12 @@ class CounterJump:
 
 
 class CounterOrder:
-    """Judges the packets of one stream by their counter.
+    """Order, losses and duplicates of the packets of one stream, by their counter.
 
     Args:
-        sensor: with the counter.
-        stats: counts what is lost, late and duplicated.
-        clock: of the packets; it is used if its pace is declared.
+        sensor: the sensor that declares the counter.
+        stats: counts lost, late and duplicate packets.
+        clock: the clock of the packets; it is used if its pace is declared.
     """
 
     def __init__(self, sensor: SensorDescription, stats: Counters, clock: Clock | None) -> None:
@@ -134,18 +135,20 @@ class CounterOrder:
         self._index = -1  # of the newest packet
         self._first = 0  # index of the first packet since the sensor started
         self._missing = dict[int, CountedLoss]()  # by index
-        self._suspect: tuple[int, int] | None = None  # number and time of a damaged packet, perhaps
+        self._suspect: tuple[int, int] | None = (
+            None  # number and time of a packet that may be damaged
+        )
         self._jump: CounterJump | None = None  # before the newest packet
 
     def push(self, batch: Batch, times: Times | None) -> tuple[Index, NDArray[np.bool_]]:
-        """Return the index of each packet, (n,), and whether there is a break before it, (n,).
+        """Return the index of each packet, (n,), and the breaks before packets, (n,).
 
         Args:
-            batch: the packets; `breaks` are those at skipped bytes, and further ones are marked.
-            times: by the sensor's clock, (n,) ns; None if it has none.
+            batch: the packets; `breaks` marks skipped bytes, and further breaks are added to it.
+            times: times by the sensor's clock, (n,) ns; None without a clock.
 
         Raises:
-            SpecError: if the counter is no field of the header.
+            SpecError: if the counter is not a field outside of arrays.
         """
         count = len(batch)
         readings = self._read(batch, times)
@@ -174,7 +177,7 @@ class CounterOrder:
         return index, batch.breaks
 
     def forget(self) -> None:
-        """Ignore the clock at the next packet: time has passed that no packet shows."""
+        """Ignore the clock at the next packet, after lost input of unknown duration."""
         self._time = None
         self._arrived = None
         self._gaps.forget()
@@ -185,7 +188,7 @@ class CounterOrder:
         if info is None or info.axes:
             raise SpecError("a sequence must be a field outside of arrays", path=self._rule.field)
         numbers = batch.table.raw(self._rule.field)
-        periods = self._last(batch, (1 << info.bits) - 1) - self._rule.first + 1
+        periods = self._find_last_number(batch, (1 << info.bits) - 1) - self._rule.first + 1
         if not isinstance(periods, int) or periods <= MAX_SIGNED_PERIOD:
             numbers = numbers.astype(np.int64)
         has_counter = batch.table.present(self._rule.field)
@@ -203,7 +206,7 @@ class CounterOrder:
         paces = read_paces(self._clock, batch)
         return CounterReadings(numbers, periods, has_counter, times, steps, paces)
 
-    def _last(self, batch: Batch, largest: int) -> int | NDArray[np.int64]:
+    def _find_last_number(self, batch: Batch, largest: int) -> int | NDArray[np.int64]:
         """Return the highest number of the counter, for each packet or for all."""
         last = self._rule.last
         if callable(last):
@@ -216,9 +219,9 @@ class CounterOrder:
         return int(last)
 
     def _find_odd(self, readings: CounterReadings) -> list[int]:
-        """Return the packets that do not follow the previous one.
+        """Return the rows of packets that do not follow the previous one.
 
-        The first packet is left out.
+        Row 0 is not included.
         """
         numbers = readings.numbers
         if readings.has_counter is not None and not readings.has_counter.all():
@@ -245,9 +248,9 @@ class CounterOrder:
     def _count_places_ahead(
         self, readings: CounterReadings, row: int
     ) -> tuple[int | None, int | None]:
-        """Return how many places a packet is ahead of the newest one, and its corrected number.
+        """Return the places of a packet ahead of the newest, and its corrected number.
 
-        Places are None if the sensor has started again.
+        The number of places is None if the sensor has restarted.
         """
         number = readings.number(row)
         if number is None:
@@ -269,17 +272,21 @@ class CounterOrder:
         if _agree(near, by_clock) and near >= -MAX_PLACES_LATE:
             self._suspect = None
             return (None if near == -MAX_PLACES_LATE else near), number
-        if ahead == 1:  # the clock was set, or a recording begins anew
+        if ahead == 1:  # the clock was set, or a recording starts again
             self._suspect = None
             return 1, number
         if by_clock <= -MAX_PLACES_LATE:
             return None, number
-        if by_clock <= 0.5:  # late, from before the numbers started again or after it
+        if by_clock <= 0.5:  # a late packet, from before or after a reset of the counter
             return round(by_clock), number
         return self._correct(number, time, pace, by_clock)
 
     def _count_by_number(self, ahead: int, period: int) -> int | None:
-        """Return the places ahead by the counter alone; None if the sensor has started again."""
+        """Return the places ahead by the counter alone; None if the sensor has restarted.
+
+        Args:
+            ahead: the difference to the newest packet's counter, from 0 to `period` - 1.
+        """
         if ahead == 0:
             return 0
         behind = period - ahead
@@ -294,9 +301,10 @@ class CounterOrder:
         return ahead
 
     def _correct(self, number: int, time: int, pace: float, by_clock: float) -> tuple[int, int]:
-        """Correct the number of a packet by the clock, if its own does not fit.
+        """Correct the number of a packet by the clock, because counter and clock disagree.
 
-        If two such numbers follow one another, the counter has started again there.
+        If two consecutive numbers disagree with the clock but agree with each other, the counter
+        was reset there.
 
         Returns:
             The places ahead and the number.
@@ -315,7 +323,7 @@ class CounterOrder:
     def _place(
         self, readings: CounterReadings, row: int, ahead: int | None, number: int | None
     ) -> tuple[int, bool]:
-        """Return the index of a packet that does not follow the newest one.
+        """Place a packet that does not follow the newest one.
 
         Returns:
             The index, and whether there is a break before the packet.
@@ -325,7 +333,7 @@ class CounterOrder:
         jump = self._jump
         self._jump = None
         is_first = self._index < 0
-        if jump is not None and self._returns(jump, number):
+        if jump is not None and self._is_continued(jump, number):
             if jump.loss is not None:
                 self._stats.lost -= jump.loss.missing
             self._begin(number)
@@ -343,20 +351,23 @@ class CounterOrder:
         return self._index, is_break
 
     def _note_jump(self, loss: CountedLoss | None) -> None:
-        """Remember that the counter jumps here, unless a clock tells damage from losses."""
+        """Remember a jump of the counter, unless a clock can show that it is damage."""
         if self._clock is None and self._number is not None:
             self._jump = CounterJump(self._number, loss)
 
-    def _returns(self, jump: CounterJump, number: int | None) -> bool:
-        """Return whether a number goes on from before a jump, which was damage then."""
+    def _is_continued(self, jump: CounterJump, number: int | None) -> bool:
+        """Return whether a number continues from before a jump.
+
+        If so, the number at the jump was damaged.
+        """
         if number is None:
             return False
         return 0 < (number - jump.number) % self._period <= MAX_PLACES_LATE
 
     def _add_loss(self, row: int, ahead: int) -> CountedLoss:
-        """Advance the index to a packet.
+        """Advance the index to a packet, and count the packets between as lost.
 
-        Packets between are counted as lost if they are not masked.
+        Masked packets are not counted as lost.
         """
         loss = CountedLoss(ahead - 1)
         before = self._index
@@ -375,9 +386,9 @@ class CounterOrder:
         return loss
 
     def _begin(self, number: int | None) -> None:
-        """Begin with a first packet, or anew after the sensor started again.
+        """Begin with a first packet, or again after the sensor restarted.
 
-        Nothing is known to be lost there; the index leaves out one number.
+        No loss is counted there; after a restart the index leaves out one number.
         """
         if self._index < 0 and number is not None:
             self._index = (number - self._rule.first) % self._period % MAX_INDEX_STEP
@@ -388,7 +399,11 @@ class CounterOrder:
         self._suspect = None
 
     def _place_late(self, behind: int) -> int:
-        """Return the index of a packet that is late or a duplicate, and count it."""
+        """Return the index of a packet that is late or a duplicate, and count it.
+
+        Args:
+            behind: the number of places behind the newest packet.
+        """
         index = self._index - behind
         if index in self._missing:
             loss = self._missing.pop(index)

@@ -1,6 +1,6 @@
-"""IMU samples of packets, in stream order.
+"""IMU samples of packets, in stream order, and the buffer that assigns them to scans.
 
-They are in SI units and the axes of the points, with their assignment to scans.
+Samples are in SI units and in the axes of the points.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class ImuSamples:
     """N samples of an IMU in stream order.
 
     Attributes:
-        time_ns: (N,) int64, by the same clock as the packets'.
-        angular_velocity: (N, 3) float64 rad/s about x, y and z; nan where a frame lacks it.
-        linear_acceleration: (N, 3) float64 m/s2 along x, y and z, gravity in it.
+        time_ns: (N,) int64, by the same clock as the times of the packets.
+        angular_velocity: (N, 3) float64 rad/s about x, y and z; nan if a frame lacks it.
+        linear_acceleration: (N, 3) float64 m/s2 along x, y and z, including gravity.
     """
 
     time_ns: NDArray[np.int64]
@@ -50,26 +50,30 @@ class ImuSamples:
         )
 
     def __getitem__(self, which: Any) -> ImuSamples:
-        """Return the samples that a mask, indices or a slice pick."""
+        """Return the samples selected by a mask, indices or a slice."""
         return ImuSamples(
             self.time_ns[which], self.angular_velocity[which], self.linear_acceleration[which]
         )
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """`time_ns`, and a column for each axis under the names that files have."""
+        """`time_ns`, and a column for each axis, by the names used in files."""
         values = np.concatenate([self.angular_velocity, self.linear_acceleration], axis=1).T
         return {"time_ns": self.time_ns, **dict(zip(UNITS, values, strict=True))}
 
     def turn(self, rotation: NDArray[np.float64]) -> ImuSamples:
-        """Return the same in other axes; `rotation`: (3, 3), from these axes to those."""
+        """Return the samples in other axes.
+
+        Args:
+            rotation: the (3, 3) matrix from the present axes to the other axes.
+        """
         return ImuSamples(
             self.time_ns, self.angular_velocity @ rotation.T, self.linear_acceleration @ rotation.T
         )
 
 
 def join_samples(parts: Sequence[ImuSamples]) -> ImuSamples:
-    """Samples one after another; none of none."""
+    """Return samples of several batches as one value, empty if there are no batches."""
     if len(parts) != 1:
         parts = [*parts, ImuSamples(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)))]
     names = ("time_ns", "angular_velocity", "linear_acceleration")
@@ -81,16 +85,16 @@ def join_samples(parts: Sequence[ImuSamples]) -> ImuSamples:
 def read_samples(
     sensor: SensorDescription, frame: str, batch: Batch, time_ns: NDArray[np.int64]
 ) -> ImuSamples:
-    """Return the samples of packets.
+    """Return the IMU samples of packets, in the axes of the points.
 
     Args:
-        frame: their type, or the parts that they are.
+        frame: the frame type of the packets, or the name of the parts.
         batch: the packets.
-        time_ns: (n,) of each.
+        time_ns: the time of each packet, (n,).
 
     Raises:
-        SpecError: where the frame type has nothing of an IMU.
-        PluginError: where the plugin's function fails or returns columns that do not fit; the cause
+        SpecError: if the frame type has no IMU data.
+        PluginError: if the plugin's function fails or returns columns of a wrong shape; the cause
             is chained.
     """
     function = sensor.imu_of(frame)
@@ -128,25 +132,35 @@ def read_samples(
 class WaitingSamples:
     """Samples that wait for the scan that they belong to.
 
-    A scan has the samples from its first point to that of the next one. Earlier samples are kept as
-    well.
+    A scan has the samples from its first point to the first point of the next scan. The first scan
+    also has all earlier samples.
     """
 
     def __init__(self) -> None:
         self._parts: list[ImuSamples] = []
 
     def add(self, more: ImuSamples) -> None:
-        """Take what came."""
+        """Add samples."""
         if len(more):
             self._parts.append(more)
 
     def keep_newest(self, most: int) -> None:
-        """Let go of all but the newest ones, where no scan ends and asks for them."""
+        """Drop all but the newest samples, if there are more than twice as many.
+
+        This bounds the memory if no scan ends.
+
+        Args:
+            most: the number of samples to keep.
+        """
         if sum(map(len, self._parts)) > 2 * most:
             self._parts = [join_samples(self._parts)[-most:]]
 
     def take_until(self, ns: int | None) -> ImuSamples:
-        """Hand out what was felt before a time, in the order of time; of None all there is."""
+        """Remove and return the samples before a time, sorted by time.
+
+        Args:
+            ns: the time; None for all samples.
+        """
         samples = join_samples(self._parts)
         samples = samples[np.argsort(samples.time_ns, kind="stable")]
         if ns is not None:

@@ -1,13 +1,12 @@
-"""Detect masked sectors, in which a rotating sensor sends nothing.
+"""Detect masked sectors, in which a rotating sensor sends no packets.
 
-The user of a sensor has configured this part of each turn.
+The user of a sensor can configure a part of each revolution to be masked.
 
-Between the packets on both sides of such a sector the clock advances and the angle leaps, as if
-packets were lost. A gap belongs to a masked sector if it recurs at the same angles while no packet
-has ever come from the angles between. In a loss the missing angles are seen one turn earlier or
-later.
+At a masked sector the clock advances and the angle leaps, as if packets were lost. A gap belongs to
+a masked sector if it recurs at the same angles and no packet has ever come from the angles between.
+After a real loss, packets from the missing angles arrive in earlier or later revolutions.
 
-All angles here are in turns, from 0 to 1. A width is measured in the direction of rotation.
+All angles here are in turns, from 0 to 1. Widths are measured in the direction of rotation.
 """
 
 from __future__ import annotations
@@ -26,34 +25,34 @@ from lidarspec.spec.timing import OnChange, OnWrap
 
 Angles = NDArray[np.float64]
 
-#: whole turns in the units of angles.
+#: a whole turn in each unit of angles.
 FULL_TURNS = {"deg": 360.0, "rad": 2 * np.pi}
-#: angles are remembered in so many equal parts of a turn.
+#: the number of equal parts of a turn in which angles are remembered.
 BINS = 360
-#: the narrowest sector that is looked for.
+#: the narrowest sector that is searched for, in turns.
 MIN_WIDTH = 1 / 36
-#: the same in steps from packet to packet.
+#: the narrowest sector in steps from packet to packet.
 MIN_WIDTH_STEPS = 4
-#: steps from packet to packet by which the edges of a gap vary.
+#: how far the edges of a gap vary, in steps from packet to packet.
 EDGE_STEPS = 1.25
-#: a step back by less is jitter of the angle, and no leap over the rest of the turn.
+#: a step back by less, in turns, is jitter of the angle and not a leap over the rest of the turn.
 JITTER = 1 / 200
-#: share of the wider one of two gaps that both have in common if they are of one sector.
+#: two gaps belong to one sector if they share more than this share of the wider gap.
 COMMON_SHARE = 0.5
-#: gaps that are compared with later ones.
+#: the number of earlier gaps that a new gap is compared with.
 REMEMBERED_GAPS = 16
-#: packets by which the gap of a masked sector may vary, since packets do not begin at its edges.
+#: how many packets the gap of a masked sector may vary by: packets do not begin at its edges.
 VARYING_PACKETS = 2
 
 
 @dataclass(frozen=True)
 class Sector:
-    """A sector of a turn.
+    """A sector of a revolution.
 
     Attributes:
-        start: the angle at which it begins, in the direction of rotation.
-        width: how far it reaches from there.
-        direction: 1 if angles grow as the sensor turns, else -1.
+        start: the angle at which it begins, in the direction of rotation, turns.
+        width: its width, turns.
+        direction: 1 if angles grow as the sensor rotates, else -1.
     """
 
     start: float
@@ -67,20 +66,20 @@ class Sector:
 
     @property
     def stop(self) -> float:
-        """The angle at which it ends."""
+        """The angle at which it ends, in turns."""
         return (self.start + self.direction * self.width) % 1
 
     @property
     def middle(self) -> float:
-        """The angle in its middle."""
+        """The angle in its middle, in turns."""
         return (self.start + self.direction * self.width / 2) % 1
 
     def contains(self, angle: float) -> bool:
-        """Return whether an angle lies within."""
+        """Return whether an angle is in the sector."""
         return forward_step(angle - self.start, self.direction) < self.width
 
     def common(self, other: Sector) -> Sector | None:
-        """Return the sector that lies in both; None if there is none."""
+        """Return the intersection of two sectors; None if they do not overlap."""
         offset = forward_step(other.start - self.start, self.direction)
         if offset < self.width:
             return Sector(other.start, min(self.width - offset, other.width), self.direction)
@@ -90,7 +89,10 @@ class Sector:
 
 
 def forward_step(step: float, direction: int) -> float:
-    """Return a step in the direction of rotation, from 0 to 1; a little back is none."""
+    """Return a step in the direction of rotation, in turns from 0 to 1.
+
+    A step back by less than `JITTER` counts as 0.
+    """
     ahead = (direction * step) % 1
     if ahead > 1 - JITTER:
         return 0.0
@@ -98,13 +100,13 @@ def forward_step(step: float, direction: int) -> float:
 
 
 class AngleReader:
-    """Reads the angle at which each packet begins, by the rule that cuts scans.
+    """A reader of the angle at which each packet begins, by the rule that cuts scans.
 
     Args:
-        sensor: of the packets.
+        sensor: the sensor that sends the packets.
 
     Attributes:
-        is_available: whether the rule names an angle in the packets.
+        is_available: whether the rule uses an angle field of datagrams.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
@@ -121,9 +123,9 @@ class AngleReader:
         self.is_available = bool(self._path) and sensor.datagrams
 
     def angles(self, table: Table) -> Angles | None:
-        """Return the angle at which each packet begins, (n,).
+        """Return the angle at which each packet begins, (n,), in turns.
 
-        Returns None if the packets have no such field, or no part that has it.
+        Returns None if the packets do not have the field, or have no part with it.
         """
         if self.is_available:
             info = table.schema.fields.get(self._path)
@@ -142,9 +144,9 @@ class AngleReader:
         return np.mod((first * info.scale + info.offset) / full, 1.0)
 
     def direction(self, table: Table) -> int:
-        """Return the direction in which the first packet of a table turns: 1 or -1.
+        """Return the direction of rotation in the first packet of a table: 1 or -1.
 
-        Returns 0 if the packet does not show it.
+        Returns 0 if the packet does not show the direction.
         """
         if self._grows:
             return 1
@@ -160,10 +162,10 @@ class AngleReader:
 
 
 class SectorFinder:
-    """Finds the masked sector of one stream.
+    """The search for the masked sector of one stream.
 
     Args:
-        direction: 1 if angles grow as the sensor turns, else -1.
+        direction: 1 if angles grow as the sensor rotates, else -1.
 
     Attributes:
         sector: the masked sector; None until it is found.
@@ -176,21 +178,21 @@ class SectorFinder:
         self._gaps = list[Sector]()
 
     def add_angles(self, angles: Angles) -> None:
-        """Note that packets came from some angles."""
+        """Record that packets came from some angles."""
         if self.sector is None:
             self._seen[(angles * BINS).astype(np.intp) % BINS] = True
 
     def add_gap(self, start: float, stop: float, step: float) -> list[int]:
-        """Compare a gap with earlier ones; set `sector` if it recurs.
+        """Compare a gap with earlier ones, and set `sector` if it recurs.
 
         Args:
-            start, stop: the angles of the packets before and after it.
-            step: from one packet to the next; the gap may vary by so much, as packets do not begin
-                at its edges.
+            start, stop: the angles of the packets before and after the gap, turns.
+            step: the angle from one packet to the next, turns. The edges of a gap may vary by about
+                this much, because packets do not begin at the edges of the sector.
 
         Returns:
-            How many gaps ago those were that contain the sector, which is found now; none if it is
-            not.
+            The earlier gaps that contain the sector, each as its distance in gaps (1 is the last
+            one). The list is empty if no sector is found.
         """
         gap = Sector.between(start, stop, self.direction)
         for other in reversed(self._gaps):
@@ -210,13 +212,13 @@ class SectorFinder:
         return []
 
     def has_unseen_gaps(self, step: float) -> bool:
-        """Return whether any gap may still turn out to be a masked sector."""
+        """Return whether any gap may still prove to be a masked sector."""
         return any(self._is_unseen(gap, step) for gap in self._gaps)
 
     def _is_unseen(self, sector: Sector, step: float) -> bool:
-        """Return whether no packet began within a sector, without its edges.
+        """Return whether no packet began in a sector, apart from its edges.
 
-        At least one of each turn would, if the sector were not masked.
+        If the sector were not masked, at least one packet of each revolution would begin there.
         """
         edge = EDGE_STEPS * step + 1 / BINS
         inner = sector.width - 2 * edge
@@ -231,8 +233,8 @@ class GapLoss(Protocol):
     """A gap that counts as a loss so far.
 
     Attributes:
-        missing: packets that count as lost.
-        masked: packets that do not, since a masked sector leaves them out.
+        missing: the number of packets that count as lost.
+        masked: the number of packets that a masked sector leaves out, which do not count as lost.
     """
 
     missing: int
@@ -240,21 +242,21 @@ class GapLoss(Protocol):
 
 
 class MaskedGaps:
-    """Tells gaps at a masked sector from losses, for one stream of packets in any order.
+    """Gaps at a masked sector of one stream, as distinct from losses.
 
-    A gap counts as a loss until it recurs, one turn later.
+    The packets may be in any order. A gap counts as a loss until it recurs one revolution later.
 
     Args:
-        sensor: of the packets.
+        sensor: the sensor that sends the packets.
 
     Attributes:
-        masked: packets that the masked sector leaves out; 0 until it is known.
+        masked: the number of packets that the masked sector leaves out; 0 until it is known.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
         self._reader = AngleReader(sensor)
-        self._angles: Angles | None = None  # of the packets at hand
-        self._first_unnoted = 0  # row of the first one that `_finder` has not seen
+        self._angles: Angles | None = None  # of the current packets
+        self._first_unnoted = 0  # the first row that `_finder` has not seen
         self._finder: SectorFinder | None = None
         self._losses = list[GapLoss]()  # at the gaps that `_finder` remembers
         self.masked = 0  # packets that the masked sector leaves out
@@ -273,19 +275,19 @@ class MaskedGaps:
             self._finder = SectorFinder(direction) if direction else None
 
     def _note_until(self, row: int) -> None:
-        """Note that the packets at hand before a row are not masked."""
+        """Record that the current packets before a row came from unmasked angles."""
         if self._finder is not None and self._angles is not None:
             self._finder.add_angles(self._angles[self._first_unnoted : row])
         self._first_unnoted = row
 
     def forget(self) -> None:
-        """Begin anew: the next packets may be those of another setting."""
+        """Start again, since the next packets may come from a sensor set differently."""
         self._finder = None
         self._losses.clear()
         self.masked = 0
 
     def angle_at(self, row: int) -> float:
-        """Return the angle of one of the packets at hand, in turns; nan if unknown."""
+        """Return the angle of a row of the current packets, in turns; nan if unknown."""
         if self._angles is None:
             return math.nan
         return self._angles.item(row)
@@ -293,7 +295,7 @@ class MaskedGaps:
     def count_masked(self, start: float, stop: float, missing: int) -> int:
         """Return how many of the packets missing between two angles are masked.
 
-        Returns 0 if the masked sector is not known.
+        Returns 0 if no masked sector is known.
         """
         if self._finder is None:
             sector = None
@@ -308,13 +310,15 @@ class MaskedGaps:
         return min(self.masked, missing)
 
     def find_unlost(self, row: int, start: float, stop: float, loss: GapLoss) -> int:
-        """Compare a loss between two angles with earlier ones; if it recurs, both are masked.
+        """Compare a loss with earlier ones; if it recurs, mark these losses as masked.
 
         Args:
-            row: of the packet behind it.
+            row: the packet after the loss.
+            start, stop: the angles of the packets before and after the loss, turns.
+            loss: its counts, which are changed if it recurs.
 
         Returns:
-            How many packets count as lost, and are not.
+            The number of packets that were counted as lost but are masked.
         """
         finder = self._finder
         if finder is None or finder.sector is not None or math.isnan(start) or math.isnan(stop):

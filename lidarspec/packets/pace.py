@@ -1,7 +1,7 @@
-"""The time that each packet takes by the sensor's clock, as the spec declares it (`Clock.pace`).
+"""Read the time that each packet takes by the sensor's clock (`Clock.pace`).
 
-Without a declared pace nothing is known about lost packets from the clock: a rate is never
-estimated from the stream, since a stream with regular losses has a regular rate, too.
+If the spec declares no pace, the clock shows no lost packets. A rate is never estimated from the
+stream, because a stream with regular losses has a regular rate, too.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ Paces = NDArray[np.float64]
 
 
 def read_paces(clock: Clock, batch: Batch) -> Paces:
-    """Return the nanoseconds that each packet takes, (n,); nan if they are not declared.
+    """Return the nanoseconds that each packet takes, (n,); nan if not declared.
 
-    Packets with one common pace share a zero-stride array.
+    If all packets have one pace, the result is a zero-stride array.
     """
     if clock.pace is None:
         return np.broadcast_to(np.nan, (len(batch),))
-    (seconds,) = header_function(clock.pace, batch.table.schema, _seconds)(batch)
+    (seconds,) = header_function(clock.pace, batch.table.schema, _to_seconds)(batch)
     paces = np.where(seconds > 0, seconds * 1e9, np.nan)
     if (paces == paces[0]).all():
         paces = paces[:1]
@@ -34,11 +34,11 @@ def read_paces(clock: Clock, batch: Batch) -> Paces:
 
 
 def shortest_pace(paces: Paces) -> float:
-    """Return the shortest of some paces, ns; inf if none is known."""
+    """Return the shortest of some paces, ns; inf if all are nan."""
     if paces.strides == (0,):
         paces = paces[:1]
     return float(np.fmin.reduce(paces, initial=math.inf))
 
 
-def _seconds(values: Any, count: int) -> NDArray[np.float64]:
+def _to_seconds(values: Any, count: int) -> NDArray[np.float64]:
     return np.broadcast_to(np.asarray(values, np.float64).reshape(-1), (count,))

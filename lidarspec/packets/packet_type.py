@@ -1,7 +1,7 @@
-"""Work out how the packets of one frame type are timed, and how losses among them are found.
+"""Decide how packets of one frame type are timed and how their losses are found.
 
-Both follow from the declaration of the sensor, so this is done once for each frame type and not for
-each stream.
+Both follow from the declaration of the sensor, so they are decided once for each frame type, not
+for each stream.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from typing import Any
 from lidarspec.errors import UnknownFrame
 from lidarspec.framing.frame_codec import Codec
 from lidarspec.framing.frame_engine import get_codec
-from lidarspec.packets.clocks import clock_parts, clock_terms, paths
+from lidarspec.packets.clocks import clock_fields, clock_parts, clock_terms
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Clock
 
 
 @dataclass(frozen=True, eq=False)
 class PacketType:
-    """The packets of one frame type of a sensor.
+    """The timing and loss rules of one frame type of a sensor.
 
     Attributes:
         sensor, frame: the sensor, and the name of the frame type.
         codec: the engine of the frame type.
-        others: the names of the frame types that packets take state from.
-        clock: the clock of these packets; None if they have none.
+        others: the names of the other frame types that packets of this type read as their state.
+        clock: the clock of these packets; None without a clock.
         timed_sensor: the sensor with this clock.
-        loss_clock: the clock that shows losses; None if there is none, or if it is in the parts of
-            a frame: a frame without parts does not show how much time has passed.
-        loss_clock_step_ns: its step; 0 if a function computes it.
-        counter_clock: the clock that is compared with the counter; None if there is none.
+        loss_clock: the clock that shows losses; None without a clock, or if the clock is in the
+            parts of a frame: a frame without parts does not show how much time has passed.
+        loss_clock_step_ns: the step of that clock; 0 if a function computes it.
+        counter_clock: the clock that is compared with the counter; None without one.
         is_counted: whether the packets have a counter.
-        is_ordered_by_clock: whether their clock shows the order in which they were sent: that of
+        is_ordered_by_clock: whether the packets are ordered by their clock. This applies to
             datagrams without a counter.
     """
 
@@ -55,7 +55,7 @@ class PacketType:
 
 @lru_cache(maxsize=256)
 def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
-    """Return the packets of a frame type, always the same object.
+    """Return the rules of a frame type; repeated calls return the same object.
 
     Raises:
         UnknownFrame: if the sensor has no such type.
@@ -74,7 +74,7 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
     loss_clock = counter_clock
     step_ns = 0.0
     if loss_clock is not None:
-        fields = paths(loss_clock)
+        fields = clock_fields(loss_clock)
         if clock_parts(fields, own_codec.schema) is not None:
             loss_clock = None
         else:
@@ -98,29 +98,32 @@ def get_packet_type(sensor: SensorDescription, frame: str) -> PacketType:
 
 
 def find_clock(sensor: SensorDescription, frame: str) -> Clock | None:
-    """Return the clock of the frames of a type, if any.
+    """Return the clock of the frames of a type; None without a clock.
 
-    Data frames use the clock of the sensor. So do frames of an IMU, and all frames of a sensor
-    without points, that have its fields.
+    A frame type that declares a clock uses it. Otherwise data frames use the clock of the sensor
+    if they have its fields. So do IMU frames, and all frames of a sensor without points.
     """
     declared = sensor.frames[frame]
     shared = sensor.clock
     if declared.clock is not None or shared is None:
         return declared.clock
     if declared.data:
-        if all(_has_field(sensor, frame, path) for path in paths(shared)):
+        if all(_has_field(sensor, frame, path) for path in clock_fields(shared)):
             return shared
         return None
-    if not paths(shared) or (declared.imu is None and sensor.has_points):
+    if not clock_fields(shared) or (declared.imu is None and sensor.has_points):
         return None
     schema = get_codec(declared).schema
-    if all(path in schema.fields for path in paths(shared)):
+    if all(path in schema.fields for path in clock_fields(shared)):
         return shared
     return None
 
 
 def _has_field(sensor: SensorDescription, frame: str, path: str) -> bool:
-    """Return whether packets of this type have a field, or should, since no data frame has it."""
+    """Return whether packets of this type have a field.
+
+    Also returns True if no data frame has the field: reading it then reports the error.
+    """
     schemas = {name: get_codec(sensor.frames[name]).schema for name in sensor.main_frames}
     having = [
         name

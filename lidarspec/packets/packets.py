@@ -21,29 +21,30 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.points.evaluate import evaluate
 from lidarspec.spec.sensor import SensorDescription
 
-#: what is known of each packet besides its fields.
+#: the attributes of `Packets` that have one value for each packet.
 _COLUMNS = ("offset", "time_ns", "host_ns", "index", "breaks")
 
-#: numbers, or what makes them when they are asked for.
+#: indices of packets, or a function that computes them when they are first read.
 Index = Numbers | Callable[[], NDArray[np.int64]]
 StateOf = tuple[Table | None, NDArray[np.intp]]
 
 
 class Packets:
-    """n frames of one type. Their arrays are to be read only: some share memory.
+    """n frames of one type, in stream order. Arrays are read-only: some share memory.
 
     Attributes:
-        sensor, frame: whose, and of which type.
-        table: their raw columns.
-        time_ns: (n,) int64, by the sensor's clock, unwrapped; else the host's.
-        host_ns: (n,) int64 arrival times; 0 where the caller gave none.
-        breaks: (n,) True where something was lost before the packet.
-        is_clocked: whether the packets are ordered by the sensor's clock instead of by a counter.
-        state: for each other frame type, its frames and which of them was last before each packet.
-        masked: (n,) packets that are missing before each since a masked sector leaves them out;
-            None if there are none.
+        sensor, frame: the sensor, and the name of the frame type.
+        table: the raw columns of the frames.
+        time_ns: (n,) int64 ns by the sensor's clock, unwrapped; arrival times without a clock.
+        host_ns: (n,) int64 arrival times, ns; 0 if unknown.
+        breaks: (n,) bool, True if something was lost before the packet.
+        is_clocked: whether the packets are ordered by the sensor's clock, not by a counter.
+        state: for each other frame type, its frames and, for each packet, the row of the last
+            frame before it.
+        masked: (n,) the number of packets before each that a masked sector leaves out; None if no
+            masked sector was found.
         stats: the counters of the decoder.
-        backend: what makes points of them, "auto", "numpy" or "jit".
+        backend: the back end that computes points: "auto", "numpy" or "jit".
     """
 
     def __init__(
@@ -80,14 +81,14 @@ class Packets:
 
     @cached_property
     def offset(self) -> NDArray[np.int64]:
-        """The first byte of each in the input, (n,)."""
+        """The offset of each packet's first byte in the input, (n,)."""
         return to_array(self._offset)
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
-        """The number of each packet, (n,), including missing packets.
+        """The index of each packet, (n,), in which missing packets are counted too.
 
-        It is the unwrapped counter of the sensor, if there is one.
+        If the sensor has a counter, it is the unwrapped counter.
         """
         if callable(self._index):
             return self._index()
@@ -95,9 +96,9 @@ class Packets:
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """The position of each packet in order, (n,), equal for duplicates.
+        """The sort key of each packet, (n,), equal for duplicates.
 
-        It follows from the counter, or else from the clock, of datagrams.
+        It follows from the counter. For datagrams without a counter it follows from the clock.
         """
         if self._order is None:
             return self.index
@@ -118,10 +119,10 @@ class Packets:
     def __getitem__(self, path: str) -> NDArray[np.float64]:
         """Return a field in its unit, float64, shape (n, *lengths of its arrays).
 
-        The value is nan if a frame lacks the field.
+        Values are nan in frames that lack the field.
 
         Raises:
-            UnknownField: with the closest known path.
+            UnknownField: if there is no such field; it suggests the closest path.
         """
         info = self.table.schema.columns.get(path)
         if info is None:
@@ -137,7 +138,7 @@ class Packets:
     def raw(self) -> NDArray[Any]:
         """The integers of the wire, a structured array (n,), nested as in the struct.
 
-        Variable arrays are padded with 0.
+        Arrays of variable length are padded with 0.
         """
         columns = {path: self.table.raw(path) for path in self.table.schema.columns}
         array = np.zeros(len(self), _nested_dtype(self.table.schema, columns, ""))
@@ -152,7 +153,7 @@ class Packets:
         """Return the length of an array in each packet, (n,).
 
         Raises:
-            UnknownField: for an array that the frame does not have.
+            UnknownField: if the frame does not have the array.
         """
         if array in self.table.schema.parts:
             found = (
@@ -172,29 +173,34 @@ class Packets:
         return self.table.counts(array)
 
     def points(self) -> PointCloud:
-        """The points of all packets in stream order, flat; columns are made when they are read.
+        """Return the points of all packets, flat, in stream order.
+
+        Columns are computed when they are first read.
 
         Raises:
-            SpecError: where the sensor's `points` function fails, or returns columns that do not
-                fit.
+            SpecError: if the sensor's `points` function fails, or returns columns of a wrong shape.
         """
         return evaluate(self.with_points).cloud
 
     def imu(self) -> ImuSamples:
         """Return the samples of the sensor's IMU in all packets, in stream order.
 
-        Columns are in SI units. Each sample has its time.
+        Columns are in SI units. Each sample has its own time.
 
         Raises:
-            SpecError: where this frame type has nothing of an IMU, or its `imu` function fails or
-                returns columns that do not fit.
+            SpecError: if this frame type has no IMU data, or if its `imu` function fails or returns
+                columns of a wrong shape.
         """
         path = self.sensor.parts_with("imu", self.frame)
         own = self.parts(path) if path else self
         return read_samples(self.sensor, own.frame, own.batch(), own.time_ns)
 
     def take(self, which: Any) -> Packets:
-        """The packets that indices, a mask or a slice pick, with their times, offsets and state."""
+        """Return some of the packets, with their times, offsets and state.
+
+        Args:
+            which: indices, a mask or a slice.
+        """
         indices = np.arange(len(self))[which]
         columns = self._columns_at(indices)
         state = {name: (table, chosen[indices]) for name, (table, chosen) in self.state.items()}
@@ -210,7 +216,11 @@ class Packets:
         )
 
     def _columns_at(self, indices: NDArray[np.intp]) -> dict[str, Any]:
-        """Return what is known of some packets besides their fields, as `Packets` takes it."""
+        """Return the arguments of `Packets` that have one value for each packet.
+
+        Args:
+            indices: the selected packets, (k,).
+        """
         columns: dict[str, Any] = {name: getattr(self, name)[indices] for name in _COLUMNS}
         order = None if self._order is None else self._order[indices]
         if self.masked is None:
@@ -222,14 +232,14 @@ class Packets:
     def parts(self, path: str) -> Packets:
         """Return the parts of all packets, in stream order, as packets.
 
-        They have the times, numbers and state of the frames that they are in.
+        They have the times, indices and state of their frames.
 
         Args:
-            path: of the parts; "tlvs.points" for one of several kinds.
+            path: the path of the parts; "tlvs.points" if there are several kinds.
 
         Raises:
-            UnknownField: for parts that the frame does not have, and for several kinds of which
-                none is named.
+            UnknownField: if the frame does not have these parts, or if it has several kinds and the
+                path does not name one.
         """
         place = self.table.schema.within(path)
         if place is None:
@@ -241,7 +251,7 @@ class Packets:
         columns = self._columns_at(which)
         columns["breaks"] = (
             np.diff(np.cumsum(self.breaks)[which], prepend=0) > 0
-        )  # also of a frame without parts before
+        )  # a break before a frame without parts counts too
         columns["time_ns"] = part_times(self.sensor, (axis, kind), table, which, columns["time_ns"])
         state = {
             name: (frames, chosen[which])
@@ -264,7 +274,7 @@ class Packets:
 
     @property
     def with_points(self) -> Packets:
-        """The packets that points are made of: these, or the parts in them."""
+        """The packets that have the points: these packets, or their parts."""
         path = self.sensor.parts_with("points", self.frame)
         if path:
             return self.parts(path)
@@ -272,14 +282,17 @@ class Packets:
 
     @property
     def frames(self) -> tuple[Table, NDArray[np.intp] | slice]:
-        """The frames that they are, or that they are parts of, and the row of each there, (n,)."""
+        """The frames that contain the packets, and the row of each packet's frame, (n,).
+
+        A packet that is not a part is a frame itself.
+        """
         table, which = self.state.get(AROUND, (None, slice(None)))
         if table is None:
             return (self.table, slice(None))
         return (table, which)
 
     def batch(self, carry: dict[int, NDArray[np.float64]] | None = None) -> Batch:
-        """Return the packets as functions of a plugin receive them, through `Fields`.
+        """Return the batch that plugin functions read through `Fields`.
 
         Args:
             carry: the state left by the previous batch.
@@ -288,7 +301,7 @@ class Packets:
 
 
 def join_packets(parts: Sequence[Packets]) -> Packets:
-    """Batches of one stream, one after another."""
+    """Return batches of one stream as one batch, in this order."""
     if len(parts) == 1:
         return parts[0]
     head = parts[0]
@@ -327,7 +340,7 @@ def join_packets(parts: Sequence[Packets]) -> Packets:
 
 
 def join_tables(tables: Sequence[Any]) -> Table:
-    """Several tables of one frame type, one after another."""
+    """Return tables of one frame type as one table, in this order."""
     return tables[0] if len(tables) == 1 else type(tables[0]).join(tables)  # type: ignore[no-any-return]
 
 
@@ -337,7 +350,7 @@ def _nested_dtype(
     """Return the structured dtype of one level of the struct.
 
     Raises:
-        SpecError: One name is a value, a struct or an array in different branches.
+        SpecError: if one name is a value, a struct or an array in different branches.
     """
     members: list[Any] = []
     seen: set[str] = set()
@@ -349,13 +362,15 @@ def _nested_dtype(
             continue
         seen.add(name)
         here = prefix + name
-        if len(_forms(schema, here)) > 1:
+        if len(_list_forms(schema, here)) > 1:
             raise SpecError(
                 "its branches are a value, a struct or an array: request its columns one by one",
                 path=here,
             )
         own = [index for index, axis in enumerate(info.axes) if axis.rstrip("[]") == here]
-        is_array = columns[path].ndim > 1  # values that are no numbers stand in lists
+        is_array = (
+            columns[path].ndim > 1
+        )  # values that are not numbers are lists, without array axes
         shape = tuple(columns[path].shape[1 + index] for index in own if is_array)
         if below:
             kind = _nested_dtype(schema, columns, f"{here}.")
@@ -365,10 +380,10 @@ def _nested_dtype(
     return np.dtype(members)
 
 
-def _forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
-    """Return the forms of a name in the branches that have it.
+def _list_forms(schema: Schema, here: str) -> set[tuple[bool, int]]:
+    """Return the forms that a name has in the branches of the struct.
 
-    A form is whether it is a value, and the number of arrays of its own.
+    A form is a pair: whether the name is a value, and the number of its own array axes.
     """
     parts = [
         (path, info)

@@ -1,14 +1,14 @@
-"""Packets in order, each once.
+"""Sort packets and drop duplicates.
 
 A packet whose predecessor has not arrived is held until it arrives, or until more than `WINDOW`
-packets are held. Duplicates are left out, and so are packets whose successors were released before
-they arrived. All other packets pass at once, so that order costs no time while nothing is late. At
+packets are held. Duplicates are dropped, and so are packets whose successors were released before
+they arrived. All other packets pass at once, so ordering adds no delay while no packet is late. At
 the start `WINDOW` packets are held, since the first packet to arrive may be late as well.
 
-`Packets.order` gives the place of each packet. With a counter it is the index. With a clock alone
-it is a time, and the packets are judged again once they are in order: scans depend on the packets,
-not on the order in which they arrive. A clock without a declared pace does not show that a packet
-is missing, so `WINDOW` packets are always held.
+`Packets.order` is the sort key. With a counter it is the index. With a clock alone it is a time,
+and losses are judged again once the packets are in order: scans depend on the packets, not on the
+order in which they arrive. A clock without a declared pace does not show that a packet is missing,
+so `WINDOW` packets are always held.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.clock_order import ClockOrder
 from lidarspec.packets.packets import Packets, join_packets
 
-#: packets that are held while one before them may be missing.
+#: the number of packets that are held while an earlier packet may be missing.
 WINDOW = 10
 
 
 class Reorder:
-    """Orders the packets of one stream."""
+    """A buffer that sorts the packets of one stream."""
 
     def __init__(self) -> None:
         self._next: int | None = None  # index that follows the packets released so far
-        self._released = 0  # the order of the last one of them
+        self._released = 0  # the order of the last released packet
         self._held: Packets | None = None
         self._clock_order: ClockOrder | None = None
 
@@ -61,14 +61,14 @@ class Reorder:
         return [self._mark(held.take(np.argsort(held.order, kind="stable")), self._next)]
 
     def _push_ascending(self, packets: Packets) -> list[Packets]:
-        """Release packets none of which is late, up to the first gap that may still be filled."""
+        """Release packets without late ones, up to the first gap that may still be filled."""
         index = packets.index
         before = self._next
         gaps = [] if before == index.item(0) else [0]
         steps = index[1:] - index[:-1]
         if len(steps) and int(steps.max()) > 1:
             gaps += (np.flatnonzero(steps > 1) + 1).tolist()
-        first_held = len(packets) - WINDOW  # those from there on are held if there is a gap
+        first_held = len(packets) - WINDOW  # packets from this row on are held if there is a gap
         end = len(packets)
         if not _shows_gaps(packets):
             end = max(first_held, 0)
@@ -89,11 +89,11 @@ class Reorder:
         return [self._mark(packets, before)]
 
     def _push_disordered(self, packets: Packets, held_count: int) -> list[Packets]:
-        """Put packets between those that are held, and release all that have no gap before them.
+        """Insert packets between held ones, and release all that have no gap before them.
 
         Args:
-            packets: those that are held, and the ones that arrived after them.
-            held_count: how many are held.
+            packets: the held packets, followed by the packets that arrived after them.
+            held_count: the number of held packets.
         """
         orders = packets.order.tolist()
         indices = packets.index.tolist()
@@ -129,11 +129,10 @@ class Reorder:
         return []
 
     def _mark(self, packets: Packets, before: int | None) -> Packets:
-        """Return packets in order, with breaks exactly where the index leaves out numbers.
+        """Return packets in order, with breaks where the index leaves out numbers.
 
         Args:
-            before: the index that follows the packets released before these; None if there are
-                none.
+            before: the index after the last packet released before these; None before the first.
         """
         marked = copy.copy(packets)
         if packets.is_clocked:
@@ -155,6 +154,6 @@ class Reorder:
 
 
 def _shows_gaps(packets: Packets) -> bool:
-    """Return whether the index of packets leaves out what is missing."""
+    """Return whether the index of packets has a gap where packets are missing."""
     clock = packets.sensor.clock
     return not packets.is_clocked or (clock is not None and clock.pace is not None)

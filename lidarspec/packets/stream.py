@@ -1,9 +1,9 @@
-"""From frames to packets: times, losses and order, and the other frames that packets depend on.
+"""Turn frames into packets: times, losses, order, and the frames that packets depend on.
 
 A `PacketStream` remembers between batches what the next one needs: the last clock reading, the
 newest packet, the last frame of each other type, and whether bytes were skipped since the last
-packet. Losses are judged by the counter of the packets (`counter_order`), for datagrams without one
-by their clock (`clock_order`), else by arrival (`arrival_order`).
+packet. Losses are judged by the counter of the packets (`counter_order`). Without a counter,
+datagrams are judged by the clock (`clock_order`), and all others by arrival (`arrival_order`).
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ OtherFrames = tuple[Frames, NDArray[np.intp]]
 
 
 class PacketStream:
-    """Makes packets of one type from the frames that a decoder finds.
+    """Packets of one type, made from the frames that a decoder finds.
 
     Args:
         sensor: the sensor that sends the packets.
         frame: the frame type of the packets.
         stats: the decoder's counters; lost, duplicate and late packets are added to them.
-        backend: calculates points from the packets: "auto", "numpy" or "jit".
+        backend: the back end that computes points: "auto", "numpy" or "jit".
         state: frames of other types, by name, that count as seen before the first packet.
         reference: dates the clock from the first packet on.
 
@@ -95,7 +95,7 @@ class PacketStream:
         self._arrival_order = ArrivalOrder(stats, loss_clock, self._type.loss_clock_step_ns)
 
     def add(self, batches: Sequence[Frames], *, whole: bool = False) -> Packets:
-        """Return the packets among some frames, and remember what the next call needs.
+        """Return the packets among some frames, and update the state of the stream.
 
         Args:
             batches: frames of all types, in stream order.
@@ -150,7 +150,7 @@ class PacketStream:
     ) -> tuple[Index, NDArray[np.bool_], Integers | None]:
         """Return the index of packets, the breaks before them, and their order.
 
-        This also counts lost, late and duplicate packets. The order is None if the packets are not
+        Lost, late and duplicate packets are counted. The order is None if the packets are not
         ordered by their clock. If the plugin raises, the packets keep the order of arrival.
         """
         fallback = (range(len(batch)), batch.breaks)
@@ -212,9 +212,9 @@ class PacketStream:
         return hold_values(which, times, before)
 
     def _date_times(self, times: Integers) -> Integers:
-        """Return times made absolute, if a frame has reported the date.
+        """Return times since 1970, ns, if a frame has reported the date.
 
-        Otherwise set `stats.undated`, which warns the user.
+        Otherwise return them unchanged and set `stats.undated`, which warns the user.
         """
         if self._epoch is None or not len(times):
             return times
@@ -321,7 +321,7 @@ class PacketStream:
 
 
 class ImuStream:
-    """Makes IMU samples from the frames that a decoder finds, of all types with an IMU.
+    """IMU samples of one stream, from all frame types that have IMU data.
 
     Args:
         sensor: the sensor that sends the frames.
@@ -356,7 +356,7 @@ class ImuStream:
 
         Args:
             found: frames of all types, in stream order.
-            data: the data packets among them; None if there are none.
+            data: the data packets among the frames; None if the frames have no data packets.
             whole: whether the frames are a whole input.
         """
         batches = list[Packets]()
@@ -431,9 +431,11 @@ class OwnFrames:
 def choose_data_frame(sensor: SensorDescription, batches: Sequence[Frames]) -> str | None:
     """Return the default data frame type of an input.
 
-    It is the configured type, or else the type of the first data frame that arrived. None if the
-    sensor has several types, none is configured, and no data frame has arrived yet, and for a
-    sensor without points.
+    It is the configured type. Without a configured type it is the type of the first data frame
+    that arrived.
+
+    Returns None for a sensor without points, and if the sensor has several types, none is
+    configured and no data frame has arrived yet.
     """
     names = sensor.data_frames
     if not sensor.has_points:
@@ -491,7 +493,10 @@ def _join_offsets(parts: Sequence[Numbers]) -> Numbers:
 
 
 def _join_values(parts: Sequence[Integers]) -> Integers:
-    """Return the values of all parts; one `repeat` if all have the same repeated value."""
+    """Return the values of all parts, in this order.
+
+    If all values are equal, the result shares one value (`repeat`).
+    """
     values = {broadcast_value(part) for part in parts}
     if len(values) == 1:
         only = values.pop()
