@@ -17,7 +17,7 @@ from lidarspec.packets.imu import WaitingSamples, join_samples
 from lidarspec.packets.packets import Packets
 from lidarspec.packets.stream import ImuStream, PacketStream, choose_data_frame
 from lidarspec.scans.scan import Scan
-from lidarspec.scans.stream import ScanStream, release_yielded
+from lidarspec.scans.stream import ScanStream, iter_released
 from lidarspec.sensor_operations import Sensor
 
 #: Number of batches that are kept until the type of the data frames is known.
@@ -124,7 +124,7 @@ class PacketReader:
             packets = self.add(batch)
             self.add_imu(batch, packets)
         if packets is not None and len(packets):
-            yield from release_yielded(stream.add(packets))
+            yield from iter_released(stream.add(packets))
         if batch.interrupted:
             yield from stream.finish()
 

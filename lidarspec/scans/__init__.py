@@ -13,7 +13,7 @@ In: batches of packets. Out: `Scan`, and `LaserScan` with ROS's names. Modules i
 * `scan_ends`: the ends of scans by the sensor's rule.
 * `rotation`: the rows at which a turning angle passes a given angle.
 * `limits`: the longest and the largest scan.
-* `completeness`: the packets of a scan, and those missing in it.
+* `completeness`: the packets of a scan, and the packets missing in it.
 * `masking`: the masked sector of a rotating sensor, in which scans are cut.
 * `selection`: selects scans of a source, parts of scans, and bytes by arrival time.
 """

@@ -1,10 +1,11 @@
-"""Planar scans on one grid of angles.
+"""Project planar scans onto one grid of angles.
 
-They are the scans of a planar sensor, or of one ring or layer of another sensor.
+These are the scans of a planar sensor, or of one ring or layer of another sensor.
 
 The first complete scan determines the grid: the number of beams, and the first and the last angle.
-The grid begins where the scans of the sensor begin, so that one line of times fits all beams. If
-the sensor sees less than a turn, the grid covers what it sees.
+The grid begins at the angle at which the scans of the sensor begin, so that times increase or
+decrease linearly over all beams. If the sensor sees less than a full turn, the grid covers its
+field of view.
 """
 
 from __future__ import annotations
@@ -18,25 +19,25 @@ from lidarspec.points.cloud import PointCloud
 from lidarspec.scans.laserscan import FULL_TURN, LaserScan, unwrap_azimuths
 from lidarspec.scans.scan import Scan
 
-#: elevations of points in the plane of a sensor, radians: rounding leaves so much of the rotation
-#: of a mount.
+#: the largest elevation, radians, of points in the plane of a sensor: the rotation of a mount
+#: leaves rounding errors of up to this size.
 MAX_LEVEL_RAD = 1e-5
-#: share of a turn from which on a scan counts as a whole turn.
+#: the share of a turn from which a scan counts as a whole turn.
 MIN_TURN_SHARE = 0.98
 
 Field = tuple[float, float]
 
 
 class PlanarScans:
-    """Makes planar scans of the scans of one sensor.
+    """The planar scans of one sensor.
 
     Args:
-        beams: the number of beams; by default that of the scans or the sensor, else the number of
-            points of the first complete scan.
-        field: the first and the last angle, radians; by default what the sensor sees.
-        ring: the ring to take from a sensor with several.
-        heights: the lowest z and the z above the highest one to take, metres, from a sensor with
-            several rings.
+        beams: the number of beams. By default it is the number that the scans or the sensor
+            declare, or the number of points of the first complete scan.
+        field: the first and the last angle, radians; by default the sensor's field of view.
+        ring: the ring to use from a sensor with several rings.
+        heights: the points to use from a sensor with several rings, by z: the lowest z, and the z
+            above the highest, metres.
     """
 
     def __init__(
@@ -55,7 +56,9 @@ class PlanarScans:
         self._grid: tuple[int, Field] | None = None
 
     def project(self, scan: Scan) -> LaserScan | None:
-        """Return the scan on the grid; None if the sensor has several planes, and none is chosen.
+        """Return the scan on the grid; None if the points are not in one plane.
+
+        A ring or heights select the points of one plane.
 
         Raises:
             UsageError: if the points do not have the chosen ring.
@@ -70,7 +73,7 @@ class PlanarScans:
         return level.to_laserscan(*self._grid)
 
     def _take_level(self, scan: Scan) -> Scan | None:
-        """Return the points of a scan that are in the plane."""
+        """Return the points of a scan that are in the plane; None if no plane is chosen."""
         cloud = scan.points
         if self._ring is None and self._heights is None:
             if self._is_flat is None and cloud.valid.any():
@@ -82,22 +85,22 @@ class PlanarScans:
         wanted = np.ones(len(cloud), np.bool_)
         if self._ring is not None:
             if cloud.ring is None:
-                raise self._no_such_ring(scan, "none")
+                raise self._make_ring_error(scan, "none")
             wanted = cloud.ring == self._ring
             if self._grid is None and not wanted.any():
-                raise self._no_such_ring(scan, f"{cloud.ring.min()} to {cloud.ring.max()}")
+                raise self._make_ring_error(scan, f"{cloud.ring.min()} to {cloud.ring.max()}")
         if self._heights is not None:
             low, high = self._heights
             wanted = wanted & (cloud.z >= low) & (cloud.z < high)
         return replace(scan, points=_project(cloud[wanted]))
 
-    def _no_such_ring(self, scan: Scan, rings: str) -> UsageError:
+    def _make_ring_error(self, scan: Scan, rings: str) -> UsageError:
         return UsageError(
             f"{scan.sensor.id}: ring {self._ring} does not exist; the rings are {rings}"
         )
 
     def _make_grid(self, scan: Scan) -> tuple[int, Field]:
-        """Return the number of beams, and the first and the last angle."""
+        """Return the number of beams, and the first and the last angle, radians."""
         azimuths, _ = unwrap_azimuths(scan.points)
         low = float(azimuths.min())
         high = float(azimuths.max())
@@ -107,7 +110,7 @@ class PlanarScans:
         step = (high - low) / (len(azimuths) - 1)
         if high - low > MIN_TURN_SHARE * FULL_TURN:
             step = FULL_TURN / count
-            low = _start_of_turn(float(azimuths[0]), float(azimuths[-1]), step)
+            low = _find_grid_start(float(azimuths[0]), float(azimuths[-1]), step)
             high = low + FULL_TURN - step
         if self._field is not None:
             low, high = self._field
@@ -115,15 +118,15 @@ class PlanarScans:
         return count, (low, high)
 
 
-def _start_of_turn(begin: float, end: float, step: float) -> float:
-    """Return the first angle of a grid of the whole turn, from -pi to pi.
+def _find_grid_start(begin: float, end: float, step: float) -> float:
+    """Return the first angle of a grid over the whole turn, from -pi to pi.
 
-    The point that is measured first is the first one of the grid. If the angle falls with time, it
-    is the last one, and the point that is measured last is the first one.
+    The point measured first is at the first angle of the grid. If angles fall with time, it is at
+    the last angle, and the point measured last is at the first angle.
 
     Args:
-        begin, end: the first and the last angle that is measured.
-        step: of the grid.
+        begin, end: the first and the last measured angle, radians.
+        step: the step of the grid, radians.
     """
     steps = round((begin + np.pi) / step)
     if end < begin:

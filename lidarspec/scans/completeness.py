@@ -1,10 +1,11 @@
 """Count the packets of the current scan, and the packets that are missing in it.
 
 The index of packets shows how many are missing before each (see `Packets.index`), and their breaks
-show that something is missing at all. A frame whose parts have the points counts once.
+show that something is missing, even if the number is unknown. A frame counts once even if several
+of its parts have points.
 
-A packet in which one scan ends and the next one begins counts in both, and what is missing before
-it counts in one.
+A packet in which one scan ends and the next one begins counts in both scans. Packets missing before
+it count in the first scan only.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ class PacketCounts:
     """The counts by which packets extend a scan, (n,) each.
 
     Attributes:
-        times: ns.
+        times: the times of the packets, ns.
         counts: 1 for each packet; for parts, 1 for the first part of a frame, and 0 for the others.
-        sizes: in bytes or in points.
-        missing: packets missing before each.
+        sizes: the sizes of the packets, in bytes or in points.
+        missing: the number of packets missing before each.
         is_broken: whether there is a break before each.
     """
 
@@ -50,9 +51,12 @@ class PacketCounts:
         """Return the counts of the first packets of a batch.
 
         Args:
-            number: the number of these packets.
-            points: of each of them, as sizes; None to take bytes.
-            previous_index: the index of the packet before them; None if there is none.
+            packets: the batch.
+            number: the number of packets to count.
+            points: the number of points of each of them, (number,), used as sizes; None to use
+                bytes.
+            previous_index: the index of the packet before the batch; None at the start of the
+                stream.
         """
         index = packets.index[:number]
         if previous_index is None:
@@ -83,7 +87,7 @@ class PacketCounts:
         return cls(packets.time_ns[:number], counts, sizes, missing, is_broken)
 
     def part(self, start: int, stop: int) -> PacketCounts:
-        """Return the counts of some of the packets, which share memory with these."""
+        """Return the counts of rows `start` to `stop`, which share memory with these."""
         rows = slice(start, stop)
         return PacketCounts(
             self.times[rows],
@@ -94,9 +98,9 @@ class PacketCounts:
         )
 
     def share(self, row: int) -> None:
-        """Count a packet, or the frame that it is part of, in the next scan as well.
+        """Count a packet, or the frame that it is part of, in the next scan too.
 
-        What is missing before it has been counted already.
+        Packets missing before it are not counted again.
         """
         if not self.counts[row]:
             self.counts[row] = 1
@@ -113,7 +117,7 @@ class OpenScan(NamedTuple):
         has_start: whether its start was seen.
         since: the time of its first packet, ns.
         packets: the number of its packets.
-        size: their bytes or points.
+        size: its size in bytes or points.
         lost: the number of packets missing between them.
         is_broken: whether there is any break.
     """
@@ -127,16 +131,16 @@ class OpenScan(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the start was seen, and at least half of the packets."""
+        """Whether the start was seen, and at least half of the packets arrived."""
         return self.has_start and self.lost <= self.packets
 
     @property
     def has_gap(self) -> bool:
-        """Whether anything is missing."""
+        """Whether any packet is missing."""
         return self.lost > 0 or self.is_broken
 
     def add(self, packets: PacketCounts) -> OpenScan:
-        """Return the scan with further packets; at least one."""
+        """Return the counts after adding packets; at least one."""
         since = self.since
         if not self.packets:
             since = packets.times.item(0)
@@ -150,7 +154,7 @@ class OpenScan(NamedTuple):
         )
 
     def add_gap(self, packets: PacketCounts) -> OpenScan:
-        """Return the scan with only what is missing before some packets."""
+        """Return the counts after adding the losses before packets, not the packets."""
         return self._replace(
             lost=self.lost + _sum(packets.missing),
             is_broken=self.is_broken or bool(packets.is_broken.any()),

@@ -1,8 +1,8 @@
 """Decide where the scans of a stream end, and whether each of them is complete.
 
-This is the only place that decides it. A scan ends at each end that the sensor's rule finds
-(`ends`), and at the limits if no end arrives in time (`limits`). What is missing in between is
-counted in `completeness`.
+No other module decides this. A scan ends at each end that the sensor's rule finds (`scan_ends`),
+and at the limits if no end arrives in time (`limits`). Missing packets are counted in
+`completeness`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lidarspec.scans.scan_ends import EndFinder, ScanEnd, first_points
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every, OnFlag, OnRewind, OnWrap, Split
 
-#: packets that are searched together for the one that exceeds the limits.
+#: the number of packets that are searched together for one that exceeds the limits.
 SEARCHED_PACKETS = 1024
 
 
@@ -38,10 +38,10 @@ class ScanCut(NamedTuple):
 
 
 class ScanCutter:
-    """Cuts the points of one stream into scans.
+    """The cuts between the scans of one stream.
 
     Args:
-        sensor: of the stream.
+        sensor: the sensor that sends the stream.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
@@ -51,7 +51,7 @@ class ScanCutter:
         self._limits = ScanLimits(sensor)
         self._warning = f"{_describe_missing_end(rule)} within {self._limits.seconds:.3g} s"
         self._has_start_flag = isinstance(rule, OnFlag)
-        # a missing end of such a rule leaves no trace
+        # with these rules, two scans without the end between them look like one long scan
         self._may_miss_ends = isinstance(rule, OnWrap | OnFlag)
         # the field whose first value marks the first packet of a scan, and that value
         self._start_value: tuple[str, int] | None = None
@@ -59,7 +59,7 @@ class ScanCutter:
         if counter is not None and isinstance(rule, OnRewind) and rule.name == counter.field:
             self._start_value = (counter.field, counter.first)
         self._scan = OpenScan()
-        # packets of the last whole scan, or of the first one if its end leaves no trace
+        # packets of the last whole scan; with rules that may miss ends, of the first scan at first
         self._usual_packets = math.inf
         self._has_ended = False
         self._last_ns: int | None = None  # the time of the last packet
@@ -69,7 +69,9 @@ class ScanCutter:
         """Cut scans in a masked sector from now on.
 
         Args:
-            angle: of the last packet before, in turns; None if there is none.
+            sector: the masked sector.
+            angle: the angle of the last packet before it was found, in turns; None before any
+                packet.
         """
         self._ends.use_sector(sector, angle)
 
@@ -95,10 +97,10 @@ class ScanCutter:
             cuts += self._add(packets, counts, start, stop, points)
             if begins_packet:
                 self._scan = self._scan.add_gap(counts.part(row, row + 1))
-            # what is missing before a packet may belong to either of the two scans
+            # packets missing before this packet may belong to either of the two scans
             is_gap_shared = begins_packet and not self._shows_start(packets, row)
             cuts.append(self._end_scan(counts, row, end, is_gap_shared=is_gap_shared))
-            if not self._has_ended:  # the rotor has spun up
+            if not self._has_ended:  # a warning while the rotor spun up no longer applies
                 packets.stats.unended = ""
                 self._has_ended = True
             start = row
@@ -121,7 +123,8 @@ class ScanCutter:
         """End the scan at an end that the rule has found, and begin the next one.
 
         Args:
-            row: of the packet with the end.
+            row: the packet with the end.
+            is_gap_shared: whether packets missing before that packet count in the next scan too.
         """
         scan = self._scan
         is_whole = scan.is_whole and not end.is_leap
@@ -138,12 +141,12 @@ class ScanCutter:
     def _add(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int, points: EvaluatedPoints
     ) -> list[ScanCut]:
-        """Add packets in which no end was found; return the cuts at the limits."""
+        """Add packets without an end to the scan, and return the cuts at the limits."""
         if start >= stop:
             return []
         part = counts.part(start, stop)
         scan = self._scan.add(part)
-        if self._limits.allow(scan, part, self._usual_packets):
+        if self._limits.allows(scan, part, self._usual_packets):
             self._scan = scan
             return []
         rows = self._cut_at_limits(packets, counts, start, stop)
@@ -152,7 +155,11 @@ class ScanCutter:
     def _cut_at_limits(
         self, packets: Packets, counts: PacketCounts, start: int, stop: int
     ) -> NDArray[np.intp]:
-        """Add packets, and cut before each with which the scan exceeds the limits."""
+        """Add packets, and cut before each packet with which the scan exceeds the limits.
+
+        Returns:
+            The rows of the packets before which the scan is cut.
+        """
         cuts = list[int]()
         while start < stop:
             part_stop = min(start + SEARCHED_PACKETS, stop)
@@ -173,7 +180,7 @@ class ScanCutter:
         return np.array(cuts, np.intp)
 
     def _step_ns(self, counts: PacketCounts, row: int) -> int:
-        """Return the time from the packet before a row to that row."""
+        """Return the time from the packet before a row to that row, ns."""
         if row:
             return counts.times.item(row) - counts.times.item(row - 1)
         assert self._last_ns is not None  # since the scan had packets
@@ -181,10 +188,10 @@ class ScanCutter:
 
 
 def _find_packet(end: ScanEnd, first: NDArray[np.intp]) -> int:
-    """Return the packet in which a scan ends.
+    """Return the row of the packet in which a scan ends.
 
     Args:
-        first: the first point of each packet.
+        first: the index of the first point of each packet.
     """
     if end.packet is not None:
         return end.packet

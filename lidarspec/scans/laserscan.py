@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 class LaserScan:
     """A planar scan with ROS's names.
 
-    `ranges[i]` is at ``angle_min + i * angle_increment``, inf without a return.
+    `ranges[i]` is the range at ``angle_min + i * angle_increment``, inf without a return.
 
     Attributes:
         ranges, intensities: (n,) float32.
@@ -27,9 +27,9 @@ class LaserScan:
         time_increment: seconds from beam to beam, negative if the angle falls with time.
         scan_time: seconds from scan to scan.
         range_min, range_max: the limits of the sensor, metres.
-        stamp_ns: when `ranges[0]` was measured; `ranges[i]` was measured ``i * time_increment``
-            later.
-        host_ns: as in `Scan`.
+        stamp_ns: the time at which `ranges[0]` was measured; `ranges[i]` was measured ``i *
+            time_increment`` later.
+        host_ns: the arrival time of the first packet, as in `Scan`.
     """
 
     angle_min: float
@@ -50,10 +50,13 @@ def find_nearest_returns(
 ) -> tuple[Floats, Floats]:
     """Return the nearest return at each of `count` angles, and its intensity.
 
-    The angles begin at `first`, radians. A return belongs to an angle if it is within half a step.
+    A return belongs to an angle if it is within half a step of it.
+
+    Args:
+        first, step: the first angle, and the step between angles, radians.
 
     Returns:
-        Ranges, (count,) metres, inf without a return; intensities, (count,), 0 without one.
+        Ranges, (count,) metres, inf without a return; intensities, (count,), 0 without a return.
     """
     azimuths = points.azimuth[points.valid].astype(np.float64)
     ahead = (azimuths - first + step / 2) % FULL_TURN
@@ -76,7 +79,7 @@ def find_nearest_returns(
 
 
 def unwrap_azimuths(points: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the azimuths and times of the points that have a direction.
+    """Return the azimuths and times of the points with a finite azimuth.
 
     Azimuths are unwrapped, radians. Times are in seconds since the stamp.
     """
@@ -88,8 +91,8 @@ def unwrap_azimuths(points: PointCloud) -> tuple[NDArray[np.float64], NDArray[np
 def fit_times(points: PointCloud, first: float, last: float) -> tuple[float, float]:
     """Return the time of a beam at azimuth `first`, and the seconds per radian.
 
-    The time is in seconds since the stamp. Both follow from a straight line fitted to the points,
-    in the turn of most points up to azimuth `last`.
+    Times are in seconds since the stamp. Both values follow from a straight line fitted to the
+    points. The line is shifted by whole turns so that most points lie between `first` and `last`.
     """
     azimuths, times = unwrap_azimuths(points)
     if len(azimuths) < 2:

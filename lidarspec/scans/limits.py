@@ -1,9 +1,10 @@
 """Limit the length and the size of a scan, so that it ends even if its end does not arrive.
 
-A scan takes at most twice as long as the slowest turn, by the times of the packets. It is at most
-twice as large as a scan of a constant number of points, else as the bytes that a serial line
-carries in that time, else `MAX_BYTES`. If packets are missing, and with them perhaps the end, it
-becomes little longer than the scan before.
+A scan takes at most twice as long as the slowest revolution, by the times of the packets. Its size
+is limited to twice the number of points of a scan, if that is constant. On a serial line, the limit
+is the number of bytes that the line carries in that time; otherwise it is `MAX_BYTES`. If packets
+are missing, and with them perhaps the end, the scan may become only slightly longer than the scan
+before.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from lidarspec.spec.links import Serial
 from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.timing import Every
 
-#: the slowest turn if the sensor does not declare it.
+#: the time of the slowest revolution, if the sensor does not declare it.
 SLOWEST_TURN_S = 1.0
-#: the least time limit if packets have the times of their arrival, which may pause.
+#: the lowest time limit if packets have arrival times, because arrival may pause.
 MIN_LIMIT_S = 1.0
 #: the largest scan if neither points nor a serial line limit it.
 MAX_BYTES = 1 << 26
-#: how much longer than the whole scan before a scan with a gap may become.
+#: how much longer than the last whole scan a scan with a gap may become, as a factor.
 MAX_GROWTH = 1.125
 
 
@@ -29,9 +30,9 @@ class ScanLimits:
     """The limits of the scans of one sensor.
 
     Attributes:
-        seconds: the longest scan.
+        seconds: the longest time that a scan takes.
         longest_ns: the same in ns.
-        has_point_limit: whether the limit of the size is in points, not in bytes.
+        has_point_limit: whether the size is limited in points, not in bytes.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
@@ -52,13 +53,13 @@ class ScanLimits:
         elif isinstance(link, Serial):
             self._largest = self.seconds * link.baud / 10
 
-    def allow(self, scan: OpenScan, packets: PacketCounts, usual: float) -> bool:
+    def allows(self, scan: OpenScan, packets: PacketCounts, usual: float) -> bool:
         """Return whether a scan is within the limits.
 
         Args:
-            scan: it, with these packets.
+            scan: the scan, including these packets.
             packets: the last packets of the scan.
-            usual: the packets of a whole scan.
+            usual: the number of packets of a whole scan.
         """
         latest = int(packets.times.max())
         earliest = int(packets.times.min())
@@ -71,14 +72,16 @@ class ScanLimits:
     def find_excess(
         self, scan: OpenScan, packets: PacketCounts, usual: float
     ) -> tuple[int | None, bool]:
-        """Return the packet with which a scan exceeds the limits, and whether its end is overdue.
-
-        If the end is not overdue, the scan has a gap. The packet is None if there is none.
+        """Find the first packet with which a scan exceeds the limits.
 
         Args:
-            scan: it, without these packets.
-            packets: the next ones.
-            usual: the packets of a whole scan.
+            scan: the scan, without these packets.
+            packets: the next packets.
+            usual: the number of packets of a whole scan.
+
+        Returns:
+            The row of the packet, or None; and whether the end of the scan is overdue. If it is not
+            overdue, the scan exceeds only the limit for scans with missing packets.
         """
         since = scan.since if scan.packets else packets.times.item(0)
         is_overdue = np.abs(packets.times - since) > self.longest_ns

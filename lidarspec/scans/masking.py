@@ -1,10 +1,10 @@
-"""Find the masked sector of a rotating sensor, and cut its scans there.
+"""Find the masked sector of a rotating sensor, and mark the packets at it.
 
-The first turns of a stream show it.
+The first revolutions of a stream show the sector.
 
-Packets pass at once until the angle leaps. Then they are held until the leap recurs, which takes a
-turn, or until all angles have been seen, so that the first scans are cut as all others. Behind the
-first whole turn without a leap, and behind a sector that was found, nothing is held.
+Packets pass at once until the angle leaps. They are then held until the leap recurs, which takes a
+revolution, or until all angles have been seen, so that the first scans are cut like all others.
+After the first whole revolution without a leap, or after a sector was found, no packets are held.
 """
 
 from __future__ import annotations
@@ -26,23 +26,25 @@ from lidarspec.packets.masked_sector import (
 from lidarspec.packets.packets import Packets, join_packets
 from lidarspec.spec.sensor import SensorDescription
 
-#: turns within which a leap has to recur.
+#: the number of revolutions within which a leap has to recur.
 MAX_TURNS = 4
-#: packets that are held at most.
+#: the largest number of packets that are held.
 MAX_HELD = 1 << 15
-#: seconds that a turn takes at the slowest if the sensor does not declare it.
+#: the time of the slowest revolution, if the sensor does not declare it.
 SLOWEST_TURN_S = 1.0
 
 
 class Masking:
-    """Marks what a masked sector leaves out in the packets of one stream, which come in order.
+    """The search for a masked sector, and the marking of packets at it.
+
+    Packets have to be in order.
 
     Args:
-        sensor: of the packets, in which its `AngleReader` is available.
+        sensor: the sensor that sends the packets; its `AngleReader` has to be available.
 
     Attributes:
-        angle_before_sector: of the last packet before the first one that is marked, in turns; None
-            if there is none.
+        angle_before_sector: the angle of the last packet before the first marked one, in turns;
+            None before any packet.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
@@ -54,7 +56,7 @@ class Masking:
         self._finder: SectorFinder | None = None
         self._turned = 0.0  # turns since the start
         self._smallest_step = np.inf
-        self._angle: float | None = None  # of the last packet looked at
+        self._angle: float | None = None  # of the last packet searched
         self._held: list[Packets] = []
         self._is_holding = False
         self._marked_angle: float | None = None  # of the last packet marked
@@ -93,7 +95,7 @@ class Masking:
         self._is_holding = True
         passed = [held.take(slice(0, before))] if before else []
         self._held = []
-        return [*map(self._note, passed), *self._pass_on(held.take(slice(before, None)))]
+        return [*map(self._remember_last, passed), *self._pass_on(held.take(slice(before, None)))]
 
     def finish(self) -> list[Packets]:
         """Return the packets that are still held."""
@@ -101,7 +103,11 @@ class Masking:
         return self._release(None)
 
     def _pass_on(self, held: Packets) -> list[Packets]:
-        """Release packets, or hold them: all from the one before a leap on, else the last one."""
+        """Release packets, or hold them.
+
+        After a leap all packets are held from the one before the leap on, else only the last
+        packet.
+        """
         self._held = [held]
         if self._is_settled:
             return self._release(None)
@@ -114,7 +120,7 @@ class Masking:
             return []
         self._held = [held.take(slice(-1, None))]
         if len(held) > 1:
-            return [self._note(held.take(slice(0, -1)))]
+            return [self._remember_last(held.take(slice(0, -1)))]
         return []
 
     def _release(self, packets: Packets | None) -> list[Packets]:
@@ -127,13 +133,13 @@ class Masking:
         return [released if self.sector is None else self._mark(released)]
 
     def _find_leap(self, packets: Packets, angles: Angles) -> int | None:
-        """Look for the sector in the next packets; return the row of the first leap."""
+        """Search the next packets for the sector, and return the row of the first leap."""
         if self._finder is None:
             direction = self._reader.direction(packets.table)
             if not direction:
                 return None
             self._finder = SectorFinder(direction)
-        steps = self._steps(angles, self._angle)
+        steps = self._compute_steps(angles, self._angle)
         smallest = np.minimum.accumulate(np.where(steps > 0, steps, np.inf))
         step_before = np.minimum(np.append(np.inf, smallest[:-1]), self._smallest_step)
         limits = np.maximum(step_before * MIN_WIDTH_STEPS, MIN_WIDTH)
@@ -161,16 +167,20 @@ class Masking:
             return leaps.item(0)
         return None
 
-    def _steps(self, angles: Angles, before: float | None) -> Angles:
-        """Return by how much of a turn each packet is ahead of the one before it, (n,)."""
+    def _compute_steps(self, angles: Angles, before: float | None) -> Angles:
+        """Return the angle from each packet to the next, (n,), in turns from 0 to 1.
+
+        Args:
+            before: the angle of the packet before the first; None before any packet.
+        """
         assert self._finder is not None
         steps = np.diff(angles, prepend=angles[0] if before is None else before)
         ahead = (self._finder.direction * steps) % 1
         ahead[ahead > 1 - JITTER] = 0
         return ahead
 
-    def _note(self, packets: Packets) -> Packets:
-        """Note the last one of some packets as it is passed on."""
+    def _remember_last(self, packets: Packets) -> Packets:
+        """Remember the angle and the index of the last packet, and return the packets."""
         angles = self._reader.angles(packets.table)
         if angles is not None:
             self._marked_angle = float(angles[-1])
@@ -178,7 +188,7 @@ class Masking:
         return packets
 
     def _mark(self, packets: Packets) -> Packets:
-        """Return packets that say how many before each the masked sector leaves out."""
+        """Return packets with the number before each that the masked sector leaves out."""
         angles = self._reader.angles(packets.table)
         sector = self.sector
         if not self._has_marked:
@@ -192,7 +202,7 @@ class Masking:
             start = self._marked_angle
         before = np.append(start, angles[:-1])
         behind = (sector.direction * (before - sector.middle)) % 1
-        is_leap = behind + self._steps(angles, self._marked_angle) >= 1
+        is_leap = behind + self._compute_steps(angles, self._marked_angle) >= 1
         index = packets.index
         if self._marked_angle is None:
             first = index.item(0) - 1
@@ -204,12 +214,12 @@ class Masking:
         few = missing <= self._masked + VARYING_PACKETS
         marked = copy.copy(packets)
         marked.masked = np.where(few, missing, self._masked)
-        self._note(packets)
+        self._remember_last(packets)
         return marked
 
 
 def describe_sector(sector: Sector) -> str:
-    """Return what to say about a masked sector."""
+    """Return the warning about a masked sector."""
     angles = sorted([sector.start * 360, sector.stop * 360], reverse=sector.direction < 0)
     if sector.contains(0.0):
         angles.reverse()

@@ -16,11 +16,11 @@ class PointOrigin(NamedTuple):
     Attributes:
         frame: the type of the frame.
         offset: the offset of its first byte in the input.
-        host_ns: when it arrived, ns since 1970; 0 if unknown.
-        part: the index of the part of the frame, if its parts have the points; else 0.
+        host_ns: its arrival time, ns since 1970; 0 if unknown.
+        part: the index of the part with the point in the frame; 0 if frames have no parts.
         number: the index of the point in the frame, or in that part.
-        data: the bytes of the frame; if it has another form on the wire, the bytes that its fields
-            are in (`Frame.wire`).
+        data: the bytes of the frame. If the frame is encoded on the wire, these are the decoded
+            bytes that contain its fields (`Frame.wire`).
     """
 
     frame: str
@@ -59,10 +59,10 @@ class Provenance:
         self._runs = runs
 
     def __call__(self, point: int) -> PointOrigin:
-        """Return the origin of a point of the scan, given its index.
+        """Return the origin of a point, given its index in the scan.
 
         Raises:
-            IndexError: if the scan has no such point.
+            IndexError: if the index is out of range.
         """
         size = sum(run.stop - run.start for run in self._runs)
         if not 0 <= point < size:
@@ -76,11 +76,11 @@ class Provenance:
         return _find_origin(run, run.start + point - first)
 
     def __reduce__(self) -> Any:
-        return Provenance, ()  # packets do not go with a scan to another process
+        return Provenance, ()  # a pickled scan does not contain its packets
 
 
 def _find_origin(run: PointRun, point: int) -> PointOrigin:
-    """Return the origin of a point of a batch, given its index there."""
+    """Return the origin of a point, given its index in the batch."""
     packets = run.packets
     starts = first_points(run.points)
     row = int(starts.searchsorted(point, side="right")) - 1

@@ -1,11 +1,11 @@
-"""Find the rows at which a turning angle passes a given angle.
+"""Find the rows at which a rotating angle passes a given angle.
 
-`WrapDetector` serves sensors whose direction of rotation is unknown: `Rotation` finds it from the
-angles. `PassDetector` serves known directions, and angles that skip the one that they pass.
+`WrapDetector` is for sensors with an unknown direction of rotation: `Rotation` finds it from the
+angles. `PassDetector` is for known directions, and for angles that skip the given angle.
 
 Both decide each row from the rows before it alone, so that the split into batches does not change
-the result. An angle has to have been away from the given one before it passes again, so that jitter
-does not count twice.
+the result. An angle has to move away from the given angle before it can pass it again, so that
+jitter is not counted as a second pass.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from lidarspec.packets.masked_sector import JITTER
 
 Floats = NDArray[np.float64]
 
-#: turns that an angle has to have been away before it passes again.
+#: how far an angle has to move away before it can pass again, in turns.
 MIN_TURNS_AWAY = 1 / 8
-#: turns back after which the direction of rotation has changed.
+#: how far back an angle has to move to reverse the direction of rotation, in turns.
 REVERSAL_TURNS = 0.5
-#: rows that are searched together at first; if nothing is found, twice as many, and so on.
+#: the number of rows that are searched together first; it doubles while nothing is found.
 FIRST_CHUNK_ROWS = 64
 
 
 class Rotation:
-    """The direction in which an angle turns.
+    """The direction in which an angle rotates.
 
-    It is the direction of the last half turn, and at the start that of the total so far.
+    It is the direction of the last half turn; at the start, the direction of all steps so far.
     """
 
     def __init__(self) -> None:
@@ -39,10 +39,10 @@ class Rotation:
     def push(self, steps: Floats) -> Floats:
         """Return the direction at each of the next steps, 1 or -1, (k,).
 
-        The length is 1 if the direction is the same for all.
+        If all directions are equal, the length is 1.
 
         Args:
-            steps: in turns, (k,), at least one.
+            steps: steps of the angle, in turns, (k,), at least one.
         """
         totals = steps.copy()
         totals[0] += self._total
@@ -54,13 +54,22 @@ class Rotation:
         return self._find_directions(totals)
 
     def _only_advances(self, total: float, steps: Floats) -> bool:
-        """Return whether the angle is farther than ever, with no step back afterwards."""
+        """Return whether the angle is farther than ever, without a step back afterwards.
+
+        Args:
+            total: the turns since the start, after the first step.
+            steps: the steps after the first.
+        """
         if self._direction * total < self._furthest:
             return False
         return float((self._direction * steps).min(initial=0.0)) >= 0
 
     def _find_directions(self, totals: Floats) -> Floats:
-        """Return the direction at each total, (k,)."""
+        """Return the direction at each total, (k,).
+
+        Args:
+            totals: the turns since the start, (k,).
+        """
         directions = np.empty(len(totals))
         start = 0
         size = FIRST_CHUNK_ROWS
@@ -89,7 +98,7 @@ class Rotation:
         return directions
 
     def _reverse(self, total: float) -> None:
-        """Change the direction, or set the first one by the total so far."""
+        """Reverse the direction, or set the first one from the turns since the start."""
         if self._direction:
             self._direction = -self._direction
         elif total > 0:
@@ -100,7 +109,7 @@ class Rotation:
 
 
 class WrapDetector:
-    """Finds the rows at which an angle passes a given angle, in either direction."""
+    """A detector of the rows at which an angle passes a given angle, in any direction."""
 
     def __init__(self) -> None:
         self._rotation = Rotation()
@@ -108,12 +117,15 @@ class WrapDetector:
         self._is_armed = True
 
     def push(self, angles: Floats, full: float, at: float) -> tuple[NDArray[np.intp], Floats]:
-        """Return the rows at which the angle passes `at`, and the turns by which it advances.
+        """Find the rows at which the angle passes `at`.
 
         Args:
-            angles: of the next rows, (k,), in any unit; rows with nan are ignored.
+            angles: the angles of the next rows, (k,), in any unit; rows with nan are ignored.
             full: a whole turn in this unit.
             at: the angle to pass.
+
+        Returns:
+            The rows, and by how much the angle advances at each of them, in turns.
         """
         finite = np.isfinite(angles)
         if not finite.all():
@@ -138,7 +150,12 @@ class WrapDetector:
     def _keep_armed(
         self, passed: NDArray[np.intp], behind: Floats, full: float
     ) -> NDArray[np.intp]:
-        """Return the rows, of those that pass, before which the angle was away."""
+        """Return the passes before which the angle was away from the given angle.
+
+        Args:
+            passed: the rows of all passes.
+            behind: the angle after the given angle at each row.
+        """
         armed = list[int]()
         start = 0
         for row in passed.tolist():
@@ -151,7 +168,7 @@ class WrapDetector:
 
 
 class PassDetector:
-    """Finds the rows at which an angle passes a given angle, which it may skip.
+    """A detector of the rows at which an angle passes a given angle, or skips it.
 
     All angles are in turns.
 
@@ -167,20 +184,22 @@ class PassDetector:
         self._turned = 1.0  # turns since it passed
 
     def restart(self, at: float, direction: int, angle: float | None) -> None:
-        """Find another angle from now on.
+        """Detect another angle from now on.
 
         Args:
-            angle: of the row before; None if there is none.
+            at: the angle to pass.
+            direction: 1 if angles grow, else -1.
+            angle: the angle of the row before; None before any row.
         """
         self._at = at
         self._direction = direction
         self._angle = angle
 
     def push(self, angles: Floats) -> NDArray[np.intp]:
-        """Return the rows at which the angle passes.
+        """Return the rows at which the angle passes the given angle.
 
         Args:
-            angles: of the next rows, (k,).
+            angles: the angles of the next rows, (k,).
         """
         if not len(angles):
             return np.empty(0, np.intp)
@@ -200,7 +219,12 @@ class PassDetector:
 
 
 def previous_values(values: Floats, first: float | None) -> Floats:
-    """Return the value before each; before the first one `first`, or if that is None itself."""
+    """Return the value before each value.
+
+    Args:
+        values: (k,).
+        first: the value before the first; None to use the first value itself.
+    """
     previous = np.empty_like(values)
     if first is None:
         previous[:1] = values[:1]
@@ -211,9 +235,9 @@ def previous_values(values: Floats, first: float | None) -> Floats:
 
 
 def _fold(angles: Floats, full: float) -> Floats:
-    """Return angles in [0, full), read-only.
+    """Return angles folded to [0, full), read-only.
 
-    The results equal `np.mod`, in a fraction of its time.
+    The results equal those of `np.mod` and take a fraction of the time.
     """
     outside = np.flatnonzero((angles < 0) | (angles >= full))
     if not len(outside):
@@ -229,7 +253,7 @@ def _fold(angles: Floats, full: float) -> Floats:
 
 
 def _was_away(behind: Floats, full: float) -> bool:
-    """Return whether any of these angles is away from 0."""
+    """Return whether any angle is at least an eighth of a turn away from 0."""
     low = full * MIN_TURNS_AWAY
     high = full * (1 - MIN_TURNS_AWAY)
     if len(behind) and low < behind[len(behind) // 2] < high:

@@ -18,33 +18,33 @@ from lidarspec.scans.laserscan import FULL_TURN, LaserScan, find_nearest_returns
 from lidarspec.scans.provenance import Provenance
 from lidarspec.spec.sensor import SensorDescription
 
-#: the usual name of the frame that the points are in: x forward, y left, z up (REP-103).
+#: the default name of the frame of reference: x forward, y left, z up (REP-103).
 FRAME_ID = "laser"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scan:
-    """The points between two cuts.
+    """The points between two cuts: one revolution or frame period.
 
     Attributes:
-        points: in stream order.
-        rate_hz: one over the time to the next scan; nan if that is unknown, or if the scan is not
-            whole.
-        complete: whether both ends were seen, and nothing is missing between them; the first and
-            the last scan of a stream are not complete.
+        points: the points, in stream order.
+        rate_hz: scans per second, from the time to the next scan; nan if unknown, or if the scan is
+            not whole.
+        complete: whether both ends were seen and no packet is missing; the first and the last scan
+            of a stream are not complete.
         sensor: the sensor that measured the points.
-        whole: whether both ends were seen, and at least half of the packets between them.
+        whole: whether both ends were seen and at least half of the packets arrived.
         imu: the samples of the IMU from the first point to the first point of the next scan; None
             without an IMU, or if it has another clock.
-        host_ns: when the packet of the first point arrived, int64 ns since 1970 by the clock of the
-            computer; 0 if unknown.
-        beams: the number of beams of `to_laserscan` by default; None: as many as the sensor
-            declares, else as there are points.
-        frame_id: the name of the frame of the points in ROS's messages.
-        number: the index of the scan in its file, if the file is read in pieces.
-        mount: how the sensor is mounted: the points are in the axes of its carrier; None if they
-            are in the axes of the sensor.
-        provenance: the frame that each point came from.
+        host_ns: the arrival time of the packet with the first point, int64 ns since 1970 by the
+            clock of the computer; 0 if unknown.
+        beams: the default number of beams of `to_laserscan`; None to use the number that the sensor
+            declares, or the number of points.
+        frame_id: the name of the frame of reference in ROS messages.
+        number: the index of the scan in its file, if the file is read in pieces; else None.
+        mount: the position and rotation of the sensor on its carrier: the points are in the axes of
+            the carrier. None if they are in the axes of the sensor.
+        provenance: finds the frame that a point came from.
     """
 
     points: PointCloud
@@ -62,7 +62,7 @@ class Scan:
 
     @property
     def stamp_ns(self) -> int:
-        """Time of the first point, int64 ns."""
+        """The time of the first point, int64 ns."""
         return self.points.stamp_ns
 
     def __len__(self) -> int:
@@ -94,8 +94,8 @@ class Scan:
     def facts(self) -> dict[str, str]:
         """The origin of the points, as stored in files.
 
-        `sensor`; `source`, the source of its format; `frame`, the directions of x, y and z;
-        `calibration`, "nominal" or "own".
+        It has the keys `sensor`; `source`, the documents that define the format; `frame`, the
+        directions of x, y and z; and `calibration`, "nominal" or "own".
         """
         directions = zip("xyz", find_axes(self.sensor), strict=True)
         return {
@@ -116,13 +116,13 @@ class Scan:
         return self.points.to_arrow(self.facts)
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """Return the table of `to_arrow` as DuckDB, Polars and pandas read it from an object."""
+        """Return the stream by which DuckDB, Polars and pandas read `to_arrow`."""
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_bins(self, n: int) -> NDArray[np.float32]:
-        """Return the nearest return in each of n equal sectors from -pi on.
+        """Return the range of the nearest return in each of n equal sectors.
 
-        The result is (n,) float32, metres, inf without a return.
+        The first sector begins at -pi. The result is (n,) float32, metres, inf without a return.
 
         Raises:
             UsageError: if `n` is not a positive whole number.
@@ -137,10 +137,10 @@ class Scan:
         """Return the scan on an even grid of angles.
 
         Args:
-            beams: the number of angles; by default that of `beams`.
-            field: the first and the last angle, radians; by default they cover the whole turn from
-                -pi on. The times of the beams are right if no scan begins within it: `PlanarScans`
-                finds such a field.
+            beams: the number of angles; by default the attribute `beams`.
+            field: the first and the last angle, radians; by default the whole turn from -pi on. The
+                times of the beams are correct only if no scan begins inside the field;
+                `PlanarScans` finds a suitable field.
 
         Raises:
             UsageError: if `beams` is not a positive whole number.
@@ -159,7 +159,7 @@ class Scan:
             period = 1 / self.rate_hz
         else:
             period = abs(slope) * FULL_TURN
-        assert self.sensor.range_limits is not None  # as of every sensor with points
+        assert self.sensor.range_limits is not None  # every sensor with points declares them
         range_min, range_max = self.sensor.range_limits
         return LaserScan(
             angle_min=first,
@@ -177,7 +177,7 @@ class Scan:
 
 
 def _check_count(count: Any, method: str) -> int:
-    """Return a number of sectors.
+    """Return a number of sectors as an int.
 
     Raises:
         UsageError: if it is not a positive whole number.

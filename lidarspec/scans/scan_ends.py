@@ -1,8 +1,8 @@
 """Find the ends of scans by the sensor's declared rule.
 
-An end is before a point. Rules look at a column of the points, at a field of the packets or of the
-rows of an array in them, or at the time; `EndFinder` translates rows to points. Whether a scan ends
-there is decided by `cutter`.
+Each end is before a point. A rule reads a column of the points, a field of the packets, a field of
+the rows of an array in them, or the time; `EndFinder` translates rows to points. The module
+`cutter` decides whether a scan ends there.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ Indices = NDArray[np.intp]
 
 
 class ScanEnd(NamedTuple):
-    """A place at which a scan ends by the rule.
+    """An end of a scan by the rule.
 
     Attributes:
-        point: the index of the point before which it ends.
-        packet: the row of the packet that shows it, which may be without points; None if a point
-            shows it.
+        point: the index of the first point after the end.
+        packet: the row of the packet that shows the end, which may have no points; None if a point
+            shows the end.
         is_leap: whether the angle leaps by more than `MIN_TURNS_AWAY`, and twice as far as at the
-            end before: something is missing there, or is no angle.
+            end before. Then packets are missing there, or the value is not an angle.
     """
 
     point: int
@@ -51,32 +51,38 @@ class ScanEnd(NamedTuple):
 
 
 class EndFinder:
-    """Finds the ends of scans in one stream of points.
+    """The ends of scans in one stream of points.
 
     Args:
-        sensor: of the stream.
+        sensor: the sensor that sends the stream.
     """
 
     def __init__(self, sensor: SensorDescription) -> None:
-        assert sensor.scan is not None  # as of every sensor with points
+        assert sensor.scan is not None  # every sensor with points declares it
         self._rule = sensor.scan
         self._reader = AngleReader(sensor)
         self._wraps = WrapDetector()
-        self._passes: PassDetector | None = None  # if scans are cut at an angle that may be skipped
+        self._passes: PassDetector | None = (
+            None  # if scans are cut at an angle that packets may skip
+        )
         self._cut: float | None = None  # the angle that the user has configured, in turns
         if "cut" in sensor.options:
             self._cut = sensor.options["cut"] / 360 % 1
             if isinstance(self._rule, OnChange):
                 self._passes = PassDetector(self._cut, direction=1)
-        self._value: float | None = None  # of the row before
+        self._value: float | None = None  # of the row before the next one
         self._start_ns: int | None = None  # the start of the first period
         self._last_leap = 0.0  # turns by which the angle advanced at the end before
 
     def use_sector(self, sector: Sector, angle: float | None) -> None:
         """Cut scans in a masked sector from now on.
 
+        A configured cut angle is kept.
+
         Args:
-            angle: of the last packet before, in turns; None if there is none.
+            sector: the masked sector.
+            angle: the angle of the last packet before it was found, in turns; None before any
+                packet.
         """
         at = sector.middle
         if self._cut is not None:
@@ -95,7 +101,7 @@ class EndFinder:
             return _make_ends(first_points(points)[rows], rows)
         if isinstance(rule, OnWrap):
             return self._find_wraps(rule, packets, points)
-        path = _own_path(packets, rule.name)
+        path = _make_own_path(packets, rule.name)
         column = _read_field(points, path)
         values, starts = _read_rows(column, points)
         rows = self._find_changes(rule, values, _full_turn(packets, path))
@@ -111,7 +117,7 @@ class EndFinder:
             full = 2 * np.pi
             ends, steps = self._wraps.push(values, full, self._cut_angle(rule, full))
         else:
-            path = _own_path(packets, rule.name)
+            path = _make_own_path(packets, rule.name)
             column = _read_field(points, path)
             values, starts = _read_rows(column, points)
             full = _full_turn(packets, path) or 2 * np.pi
@@ -122,7 +128,7 @@ class EndFinder:
         return _make_ends(ends, rows, map(self._is_leap, steps.tolist()))
 
     def _cut_angle(self, rule: OnWrap, full: float) -> float:
-        """Return the angle at which scans are cut, in the unit in which a turn is `full`."""
+        """Return the angle at which scans are cut, in a unit in which a turn is `full`."""
         if self._cut is None:
             return rule.at
         return self._cut * full
@@ -137,7 +143,7 @@ class EndFinder:
     ) -> list[ScanEnd]:
         """Return the ends at which the angle of packets or rows passes an angle."""
         if isinstance(self._rule, OnWrap):
-            path = _own_path(packets, self._rule.name)
+            path = _make_own_path(packets, self._rule.name)
             column = _read_field(points, path)
             values, starts = _read_rows(column, points)
             rows = passes.push(values / (_full_turn(packets, path) or 2 * np.pi))
@@ -156,10 +162,11 @@ class EndFinder:
         values: Floats,
         full: float | None,
     ) -> Indices:
-        """Return the rows that begin a scan by their value, or by the one before.
+        """Return the rows that begin a scan by their value or the value before.
 
         Args:
-            full: a whole turn, if the values are angles.
+            values: the values of the rows.
+            full: a whole turn in the unit of the values; None if they are not angles.
         """
         if isinstance(rule, OnFlag):
             if rule.value is None:
@@ -203,7 +210,7 @@ def _make_ends(
 
 
 def _full_turn(packets: Packets, path: str) -> float | None:
-    """Return a whole turn in the unit of a field, None if it is no angle."""
+    """Return a whole turn in the unit of a field; None if it is not an angle."""
     if path.startswith("frame."):
         table, _ = packets.frames
     else:
@@ -211,8 +218,11 @@ def _full_turn(packets: Packets, path: str) -> float | None:
     return FULL_TURNS.get(table.schema.fields[path.removeprefix("frame.")].unit)
 
 
-def _own_path(packets: Packets, path: str) -> str:
-    """Return the path of a field of the frame; packets that are parts have another one."""
+def _make_own_path(packets: Packets, path: str) -> str:
+    """Return the path of a field in the packets, from its path in the frame.
+
+    The paths differ if the packets are parts of a frame.
+    """
     _, _, parts = packets.frame.partition(".")
     if not parts:
         return path
@@ -234,14 +244,14 @@ def _read_field(points: EvaluatedPoints, path: str) -> Column:
 
 
 def _is_per_packet(column: Column) -> bool:
-    """Return whether a field has one value in each packet, and is not in an array."""
+    """Return whether a field has one value in each packet, outside of arrays."""
     return all(name is None for name in column.axes)
 
 
 def _read_rows(column: Column, points: EvaluatedPoints) -> tuple[Floats, Indices]:
-    """Return the values of a field row by row, and the index of the first point of each row.
+    """Return the values of a field row by row, and the first point of each row.
 
-    Rows are in stream order.
+    Rows are in stream order. Rows of an array without points are left out.
     """
     levels = 1 + max(
         (index for index, name in enumerate(column.axes) if name is not None), default=-1
@@ -276,7 +286,7 @@ def first_points(points: EvaluatedPoints) -> Indices:
 def _sum_axes(counts: NDArray[Any], axis_count: int) -> Indices:
     """Return the sums over all axes but the first `axis_count`.
 
-    Along axes that repeat one number, sums are computed as products.
+    Axes with zero stride are multiplied instead of summed, which is faster.
     """
     times = 1
     while counts.ndim > axis_count:

@@ -1,9 +1,9 @@
-"""Select scans of a source by time or number, and parts of each scan.
+"""Select scans of a source by time or index, and parts of each scan.
 
 A `Selection` is a value. A `ScanSelector` applies it to the scans of one stream as they arrive, and
-reports when no further scan is selected. `iter_received` selects bytes by their arrival.
+reports when all selected scans have passed. `iter_received` selects bytes by their arrival time.
 
-If a source can seek, the data before a slice is skipped without reading it. Reading starts early
+If a source can seek, the data before a slice is skipped without being read. Reading starts early
 enough that a whole scan comes before the slice, even if the clocks of sensor and host differ.
 """
 
@@ -27,13 +27,13 @@ from lidarspec.transports.protocol import Chunk, Transport
 #: seconds from the first scan, or a date.
 Moment = float | datetime
 Times = tuple[Moment | None, Moment | None]
-#: how long before a slice reading starts.
+#: how many seconds before a slice reading starts.
 LEAD_S = 5.0
-#: share of the distance by which the clocks of sensor and host may differ.
+#: how far the clocks of sensor and host may drift apart, as a share of the elapsed time.
 MAX_CLOCK_DRIFT = 1e-3
-#: the shortest stretch that is worth seeking.
+#: the shortest time that is skipped by seeking.
 MIN_SKIP_S = 5.0
-#: a later time is a date; an earlier one is of a clock that started with the sensor.
+#: times from this one on are dates; earlier times count from the start of the sensor.
 MIN_DATE_NS = 10**18
 
 
@@ -46,18 +46,18 @@ class Selection:
     Args:
         times: the first time, and the time after the last one: seconds from the first scan, or a
             `datetime`, in UTC if it has no zone; None leaves an end open.
-        scans: the first scan, and the scan after the last one, counted from 0 with incomplete
-            scans: (5, 10) selects five.
+        scans: the index of the first scan, and the index after the last scan, counted from 0 with
+            incomplete scans: (5, 10) selects five; None leaves the end open.
         every: the step between selected scans; 1 for all.
-        ranges: the least and the largest range, metres. A return from elsewhere counts as none; its
-            range is -inf if it is nearer, inf if it is farther (REP-117).
-        columns: the columns of the points, by name, in this order; () for all.
-        time: the clock of the stamps and of `times`: "device", or "host" for the arrival of the
-            first packet of a scan.
+        ranges: the least and the greatest range, metres. Points outside become invalid; their range
+            is -inf if they are nearer, and inf if they are farther (REP-117).
+        columns: the names of the columns of the points, in this order; () for all.
+        time: the clock of the stamps and of `times`: "device", or "host" for the arrival time of
+            the first packet of a scan.
         beams, frame_id: as in `Scan`.
 
     Raises:
-        UsageError: for numbers that can select nothing.
+        UsageError: if the numbers cannot select any scan.
     """
 
     times: Times = (None, None)
@@ -92,13 +92,13 @@ class Selection:
     def is_counted(self) -> bool:
         """Whether scans are counted from the first scan of the source on.
 
-        This is required if scans are selected by number or time.
+        This is required if scans are selected by index, by time or by step.
         """
         return self.is_timed or self.scans != (0, None) or self.every != 1
 
 
 def _add_zone(moment: Moment | None) -> Moment | None:
-    """Return a time, a date without a zone as one in UTC."""
+    """Return a time; a date without a zone becomes a date in UTC."""
     if isinstance(moment, datetime) and moment.tzinfo is None:
         return moment.replace(tzinfo=UTC)
     return moment
@@ -123,7 +123,7 @@ class TimeSlice:
 
     Attributes:
         first, last: the first and the last time so far, ns; None before any.
-        ended: whether all further times are behind the end.
+        ended: whether all further times are after the end of the slice.
     """
 
     def __init__(self, times: Times) -> None:
@@ -133,7 +133,7 @@ class TimeSlice:
         self.last: int | None = None
 
     def holds(self, at: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which of the next times are selected, (n,).
+        """Return a mask of the next times that are selected, (n,), and update the state.
 
         Args:
             at: the times, (n,) ns.
@@ -154,11 +154,12 @@ class TimeSlice:
         return wanted & (at < end)
 
     def missed_error(self, source: object, number: str = "data") -> UsageError:
-        """Return the error that no time of a source was selected.
+        """Return the error to raise if no time of a source was selected.
 
-        It gives the times of the source.
+        It states the times that the source has.
 
         Args:
+            source: the name of the source.
             number: the items of the source, in words.
         """
         first = self.first or 0
@@ -180,7 +181,10 @@ class TimeSlice:
         return (self.ns(self._times[0]) or 0) - (self.first or 0)
 
     def ns(self, moment: Moment | None) -> int | None:
-        """Return a moment as a time of the stream, ns; None if no time of the stream is known."""
+        """Return a moment as a time of the stream, ns.
+
+        Returns None if the moment is None, or if it counts from a first time that is still unknown.
+        """
         if isinstance(moment, datetime):
             return round(moment.timestamp() * 1e6) * 1000
         if moment is None or self.first is None:
@@ -194,13 +198,14 @@ def format_date(ns: int) -> str:
 
 
 def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chunk]:
-    """Yield the chunks of a source that arrived at some times.
+    """Yield the chunks of a source that arrived in a time slice.
 
     Args:
-        name: of the source, for messages.
+        times: the start and the end of the slice, as in `Selection`.
+        name: the name of the source, for messages.
 
     Raises:
-        UsageError: if the times of arrival are unknown, or nothing arrived at these times.
+        UsageError: if arrival times are unknown, or if no chunk arrived in the slice.
     """
     if times == (None, None):
         yield from source.chunks()
@@ -223,15 +228,16 @@ def iter_received(source: Transport, times: Times, name: object) -> Iterator[Chu
 
 
 class ScanSelector:
-    """Applies a selection to the scans of one stream.
+    """A selection, applied to the scans of one stream.
 
     Args:
-        source: its name in messages.
+        selection: the selection.
+        source: the name of the source, for messages.
         skip: skips the data of the source that arrived before a time, ns since 1970, and returns
-            whether it has done so; None if the source cannot seek.
+            whether it did; None if the source cannot seek.
 
     Attributes:
-        ended: whether no further scan is selected.
+        ended: whether all selected scans have passed.
         slice: the selected times.
     """
 
@@ -245,16 +251,16 @@ class ScanSelector:
         self._source = source
         self._skip = skip
         self._seen = 0
-        self._selected = 0  # by time and number, whatever `every` is
+        self._selected = 0  # selected by time and index, before `every` is applied
         self._has_skipped = False
         self.ended = False
         self.slice = TimeSlice(selection.times)
 
     def iter_selected(self, scans: Iterable[Scan | None]) -> Iterator[Scan | None]:
-        """Yield the selected scans, with their selected parts; None is passed on.
+        """Yield the selected parts of selected scans, and each None of the input.
 
         Raises:
-            UsageError: if there were scans, and none of them was selected.
+            UsageError: if there were scans but none was selected.
         """
         for scan in scans:
             selected = None
@@ -270,10 +276,10 @@ class ScanSelector:
             raise self.missing()
 
     def select(self, scan: Scan) -> Scan | None:
-        """Return the selected parts of the next scan, None if it is not selected.
+        """Return the selected parts of the next scan; None if it is not selected.
 
         Raises:
-            UsageError: if its time is needed and unknown, or if the points do not have the columns.
+            UsageError: if a required time is unknown, or if the points do not have the columns.
         """
         selection = self._selection
         number = self._seen
@@ -296,11 +302,14 @@ class ScanSelector:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there were scans, and none of them was selected."""
+        """Whether there were scans but none was selected."""
         return self._seen > 0 and not self._selected
 
     def missing(self) -> UsageError:
-        """Return the error that no scan was selected; it names those of the source."""
+        """Return the error to raise if no scan was selected.
+
+        It states the scans that the source has.
+        """
         if self._seen == 1:
             number = "1 scan"
         else:
@@ -325,12 +334,12 @@ class ScanSelector:
         return scan.stamp_ns
 
     def _skip_to_slice(self, scan: Scan) -> None:
-        """Skip the data of the source up to a little before the slice, if that is possible."""
+        """Skip the data of the source up to shortly before the slice, if possible."""
         if self._skip is None or not scan.host_ns or self._selection.scans != (0, None):
             return
         clock = scan.sensor.clock
         if clock is not None and clock.wraps_at and clock.wraps_at < 1:
-            return  # its wraps cannot be counted over a gap
+            return  # wraps of its clock cannot be counted over a gap
         distance_s = self.slice.time_until_start * 1e-9
         skipped_s = distance_s - LEAD_S - MAX_CLOCK_DRIFT * distance_s
         if skipped_s > MIN_SKIP_S:
@@ -359,7 +368,7 @@ class ScanSelector:
 
 
 class _LimitedRanges(CloudColumns):
-    """The columns of a cloud in which returns outside some ranges, metres, count as none."""
+    """The columns of a cloud in which points outside some ranges, metres, are invalid."""
 
     def __init__(self, cloud: PointCloud, near: float, far: float) -> None:
         super().__init__(cloud)

@@ -1,8 +1,8 @@
 """Make scans of batches of packets as they arrive.
 
-Packets are put in order (`packets.reorder`), marked at a masked sector (`masking`), evaluated to
-points, and cut (`cutter`). A `ScanStream` keeps the points of the scan that has not ended, and the
-packets whose points depend on the next ones.
+Packets are sorted (`packets.reorder`), marked at a masked sector (`masking`), evaluated to points,
+and cut (`cutter`). A `ScanStream` keeps the points of the scan that has not ended, and packets if
+their points depend on the next packets.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class ScanStart(NamedTuple):
     """The start of a scan.
 
     Attributes:
-        time_ns: the time of its first point.
-        host_ns: when the packet of that point arrived; 0 if unknown.
+        time_ns: the time of its first point, ns.
+        host_ns: the arrival time of the packet with that point, ns; 0 if unknown.
     """
 
     time_ns: int
@@ -43,11 +43,11 @@ class ScanStart(NamedTuple):
 
 
 class ScanStream:
-    """Makes the scans of one stream.
+    """The scans of one stream.
 
     Args:
-        sensor: that sends the packets.
-        mount: how it is mounted; the scans are in the axes of its carrier.
+        sensor: the sensor that sends the packets.
+        mount: the mount of the sensor; the scans are in the axes of its carrier.
         imu: the samples of its IMU; they are added before the packets that arrived with them.
     """
 
@@ -68,25 +68,25 @@ class ScanStream:
             self._masking = Masking(sensor)
         self._uses_sector = False
         self._cutter = ScanCutter(sensor)
-        self._waiting: Packets | None = None  # whose points depend on the next packets
-        self._waiting_parts = 0  # parts of their first frame that were ready
+        self._waiting: Packets | None = None  # packets with points that depend on the next packets
+        self._waiting_parts = 0  # the number of parts of their first frame that were ready
         self._carry: Carry = {}
-        self._epoch: int | None = None  # of all batches, so that they do not change a bit of a time
-        self._empty_frames = 0  # frames without parts that have points
-        self._is_broken = False  # whether there is a break before the last ones of them
+        self._epoch: int | None = None  # one for all batches: times must not depend on them
+        self._empty_frames = 0  # the number of frames without parts that have points
+        self._is_broken = False  # whether there is a break before the last of these frames
         self._runs: list[PointRun] = []  # of the scan that has not ended
         self._start: ScanStart | None = None  # of that scan; None without points
-        self._is_foreign = False  # whether another stream makes that scan
+        self._is_foreign = False  # whether another stream makes that scan, after unpickling
 
     @property
     def is_under_way(self) -> bool:
-        """Whether there are points of a scan that has not ended, and is made here."""
+        """Whether this stream has points of a scan that has not ended."""
         return bool(self._runs) and not self._is_foreign
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state to pickle, which continues behind the scan that has not ended.
+        """Return the state to pickle, without the points of the scan that has not ended.
 
-        Its points are left out.
+        The unpickled stream continues after that scan.
         """
         is_foreign = self._is_foreign or bool(self._runs)
         return {**vars(self), "_runs": [], "_is_foreign": is_foreign}
@@ -101,7 +101,7 @@ class ScanStream:
         return self._add_ordered(ordered)
 
     def finish(self) -> list[Scan]:
-        """Return the scans that waited for more packets, and what remains."""
+        """Return the scans that waited for more packets, and the last, partial scan."""
         scans = list[Scan]()
         if self._reorder is not None:
             scans += self._add_ordered(self._reorder.finish())
@@ -113,18 +113,18 @@ class ScanStream:
         return scans
 
     def _add_ordered(self, batches: list[Packets]) -> list[Scan]:
-        """Return the scans that packets in order complete."""
+        """Return the scans that sorted packets complete."""
         if self._masking is not None:
             batches = [marked for packets in batches for marked in self._masking.push(packets)]
         return self._add_marked(batches)
 
     def _add_marked(self, batches: list[Packets]) -> list[Scan]:
-        """Return the scans that packets complete, which are marked at a masked sector."""
+        """Return the scans that packets complete after masked sectors were marked."""
         scans = list[Scan]()
         for packets in batches:
             if packets.masked is not None and not self._uses_sector:
                 self._use_sector(packets)
-            ready = self._with_points(packets)
+            ready = self._take_parts_with_points(packets)
             if self._waiting is not None:
                 ready = join_packets([self._waiting, ready])
             if len(ready):
@@ -140,10 +140,10 @@ class ScanStream:
         packets.stats.masked = describe_sector(sector)
         self._uses_sector = True
 
-    def _with_points(self, packets: Packets) -> Packets:
-        """Return the packets with points: these, or the parts in them.
+    def _take_parts_with_points(self, packets: Packets) -> Packets:
+        """Return the packets with points: these packets, or their parts.
 
-        A frame without any part leaves no gap.
+        A frame without parts leaves no gap in the index.
         """
         parts = packets.with_points
         if parts is not packets:
@@ -160,7 +160,11 @@ class ScanStream:
         return parts
 
     def _evaluate(self, packets: Packets, *, final: bool) -> list[Scan]:
-        """Return the scans that the points of some packets complete."""
+        """Return the scans that the points of some packets complete.
+
+        Args:
+            final: whether no packets follow.
+        """
         self._waiting = None
         if self._epoch is None:
             self._epoch = packets.time_ns.item(0)
@@ -201,10 +205,11 @@ class ScanStream:
     def _close(
         self, following: ScanStart | None, *, whole: bool = False, complete: bool = False
     ) -> list[Scan]:
-        """Return the scan of the points so far; none if there are no points.
+        """Return the scan of the points so far; an empty list if there are no points.
 
         Args:
             following: the start of the next scan; None if it is unknown.
+            whole, complete: as in `Scan`.
         """
         runs = self._runs
         start = self._start
@@ -217,7 +222,7 @@ class ScanStream:
         if is_foreign and self._imu is not None:
             self._imu.take_until(
                 end_ns
-            )  # those samples belong to the scan that another stream makes
+            )  # these samples belong to the scan that another stream makes
         if is_foreign or not runs:
             return []
         assert start is not None  # since there are points
@@ -250,7 +255,7 @@ class ScanStream:
 def _read_starts(
     packets: Packets, points: EvaluatedPoints, indices: Sequence[int]
 ) -> list[ScanStart | None]:
-    """Return the starts of scans at some points, in order; None for indices past the end."""
+    """Return the starts of scans at some points, in order; None past the end."""
     source = points.source
     known = [index for index in indices if index < source.size]
     starts: list[ScanStart | None] = [None] * len(indices)
@@ -269,16 +274,16 @@ def iter_scans(
     """Yield every scan of the batches of one stream.
 
     Args:
-        imu: the samples that belong to them.
+        imu: the IMU samples of the stream.
     """
     stream = ScanStream(sensor, imu=imu)
     for batch in batches:
-        yield from release_yielded(stream.add(batch))
+        yield from iter_released(stream.add(batch))
     yield from stream.finish()
 
 
-def release_yielded(scans: list[Scan]) -> Iterator[Scan]:
-    """Yield scans one by one, and release each with its columns."""
+def iter_released(scans: list[Scan]) -> Iterator[Scan]:
+    """Yield scans, and release each with its columns once it was yielded."""
     scans.reverse()
     while scans:
         yield scans.pop()
