@@ -4,6 +4,10 @@
 
 from __future__ import annotations
 
+import functools
+import math
+from operator import xor
+from struct import pack
 from typing import Any
 
 from construct import (
@@ -99,12 +103,17 @@ def _tokens(form: Tokens, struct: Construct, data: bytes) -> tuple[bytes, int] |
     end = data.find(form.end)
     if not data.startswith(form.start) or end < 0 or form.start in data[1:end]:
         return None
-    reader = _Reader(data[1 : end + 1], form)
+    content = data[1:end]
+    if form.check is not None:
+        content, star, digits = content[:-3], content[-3:-2], content[-2:]
+        if star != b"*" or digits.upper() != b"%02X" % functools.reduce(xor, content, 0):
+            return None
+    reader = _Reader(content + form.sep, form)
     try:
         reader.read(struct, Container(), "")
     except (ValueError, OverflowError):
         return None
-    return (bytes(reader.row), end + 1) if not reader.left else None
+    return (bytes(reader.row), end + len(form.end)) if not reader.left else None
 
 
 class _Reader:
@@ -112,6 +121,8 @@ class _Reader:
 
     def __init__(self, left: bytes, form: Any) -> None:
         self.left, self.row, self._form = left, bytearray(), form
+        self._texts = 0
+        self._missing = 0
 
     def read(self, part: Construct, context: Container, name: str) -> None:
         if isinstance(part, Renamed):
@@ -147,10 +158,39 @@ class _Reader:
     def _text(self, size: int) -> None:
         if not size:
             return
+        self._texts += 1
+        if isinstance(self._form, Tokens) and self._texts < self._form.joined:
+            text, self.left = self.left[:size], self.left[size:]
+            if len(text) < size or self._form.sep in text:
+                raise ValueError("the first token is short")
+            self.row += text
+            return
+        if isinstance(self._form, Tokens) and self._form.padded:
+            self._padded_text(size)
+            return
         text, mark, self.left = self.left[:size], self.left[size : size + 1], self.left[size + 1 :]
         if mark not in (self._form.sep, self._form.end) or not mark:
             raise ValueError("a token of another length")
         self.row += text
+
+    def _padded_text(self, size: int) -> None:
+        text, _, left = self.left.partition(self._form.sep)
+        if self._form.rest and self._texts > self._form.joined:
+            text, left = self.left[:-1], b""
+        if not self.left:
+            self._missing += 1
+        if self._missing > self._form.optional or len(text) > size:
+            raise ValueError("a token is missing or too long")
+        self.left = left
+        self.row += text.ljust(size, b"\x00")
+
+    def _decimal(self, token: str, field: FormatField) -> None:
+        digits = token[1:] if token[:1] in ("+", "-") else token
+        number = digits.replace(".", "", 1)
+        if token and not (number.isascii() and number.isdigit() and len(token) <= 40):
+            raise ValueError(token)
+        value = float(token) if token else math.nan
+        self.row += pack(field.fmtstr, value)
 
     def _number(self, field: FormatField) -> int:
         stops = [
@@ -159,6 +199,9 @@ class _Reader:
         if not stops:
             raise ValueError("no token")
         token, self.left = self.left[: min(stops)].decode("latin-1"), self.left[min(stops) + 1 :]
+        if field.fmtstr[-1] in "fd" and self._form.base == 10:
+            self._decimal(token, field)
+            return 0
         digits = token[1:] if token[:1] in ("+", "-") else token
         if not digits or len(digits) > 16 or not set(digits) <= set("0123456789abcdefABCDEF"):
             raise ValueError(token)

@@ -54,7 +54,7 @@ def worst(sensor: Sensor, length: int) -> bytes:
     as they can be.
     """
     source = random.Random(sensor.id)
-    longest = max((sensor.example(sensor.data_frame, seed=seed) for seed in range(40)), key=len)
+    longest = max((sensor.example(sensor.main_frames[0], seed=seed) for seed in range(40)), key=len)
     unit = b"".join(longest[: source.randint(3, 8)] + source.randbytes(2) for _ in range(64))
     return (unit * (length // len(unit) + 1))[:length]
 

@@ -121,7 +121,7 @@ def test_the_rule_holds_on_long_streams(name: str) -> None:
 )
 def test_every_recoverable_frame_of_a_representative_is_recovered(name: str) -> None:
     sensor = load_sensor(name)
-    longest = len(sensor.example(sensor.data_frame))
+    longest = len(sensor.example(sensor.main_frames[0]))
     rule.every_recoverable_frame_is_recovered(
         SensorUnderTest(sensor), max(2 * QUICK_LENGTH, 5 * longest // 2)
     )

@@ -88,7 +88,7 @@ def test_garbage_and_the_worst_stream_take_little_memory_on_every_sensor(module:
         if sensor.datagrams:
             continue
         assert_takes_little_memory(sensor, garbage(MEGABYTE // 8), MEGABYTE // 2)
-        if is_compiled(sensor.frames[sensor.data_frame]):
+        if is_compiled(sensor.frames[sensor.main_frames[0]]):
             assert_takes_little_memory(sensor, worst(sensor, MEGABYTE // 16), MEGABYTE)
 
 
