@@ -349,3 +349,9 @@ def test_declarations_that_cannot_be_are_refused() -> None:
         sensor(struct, Lines(64, head=(2,)) | SixBits(echoes=Echoes(3, 3))).example("data")
     with pytest.raises(SpecError, match="differ"):
         Escaped(0x7E, 0x5E)
+
+
+def test_the_first_byte_of_the_end_alone_ends_no_frame() -> None:
+    data = line(b"GPRMC,1,\r,0.25,07,D,V")
+    assert [item.data for item in LINE.split(data)] == [data]
+    assert LINE.parse(data).status == b"\r"
