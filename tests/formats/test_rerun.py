@@ -155,8 +155,9 @@ def test_where_no_viewer_can_be_shown_one_line_says_so(tmp_path: Path) -> None:
         "-o requires --rerun"
         in ran("view", "sim:ldrobot-stl27l", "--web", "-o", "a.rrd", code=2).stderr
     )
-    assert "choose one" in ran("view", "sim:ldrobot-stl27l", "--rerun", "--web", code=2).stderr
-    assert "add --web" in ran("view", "sim:ldrobot-stl27l", "--rerun", "--open", code=2).stderr
+    both = ran("view", "sim:ldrobot-stl27l", "--rerun", "--web", code=2)
+    assert "cannot be combined" in both.stderr
+    assert "require --web" in ran("view", "sim:ldrobot-stl27l", "--rerun", "--open", code=2).stderr
     assert (
         str(tmp_path / "no")
         in ran(

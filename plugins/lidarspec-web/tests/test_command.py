@@ -174,7 +174,7 @@ def test_a_source_that_fails_ends_it_with_its_code(tmp_path: Path) -> None:
     with run_verb(tmp_path, write_recording(tmp_path), "--slice", "100:200") as (running, _):
         code, _, lines = wait_until_end(running)
     assert code == 2
-    assert "nothing of that is asked for" in lines[0]
+    assert "the selection is outside" in lines[0]
 
 
 @pytest.mark.slow
