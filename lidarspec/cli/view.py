@@ -37,9 +37,9 @@ from lidarspec.view.polar import draw_cloud
 from lidarspec.view.terminal_screen import (
     Screen,
     TerminatedError,
-    find_plain_characters,
     is_interactive,
     keyboard,
+    supports_braille,
 )
 from lidarspec.view.terminal_window import Window
 
@@ -285,7 +285,7 @@ def _draw_once(
     cells: CellGrid = draw_cloud(
         feed.scan.points, width=columns, height=max(lines - 2, 4), look=chosen
     )
-    if not find_plain_characters(sys.stdout):
+    if not supports_braille(sys.stdout):
         cells = cells.ascii()
     colours = f"{chosen.ramp} {' to '.join(chosen.ends)}"
     return f"{render(cells.text())}\n{device.sensor.id}: {feed.scan}; colours: {colours}"

@@ -1,7 +1,7 @@
 """File formats of scans, by the suffix of the file.
 
-In: scans. Out: a file, which gets its name only when it is complete. `write` is the function
-for callers. `formats` includes the formats of plugins. Modules in reading order:
+In: scans. Out: a file, which gets its name only when it is complete. Callers use `write`.
+`formats` includes the formats of plugins. Modules in reading order:
 
 * `common`: functions shared by the formats.
 * `text`: .csv, .csv.gz and .xyz, one row per point.
@@ -54,10 +54,15 @@ from lidarspec.plugins import registry
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Chunk, Format
 
-#: placeholders of a path for date, hour, minute and second of a scan's stamp, as parts of an ISO
-#: text; `PLACE` also matches the number of a scan.
-MOMENT = {"%F": slice(10), "%H": slice(11, 13), "%M": slice(14, 16), "%S": slice(17, 19)}
-PLACE = re.compile(rf"%0?\d?d|{'|'.join(MOMENT)}")
+#: placeholder of a path for a part of a scan's stamp -> the part of the ISO text of the stamp.
+TIME_PLACEHOLDERS = {
+    "%F": slice(10),
+    "%H": slice(11, 13),
+    "%M": slice(14, 16),
+    "%S": slice(17, 19),
+}
+#: all placeholders of a path: for the time or the number of a scan.
+PLACEHOLDER = re.compile(rf"%0?\d?d|{'|'.join(TIME_PLACEHOLDERS)}")
 ARRAYS = (CSV, CSV_GZ, XYZ, NPZ, NPY, ZARR)
 TABLES = (PARQUET, ARROW, FEATHER)
 CLOUDS = (PCD, LZF_PCD, PLY, KITTI, LAS, LAZ, E57)
@@ -66,9 +71,9 @@ BUILT_IN = {known.suffix: known for known in (*ARRAYS, *TABLES, *CLOUDS, *BAGS)}
 
 
 def formats() -> dict[str, Format]:
-    """Return every format by suffix, including those of plugins.
+    """Return every format by suffix, including the formats of plugins.
 
-    The package's own formats have priority.
+    The built-in formats have priority.
 
     Raises:
         SpecError: if a plugin's hook fails.
@@ -85,10 +90,10 @@ def formats() -> dict[str, Format]:
 def format_of(path: str | Path) -> Format:
     """Return the format of a file name.
 
-    Plugins are only loaded if the suffix is not one of the package's own.
+    Plugins are loaded only if no built-in format has the suffix.
 
     Raises:
-        UnknownFormat: with a suggestion.
+        UnknownFormat: if no format has the suffix.
     """
     return (
         _find_by_suffix(path, BUILT_IN)
@@ -98,7 +103,7 @@ def format_of(path: str | Path) -> Format:
 
 
 def _find_by_suffix(path: str | Path, formats_by_suffix: Mapping[str, Format]) -> Format | None:
-    """Return the format with the longest suffix of a name, such as .csv.gz."""
+    """Return the format with the longest suffix of a name (.csv.gz); None if unknown."""
     name = Path(path).name.lower()
     return max(
         (format for suffix, format in formats_by_suffix.items() if name.endswith(suffix)),
@@ -114,10 +119,10 @@ def _unknown_format_error(path: str | Path, formats_by_suffix: Mapping[str, Form
 def write_imu(path: str | Path, samples: ImuSamples) -> None:
     """Write IMU samples to a .csv or .npz file.
 
-    The columns are time_ns, and six columns in rad/s and m/s2.
+    The columns are time_ns, three angular velocities in rad/s and three accelerations in m/s2.
 
     Raises:
-        UnknownFormat: for another suffix.
+        UnknownFormat: for any other suffix.
         SourceError: if the file cannot be written.
     """
     path = Path(path)
@@ -135,13 +140,13 @@ def write_imu(path: str | Path, samples: ImuSamples) -> None:
 def find_existing(path: str | Path) -> list[str]:
     """Return the existing files that `write` may replace.
 
-    For a path without placeholders, it is that path, existing or not.
+    For a path without placeholders, the path is returned even if it does not exist.
     """
     path = Path(path)
-    if not PLACE.search(str(path)):
+    if not PLACEHOLDER.search(str(path)):
         return [str(path)]
-    fixed = list(itertools.takewhile(lambda part: not PLACE.search(part), path.parts[:-1]))
-    named = re.compile(r" *[-\d]+".join(map(re.escape, PLACE.split(str(path)))))
+    fixed = list(itertools.takewhile(lambda part: not PLACEHOLDER.search(part), path.parts[:-1]))
+    named = re.compile(r" *[-\d]+".join(map(re.escape, PLACEHOLDER.split(str(path)))))
     files = Path(*fixed).glob("/".join("*" for _ in path.parts[len(fixed) :]))
     return sorted(str(file) for file in files if named.fullmatch(str(file)))
 
@@ -154,71 +159,81 @@ def write(
     organized: bool = False,
     packets: Iterable[Chunk] | None = None,
 ) -> None:
-    """Write scans to a file in the format of its suffix, or to several.
+    """Write scans to one or several files in the format of the suffix.
 
     Args:
-        path: the file. An old file is replaced when the new one is complete, and kept if writing
-            fails. The path may have placeholders: consecutive scans with the same path share a
-            file, and missing folders are made. "scans/%05d.pcd" has the number of the scan, from 0,
-            so each scan gets a file. "drive/date=%F/hour=%H/%M.parquet" has a file for each minute
-            of the stamps, in UTC; %S is the second.
-        every_point: also write points without a valid return.
-        organized: write every point of a scan in rows and columns, missing ones as nan. Each file
-            then has one scan, unless the format stores scans separately.
-        packets: the raw packets, to be written beside the points to a ROS log.
+        path: the file. An existing file is replaced when the new file is complete, and kept if
+            writing fails. The path may have placeholders: consecutive scans with the same path
+            share a file, and missing folders are made. In "scans/%05d.pcd", %05d is the number of
+            the scan, from 0, so each scan has a file. In "drive/date=%F/hour=%H/%M.parquet", %F,
+            %H and %M are the date, hour and minute of the scan's stamp in UTC, so each minute has a
+            file; %S is the second.
+        scans: the scans.
+        every_point: whether to write points without a valid return as well.
+        organized: whether to write every point of a scan in rows and columns, with nan for missing
+            points. A file then contains one scan, unless the format stores scans separately.
+        packets: the raw packets, to write to a ROS log in addition to the points; None for no
+            packets.
 
     Raises:
         UnknownFormat: for an unknown suffix.
-        UsageError: if a file would be started again because its time occurs again; and if the
+        UsageError: if the time in a path repeats, so that a file would be overwritten; or if the
             format, the sensor or the number of scans does not support `organized` or `packets`.
         SourceError: if the file cannot be written.
     """
     path = Path(path)
     chosen = format_of(path)
-    beside = {} if packets is None else {"packets": packets}
-    if beside:
+    packet_argument = {} if packets is None else {"packets": packets}
+    if packet_argument:
         check_holds(path, "packets")
-        if PLACE.search(str(path)):
+        if PLACEHOLDER.search(str(path)):
             raise UsageError(
                 f"{path}: packets can be written beside the points to a single file only"
             )
     if organized:
         check_holds(path, "organized")
-        is_alone = "scans" not in chosen.holds
-        scans = _iter_organized(path, scans, alone=is_alone and not PLACE.search(str(path)))
+        has_one_scan = "scans" not in chosen.holds
+        scans = _iter_organized(
+            path, scans, is_single=has_one_scan and not PLACEHOLDER.search(str(path))
+        )
         every_point = True
-        if is_alone:
+        if has_one_scan:
             chosen = dataclasses.replace(chosen, write=partial(chosen.write, organized=True))
-    for target, held in _iter_files(path, scans) if PLACE.search(str(path)) else [(path, scans)]:
+    if PLACEHOLDER.search(str(path)):
+        files: Iterable[tuple[Path, Iterable[Scan]]] = _iter_files(path, scans)
+    else:
+        files = [(path, scans)]
+    for target, file_scans in files:
         with replace_file(target) as part:
-            chosen.write(part, held, every_point=every_point, **beside)
+            chosen.write(part, file_scans, every_point=every_point, **packet_argument)
 
 
-def check_holds(path: str | Path, what: str) -> None:
-    """Raise UsageError unless a format has a feature of `Format.holds`.
+def check_holds(path: str | Path, feature: str) -> None:
+    """Raise UsageError if the format of a path lacks a feature of `Format.holds`.
 
     Raises:
-        UsageError: with the formats that have it.
+        UsageError: with the formats that have the feature.
     """
-    if what not in format_of(path).holds:
-        having = ", ".join(suffix for suffix, known in formats().items() if what in known.holds)
+    if feature not in format_of(path).holds:
+        having = ", ".join(suffix for suffix, known in formats().items() if feature in known.holds)
         raise UsageError(
-            f"{path}: {format_of(path).suffix} does not support --{what}; formats that do: {having}"
+            f"{path}: {format_of(path).suffix} does not support --{feature}; formats that do:"
+            f" {having}"
         )
 
 
-def _iter_organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterator[Scan]:
+def _iter_organized(path: Path, scans: Iterable[Scan], *, is_single: bool) -> Iterator[Scan]:
     """Yield scans, and check that they are organized.
 
     Args:
-        alone: whether only one scan is allowed.
+        is_single: whether only one scan is allowed.
     """
     for number, scan in enumerate(scans):
         if scan.points.shape is None:
             raise UsageError(
                 f"points of {scan.sensor.id} have no rows and columns: omit --organized"
             )
-        if number and alone:
+        if number and is_single:
             error = UsageError(
                 f"with --organized, {path} can hold one scan only, but several are selected"
             )
@@ -231,17 +246,17 @@ def _iter_organized(path: Path, scans: Iterable[Scan], *, alone: bool) -> Iterat
 
 
 def _iter_files(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Iterator[Scan]]]:
-    """Yield each file, and the scans for it."""
-    begun = set[str]()
+    """Yield the path and the scans of each file."""
+    started = set[str]()
     for name, group in itertools.groupby(
         enumerate(scans), lambda numbered: _fill_path(str(path), *numbered)
     ):
-        if name in begun:
+        if name in started:
             raise UsageError(
                 f"{name} would be written twice, as its time repeats; use %F, %H, %M and %S in the"
                 " name"
             )
-        begun.add(name)
+        started.add(name)
         with system_errors(path):
             Path(name).parent.mkdir(parents=True, exist_ok=True)
         yield (
@@ -254,11 +269,12 @@ def _iter_files(path: Path, scans: Iterable[Scan]) -> Iterator[tuple[Path, Itera
 
 
 def _fill_path(path: str, number: int, scan: Scan) -> str:
-    """Return a path with the number and time of a scan in place of the placeholders.
+    """Return a path with the number and time of a scan in place of the placeholders."""
+    stamp = str(np.datetime64(scan.stamp_ns, "ns"))
 
-    Other percent signs are kept.
-    """
-    moment = str(np.datetime64(scan.stamp_ns, "ns"))
-    return PLACE.sub(
-        lambda place: moment[MOMENT[place[0]]] if place[0] in MOMENT else place[0] % number, path
-    )
+    def fill(placeholder: re.Match[str]) -> str:
+        if placeholder[0] in TIME_PLACEHOLDERS:
+            return stamp[TIME_PLACEHOLDERS[placeholder[0]]]
+        return placeholder[0] % number
+
+    return PLACEHOLDER.sub(fill, path)

@@ -1,8 +1,8 @@
 """Write NumPy arrays (.npz, .npy) and Zarr folders.
 
-The size of an array precedes its data, but is only known at the end: until then each column of an
-.npz is written to an unnamed file in the same folder. The arrays of Zarr, as xarray and Dask open
-them, grow by whole chunks.
+The size of an array precedes its data in .npz, but is known only at the end. Each column is
+therefore first written to an unnamed file in the same folder. The arrays of Zarr, which xarray and
+Dask open, grow by whole chunks.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from lidarspec.points.table_types import structured_type
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: values in a chunk of Zarr: of point columns, and of scan columns.
-ROWS = 1 << 18
-SCANS = 1 << 12
-#: the columns with a value per scan: type and unit, as xarray reads it.
-OF_SCANS: dict[str, tuple[DTypeLike, str]] = {
+#: number of values in a Zarr chunk of a column of points.
+POINT_CHUNK = 1 << 18
+#: number of values in a Zarr chunk of a column of scans.
+SCAN_CHUNK = 1 << 12
+#: columns with one value per scan -> type, and unit in the form that xarray reads.
+SCAN_COLUMNS: dict[str, tuple[DTypeLike, str]] = {
     "stamp_ns": (np.int64, "nanoseconds since 1970-01-01"),
     "rate_hz": (np.float64, "Hz"),
     "complete": (np.bool_, ""),
@@ -42,7 +43,10 @@ def write_array(
     """Add a column to an archive as a NumPy array.
 
     Args:
-        height: number of rows of an organized column; None for a flat one.
+        archive: the archive.
+        name: the name of the array.
+        column: its values.
+        height: number of rows of an organized column; None for a flat column.
     """
     with archive.open(f"{name}.npy", "w", force_zip64=True) as target:
         lengths = (column.length,) if height is None else (height, column.length // height)
@@ -52,11 +56,12 @@ def write_array(
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bool = False) -> None:
-    """Write the columns that all scans have, and the columns of scans.
+    """Write an .npz file with the columns of points and of scans.
 
-    Each point has `scan`, and each scan has `stamp_ns`, `rate_hz` and `complete`. The unit of an
-    additional column is in NAME.unit. With `organized`, the columns of the only scan are (rows,
-    columns), with several returns side by side.
+    Columns of points are written if all scans have them. The column `scan` has the number of each
+    point's scan; `stamp_ns`, `rate_hz` and `complete` have one value per scan. The unit of an
+    additional column is in NAME.unit. With `organized`, the columns of the single scan have the
+    shape (rows, columns), with several returns side by side.
     """
     height: int | None = None
     with contextlib.ExitStack() as files:
@@ -64,7 +69,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
         def column(dtype: DTypeLike) -> ColumnSpool:
             return files.enter_context(contextlib.closing(ColumnSpool(path.parent, dtype)))
 
-        of_scans = {
+        scan_columns = {
             "stamp_ns": column(np.int64),
             "rate_hz": column(np.float64),
             "complete": column(np.bool_),
@@ -86,7 +91,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
             for name, kept in columns.items():
                 kept.add(own[name])
             numbers.add(np.full(len(cloud), number))
-            for name, kept in of_scans.items():
+            for name, kept in scan_columns.items():
                 kept.add(np.array([getattr(scan, name)]))
         unit_columns = {f"{name}.unit": column(f"<U{len(unit)}") for name, unit in units.items()}
         for unit, kept in zip(units.values(), unit_columns.values(), strict=True):
@@ -94,7 +99,7 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, organized: bo
         with zipfile.ZipFile(path, "w") as archive:
             for name, kept in {**columns, "scan": numbers}.items():
                 write_array(archive, name, kept, height)
-            for name, kept in {**of_scans, **unit_columns}.items():
+            for name, kept in {**scan_columns, **unit_columns}.items():
                 write_array(archive, name, kept)
 
 
@@ -103,25 +108,25 @@ def write_npy(
 ) -> None:
     """Write one structured array with PCL's layout, as `PointCloud.to_structured`.
 
-    Missing columns are 0. If there are several scans, the column `scan` has their number. With
-    `organized`, the array of the only scan is (rows, columns). The file can be memory-mapped:
-    ``np.load(path, mmap_mode="r")``.
+    Missing columns are 0. If there are several scans, the column `scan` has the number of each
+    point's scan. With `organized`, the array has the shape (rows, columns) of the single scan. The
+    file can be memory-mapped: ``np.load(path, mmap_mode="r")``.
     """
     write_rows(
         path,
-        PointRows(scans, _structured_dtype, every_point=every_point, is_picture=organized),
-        _npy_header,
+        PointRows(scans, _make_structured_dtype, every_point=every_point, is_image=organized),
+        _make_npy_header,
     )
 
 
-def _structured_dtype(types: Mapping[str, Any]) -> np.dtype[Any]:
+def _make_structured_dtype(types: Mapping[str, Any]) -> np.dtype[Any]:
     return structured_type(
         {name: np.dtype(dtype) for name, dtype in types.items() if name not in NAMES}
     )
 
 
-def _npy_header(rows: PointRows) -> bytes:
-    """Return the header; NumPy pads it, so its length does not depend on the size."""
+def _make_npy_header(rows: PointRows) -> bytes:
+    """Return the header; NumPy pads it, so its length does not depend on the shape."""
     header = io.BytesIO()
     shape = {
         "descr": np.lib.format.dtype_to_descr(rows.dtype),
@@ -138,7 +143,7 @@ class _ZarrColumn:
     def __init__(
         self, group: Any, name: str, dtype: DTypeLike, *, unit: str = "", along: str = "points"
     ) -> None:
-        self._chunk = {"points": ROWS, "scans": SCANS}[along]
+        self._chunk = {"points": POINT_CHUNK, "scans": SCAN_CHUNK}[along]
         self._array = group.create_array(
             name,
             shape=(0,),
@@ -151,7 +156,7 @@ class _ZarrColumn:
         self._length = 0
 
     def add(self, values: NDArray[Any] | None, length: int) -> None:
-        """Append values; None appends `length` times nan or 0."""
+        """Append values; if they are None, append nan or 0 `length` times."""
         dtype = self._array.dtype
         self._waiting.append(
             np.full(length, np.nan if dtype.kind == "f" else 0, dtype) if values is None else values
@@ -160,12 +165,12 @@ class _ZarrColumn:
         if self._length >= self._chunk:
             self.write(self._length - self._length % self._chunk)
 
-    def write(self, number: int) -> None:
-        """Write a number of waiting values."""
+    def write(self, count: int) -> None:
+        """Write the first `count` waiting values."""
         waiting = np.concatenate([np.empty(0, self._array.dtype), *self._waiting])
-        self._array.append(waiting[:number])
-        self._waiting = [waiting[number:].copy()]
-        self._length = len(waiting) - number
+        self._array.append(waiting[:count])
+        self._waiting = [waiting[count:].copy()]
+        self._length = len(waiting) - count
 
     def finish(self) -> None:
         """Write all waiting values."""
@@ -173,16 +178,17 @@ class _ZarrColumn:
 
 
 def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write the columns of the first scan along "points", and those of scans.
+    """Write a folder with the columns of the first scan, and the columns of scans.
 
-    Each point has `scan`; `stamp_ns`, `rate_hz` and `complete` are along "scans". Arrays have their
-    `units`; the group has `sensor`, `source`, `frame` (the directions of x, y and z) and
+    The dimension of point columns is "points"; the column `scan` has the number of each point's
+    scan. The dimension of `stamp_ns`, `rate_hz` and `complete` is "scans". Arrays have the
+    attribute `units`; the group has `sensor`, `source`, `frame` (the directions of x, y and z) and
     `calibration`. If a later scan lacks a column, its values are nan, or 0 for integers.
     """
     group = import_library("zarr", "zarr").open_group(str(path), mode="w")
-    of_scans = {
+    scan_columns = {
         name: _ZarrColumn(group, name, dtype, unit=unit, along="scans")
-        for name, (dtype, unit) in OF_SCANS.items()
+        for name, (dtype, unit) in SCAN_COLUMNS.items()
     }
     columns = {"scan": _ZarrColumn(group, "scan", np.int32)}
     for number, scan in enumerate(scans):
@@ -197,9 +203,9 @@ def write_zarr(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             }
         for name, column in columns.items():
             column.add(own.get(name), len(cloud))
-        for name, column in of_scans.items():
+        for name, column in scan_columns.items():
             column.add(np.array([getattr(scan, name)]), 1)
-    for column in (*columns.values(), *of_scans.values()):
+    for column in (*columns.values(), *scan_columns.values()):
         column.finish()
 
 

@@ -1,7 +1,7 @@
 """Write tables with pyarrow, one row per point: Parquet, Arrow and Feather.
 
 Arrow and Feather files can be memory-mapped. Scans are joined to row groups or record batches of at
-least `ROWS` points. Columns are passed on without a copy.
+least `MIN_GROUP_ROWS` points. Columns are not copied.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from lidarspec.points.table_types import arrow_schema
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: minimum number of points of a row group or record batch, except the last one.
-ROWS = 1 << 17
-#: maximum number of scans of this size that are not joined.
-MANY = 8
+#: minimum number of points in a row group or record batch; the last may have fewer.
+MIN_GROUP_ROWS = 1 << 17
+#: maximum number of record batches in a table that are not copied together.
+MAX_UNJOINED_BATCHES = 8
 
 
 def _write(
     path: Path, scans: Iterable[Scan], *, every_point: bool, open_writer: Callable[[Path, Any], Any]
 ) -> None:
-    """Write the columns of the first scan, and the scan of each point.
+    """Write the columns of the first scan, and columns about the scan of each point.
 
-    `scan` is its number; `stamp` its stamp as a timestamp in ns without a zone, which pandas and
-    DuckDB keep exactly (`time` counts from it); `complete` is as in `Scan`. If a later scan lacks a
-    column, its values are nan, or null for integers. With `every_point`, x, y and z of a point
-    without a return are nan. The metadata of a field has its unit. The metadata of the schema has
-    `sensor`, `source` (the facts about its format), `frame` (the directions of x, y and z), `units`
-    as JSON, and `calibration`: "nominal" or "own".
+    `scan` is the number of the scan. `stamp` is its stamp as a timestamp in ns without a time zone,
+    which pandas and DuckDB keep exactly; `time` counts from it. `complete` is `Scan.complete`. If a
+    later scan lacks a column, its values are nan, or null for integers. With `every_point`, x, y
+    and z of a point without a return are nan. The metadata of a field has its unit. The metadata of
+    the schema has `sensor`, `source` (the source of the format's facts), `frame` (the directions of
+    x, y and z), `units` as JSON, and `calibration`: "nominal" or "own".
     """
     tables = iter_tables(scans, path, every_point=every_point)
     first = next(tables)
@@ -49,41 +49,45 @@ def _write(
 def iter_tables(
     scans: Iterable[Scan], path: Path | None = None, *, every_point: bool
 ) -> Iterator[Any]:
-    """Yield the points of scans as tables of at least `ROWS` rows, and at least one.
+    """Yield the points of scans as tables of at least `MIN_GROUP_ROWS` rows.
+
+    At least one table is yielded, even if it is empty.
 
     Args:
-        path: of the file; a column that its folder names, such as scan=7, is left out, as in Hive.
+        scans: the scans.
+        path: the path of the file. If a folder in it gives a column, for example scan=7, the column
+            is omitted, as in Hive.
+        every_point: whether to include points without a valid return.
     """
     arrow = import_library("pyarrow", "arrow")
-    of_scans = _of_scans(path)
+    scan_fields = _make_scan_fields(path)
     schema = None
-    gathered = list[Any]()
-    rows = 0
-    for place, scan in enumerate(scans):
+    batches = list[Any]()
+    row_count = 0
+    for index, scan in enumerate(scans):
         cloud = select_points(scan, every_point=every_point)
-        schema = schema or _schema(arrow, scan, cloud, of_scans)
-        gathered.append(
-            _batch(arrow, schema, cloud, place if scan.number is None else scan.number, scan)
-        )
-        rows += len(cloud)
-        if rows >= ROWS:
-            yield _table(arrow, gathered, schema)
-            gathered = []
-            rows = 0
-    if gathered or schema is None:
-        yield _table(arrow, gathered, schema or arrow.schema(of_scans))
+        schema = schema or _make_schema(scan, cloud, scan_fields)
+        number = index if scan.number is None else scan.number
+        batches.append(_make_batch(arrow, schema, cloud, number, scan))
+        row_count += len(cloud)
+        if row_count >= MIN_GROUP_ROWS:
+            yield _make_table(arrow, batches, schema)
+            batches = []
+            row_count = 0
+    if batches or schema is None:
+        yield _make_table(arrow, batches, schema or arrow.schema(scan_fields))
 
 
-def _table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
-    """Return the rows of some batches as a table; many small ones are joined."""
+def _make_table(arrow: Any, batches: Sequence[Any], schema: Any) -> Any:
+    """Return the rows of record batches as a table; join many small batches."""
     table = arrow.Table.from_batches(batches, schema)
-    if len(batches) > MANY:
+    if len(batches) > MAX_UNJOINED_BATCHES:
         return table.combine_chunks()
     return table
 
 
-def _of_scans(path: Path | None) -> list[Any]:
-    """Return the fields about the scan of a point, except those that the folder names."""
+def _make_scan_fields(path: Path | None) -> list[Any]:
+    """Return the fields about the scan of a point, without fields that a folder gives."""
     arrow = import_library("pyarrow", "arrow")
     folders = path.parent.parts if path else ()
     named = {part.partition("=")[0] for part in folders if "=" in part}
@@ -93,13 +97,14 @@ def _of_scans(path: Path | None) -> list[Any]:
     ]
 
 
-def _schema(arrow: Any, scan: Scan, cloud: PointCloud, of_scans: Sequence[Any]) -> Any:
+def _make_schema(scan: Scan, cloud: PointCloud, scan_fields: Sequence[Any]) -> Any:
     """Return the schema of the points of a scan."""
+    arrow = import_library("pyarrow", "arrow")
     schema = arrow_schema(cloud.columns, units_of(cloud), scan.facts)
-    return arrow.schema([*schema, *of_scans], schema.metadata)
+    return arrow.schema([*schema, *scan_fields], schema.metadata)
 
 
-def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) -> Any:
+def _make_batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) -> Any:
     """Return the points of a scan as a record batch."""
     own: dict[str, Any] = {**cloud.columns}
     for name, value in (
@@ -115,15 +120,15 @@ def _batch(arrow: Any, schema: Any, cloud: PointCloud, number: int, scan: Scan) 
             else:
                 own[field.name] = arrow.nulls(len(cloud), field.type)
     return arrow.RecordBatch.from_arrays(
-        [_array(arrow, own[field.name], field.type) for field in schema], schema=schema
+        [_make_array(arrow, own[field.name], field.type) for field in schema], schema=schema
     )
 
 
-def _array(arrow: Any, values: Any, kind: Any) -> Any:
+def _make_array(arrow: Any, values: Any, kind: Any) -> Any:
     """Return values as an Arrow array.
 
-    Values of the right type are not converted, because pyarrow loads pandas for that, which takes
-    0.2 s.
+    If the values have the right type, the array is made from their buffer: otherwise pyarrow would
+    load pandas, which takes 0.2 s.
     """
     if not isinstance(values, np.ndarray) or arrow.from_numpy_dtype(values.dtype) != kind:
         return arrow.array(values, kind)
@@ -137,18 +142,25 @@ def _array(arrow: Any, values: Any, kind: Any) -> Any:
 def open_parquet(path: Path, schema: Any) -> Any:
     """Return a Parquet writer, without compression.
 
-    Compression would take longer than everything else. Columns with few values use a dictionary.
+    Compression would take longer than everything else. Columns of integers, which have few distinct
+    values, use a dictionary.
     """
-    few = [field.name for field in schema if str(field.type) not in ("float", "double", "bool")]
-    timed = [name for name in ("scan", "stamp") if name in schema.names]
+    dictionary_columns = [
+        field.name for field in schema if str(field.type) not in ("float", "double", "bool")
+    ]
+    statistics_columns = [name for name in ("scan", "stamp") if name in schema.names]
     parquet = import_library("pyarrow.parquet", "arrow")
     return parquet.ParquetWriter(
-        path, schema, compression="none", use_dictionary=few, write_statistics=timed
+        path,
+        schema,
+        compression="none",
+        use_dictionary=dictionary_columns,
+        write_statistics=statistics_columns,
     )
 
 
 def open_batches(path: Path, schema: Any, compression: str | None) -> Any:
-    """Return a writer of Arrow's file format."""
+    """Return a writer of Arrow's file format; `compression` is None or "lz4"."""
     ipc = import_library("pyarrow.ipc", "arrow")
     return ipc.new_file(str(path), schema, options=ipc.IpcWriteOptions(compression=compression))
 

@@ -1,10 +1,10 @@
 """Write robotics logs: ROS messages in an MCAP file, ROS 1 bag or ROS 2 bag.
 
-/points has each scan as sensor_msgs/PointCloud2. For planar sensors, /scan has it as
-sensor_msgs/LaserScan (see `messages`). The frame is "laser", and the log time of both is the stamp
-of the scan. The units of additional columns, for which messages have no field, are in the metadata
-of the log; ROS 1 bags have none. On request, /packets has the raw packets with their arrival times,
-so that the log can be read again as a source.
+The topic /points has each scan as sensor_msgs/PointCloud2. For planar sensors, /scan has each scan
+as sensor_msgs/LaserScan (see `messages`). The frame is "laser", and the log time of both is the
+stamp of the scan. Messages have no field for the units of additional columns; they are in the
+metadata of the log, except in ROS 1 bags, which have no metadata. On request, /packets has the raw
+packets with their arrival times, so that the log can be read again as a source.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from lidarspec.transports.robotics_logs import RAW
 
 #: message type -> topic.
 TOPICS = {CLOUD: "/points", SCAN: "/scan", RAW: "/packets"}
-#: bytes of a chunk of an MCAP file, which a reader loads at once: about one scan.
-CHUNK = 1 << 20
+#: size of a chunk of an MCAP file, which readers load at once: about one scan.
+CHUNK_BYTES = 1 << 20
 
 
 class BagWriter:
-    """The messages of one log.
+    """Makes the messages of one log.
 
     Args:
-        release: the release with the message definitions, as rosbags names it: "ROS1_NOETIC".
+        release: the release with the message definitions, by its name in rosbags: "ROS1_NOETIC".
 
     Attributes:
         types: the definitions.
@@ -56,12 +56,14 @@ class BagWriter:
             UsageError: for a stamp that no message can contain.
         """
         return heapq.merge(
-            self._of_scans(scans, every_point=every_point),
+            self._iter_scan_messages(scans, every_point=every_point),
             map(self._messages.raw, packets),
             key=attrgetter("at"),
         )
 
-    def _of_scans(self, scans: Iterable[Scan], *, every_point: bool) -> Iterator[RosMessage]:
+    def _iter_scan_messages(
+        self, scans: Iterable[Scan], *, every_point: bool
+    ) -> Iterator[RosMessage]:
         for number, scan in enumerate(scans):
             self.units |= {name: unit for name, unit in scan.points.units.items() if unit}
             yield self._messages.cloud(scan, scan.stamp_ns, every_point=every_point, number=number)
@@ -74,37 +76,34 @@ class BagWriter:
 def write_mcap(
     path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
 ) -> None:
-    """Write an MCAP file as ROS 2 records it.
-
-    Foxglove, `ros2 bag` and PlotJuggler read it.
-    """
+    """Write an MCAP file like ROS 2, for Foxglove, `ros2 bag` and PlotJuggler."""
     mcap = import_library("mcap.writer", "ros")
-    held = BagWriter("ROS2_HUMBLE")
+    bag_writer = BagWriter("ROS2_HUMBLE")
     channels = dict[str, int]()
     with path.open("wb") as file:
-        log = mcap.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
+        log = mcap.Writer(file, chunk_size=CHUNK_BYTES, compression=mcap.CompressionType.NONE)
         log.start(profile="ros2", library="lidarspec")
-        for kind, at, data in held.messages(scans, packets, every_point=every_point):
+        for kind, at, data in bag_writer.messages(scans, packets, every_point=every_point):
             if kind not in channels:
-                text, _ = held.types.generate_msgdef(kind, ros_version=2)
+                text, _ = bag_writer.types.generate_msgdef(kind, ros_version=2)
                 channels[kind] = log.register_channel(
                     TOPICS[kind], "cdr", log.register_schema(kind, "ros2msg", text.encode())
                 )
             log.add_message(channels[kind], log_time=at, publish_time=at, data=data)
-        if held.units:
-            log.add_metadata("units", held.units)
+        if bag_writer.units:
+            log.add_metadata("units", bag_writer.units)
         log.finish()
 
 
 def write_ros1(
     path: Path, scans: Iterable[Scan], packets: Iterable[Chunk] = (), *, every_point: bool
 ) -> None:
-    """Write a bag as `rosbag record` does."""
-    held = BagWriter("ROS1_NOETIC")
+    """Write a ROS 1 bag like `rosbag record`."""
+    bag_writer = BagWriter("ROS1_NOETIC")
     _record(
         import_library("rosbags.rosbag1", "ros").Writer(path),
-        held,
-        held.messages(scans, packets, every_point=every_point),
+        bag_writer,
+        bag_writer.messages(scans, packets, every_point=every_point),
     )
 
 
@@ -116,11 +115,15 @@ def write_ros2(
     storage: str,
     every_point: bool,
 ) -> None:
-    """Write a ROS 2 bag of metadata version 8, which releases from Foxy on read.
+    """Write a ROS 2 bag of metadata version 8, which releases since Foxy can read.
 
     Args:
+        path: the folder or file.
+        scans: the scans.
+        packets: the raw packets.
         storage: "mcap" for a folder with metadata.yaml and an MCAP file; "sqlite3" for a single
-            database file, which `ros2 bag` reads too.
+            database file, which `ros2 bag` can read as well.
+        every_point: whether to write points without a valid return.
     """
     import sqlite3  # only needed here
 
@@ -129,22 +132,24 @@ def write_ros2(
         bag = Path(folder) / "scans"
         log = rosbag2.Writer(bag, version=8, storage_plugin=rosbag2.StoragePlugin[storage.upper()])
         try:
-            held = BagWriter("ROS2_HUMBLE")
-            _record(log, held, held.messages(scans, packets, every_point=every_point))
+            bag_writer = BagWriter("ROS2_HUMBLE")
+            _record(log, bag_writer, bag_writer.messages(scans, packets, every_point=every_point))
         except sqlite3.Error as error:
             raise OSError(str(error)) from None
         (bag if storage == "mcap" else bag / "scans.db3").rename(path)
 
 
-def _record(log: Any, held: BagWriter, every: Iterable[RosMessage]) -> None:
+def _record(log: Any, bag_writer: BagWriter, messages: Iterable[RosMessage]) -> None:
     """Write messages with a writer of rosbags."""
     connections = dict[str, Any]()
     with log:
-        for kind, at, data in every:
+        for kind, at, data in messages:
             if kind not in connections:
-                connections[kind] = log.add_connection(TOPICS[kind], kind, typestore=held.types)
+                connections[kind] = log.add_connection(
+                    TOPICS[kind], kind, typestore=bag_writer.types
+                )
             log.write(connections[kind], at, data)
-        for name, unit in held.units.items() if hasattr(log, "set_custom_data") else ():
+        for name, unit in bag_writer.units.items() if hasattr(log, "set_custom_data") else ():
             log.set_custom_data(f"unit of {name}", unit)
 
 

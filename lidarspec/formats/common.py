@@ -1,11 +1,11 @@
 """Functions shared by file formats.
 
-They select the points of scans, spool columns beside the file, and replace a file when the new one
-is complete.
+They select the points of scans, store columns in temporary files, and replace a file when the new
+file is complete.
 
-A format is a function that writes scans to a path, one by one, so that memory stays small. Many
-formats begin with their size, which is only known at the end: they go back and write it, or spool
-their columns in unnamed files.
+A format is a function that writes scans to a path while they arrive, so that it needs little
+memory. Many formats begin with their size, which is known only at the end. They write the size last
+at the start of the file, or store their columns in unnamed files until the size is known.
 """
 
 from __future__ import annotations
@@ -29,26 +29,27 @@ from lidarspec.remote_files import remove
 from lidarspec.scans.scan import Scan
 from lidarspec.unfinished_files import path_while_written, remove_abandoned
 
-# Files of a folder format, by suffix: an existing folder with any other file is not replaced.
+#: suffix of a folder format -> the names of its files. A folder with any other file is not
+#: replaced.
 FOLDER_FILES = {
     ".zarr": re.compile(r"(.+/)?(zarr\.json|\.z(group|attrs|array|metadata)|(c/)?\d+([./]\d+)*)"),
     ".rosbag2": re.compile(r"metadata\.yaml|[^/]+\.(mcap|db3(-wal|-shm)?)"),
 }
-#: ns since 1970 of the GPS epoch, 1980-01-06, for a clock without leap seconds, minus the 18 leap
-#: seconds that apply since 2017.
-GPS_EPOCH = (315_964_800 - 18) * 10**9
+#: the GPS epoch, 1980-01-06, in ns since 1970, minus the 18 leap seconds that apply since 2017.
+#: Unix time minus this value is GPS time.
+GPS_EPOCH_NS = (315_964_800 - 18) * 10**9
 _Piece = TypeVar("_Piece")
 
 
 @contextlib.contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
-    """Yield a path to write to; it replaces a file or folder when the block ends.
+    """Yield a temporary path to write to; it replaces `path` when the block ends.
 
-    If the block fails, the new file is removed.
+    If the block raises, the new file is removed.
 
     Raises:
-        SourceError: if it cannot be written.
-        UsageError: if the path is a folder with files of other kinds.
+        SourceError: if the file cannot be written.
+        UsageError: if the path is a folder with files that its format does not write.
     """
     refuse_foreign_files(path)
     remove_abandoned(path)
@@ -72,7 +73,7 @@ def refuse_foreign_files(folder: Path) -> None:
     """Raise if replacing a folder would delete files that its format does not write.
 
     Raises:
-        UsageError: with the first such file.
+        UsageError: with the first of these files.
     """
     if not folder.is_dir():
         return
@@ -88,24 +89,25 @@ def refuse_foreign_files(folder: Path) -> None:
 
 @contextlib.contextmanager
 def write_in_thread(write: Callable[[_Piece], object]) -> Iterator[Callable[[_Piece], None]]:
-    """Yield a function that writes pieces in a thread, while the next piece is made.
+    """Yield a function that writes a piece in a thread while the next piece is made.
 
-    At the end everything is written. An error is raised with the next piece, or at the end.
+    All pieces are written when the block ends. An error in the thread is raised by the next call,
+    or at the end of the block.
     """
     with ThreadPoolExecutor(1) as thread:
         last: Future[object] = thread.submit(lambda: None)
 
-        def hand_over(piece: _Piece) -> None:
+        def write_next(piece: _Piece) -> None:
             nonlocal last
             last.result()
             last = thread.submit(write, piece)
 
-        yield hand_over
+        yield write_next
         last.result()
 
 
 def select_points(scan: Scan, *, every_point: bool) -> PointCloud:
-    """Return the points of a scan to write: those with a valid return, or all."""
+    """Return the points of a scan to write: all points, or only the valid points."""
     which = find_points(scan.points, every_point=every_point)
     if which is None:
         return scan.points
@@ -113,9 +115,9 @@ def select_points(scan: Scan, *, every_point: bool) -> PointCloud:
 
 
 def find_points(cloud: PointCloud, *, every_point: bool) -> NDArray[np.intp] | None:
-    """Return the indices of the points to write, None for all.
+    """Return the indices of the points to write; None for all points.
 
-    Indexing columns by numbers is several times as fast as by a mask.
+    Indexing columns by integers is several times as fast as by a mask.
     """
     if every_point or cloud.valid.all():
         return None
@@ -127,14 +129,14 @@ def select_columns(
 ) -> dict[str, NDArray[Any]]:
     """Return the requested columns that a scan has, for the points to write.
 
-    "valid" and additional columns may be requested too.
+    "valid" and additional columns can be requested as well.
     """
     cloud = scan.points
-    named = tuple(name for name in names if name == "valid" or cloud.has_column(name))
-    cloud.load(*named, "valid")
+    existing = tuple(name for name in names if name == "valid" or cloud.has_column(name))
+    cloud.load(*existing, "valid")
     columns = {
         name: getattr(cloud, name) if name in (*COLUMNS, "valid") else cloud.extra.get(name)
-        for name in named
+        for name in existing
     }
     which = find_points(cloud, every_point=every_point)
     return {
@@ -145,23 +147,24 @@ def select_columns(
 
 
 def to_image(values: NDArray[Any], cloud: PointCloud) -> NDArray[Any]:
-    """Return values of organized points, (n,), as (rows, columns).
+    """Return values of organized points, (n,), as an image, (rows, columns).
 
-    There is a row for each ring; several returns are side by side.
+    The image has a row for each ring, with several returns side by side.
     """
     columns, rows = cloud.shape or (len(cloud), 1)
     returns = len(cloud) // max(columns * rows, 1) or 1
     height = rows
     if cloud.ring is not None and columns:
         rings = cloud.ring[: rows * returns : returns]
-        once = len(np.unique(rings))
-        if rows % once == 0 and (rings.reshape(-1, once) == rings[:once]).all():
-            height = once  # a packet's column may hold several firings
+        ring_count = len(np.unique(rings))
+        is_periodic = rows % ring_count == 0
+        if is_periodic and (rings.reshape(-1, ring_count) == rings[:ring_count]).all():
+            height = ring_count  # a column of a packet may contain several firings
     return values.reshape(-1, height, returns).swapaxes(0, 1).reshape(height, -1)
 
 
 class ColumnSpool:
-    """The values of one column in an unnamed file in the folder of the target."""
+    """Stores the values of one column in an unnamed file in the folder of the target."""
 
     def __init__(self, folder: Path, dtype: DTypeLike) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  closed by `close`

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.formats.common import GPS_EPOCH, select_columns
+from lidarspec.formats.common import GPS_EPOCH_NS, select_columns
 from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
@@ -43,8 +43,8 @@ INVALID = 2
 #: prefix and URL of the extension with the additional columns.
 PREFIX = "lidarspec"
 EXTENSION = "urn:lidarspec:columns"
-#: types that libE57Format does not support, and their replacements.
-TAKEN_AS = {
+#: types that libE57Format does not support -> their replacements.
+REPLACED_TYPES = {
     "f2": np.float32,
     "b1": np.uint8,
     **dict.fromkeys(("i4", "u4", "i8", "u8"), np.longlong),
@@ -54,12 +54,12 @@ TAKEN_AS = {
 def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write each scan with a header.
 
-    Points have coordinates, intensity, time, ring as row, column and return, and the additional
+    Points have coordinates, intensity, time, ring (as row), column, return, and the additional
     columns. `timeStamp` counts from the scan's acquisitionStart, which is its stamp as GPS time
     with 18 leap seconds. `returnCount` is the maximum of the scan. Additional columns are an
-    extension, lidarspec:NAME, which other readers skip; their units are in the scan's description.
-    With `every_point`, a point without a return is at 0 with cartesianInvalidState 2. The library
-    keeps headers in memory until the file is closed.
+    extension, lidarspec:NAME, which other readers ignore; their units are in the scan's
+    description. With `every_point`, a point without a return is at 0 with cartesianInvalidState 2.
+    The library keeps headers in memory until the file is closed.
     """
     pye57 = import_library("pye57", "e57")
     libe57 = import_library("pye57.libe57", "e57")
@@ -70,13 +70,13 @@ def _write(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
             file.image_file.extensionsAdd(PREFIX, EXTENSION)
             for number, scan in enumerate(scans):
                 own = select_columns(scan, (*NAMES, *scan.points.extra), every_point=every_point)
-                _add(libe57, file, _header(number, scan), _columns(own))
+                _add_scan(libe57, file, _make_header(number, scan), _convert_columns(own))
             file.close()
-        except libe57.E57Exception as error:  # it omits the text of system errors
+        except libe57.E57Exception as error:  # the library omits the text of system errors
             raise OSError(f"{str(error).splitlines()[0]}; is the disk full?") from None
 
 
-def _add(
+def _add_scan(
     libe57: Any, file: Any, header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]
 ) -> None:
     """Add a scan to a file."""
@@ -85,10 +85,10 @@ def _add(
     prototype = libe57.StructureNode(image)
     buffers = libe57.VectorSourceDestBuffer()
     for name, column in columns.items():
-        prototype.set(name, _kind(libe57, image, column))
+        prototype.set(name, _make_column_node(libe57, image, column))
         buffers.append(libe57.SourceDestBuffer(image, name, column, max(length, 1), True, True))
     points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
-    scan = _node(libe57, image, {**header, **_limits(columns)})
+    scan = _make_node(libe57, image, {**header, **_find_limits(columns)})
     scan.set("points", points)
     file.data3d.append(scan)
     writer = points.writer(buffers)
@@ -96,11 +96,11 @@ def _add(
         writer.write(length)
         writer.close()
     finally:
-        del writer  # its destructor writes to the file, so it has to go before the file is closed
+        del writer  # its destructor writes to the file, so it has to run before the file is closed
 
 
-def _columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return the columns by their standard names, in supported types."""
+def _convert_columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the columns with the names of the standard, in supported types."""
     invalid = ~own["valid"]
     columns = {NAMES.get(name, f"{PREFIX}:{name}"): column for name, column in own.items()}
     columns["cartesianInvalidState"] = invalid * np.uint8(INVALID)
@@ -113,15 +113,15 @@ def _columns(own: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
             len(invalid), columns["returnIndex"].max(initial=0) + 1, np.uint8
         )
     return {
-        name: np.ascontiguousarray(column, TAKEN_AS.get(column.dtype.str[1:]))
+        name: np.ascontiguousarray(column, REPLACED_TYPES.get(column.dtype.str[1:]))
         for name, column in columns.items()
     }
 
 
-def _header(number: int, scan: Scan) -> dict[str, Any]:
-    """Return the header of a scan."""
+def _make_header(number: int, scan: Scan) -> dict[str, Any]:
+    """Return the header of a scan: name -> value."""
     units = ", ".join(f"{name} [{unit}]" for name, unit in scan.points.units.items() if unit)
-    start = (scan.stamp_ns - GPS_EPOCH) * 1e-9
+    start = (scan.stamp_ns - GPS_EPOCH_NS) * 1e-9
     return {
         "guid": f"{{{uuid.uuid4()}}}",
         "name": f"scan {number}",
@@ -136,8 +136,8 @@ def _header(number: int, scan: Scan) -> dict[str, Any]:
     }
 
 
-def _limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return the minimum and maximum of the valid points, by group and name."""
+def _find_limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return minima and maxima of the valid points: group -> name -> value."""
     valid = columns["cartesianInvalidState"] == 0
     if not valid.any():
         return {}
@@ -153,19 +153,19 @@ def _limits(columns: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     }
 
 
-def _node(libe57: Any, image: Any, value: Any) -> Any:
-    """Return a node for a value of a header; mappings become structures."""
+def _make_node(libe57: Any, image: Any, value: Any) -> Any:
+    """Return a node for a value of a header; a structure for a mapping."""
     if not isinstance(value, Mapping):
         kinds = {str: libe57.StringNode, int: libe57.IntegerNode, float: libe57.FloatNode}
         return kinds[type(value)](image, value)
     structure = libe57.StructureNode(image)
     for name, part in value.items():
-        structure.set(name, _node(libe57, image, part))
+        structure.set(name, _make_node(libe57, image, part))
     return structure
 
 
-def _kind(libe57: Any, image: Any, column: NDArray[Any]) -> Any:
-    """Return the node of a column; integers use only the bits that they need."""
+def _make_column_node(libe57: Any, image: Any, column: NDArray[Any]) -> Any:
+    """Return the node of a column; integers have only the bits that they need."""
     if column.dtype.kind != "f":
         low, high = (int(column.min()), int(column.max())) if len(column) else (0, 0)
         return libe57.IntegerNode(image, low, low, high)

@@ -1,8 +1,8 @@
 """Write logs for Foxglove: scans as Foxglove Protobuf messages in an MCAP file.
 
-/points has each scan as foxglove.PointCloud. For planar sensors, /scan has it as
-foxglove.LaserScan. Stamps, frame, layout of the points and the units in the metadata are those of
-ROS logs (see `bags`).
+The topic /points has each scan as foxglove.PointCloud. For planar sensors, /scan has each scan as
+foxglove.LaserScan. Stamps, frame, layout of the points, and units in the metadata are the same as
+in ROS logs (see `bags`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarspec.errors import UsageError
-from lidarspec.formats.bags import CHUNK, TOPICS
+from lidarspec.formats.bags import CHUNK_BYTES, TOPICS
 from lidarspec.formats.messages import CLOUD, SCAN, describe_fields, make_records
 from lidarspec.optional_libraries import import_library
 from lidarspec.points.cloud import PointCloud
@@ -21,7 +21,7 @@ from lidarspec.scans.laserscan import LaserScan
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: the numbers of types in foxglove.PackedElementField.
+#: type -> its number in foxglove.PackedElementField.
 FIELD_TYPES = {"u1": 1, "b1": 1, "i1": 2, "u2": 3, "i2": 4, "u4": 5, "i4": 6, "f4": 7, "f8": 8}
 
 
@@ -36,17 +36,17 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
     planes = PlanarScans()
     units = dict[str, str]()
     with path.open("wb") as file:
-        log = support.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
+        log = support.Writer(file, chunk_size=CHUNK_BYTES, compression=mcap.CompressionType.NONE)
         for scan in scans:
             if scan.stamp_ns < 0:
                 raise UsageError(
                     f"stamp of a scan is {scan.stamp_ns} ns: MCAP files support no time before 1970"
                 )
             units |= {name: unit for name, unit in scan.points.units.items() if unit}
-            messages = {TOPICS[CLOUD]: _cloud(scan.points, every_point=every_point)}
+            messages = {TOPICS[CLOUD]: _make_cloud(scan.points, every_point=every_point)}
             if (planar := planes.project(scan)) is not None:
-                messages[TOPICS[SCAN]] = _planar(
-                    planar, is_graded=scan.points.intensity is not None
+                messages[TOPICS[SCAN]] = _make_planar(
+                    planar, has_intensity=scan.points.intensity is not None
                 )
             for topic, message in messages.items():
                 message.timestamp.FromNanoseconds(scan.stamp_ns)
@@ -58,7 +58,7 @@ def write_foxglove(path: Path, scans: Iterable[Scan], *, every_point: bool) -> N
         log.finish()
 
 
-def _cloud(cloud: PointCloud, *, every_point: bool) -> Any:
+def _make_cloud(cloud: PointCloud, *, every_point: bool) -> Any:
     points = make_records(cloud, every_point=every_point)
     fields = [
         {"name": name, "offset": offset, "type": FIELD_TYPES[kind]}
@@ -68,9 +68,9 @@ def _cloud(cloud: PointCloud, *, every_point: bool) -> Any:
     return message(point_stride=points.itemsize, fields=fields, data=points.tobytes())
 
 
-def _planar(scan: LaserScan, *, is_graded: bool) -> Any:
+def _make_planar(scan: LaserScan, *, has_intensity: bool) -> Any:
     message = import_library("foxglove_schemas_protobuf.LaserScan_pb2", "foxglove").LaserScan
-    intensities = scan.intensities if is_graded else ()
+    intensities = scan.intensities if has_intensity else ()
     return message(
         start_angle=scan.angle_min,
         end_angle=scan.angle_max,

@@ -1,10 +1,11 @@
 """Write frames of any type, one row each, with their fields in units.
 
 A row has `time_ns`, the time of the frame, and each field that is not constant: numbers in their
-unit, other integers as they are, bytes as hexadecimal text, or as text if the frame is text. An
-element of an array of numbers has a column of its own, such as `gains[2]`; nan where a frame lacks
-it. Tables hold one frame type. An MCAP file has a topic for each type, with JSON messages, which
-Foxglove and PlotJuggler read; its log times are those of arrival, if they are known.
+units, integers without a unit unchanged, bytes as hexadecimal text, or as text if the frame is
+text. Each element of an array of numbers is a column, for example `gains[2]`; its value is nan if a
+frame does not have the element. A table contains one frame type. An MCAP file has a topic for each
+type, with JSON messages for Foxglove and PlotJuggler; its log times are the arrival times, if they
+are known.
 """
 
 from __future__ import annotations
@@ -21,43 +22,46 @@ from numpy.typing import NDArray
 
 from lidarspec.errors import UsageError
 from lidarspec.formats.arrow_tables import ARROW, FEATHER, PARQUET, open_batches, open_parquet
-from lidarspec.formats.bags import CHUNK, MCAP
+from lidarspec.formats.bags import CHUNK_BYTES, MCAP
 from lidarspec.formats.common import replace_file, write_in_thread
 from lidarspec.formats.text import CSV, CSV_GZ, open_text_file
 from lidarspec.optional_libraries import import_library
 from lidarspec.packets.packets import Packets
 from lidarspec.spec.tree import FieldInfo
 
-#: Columns by name: numbers, or lists of texts.
+#: column name -> array of numbers, or list of texts.
 Columns = dict[str, Any]
-#: The packets that arrived together, by frame type.
+#: frame type -> the packets that arrived together.
 Batch = Mapping[str, Packets]
 
 
 def frame_columns(packets: Packets) -> Columns:
-    """Return the columns of packets: `time_ns`, and the fields that are not constant."""
+    """Return the columns of packets: `time_ns`, and all fields that are not constant."""
     columns: Columns = {"time_ns": packets.time_ns}
     for path, info in packets.table.schema.fields.items():
         if info.const is not None:
             continue
         if info.kind == "bytes":
             is_text = getattr(packets.sensor.frames[packets.frame].wire, "is_text", False)
-            columns[path] = _texts(packets.table.raw(path), is_text=is_text)
+            columns[path] = _format_bytes(packets.table.raw(path), is_text=is_text)
         else:
-            columns |= _elements(path, _numbers(packets, path, info))
+            columns |= _split_elements(path, _read_numbers(packets, path, info))
     return columns
 
 
-def _numbers(packets: Packets, path: str, info: FieldInfo) -> NDArray[Any]:
-    """Return a field in its unit; an integer without one stays an integer if no frame lacks it."""
+def _read_numbers(packets: Packets, path: str, info: FieldInfo) -> NDArray[Any]:
+    """Return a field in its unit, (n, ...) float64.
+
+    If an integer field has no unit, and all frames have it, the integers are returned.
+    """
     values = packets[path]
     if info.kind == "int" and not info.scaled and values.ndim == 1 and not np.isnan(values).any():
         return packets.table.raw(path)
     return values
 
 
-def _elements(path: str, values: NDArray[Any]) -> Columns:
-    """Return a column for each element of an array field, or the column of another field."""
+def _split_elements(path: str, values: NDArray[Any]) -> Columns:
+    """Return a column for each element of an array field, or one column for a scalar."""
     if values.ndim == 1:
         return {path: values}
     columns: Columns = {}
@@ -67,8 +71,12 @@ def _elements(path: str, values: NDArray[Any]) -> Columns:
     return columns
 
 
-def _texts(values: NDArray[Any], *, is_text: bool) -> list[str]:
-    """Return a field of bytes as texts, (n, bytes) or (n, elements, bytes) to n texts."""
+def _format_bytes(values: NDArray[Any], *, is_text: bool) -> list[str]:
+    """Return a text for each frame from a field of bytes, (n, ..., bytes).
+
+    Args:
+        is_text: whether the bytes are ASCII; otherwise the texts are hexadecimal.
+    """
     rows = [row.tobytes() for row in values]
     if is_text:
         return [row.rstrip(b"\x00").decode("ascii", "backslashreplace") for row in rows]
@@ -79,10 +87,12 @@ def write_frames(path: str | Path, batches: Iterable[Batch]) -> int:
     """Write frames to a file in the format of its suffix; return their number.
 
     Args:
-        path: .csv, .csv.gz, .parquet, .arrow or .feather for one frame type; .mcap for several.
+        path: the file: .csv, .csv.gz, .parquet, .arrow or .feather for one frame type; .mcap for
+            several.
+        batches: the frames.
 
     Raises:
-        UsageError: for another suffix.
+        UsageError: for any other suffix.
         SourceError: if the file cannot be written.
     """
     path = Path(path)
@@ -95,12 +105,12 @@ def write_frames(path: str | Path, batches: Iterable[Batch]) -> int:
 
 
 def holds_several_types(path: str | Path) -> bool:
-    """Return whether a file of this name can hold several frame types."""
+    """Return whether a file of this name can contain several frame types."""
     return str(path).lower().endswith(MCAP.suffix)
 
 
-def _tables(batches: Iterable[Batch]) -> Iterator[Columns]:
-    """Yield the columns of each batch of one frame type; later ones as the first one."""
+def _iter_tables(batches: Iterable[Batch]) -> Iterator[Columns]:
+    """Yield the columns of each batch; all batches have the columns of the first."""
     names: list[str] = []
     for packets in itertools.chain.from_iterable(batch.values() for batch in batches):
         columns = frame_columns(packets)
@@ -112,18 +122,18 @@ def _tables(batches: Iterable[Batch]) -> Iterator[Columns]:
 def _write_csv(path: Path, batches: Iterable[Batch], *, is_zipped: bool = False) -> int:
     count = 0
     with open_text_file(path, is_zipped=is_zipped) as put:
-        for columns in _tables(batches):
+        for columns in _iter_tables(batches):
             if not count:
                 put(",".join(columns) + "\n")
-            cells = [_cells(values) for values in columns.values()]
+            cells = [_format_cells(values) for values in columns.values()]
             for row in zip(*cells, strict=True):
                 put(",".join(row) + "\n")
                 count += 1
     return count
 
 
-def _cells(values: Any) -> list[str]:
-    """Return a column as CSV; texts that need it are quoted."""
+def _format_cells(values: Any) -> list[str]:
+    """Return the cells of a column for CSV; texts with special characters are quoted."""
     if isinstance(values, list):
         return [_quote(text) for text in values]
     if values.dtype.kind == "f":
@@ -142,7 +152,7 @@ def _write_table(
 ) -> int:
     arrow = import_library("pyarrow", "arrow")
     count = 0
-    tables = (arrow.table(_with_float_integers(columns)) for columns in _tables(batches))
+    tables = (arrow.table(_with_float_integers(columns)) for columns in _iter_tables(batches))
     first = next(tables, None)
     if first is None:
         return 0
@@ -154,7 +164,10 @@ def _write_table(
 
 
 def _with_float_integers(columns: Columns) -> Columns:
-    """Return columns whose types do not depend on the batch: integers but times as float64."""
+    """Return columns with integers as float64, except `time_ns`.
+
+    The types then do not depend on the batch: integers become float64 if a frame lacks them.
+    """
     return {
         name: values.astype(np.float64)
         if name != "time_ns" and not isinstance(values, list)
@@ -168,18 +181,20 @@ def _write_mcap(path: Path, batches: Iterable[Batch]) -> int:
     channels = dict[str, int]()
     count = 0
     with path.open("wb") as file:
-        log = mcap.Writer(file, chunk_size=CHUNK, compression=mcap.CompressionType.NONE)
+        log = mcap.Writer(file, chunk_size=CHUNK_BYTES, compression=mcap.CompressionType.NONE)
         log.start(profile="", library="lidarspec")
         for packets in itertools.chain.from_iterable(batch.values() for batch in batches):
             columns = frame_columns(packets)
             frame = packets.frame
             if frame not in channels:
                 name = f"{packets.sensor.id}.{frame}"
-                schema = log.register_schema(name, "jsonschema", _json_schema(columns).encode())
+                schema = log.register_schema(
+                    name, "jsonschema", _make_json_schema(columns).encode()
+                )
                 channels[frame] = log.register_channel(f"/{frame}", "json", schema)
             times = np.where(packets.host_ns > 0, packets.host_ns, packets.time_ns)
             for row, time_ns in enumerate(np.maximum(times, 0).tolist()):
-                data = json.dumps({name: _plain(values[row]) for name, values in columns.items()})
+                data = json.dumps({name: _to_json(values[row]) for name, values in columns.items()})
                 log.add_message(
                     channels[frame], log_time=time_ns, publish_time=time_ns, data=data.encode()
                 )
@@ -188,7 +203,7 @@ def _write_mcap(path: Path, batches: Iterable[Batch]) -> int:
     return count
 
 
-def _json_schema(columns: Columns) -> str:
+def _make_json_schema(columns: Columns) -> str:
     types = {
         name: "string" if isinstance(values, list) else "number" for name, values in columns.items()
     }
@@ -196,8 +211,8 @@ def _json_schema(columns: Columns) -> str:
     return json.dumps({"type": "object", "properties": properties})
 
 
-def _plain(value: Any) -> Any:
-    """Return a value for JSON, null for nan and infinity."""
+def _to_json(value: Any) -> Any:
+    """Return a value for JSON; None for nan and infinity."""
     if isinstance(value, str):
         return value
     number = value.item()

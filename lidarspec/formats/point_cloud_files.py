@@ -1,8 +1,8 @@
 """Write point clouds: PCD of the Point Cloud Library, PLY, and the .bin of KITTI.
 
-The formats have no scans: the rows of several scans follow one another, with the number of the scan
-as a field. `time` counts from the stamp of the scan. Comments of the header have the stamp of the
-first scan, the sensor and the units.
+The formats have no concept of scans: the rows of several scans follow one another, and a field has
+the number of the scan. `time` counts from the stamp of the scan. Comments in the header have the
+stamp of the first scan, the sensor and the units.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from lidarspec.optional_libraries import import_library
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: types that a format, or a common reader of it, does not support, and their replacements. Integers
-#: of 64 bits are exact up to 2**53.
+#: types that a format, or common readers of the format, do not support -> their replacements.
+#: Integers of 64 bits are exact up to 2**53.
 _PCD_TYPES = {"f2": "f4", "b1": "u1"}
 _PLY_TYPES = {
     **_PCD_TYPES,
@@ -31,8 +31,8 @@ _PLY_TYPES = {
     **dict.fromkeys(("u4", "i8", "u8"), "f8"),
 }
 _PLY_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-#: maximum size in the header of compressed points.
-_MOST_COMPRESSED = (1 << 32) - 1
+#: maximum number of bytes that the header of compressed points can give.
+_MAX_COMPRESSED_BYTES = (1 << 32) - 1
 
 
 def write_pcd(
@@ -40,11 +40,11 @@ def write_pcd(
 ) -> None:
     """Write a binary PCD 0.7 file.
 
-    It has the columns of x y z intensity ring time that the sensor has, and its additional columns
-    in their types. WIDTH and HEIGHT are those of a single organized scan if every point is written,
-    with missing points as nan; otherwise HEIGHT is 1.
+    The fields are x y z intensity ring time, if the sensor has them, and the additional columns. If
+    every point of a single organized scan is written, WIDTH and HEIGHT are the shape of the scan,
+    and missing points are nan. Otherwise HEIGHT is 1.
     """
-    write_rows(path, _pcd_rows(scans, every_point=every_point), _pcd_header)
+    write_rows(path, _make_pcd_rows(scans, every_point=every_point), _make_pcd_header)
 
 
 def write_lzf_pcd(
@@ -56,7 +56,7 @@ def write_lzf_pcd(
         UsageError: for 4 GiB of points or more, which the format does not support.
     """
     compress = import_library("lzf", "pcd").compress
-    rows = _pcd_rows(scans, every_point=every_point)
+    rows = _make_pcd_rows(scans, every_point=every_point)
     with contextlib.ExitStack() as files, path.open("wb") as target:
         names = rows.dtype.names or ()
         fields = {
@@ -66,10 +66,9 @@ def write_lzf_pcd(
         for block in rows:
             _refuse_size(rows.length * rows.dtype.itemsize)
             for name, field in fields.items():
-                field.add(
-                    _compress(block[name], compress)
-                )  # concatenated compressed blocks are a valid compressed field
-        start = target.write(_pcd_header(rows, "binary_compressed")) + 8
+                # Concatenated compressed blocks are a valid compressed field.
+                field.add(_compress(block[name], compress))
+        start = target.write(_make_pcd_header(rows, "binary_compressed")) + 8
         target.seek(start)
         for field in fields.values():
             field.copy_to(target)
@@ -81,29 +80,30 @@ def write_lzf_pcd(
 
 def _compress(values: NDArray[Any], compress: Any) -> NDArray[np.uint8]:
     data = values.tobytes()
-    return np.frombuffer(
-        compress(data, len(data) + len(data) // 16 + 64) if data else b"", np.uint8
-    )  # the maximum size of compressed noise
+    if not data:
+        return np.empty(0, np.uint8)
+    max_compressed_size = len(data) + len(data) // 16 + 64  # reached by noise
+    return np.frombuffer(compress(data, max_compressed_size), np.uint8)
 
 
 def _refuse_size(size: int) -> None:
-    if size > _MOST_COMPRESSED:
+    if size > _MAX_COMPRESSED_BYTES:
         reason = "a compressed PCD file can hold at most 4 GiB of points"
         raise suggest(
             UsageError(reason), "repeat with a .pcd file, or with one for each scan: %05d.lzf.pcd"
         )
 
 
-def _pcd_rows(scans: Iterable[Scan], *, every_point: bool) -> PointRows:
+def _make_pcd_rows(scans: Iterable[Scan], *, every_point: bool) -> PointRows:
     return PointRows(
         scans,
         lambda types: _packed_dtype(types, _PCD_TYPES),
         every_point=every_point,
-        is_picture=True,
+        is_image=True,
     )
 
 
-def _pcd_header(rows: PointRows, data: str = "binary") -> bytes:
+def _make_pcd_header(rows: PointRows, data: str = "binary") -> bytes:
     width, height = rows.shape or (rows.length, 1)
     types = [rows.dtype[name] for name in rows.dtype.names or ()]
     lines = [
@@ -126,18 +126,18 @@ def _pcd_header(rows: PointRows, data: str = "binary") -> bytes:
 def write_ply(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write a binary little-endian PLY file.
 
-    It has the columns of x y z intensity ring time that the sensor has, and its additional columns.
-    Properties are float, double, uchar or int, because Open3D skips other types: int for `ring`,
-    double for larger integers.
+    The properties are x y z intensity ring time, if the sensor has them, and the additional
+    columns. Their types are float, double, uchar or int, because Open3D ignores other types: int
+    for `ring`, double for larger integers.
     """
     write_rows(
         path,
         PointRows(scans, lambda types: _packed_dtype(types, _PLY_TYPES), every_point=every_point),
-        _ply_header,
+        _make_ply_header,
     )
 
 
-def _ply_header(rows: PointRows) -> bytes:
+def _make_ply_header(rows: PointRows) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
@@ -164,8 +164,8 @@ def _packed_dtype(types: Mapping[str, Any], supported: Mapping[str, str]) -> np.
 def write_kitti(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
     """Write x y z intensity as little-endian float32, without a header.
 
-    The intensity is 0 if the sensor has none. A file of KITTI is one scan: ``out/%06d.bin``.
-    Intensities are raw values, not scaled to 1.
+    The intensity is the raw value, not scaled to 1; it is 0 if the sensor has none. In KITTI each
+    file is one scan: ``out/%06d.bin``.
     """
     row = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
     write_rows(path, PointRows(scans, lambda types: row, every_point=every_point), lambda rows: b"")

@@ -1,6 +1,6 @@
 """Convert points to rows of bytes, for PCD, PLY, KITTI's .bin and .npy.
 
-The rows of all scans follow one another, after a header with their number.
+A file has a header with the number of rows, and then the rows of all scans.
 """
 
 from __future__ import annotations
@@ -21,27 +21,32 @@ from lidarspec.scans.stream import iter_released
 
 #: the first columns of a row; additional columns follow.
 NAMES = STRUCTURED.names or ()
-#: digits reserved for the number of rows in a header.
-FIGURES = 20
-#: bytes per write; pieces that fit into the processor's cache are copied three times as fast.
-PIECE = 1 << 20
+#: number of digits that are reserved for a number in a header.
+RESERVED_DIGITS = 20
+#: number of bytes per write; if they fit into the processor's cache, copying is three times as
+#: fast.
+WRITE_BYTES = 1 << 20
 
 
 class PointRows:
     """The points of scans as structured rows of one type, (n,) per scan.
 
+    The possible columns are x y z intensity ring time, the additional columns of the first scan,
+    and the number of the scan (`scan`), if there are several scans. If a later scan lacks a column,
+    its values are 0.
+
     Args:
-        layout: returns the type of a row for the types of the columns of the first scan: x y z
-            intensity ring time, additional ones, and `scan`, the number of the scan, if there are
-            several. Other columns are left out. If a later scan lacks a column, its values are 0.
-        every_point: also points without a valid return.
-        is_picture: order the points row by row if every point of a single organized scan is
-            written.
+        scans: the scans.
+        layout: returns the type of a row, given the types of the columns of the first scan.
+        every_point: whether to include points without a valid return.
+        is_image: whether the points of a single organized scan are ordered row by row, if every
+            point is written.
 
     Attributes:
-        dtype: of a row.
-        length: the number of rows so far.
-        shape: (width, height) of an organized scan, else None; several returns are side by side.
+        dtype: the type of a row.
+        length: number of rows so far.
+        shape: (width, height) of a single organized scan, with several returns side by side; None
+            for other scans.
         facts: lines for a header: the sensor, the stamp of the first scan, and the units.
     """
 
@@ -51,7 +56,7 @@ class PointRows:
         layout: Callable[[Mapping[str, Any]], np.dtype[Any]],
         *,
         every_point: bool,
-        is_picture: bool = False,
+        is_image: bool = False,
     ) -> None:
         scans = iter(scans)
         first = list(itertools.islice(scans, 2))
@@ -62,14 +67,14 @@ class PointRows:
         types: dict[str, Any] = dict.fromkeys("xyz", np.float32)
         if first:
             cloud = first[0].points
-            columns = self._columns(
+            columns = self._select_columns(
                 first[0], 0, (*NAMES, *cloud.extra, *(["scan"] if len(first) > 1 else []))
             )
             types |= {
                 name: STRUCTURED[name] if name in NAMES else column.dtype
                 for name, column in columns.items()
             }
-            if is_picture and every_point and len(first) == 1 and cloud.shape:
+            if is_image and every_point and len(first) == 1 and cloud.shape:
                 height, width = to_image(np.empty(len(cloud), np.bool_), cloud).shape
                 self.shape = width, height
             units = [f"unit {name} {unit}" for name, unit in cloud.units.items() if unit]
@@ -78,15 +83,15 @@ class PointRows:
         self._scans = itertools.chain(iter_released(first), scans)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        return itertools.starmap(self.fill, self.parts())
+        return itertools.starmap(self.fill, self.iter_parts())
 
-    def parts(self) -> Iterator[tuple[Mapping[str, NDArray[Any]], PointCloud]]:
+    def iter_parts(self) -> Iterator[tuple[Mapping[str, NDArray[Any]], PointCloud]]:
         """Yield the columns and points of each scan, for `fill`."""
         for number, scan in enumerate(self._scans):
-            yield self._columns(scan, number, self.dtype.names or ()), scan.points
+            yield self._select_columns(scan, number, self.dtype.names or ()), scan.points
 
     def fill(self, columns: Mapping[str, NDArray[Any]], points: PointCloud) -> NDArray[Any]:
-        """Return the rows of a scan, and count them."""
+        """Return the rows of a scan, and add them to `length`."""
         rows = np.zeros(len(columns["x"]), self.dtype)
         for name, column in columns.items():
             rows[name] = column
@@ -95,38 +100,43 @@ class PointRows:
             return to_image(rows, points).reshape(-1)
         return rows
 
-    def _columns(self, scan: Scan, number: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Return the requested columns that the scan has, of the points to write.
+    def _select_columns(
+        self, scan: Scan, number: int, names: Sequence[str]
+    ) -> dict[str, NDArray[Any]]:
+        """Return the requested columns that the scan has, for the points to write.
 
         The column "scan" has the number of the scan.
         """
         columns = select_columns(scan, names, every_point=self._every_point)
-        return columns | (
-            {"scan": np.full(len(columns["x"]), number, np.int32)} if "scan" in names else {}
-        )
+        if "scan" in names:
+            columns["scan"] = np.full(len(columns["x"]), number, np.int32)
+        return columns
 
 
 def write_rows(path: Path, rows: PointRows, header: Callable[[PointRows], bytes]) -> None:
-    """Write rows after a header.
+    """Write a header and rows.
 
-    The header is written again at the end with the number of rows, so its length must not depend on
-    it.
+    Args:
+        path: the file.
+        rows: the rows.
+        header: returns the header. It is called again at the end, when the number of rows is known,
+            so the length of the header must not depend on this number.
     """
     with path.open("wb") as file:
         file.write(header(rows))
 
         def append(part: tuple[Mapping[str, NDArray[Any]], PointCloud]) -> None:
             data = rows.fill(*part).view(np.uint8).data
-            for start in range(0, len(data), PIECE):
-                file.write(data[start : start + PIECE])
+            for start in range(0, len(data), WRITE_BYTES):
+                file.write(data[start : start + WRITE_BYTES])
 
         with write_in_thread(append) as write:
-            for part in rows.parts():
+            for part in rows.iter_parts():
                 write(part)
         file.seek(0)
         file.write(header(rows))
 
 
 def pad_header(*numbers: int) -> str:
-    """Return spaces that make the length of a header independent of these numbers."""
-    return " " * sum(FIGURES - len(str(number)) for number in numbers)
+    """Return spaces that make the length of a header independent of some numbers."""
+    return " " * sum(RESERVED_DIGITS - len(str(number)) for number in numbers)

@@ -1,8 +1,8 @@
 """Write Rerun recordings, .rrd: scans as coloured points, with statistics.
 
-They are on the timelines of the sensor and of the host. `view --rerun` uses the same
-`RerunRecording` for the Rerun viewer. All entities of a sensor are below its id, so that recordings
-of several sensors can be opened together: its points, its mount, facts about it, and `statistics`.
+The data is on the timelines of the sensor and of the host. `view --rerun` uses the same
+`RerunRecording` for the Rerun viewer. All entities of a sensor (points, mount, facts, `statistics`)
+are below its id, so that recordings of several sensors can be opened together.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ from lidarspec.points.colours import make_ramp
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: radius of a point in pixels of the viewer; length of a sensor's axes in metres.
-RADIUS = 1.5
-AXES = 0.3
-#: points that are flushed together, which limits the memory.
-HELD = 1 << 13
-#: maximum bytes per read of a pipe.
-PIPED = 1 << 16
+#: radius of a point in the viewer.
+POINT_RADIUS_PX = 1.5
+#: length of a sensor's axes.
+AXIS_LENGTH_M = 0.3
+#: number of points after which the data is flushed, which limits the memory.
+FLUSH_POINTS = 1 << 13
+#: maximum number of bytes per read of a pipe.
+MAX_PIPE_READ_BYTES = 1 << 16
 #: names of the timelines: sensor clock, arrival, number of the scan.
 SENSOR = "sensor_time"
 HOST = "host_time"
@@ -40,13 +41,13 @@ NUMBER = "scan"
 
 
 class RerunRecording:
-    """One recording, a context manager.
+    """One recording; a context manager.
 
-    It is written to a file (`save`), or to the target of its `stream` (`spawn`, `connect_grpc`).
+    The data is written to a file (`save`), or to a viewer (`spawn` and `connect_grpc` of `stream`).
 
     Args:
-        ramp: the column that colours show, "range", "intensity" or an additional one; the first
-            scan sets their scale.
+        ramp: the column that colours show: "range", "intensity" or an additional column. The first
+            scan determines the scale of colours.
 
     Raises:
         UsageError: if the Rerun SDK is not installed.
@@ -55,7 +56,7 @@ class RerunRecording:
     def __init__(self, ramp: str = "range") -> None:
         self._rerun = import_library("rerun", "rerun")
         self.stream = self._rerun.RecordingStream("lidarspec", send_properties=False)
-        self.stream.set_log_time_enabled(False)  # it is not the time of measurement
+        self.stream.set_log_time_enabled(False)  # the log time is not the time of measurement
         self.stream.set_log_tick_enabled(False)
         self._ramp = ramp
         self._colours = _Colours()
@@ -74,7 +75,7 @@ class RerunRecording:
         trace: TracebackType | None,
     ) -> None:
         try:
-            if not isinstance(error, OSError):  # an interrupted recording is complete too
+            if not isinstance(error, OSError):  # an interrupted recording has to be complete
                 self.flush()
         finally:
             self.stream.disconnect()
@@ -87,7 +88,7 @@ class RerunRecording:
         """Write the recording to a file.
 
         Raises:
-            OSError: if it cannot be written.
+            OSError: if the file cannot be written.
         """
         if os.name != "posix":
             with _translate_errors():
@@ -99,10 +100,10 @@ class RerunRecording:
             self.stream.save(f"/dev/fd/{self._copy.end}")
 
     def scan(self, scan: Scan, *, every_point: bool = False) -> None:
-        """Log a scan, and before the first one the facts about its sensor.
+        """Log a scan; before the first scan, log the facts about the sensor.
 
         Raises:
-            OSError: if it cannot be written.
+            OSError: if the recording cannot be written.
         """
         is_first = not self._home
         if is_first:
@@ -120,32 +121,32 @@ class RerunRecording:
             *scan.points.extra,
         )
         columns = select_columns(scan, names, every_point=every_point)
-        places = np.stack([columns.pop(name) for name in "xyz"], axis=-1)
+        positions = np.stack([columns.pop(name) for name in "xyz"], axis=-1)
         if every_point:
             shown = scan.points
         else:
             shown = scan.points[scan.points.valid]
         points = self._rerun.Points3D(
-            places,
+            positions,
             colors=self._colours(shown, self._ramp),
-            radii=self._rerun.Radius.ui_points(RADIUS),
+            radii=self._rerun.Radius.ui_points(POINT_RADIUS_PX),
         )
         self.stream.log(f"{self._home}/points", points, self._rerun.AnyValues(**columns))
-        self._waiting += len(places)
-        if self._waiting >= HELD:
+        self._waiting += len(positions)
+        if self._waiting >= FLUSH_POINTS:
             self.flush()
-        self.figures(
+        self.log_statistics(
             {"points": len(scan), "valid": int(scan.points.valid.sum()), "speed_hz": scan.rate_hz}
         )
-        if is_first:  # it refers to a timeline, which has to exist by then
-            self.stream.send_blueprint(self._layout())
+        if is_first:  # the layout refers to a timeline, which has to exist
+            self.stream.send_blueprint(self._make_layout())
 
-    def figures(self, figures: Mapping[str, float | None]) -> None:
-        """Log figures by name at the time of the last scan.
+    def log_statistics(self, statistics: Mapping[str, float | None]) -> None:
+        """Log statistics by name at the time of the last scan.
 
-        Figures that are None or not finite are left out.
+        Values that are None or not finite are omitted.
         """
-        for name, value in figures.items():
+        for name, value in statistics.items():
             if value is not None and np.isfinite(value):
                 self.stream.log(
                     f"{self._home}/statistics/{name}", self._rerun.Scalars(float(value))
@@ -155,7 +156,7 @@ class RerunRecording:
         """Flush the logged data.
 
         Raises:
-            OSError: if it cannot be written.
+            OSError: if the recording cannot be written.
         """
         self._waiting = 0
         with _translate_errors():
@@ -176,7 +177,7 @@ class RerunRecording:
         self.stream.log(
             f"{self._home}/sensor",
             rerun.Transform3D(**turn),
-            rerun.TransformAxes3D(AXES),
+            rerun.TransformAxes3D(AXIS_LENGTH_M),
             static=True,
         )
         facts = {
@@ -195,36 +196,37 @@ class RerunRecording:
         if scan.host_ns:
             self.stream.set_time(HOST, timestamp=np.datetime64(scan.host_ns, "ns"))
 
-    def _layout(self) -> Any:
-        """Return the layout: points, with statistics and facts beside them.
+    def _make_layout(self) -> Any:
+        """Return the layout of the viewer: points, with statistics and facts beside them.
 
         The sensor's timeline is active.
         """
         views = import_library("rerun.blueprint", "rerun")
-        figures = [
+        plots = [
             views.TimeSeriesView(
                 origin=f"{self._home}/statistics", contents=f"$origin/{name}", name=name
             )
             for name in ("speed_hz", "valid")
         ]
         facts = views.TextDocumentView(origin=f"{self._home}/about", name="about")
-        beside = views.Vertical(*figures, facts)
-        whole = views.Horizontal(
-            views.Spatial3DView(origin="/", name=self._home[1:]), beside, column_shares=[3, 1]
+        side = views.Vertical(*plots, facts)
+        window = views.Horizontal(
+            views.Spatial3DView(origin="/", name=self._home[1:]), side, column_shares=[3, 1]
         )
         return views.Blueprint(
-            whole, views.TimePanel(timeline=SENSOR, state="collapsed"), collapse_panels=True
+            window, views.TimePanel(timeline=SENSOR, state="collapsed"), collapse_panels=True
         )
 
 
 class _PipeCopy(threading.Thread):
     """Copies the output of the Rerun SDK from a pipe to a file.
 
-    If a disk is full, the SDK may wait forever for its own file.
+    The SDK does not write the file itself, because it may wait forever if the disk is full.
 
     Attributes:
         end: the end of the pipe to write to.
-        failure: the error of the file; data after it is read and discarded.
+        failure: the error of writing the file; None if there is none. All later data is read and
+            discarded.
 
     Raises:
         OSError: if the file cannot be written.
@@ -241,11 +243,11 @@ class _PipeCopy(threading.Thread):
         with open(self._begin, "rb", buffering=0) as pipe:
             try:
                 with self._file:
-                    while data := pipe.read(PIPED):
+                    while data := pipe.read(MAX_PIPE_READ_BYTES):
                         self._file.write(data)
             except OSError as error:
                 self.failure = error
-            while pipe.read(PIPED):  # the SDK must not block
+            while pipe.read(MAX_PIPE_READ_BYTES):  # the SDK must not block
                 pass
 
 
@@ -259,7 +261,7 @@ def _translate_errors() -> Iterator[None]:
 
 
 class _Colours:
-    """The colours of points, on the scale of the first cloud."""
+    """Chooses the colours of points, on the scale of the first cloud."""
 
     def __init__(self) -> None:
         self._look: CloudAppearance | None = None
@@ -274,7 +276,7 @@ class _Colours:
 
 
 def write_rerun(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write a recording."""
+    """Write a Rerun recording."""
     with RerunRecording() as log:
         log.save(path)
         for scan in scans:

@@ -21,34 +21,34 @@ from lidarspec.formats.common import find_points, select_points, write_in_thread
 from lidarspec.scans.scan import Scan
 from lidarspec.transports.protocol import Format
 
-#: format of numbers by type: seven digits are half a micrometre at a metre; times keep their
-#: nanoseconds.
-_WRITTEN = {"f2": "%.7g", "f4": "%.7g", "f8": "%.15g"}
-_TIME = "%.9f"
-#: rows per template: a third faster than row by row.
-ROWS = 1 << 10
-#: level of gzip: compresses numbers to 34 % of their size; the default 6 reaches 27 % in five times
-#: the time.
-_LEVEL = 1
+#: type -> format of numbers. Seven digits are half a micrometre at a distance of a metre.
+_NUMBER_FORMATS = {"f2": "%.7g", "f4": "%.7g", "f8": "%.15g"}
+#: format of times, with nanoseconds.
+_TIME_FORMAT = "%.9f"
+#: number of rows that are formatted together, which is a third faster than single rows.
+BLOCK_ROWS = 1 << 10
+#: level of gzip. Level 1 compresses numbers to 34 % of their size; the default level 6 reaches 27 %
+#: in five times the time.
+_GZIP_LEVEL = 1
 
 
 @contextlib.contextmanager
 def open_text_file(path: Path, *, is_zipped: bool = False) -> Iterator[Callable[[str], None]]:
     """Open a text file, compressed or not; yield a function that writes to it.
 
-    It writes in a thread, while the next text is made. A compressed file contains neither name nor
-    time.
+    The function writes in a thread, while the next text is made. A compressed file contains neither
+    its name nor a time, so that equal content gives equal files.
     """
     with contextlib.ExitStack() as files:
         file: Any = files.enter_context(path.open("wb"))
         if is_zipped:
-            file = files.enter_context(gzip.GzipFile("", "wb", _LEVEL, file, mtime=0))
+            file = files.enter_context(gzip.GzipFile("", "wb", _GZIP_LEVEL, file, mtime=0))
         text = files.enter_context(io.TextIOWrapper(file, encoding="ascii", newline=""))
         yield files.enter_context(write_in_thread(text.write))
 
 
 def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bool = False) -> None:
-    """Write the columns that the first scan has, and the number of the scan."""
+    """Write the columns of the first scan, and the number of each point's scan."""
     names: tuple[str, ...] = ()
     with open_text_file(path, is_zipped=is_zipped) as put:
         for number, scan in enumerate(scans):
@@ -59,14 +59,14 @@ def write(path: Path, scans: Iterable[Scan], *, every_point: bool, is_zipped: bo
             own = cloud.columns
             columns = [_column(own.get(name), len(cloud)) for name in names]
             cells = [
-                _TIME if name == "time" else _WRITTEN.get(column.dtype.str[1:], "%d")
+                _TIME_FORMAT if name == "time" else _NUMBER_FORMATS.get(column.dtype.str[1:], "%d")
                 for name, column in zip(names, columns, strict=True)
             ]
             _put_rows(put, ",".join([*cells, f"{number}\n"]), columns)
 
 
 def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
-    """Write x y z in metres, nothing else; missing points as nan."""
+    """Write only x y z in metres; missing points are nan."""
     with open_text_file(path) as put:
         for scan in scans:
             which = find_points(scan.points, every_point=every_point)
@@ -79,7 +79,7 @@ def write_xyz(path: Path, scans: Iterable[Scan], *, every_point: bool) -> None:
 
 
 def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write columns of one length, whole numbers and float64, with their names above."""
+    """Write columns of integers or float64, of equal length, with a header row."""
     template = (
         ",".join("%d" if column.dtype.kind == "i" else "%.15g" for column in columns.values())
         + "\n"
@@ -90,9 +90,17 @@ def write_columns(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _put_rows(put: Callable[[str], None], template: str, columns: Sequence[NDArray[Any]]) -> None:
-    """Write the rows of columns with the template of a row."""
-    for start in range(0, len(columns[0]), ROWS):
-        rows = zip(*(column[start : start + ROWS].tolist() for column in columns), strict=True)
+    """Write the rows of columns.
+
+    Args:
+        put: writes a text.
+        template: the %-format of a row.
+        columns: the columns, (n,) each.
+    """
+    for start in range(0, len(columns[0]), BLOCK_ROWS):
+        rows = zip(
+            *(column[start : start + BLOCK_ROWS].tolist() for column in columns), strict=True
+        )
         values = tuple(itertools.chain.from_iterable(rows))
         put(template * (len(values) // len(columns)) % values)
 

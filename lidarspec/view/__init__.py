@@ -3,11 +3,11 @@
 In: a device, or points. Out: pictures. The distribution `lidarspec-web` draws the page in a
 browser. Modules in reading order:
 
-* `terminal_window`: shows a sensor at work in the terminal: keys in, pictures and figures out.
+* `terminal_window`: shows a running sensor in the terminal: keys in, pictures and figures out.
 * `terminal_window_parts`: title, figures, colours and keys around the picture.
 * `live_scans`: reads, counts and plays the scans of a device.
 * `live_frames`: the same for the frames of a device without points.
-* `rate_meter`: speed, rates, losses and jitter of a sensor at work.
+* `rate_meter`: speed, rates, losses and jitter of a running sensor.
 * `polar`: points from above and from the side.
 * `canvas`: pictures in character cells, and their colours.
 * `terminal_screen`: the terminal: writes changed cells, reads single keys.

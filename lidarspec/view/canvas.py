@@ -1,8 +1,8 @@
 """Pictures in character cells, with two by four braille dots per cell.
 
-The dots are square if a cell is twice as high as wide. Pictures contain the numbers of inks, so
-that two of them can be compared cell by cell. The colour depth of the terminal decides how an ink
-is shown: true colour, 256 colours, 16, or none.
+The dots are square if a cell is twice as high as wide. Each cell has a character and an ink, which
+is an index of `INKS`, so that two pictures can be compared cell by cell. The colour depth of the
+terminal decides how an ink is shown: with true colour, 256 colours, 16 colours, or no colour.
 """
 
 from __future__ import annotations
@@ -23,16 +23,19 @@ from lidarspec.points.colours import Rgb, make_ramp
 
 Depth = Literal["truecolor", "256", "standard", "none"]
 
-#: SGR numbers of the ramp in 16 colours, from dark to light.
+#: SGR codes of the ramp in 16 colours, from dark to light.
 _STANDARD = (94, 36, 92, 93)
+#: indices of the inks that are not part of the ramp.
 PLAIN, STRONG, FAINT, LABEL, GOOD, ALARM = range(6)
-ACROSS = 2
-DOWN = 4
+#: number of dots in a cell, horizontally and vertically.
+DOTS_ACROSS = 2
+DOTS_DOWN = 4
 #: the bit of each dot of a braille character, by row and column.
 BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.int64)
 BLANK = 0x2800
 _SPACE = ord(" ")
-#: replacements in ASCII; a braille character is replaced by its number of dots.
+#: character -> its replacement in ASCII. `_BY_DOTS` has the replacements of braille characters, by
+#: their number of dots.
 ASCII = {
     "▲": "^",
     "▶": ">",
@@ -52,12 +55,13 @@ _BY_DOTS = " ..::oo##"
 
 @dataclass(frozen=True)
 class TextStyle:
-    """A colour and weight.
+    """A colour and a weight.
 
     Attributes:
-        rgb: None for the terminal's own colour.
-        standard: the SGR number of the nearest of 16 colours.
-        bold, faint: the weight.
+        rgb: the colour; None for the default colour of the terminal.
+        standard: the SGR code of the nearest of 16 colours; None for the default colour.
+        bold: whether the weight is bold.
+        faint: whether the weight is faint.
     """
 
     rgb: Rgb | None = None
@@ -85,9 +89,9 @@ INKS: tuple[TextStyle, ...] = (*_FIXED, *_SCALE)
 
 @functools.cache
 def sgr(ink: int, depth: Depth) -> str:
-    """The escape sequence that selects an ink, from whatever was selected before.
+    """Return the escape sequence that selects an ink.
 
-    Without colours the weights are kept: only they distinguish faint lines from points.
+    If the terminal has no colours, the weights distinguish faint lines from points.
     """
     chosen = INKS[ink]
     parts = ["0"]
@@ -121,8 +125,8 @@ class CellGrid:
     """A picture as characters and inks.
 
     Attributes:
-        codes: (height, width) int32, the characters as code points.
-        inks: (height, width) int16, their colours, as indices of `INKS`.
+        codes: the characters as code points, (height, width) int32.
+        inks: their inks as indices of `INKS`, (height, width) int16.
     """
 
     codes: NDArray[np.int32]
@@ -139,7 +143,7 @@ class CellGrid:
         return self.codes.shape[1], self.codes.shape[0]
 
     def write(self, row: int, column: int, text: str, ink: int = PLAIN) -> None:
-        """Write text from a cell on; it is cut off at the edge."""
+        """Write text that begins in a cell; cut it off at the edges."""
         width, height = self.size
         if not 0 <= row < height or column >= width:
             return
@@ -150,7 +154,7 @@ class CellGrid:
         self.inks[row, column : column + len(text)] = ink
 
     def paste(self, row: int, column: int, other: CellGrid) -> None:
-        """Copy a picture, with its upper left corner in a cell; it is cut off at the edge."""
+        """Copy a picture with its upper left corner in a cell; cut it off at the edges."""
         width = min(other.size[0], self.size[0] - column)
         height = min(other.size[1], self.size[1] - row)
         if width > 0 and height > 0:
@@ -192,51 +196,55 @@ class Canvas:
     """Dots and labels on a grid of cells.
 
     Attributes:
-        width, height: in cells.
-        ramp: the column that colours show: "range", or one with weak and strong values.
-        dots: (4 * height, 2 * width) bool, points.
-        lines: the same for rings and axes, shown where a cell has no point.
-        steps: (height, width) int16, the colour of a cell's points on the ramp; -1 without.
-        labels: text in cells, (row, column) -> character and ink.
+        width: number of columns of cells.
+        height: number of rows of cells.
+        ramp: the column that colours show. For "range", a cell has the colour of its nearest point;
+            for other columns, the colour of its strongest point.
+        dots: the dots of points, (4 * height, 2 * width) bool.
+        lines: the dots of rings and axes, (4 * height, 2 * width) bool. They are only shown in
+            cells without points.
+        steps: the step of the ramp of each cell's points, (height, width) int16; -1 for cells
+            without points.
+        labels: (row, column) of a cell -> character and ink of a text.
     """
 
     def __init__(self, width: int, height: int, ramp: str = "range") -> None:
         self.width = width
         self.height = height
         self.ramp = ramp
-        self.dots, self.lines = np.zeros((2, DOWN * height, ACROSS * width), np.bool_)
+        self.dots, self.lines = np.zeros((2, DOTS_DOWN * height, DOTS_ACROSS * width), np.bool_)
         self.steps = np.full((height, width), -1, np.int16)
         self.labels: dict[tuple[int, int], tuple[str, int]] = {}
 
     def plot(self, column: NDArray[Any], row: NDArray[Any], shade: NDArray[Any]) -> None:
-        """Set dots of points at fractional dot coordinates; dots outside are left out.
+        """Set dots of points; points outside the canvas are ignored.
 
         Args:
-            column, row: (n,) coordinates in dots.
-            shade: (n,) positions on the ramp, from 0 to 1. A cell takes the colour of its nearest
-                or strongest point.
+            column, row: fractional coordinates in dots, (n,).
+            shade: positions on the ramp, from 0 to 1, (n,).
         """
-        across, down, inside = self._places(column, row)
+        across, down, inside = self._to_dots(column, row)
         self.dots[down, across] = True
         steps = np.clip(shade[inside] * STEPS, 0, STEPS - 1).astype(np.uint8)
         order = np.argsort(STEPS - steps if self.ramp == "range" else steps, kind="stable")
-        self.steps[down[order] // DOWN, across[order] // ACROSS] = steps[order]
+        self.steps[down[order] // DOTS_DOWN, across[order] // DOTS_ACROSS] = steps[order]
 
     def line(self, column: NDArray[Any], row: NDArray[Any]) -> None:
         """Set dots of rings and axes."""
-        across, down, _ = self._places(column, row)
+        across, down, _ = self._to_dots(column, row)
         self.lines[down, across] = True
 
     def label(
         self, row: int, column: int, text: str, ink: int = LABEL, *, over: bool = False
     ) -> bool:
-        """Write text from a cell on, unless it would leave the canvas or hide something.
+        """Write text that begins in a cell, if there is room for it.
 
         Args:
-            over: whether it may hide points.
+            over: whether the text may hide points.
 
         Returns:
-            Whether it was written.
+            Whether the text was written. It is not if it would leave the canvas, or hide points or
+            other text.
         """
         cells = [(row, column + index) for index in range(len(text))]
         if not (0 <= row < self.height and column >= 0 and column + len(text) <= self.width):
@@ -248,8 +256,8 @@ class Canvas:
 
     def cells(self) -> CellGrid:
         """Return the picture."""
-        points = _braille(self.dots)
-        lines = _braille(self.lines)
+        points = _to_braille(self.dots)
+        lines = _to_braille(self.lines)
         codes = np.where(
             points > 0, BLANK + points, np.where(lines > 0, BLANK + lines, _SPACE)
         ).astype(np.int32)
@@ -257,10 +265,11 @@ class Canvas:
             points > 0, FIRST_STEP + self.steps, np.where(lines > 0, FAINT, PLAIN)
         ).astype(np.int16)
         for cell, (character, ink) in self.labels.items():
-            codes[cell], inks[cell] = ord(character), ink
+            codes[cell] = ord(character)
+            inks[cell] = ink
         return CellGrid(codes, inks)
 
-    def _places(
+    def _to_dots(
         self, column: NDArray[Any], row: NDArray[Any]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
         height, width = self.dots.shape
@@ -268,7 +277,9 @@ class Canvas:
         return column[inside].astype(np.intp), row[inside].astype(np.intp), inside
 
 
-def _braille(dots: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the braille bits of each cell, (height, width)."""
-    blocks = dots.reshape(dots.shape[0] // DOWN, DOWN, dots.shape[1] // ACROSS, ACROSS)
+def _to_braille(dots: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the braille bits of each cell for dots, (height, width)."""
+    blocks = dots.reshape(
+        dots.shape[0] // DOTS_DOWN, DOTS_DOWN, dots.shape[1] // DOTS_ACROSS, DOTS_ACROSS
+    )
     return np.asarray(np.einsum("rdca,da->rc", blocks, BITS))

@@ -1,4 +1,4 @@
-"""The frames of an open device without points, between two lines of figures.
+"""Read and count the frames of an open device without points.
 
 `open_live` chooses between these frames and the scans of a device with points (`live_scans`).
 """
@@ -19,7 +19,7 @@ from lidarspec.view.rate_meter import RateMeter
 
 
 def open_live(device: Device, select: Selection = EVERYTHING) -> LiveScans | LiveFrames:
-    """Return the scans of an open device, or the frames of one without points.
+    """Return the scans of an open device, or the frames of a device without points.
 
     Raises:
         UsageError: if scans are selected, and the sensor has no points.
@@ -32,13 +32,13 @@ def open_live(device: Device, select: Selection = EVERYTHING) -> LiveScans | Liv
 
 
 class LiveFrames:
-    """Takes the frames of every type of an open device, and counts them.
+    """Reads and counts the frames of all types of an open device.
 
     Args:
-        device: open; it is not closed.
+        device: the open device; it is not closed.
 
     Attributes:
-        packets: the batches that were read last, one for each type that arrived.
+        packets: the batches that were read last, one for each frame type that arrived.
         ended: whether the input has ended.
         meter: counts the frames.
     """
@@ -52,12 +52,14 @@ class LiveFrames:
 
     @property
     def times_ns(self) -> Times:
-        """The times of arrival of the frames that were read last, ns, ascending."""
-        arrivals = np.concatenate([np.zeros(0, np.int64), *(one.host_ns for one in self.packets)])
+        """The arrival times of the frames that were read last, ascending, ns."""
+        arrivals = np.concatenate(
+            [np.zeros(0, np.int64), *(packets.host_ns for packets in self.packets)]
+        )
         return np.sort(arrivals[arrivals > 0])
 
     def read(self, until: float) -> None:
-        """Read until a time of `time.monotonic`, or the end; at least once.
+        """Read at least once, until a time of `time.monotonic` or the end of the input.
 
         Raises:
             LidarSpecError: if the source fails.

@@ -1,8 +1,8 @@
-"""The scans of an open device, between two pictures or two lines of figures.
+"""Read, count and play the scans of an open device.
 
-`read` reads arrived data, counts it in a `RateMeter` and keeps the newest scan. A file can be
-played: then each scan is shown as long after the one before as their times say, and little of the
-file is read ahead, so that figures and bytes belong to the scan that is shown.
+`read` reads the data that has arrived, counts it in a `RateMeter` and keeps the newest scan. A file
+can be played: scans are then shown at the intervals of their times. Only little of the file is read
+ahead, so that figures and bytes belong to the scan that is shown.
 """
 
 from __future__ import annotations
@@ -21,41 +21,42 @@ from lidarspec.scans.selection import ScanSelector, Selection, TimeSlice
 from lidarspec.scans.stream import ScanStream
 from lidarspec.view.rate_meter import RateMeter
 
-#: seconds that one read of a live source waits for data.
+#: the longest time that one read of a live source waits for data.
 LOOK_S = 0.04
-#: seconds between scans of a file without times.
+#: time between scans of a file without times.
 DEFAULT_STEP_S = 0.1
-#: the longest pause between two scans of a file in seconds; longer ones become `DEFAULT_STEP_S`.
+#: the longest time between two scans of a file; longer times are replaced by `DEFAULT_STEP_S`.
 MAX_STEP_S = 2.0
-#: seconds of a played file that one read covers.
+#: recorded time that one read of a played file covers.
 READ_AHEAD_S = 0.1
-#: bytes of the first read of a played file.
+#: size of the first read of a played file.
 MIN_PORTION_BYTES = 1 << 12
 
 Times = NDArray[np.int64]
 
 
 class LiveScans:
-    """Takes the scans of an open device.
+    """Reads, counts and plays the scans of an open device.
+
+    Args:
+        device: the open device; it is not closed.
+        played: whether scans of a file are shown at the intervals of their times, not as fast as
+            possible.
+        speed: the speed of a played file, relative to the recorded speed.
+        select: the scans to show; None for all.
+        ahead: recorded time of a played file that is read at once, in seconds; None for the fastest
+            size.
+
+    Attributes:
+        speed: the speed of a played file; it may be changed.
+        packets: the batch that was read last; None if nothing arrived.
+        scans: the scans, and pieces of scans, of the last `read` or `step`.
+        scan: the newest whole scan; until there is a whole scan, the newest piece; None at first.
+        number: how often `scan` has changed.
+        meter: counts packets and scans.
 
     Raises:
         UsageError: for a sensor without points.
-
-    Args:
-        device: open; it is not closed.
-        played: whether scans of a file are shown at their own times, or as fast as possible.
-        speed: of a file that is played, as a multiple of its own.
-        select: the scans to take; by default all.
-        ahead: seconds of a file that is played that are read at once; None for as many as are
-            decoded fastest.
-
-    Attributes:
-        speed: may be changed while a file is played.
-        packets: the batch that was read last, None if nothing came.
-        scans: the scans, and pieces of scans, of the last `read` or `step`.
-        scan: the newest whole scan; before there is one, the newest piece.
-        number: how often `scan` has changed.
-        meter: counts packets and scans.
     """
 
     def __init__(
@@ -84,8 +85,8 @@ class LiveScans:
         self._has_counted = False
         self._is_read_out = False
         self._plays_in_real_time = played and not device.is_live
-        self._waiting = deque[Scan]()  # scans of a file, until they are due
-        self._due: float | None = None  # when the last scan was, by `time.monotonic`
+        self._waiting = deque[Scan]()  # scans of a played file that are not due yet
+        self._due: float | None = None  # when the last scan was due, by `time.monotonic`
         self._last_stamp_ns = 0
         self._read_ahead_s = ahead if self._plays_in_real_time else None
         self._portion = MIN_PORTION_BYTES
@@ -94,12 +95,12 @@ class LiveScans:
 
     @property
     def ended(self) -> bool:
-        """Whether the input has ended and every scan was shown."""
+        """Whether the input has ended and all scans were shown."""
         return self._is_read_out and not self._waiting
 
     @property
     def times_ns(self) -> Times:
-        """The times of the packets that were read last, ns: of arrival, or else their own."""
+        """The arrival times of the packets that were read last, or else their times, ns."""
         if self.packets is None:
             return np.zeros(0, np.int64)
         if self.packets.host_ns.any():
@@ -107,11 +108,11 @@ class LiveScans:
         return self.packets.time_ns
 
     def read(self, until: float) -> None:
-        """Read until a time of `time.monotonic`, or the end; at least once.
+        """Read at least once, until a time of `time.monotonic` or the end of the input.
 
         Raises:
             LidarSpecError: if the source fails.
-            UsageError: if the input ends and no scan of it was selected.
+            UsageError: if the input has ended and contained no selected scan.
         """
         self.scans = []
         while not self.ended:
@@ -127,7 +128,7 @@ class LiveScans:
 
         Raises:
             LidarSpecError: if the source fails.
-            UsageError: if the input ends and no scan of it was selected.
+            UsageError: if the input has ended and contained no selected scan.
         """
         self.scans = []
         number = self.number
@@ -136,15 +137,15 @@ class LiveScans:
                 self._show_next()
             else:
                 self._read()
-        self.read_rest()
+        self.stop_clock()
 
-    def read_rest(self) -> None:
-        """Stop the clock of a file that is played; call it while the picture does not change."""
+    def stop_clock(self) -> None:
+        """Stop the clock of a played file, while the picture does not change."""
         self._due = None
 
     def _read(self) -> None:
-        """Read the next batch, or the end."""
-        # Figures begin with the first selected packet, but with the counters before it was read.
+        """Read the next batch, or handle the end of the input."""
+        # Figures begin with the first selected packet, and the counters before it was read.
         if self._has_counted:
             meter = self.meter
         else:
@@ -181,7 +182,7 @@ class LiveScans:
             raise self._sieve.missing()
 
     def _adjust_portion(self, packets: Packets, ahead: float) -> None:
-        """Read about as much at once as is shown in some seconds."""
+        """Adjust the size of a read to `ahead` seconds of recorded time."""
         portion = self._portion
         duration_s = (int(packets.time_ns[-1]) - int(packets.time_ns[0])) * 1e-9
         if duration_s < ahead / 2 and portion < BATCH_BYTES:
@@ -193,7 +194,7 @@ class LiveScans:
             self.device.read_ahead(portion)
 
     def _make_meter(self) -> RateMeter:
-        """Return a meter that counts from now on."""
+        """Return a new meter, which counts from now on."""
         return RateMeter(self.device.stats, counts_losses=self.device.sensor.counts_losses)
 
     def _select_packets(self, packets: Packets) -> Packets:
@@ -210,7 +211,7 @@ class LiveScans:
         return packets.take(is_selected)
 
     def _store_scans(self, scans: list[Scan]) -> None:
-        """Show the selected ones of some scans, or keep them until they are due."""
+        """Show the selected scans, or keep them until they are due."""
         for scan in scans:
             if self._sieve.ended:
                 return
@@ -230,14 +231,14 @@ class LiveScans:
             self.number += 1
 
     def _show_when_due(self, until: float) -> None:
-        """Wait until the next scan of a file is due, and show it; or wait until a time."""
+        """Wait until the next scan of a file is due and show it, or wait until a time."""
         now = time.monotonic()
         if self._due is None:
             self._due = now
             self._show_next()
             return
-        # A reader that is late catches up by the longest pause at most.
-        due = max(self._due + self._step() / self.speed, now - MAX_STEP_S)
+        # If the reader is late, it catches up by at most the longest pause.
+        due = max(self._due + self._find_step() / self.speed, now - MAX_STEP_S)
         if due > until:
             time.sleep(max(until - now, 0.0))
             return
@@ -245,8 +246,8 @@ class LiveScans:
         self._due = due
         self._show_next()
 
-    def _step(self) -> float:
-        """Return the seconds from the last scan to the next, by their times."""
+    def _find_step(self) -> float:
+        """Return the seconds from the last scan to the next scan, by their stamps."""
         step = (self._waiting[0].stamp_ns - self._last_stamp_ns) * 1e-9
         if 0 < step <= MAX_STEP_S:
             return step

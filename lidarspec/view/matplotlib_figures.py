@@ -1,6 +1,6 @@
 """Draw figures for reports with matplotlib.
 
-They show a scan to scale, its intensities, ranges over time, and rates of a source over time.
+They show a scan to scale, a histogram of intensities, ranges over time, and rates over time.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ from lidarspec.view.rate_meter import totals
 
 #: supported suffixes of `save`.
 SUFFIXES = (".png", ".pdf", ".svg")
-#: in inches: the width of a figure, the height of a panel, and the limits of the side view; dots
-#: per inch.
-WIDTH = 7.0
-PANEL = 4.2
-LOWEST = 0.7
-HIGHEST = 3.0
+#: width of a figure and height of a panel.
+WIDTH_INCHES = 7.0
+PANEL_INCHES = 4.2
+#: limits of the height of the side view.
+MIN_SIDE_INCHES = 0.7
+MAX_SIDE_INCHES = 3.0
 DPI = 160
-#: maximum bins of a histogram, of ranges, and of time; the smallest bin of time in seconds.
-BINS = 128
-NEAR = 200
-MOMENTS = 400
-NARROWEST = 0.1
-#: the percentile of the ranges that the axis shows.
-MOST = 99.8
-#: steps of the colour ramp.
-COLOURS = 256
+#: maximum number of bins of intensities, of ranges, and of time.
+MAX_INTENSITY_BINS = 128
+RANGE_BINS = 200
+MAX_TIME_BINS = 400
+#: the shortest bin of time.
+MIN_TIME_BIN_S = 0.1
+#: the axis of ranges shows this percentile.
+SHOWN_PERCENTILE = 99.8
+#: number of steps of the colour ramp.
+COLOUR_COUNT = 256
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -57,7 +58,7 @@ _Drawing = TypeVar("_Drawing", bound=Callable[..., Any])
 
 
 def _with_style(draw: _Drawing) -> _Drawing:
-    """Return a function that draws in the style of these figures."""
+    """Decorate a function to draw in the style of these figures."""
 
     @functools.wraps(draw)
     def drawn(*args: Any, **options: Any) -> Any:
@@ -80,9 +81,9 @@ def save(figure: Any, target: Any, suffix: str) -> None:
 
 @_with_style
 def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
-    """Draw a scan from above, forward up, to scale.
+    """Draw a scan to scale, from above with forward up.
 
-    Unless it is flat, it is also drawn from its right side.
+    If the appearance is not flat, the view from the right side is drawn as well.
     """
     cloud = scan.points[scan.points.valid]
     column: Any
@@ -99,13 +100,19 @@ def draw_scan(scan: Scan, look: CloudAppearance, title: str) -> Any:
     if look.flat:
         tall = 0.0
     else:
-        tall = float(np.clip((high - low) / (2 * look.reach) * WIDTH * 0.85, LOWEST, HIGHEST))
-    figure = _figure(title, WIDTH * 0.92 + tall)
+        tall = float(
+            np.clip(
+                (high - low) / (2 * look.reach) * WIDTH_INCHES * 0.85,
+                MIN_SIDE_INCHES,
+                MAX_SIDE_INCHES,
+            )
+        )
+    figure = _make_figure(title, WIDTH_INCHES * 0.92 + tall)
     rows = figure.subplots(
         1 if look.flat else 2,
         1,
         squeeze=False,
-        height_ratios=[WIDTH * 0.75, *[tall] * (not look.flat)],
+        height_ratios=[WIDTH_INCHES * 0.75, *[tall] * (not look.flat)],
     )[:, 0]
     dots = {
         "c": column,
@@ -138,24 +145,24 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
     """Draw the histogram of the intensities.
 
     Raises:
-        UsageError: if the sensor has none.
+        UsageError: if the sensor has no intensities.
     """
     counted = Counter[float]()
     for scan in scans:
         if scan.points.intensity is not None:
-            values, numbers = np.unique(
+            values, value_counts = np.unique(
                 np.rint(scan.points.intensity[scan.points.valid]), return_counts=True
             )
-            counted.update(dict(zip(values.tolist(), numbers.tolist(), strict=True)))
+            counted.update(dict(zip(values.tolist(), value_counts.tolist(), strict=True)))
     if not counted:
         raise UsageError("the points have no intensity")
     strengths, counts = np.array(sorted(counted.items())).T
     middle = strengths[np.searchsorted(np.cumsum(counts), counts.sum() / 2)]
-    figure = _figure(f"{title}: {int(counts.sum()):,} returns")
+    figure = _make_figure(f"{title}: {int(counts.sum()):,} returns")
     axes = figure.subplots()
     low = min(float(strengths[0]), 0.0)
     high = float(strengths[-1]) + 1
-    width = max(np.ceil((high - low) / BINS), 1.0)
+    width = max(np.ceil((high - low) / MAX_INTENSITY_BINS), 1.0)
     axes.hist(strengths, bins=np.arange(low, high + width, width), weights=counts, color="C0")
     axes.axvline(float(middle) + 0.5, color="C1", label=f"median {middle:g}")
     axes.set(
@@ -165,42 +172,46 @@ def draw_intensities(scans: Iterable[Scan], title: str) -> Any:
         xlim=(low, high + width),
         ylim=(0.5, None),
     )
-    _legend(axes)
+    _draw_legend(axes)
     return figure
 
 
 @_with_style
 def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
-    """Draw the number of returns by range over time, and the median.
+    """Draw the number of returns by range over time, and the median range.
 
-    If there are many scans, an even selection is shown.
+    If there are many scans, only every n-th scan is shown.
 
     Args:
-        scans: at least one.
+        scans: at least one scan.
+        title: the title of the figure.
     """
-    every = list[tuple[int, NDArray[np.float32], bool]]()
+    kept = list[tuple[int, NDArray[np.float32], bool]]()
     step = 1
     number = 0
     for number, scan in enumerate(scans, 1):
         if (number - 1) % step == 0:
-            every.append((scan.stamp_ns, scan.points.range[scan.points.valid], scan.whole))
-        if len(every) == 2 * MOMENTS:  # limits memory for any duration
-            every = every[::2]
+            kept.append((scan.stamp_ns, scan.points.range[scan.points.valid], scan.whole))
+        if len(kept) == 2 * MAX_TIME_BINS:  # limits memory for any duration
+            kept = kept[::2]
             step = 2 * step
-    every = [one for one in every if one[2]] or every  # incomplete scans have fewer returns
+    whole = [entry for entry in kept if entry[2]]
+    every = whole or kept  # incomplete scans have fewer returns
     if any(len(ranges) for _, ranges, _ in every):
-        farthest = np.percentile(np.concatenate([ranges for _, ranges, _ in every]), MOST)
+        farthest = np.percentile(
+            np.concatenate([ranges for _, ranges, _ in every]), SHOWN_PERCENTILE
+        )
     else:
         farthest = 1.0
-    edges = np.linspace(0, float(farthest) * 1.05, NEAR + 1)
+    edges = np.linspace(0, float(farthest) * 1.05, RANGE_BINS + 1)
     times = np.array([(stamp - every[0][0]) * 1e-9 for stamp, *_ in every])
     order = np.argsort(times, kind="stable")
     if len(times) > 1:
         last = float(np.median(np.diff(times[order])))
     else:
-        last = NARROWEST
+        last = MIN_TIME_BIN_S
     counts = np.stack([np.histogram(every[which][1], edges)[0] for which in order], axis=1)
-    figure = _figure(
+    figure = _make_figure(
         f"{title}: {number:,} scans" + f", of which one in {step} is shown" * (step > 1)
     )
     axes = figure.subplots()
@@ -219,25 +230,27 @@ def draw_ranges(scans: Iterable[Scan], title: str) -> Any:
     ]
     axes.plot(times[order] + last / 2, medians, color="C3", linewidth=1, label="median")
     axes.set(xlabel="time from the first scan [s]", ylabel="range [m]", ylim=(0, edges[-1]))
-    _legend(axes)
+    _draw_legend(axes)
     figure.colorbar(shown, label=f"returns per scan, in bins of {edges[1]:.2g} m", pad=0.02)
     return figure
 
 
 @_with_style
 def draw_rates(rates: RateSeries, title: str) -> Any:
-    """Draw packets and scans per second, and the lost and invalid shares, over time.
+    """Draw packets and scans per second, and lost and invalid shares, over time.
 
     Raises:
-        UsageError: if packets have no times.
+        UsageError: if the packets have no times.
     """
     seconds, (packets, lost, wrong) = rates.series()
-    figure = _figure(f"{title}: {int(rates.totals[0].sum()):,} packets", 2 * PANEL * 0.8)
+    figure = _make_figure(
+        f"{title}: {int(rates.totals[0].sum()):,} packets", 2 * PANEL_INCHES * 0.8
+    )
     panels = figure.subplots(4, 1, sharex=True)
     for axes, values, label in (
         (panels[0], packets / rates.width, "packets [1/s]"),
-        (panels[2], _share(lost, packets), "lost [%]"),
-        (panels[3], _share(wrong, packets), "invalid [%]"),
+        (panels[2], _percentage(lost, packets), "lost [%]"),
+        (panels[3], _percentage(wrong, packets), "invalid [%]"),
     ):
         axes.stairs(values, seconds, baseline=None, color="C0", linewidth=1.2, clip_on=False)
         axes.set(ylabel=label, ylim=(0, max(float(np.nanmax(values, initial=0)) * 1.15, 1.0)))
@@ -259,33 +272,33 @@ def draw_rates(rates: RateSeries, title: str) -> Any:
 class RateSeries:
     """Counts of packets, losses and invalid frames in even steps of time.
 
-    The time is that of arrival, else that of the sensor's clock.
+    The times are arrival times, or times of the sensor's clock if arrival times are unknown.
 
     Args:
-        feed: is read to its end, or until a time.
+        live: the scans of an open device, which are read to the end, or until a time.
         until: a time of `time.monotonic`.
 
     Attributes:
-        width: of a step, seconds.
-        totals: (3, n): packets, lost packets and invalid frames in each step. Losses and invalid
-            frames are counted per batch of packets, and spread over it.
-        scans: seconds from the first packet, and rate, of each whole scan.
+        width: the length of a step, in seconds.
+        totals: packets, lost packets and invalid frames in each step, (3, n). Losses and invalid
+            frames are counted per batch of packets, and distributed over the batch.
+        scans: for each whole scan: seconds from the first packet, and scans per second.
     """
 
-    def __init__(self, feed: LiveScans, until: float) -> None:
-        self._feed = feed
+    def __init__(self, live: LiveScans, until: float) -> None:
+        self._live = live
         self._first = 0
-        self._before = totals(feed.device.stats)
-        self.width = NARROWEST
+        self._before = totals(live.device.stats)
+        self.width = MIN_TIME_BIN_S
         self.totals = np.zeros((3, 1))
         self._last = 0.0
         self.scans = list[tuple[float, float]]()
-        while not feed.ended and time.monotonic() < until:
-            feed.read(0.0)
+        while not live.ended and time.monotonic() < until:
+            live.read(0.0)
             self._take()
             self.scans += [
                 (self._seconds(scan.host_ns or scan.stamp_ns), scan.rate_hz)
-                for scan in feed.scans
+                for scan in live.scans
                 if scan.whole
             ]
 
@@ -294,8 +307,8 @@ class RateSeries:
         return (at - self._first) * 1e-9
 
     def _take(self) -> None:
-        """Count the last batch of the feed."""
-        packets = self._feed.packets
+        """Count the last batch."""
+        packets = self._live.packets
         if packets is None or not len(packets):
             return
         if packets.host_ns.any():
@@ -303,7 +316,7 @@ class RateSeries:
         else:
             times = packets.time_ns
         self._first = self._first or int(times[0])
-        after = totals(self._feed.device.stats)
+        after = totals(self._live.device.stats)
         lost, wrong = (after[name] - self._before[name] for name in ("lost", "rejected"))
         self._before = after
         steps = np.maximum((times - self._first) * (1e-9 / self.width), 0).astype(np.intp)
@@ -316,12 +329,12 @@ class RateSeries:
     def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the edges of the steps, (n + 1,) seconds, and their counts, (3, n).
 
-        The last step is left out, because it is incomplete.
+        The last step is omitted, because it is incomplete.
         """
         if self._last < self.width:
-            raise UsageError(f"{self._feed.device.source}: packets have no times, or all the same")
+            raise UsageError(f"{self._live.device.source}: packets have no times, or all the same")
         full = max(int(self._last / self.width), 1)
-        joined = -(-full // MOMENTS)
+        joined = -(-full // MAX_TIME_BINS)
         counts = self.totals[:, : max(full // joined, 1) * joined]
         counts = np.add.reduceat(counts, np.arange(0, counts.shape[1], joined), axis=1)
         self.width = round(self.width * joined, 6)
@@ -329,25 +342,27 @@ class RateSeries:
 
 
 def colour_map() -> Any:
-    """Return the colours of values on white paper, for matplotlib."""
+    """Return the colour map of matplotlib for a white background."""
     colours = import_library("matplotlib.colors", "plot")
-    return colours.ListedColormap([to_hex(rgb) for rgb in make_ramp("light", COLOURS)], "lidarspec")
+    return colours.ListedColormap(
+        [to_hex(rgb) for rgb in make_ramp("light", COLOUR_COUNT)], "lidarspec"
+    )
 
 
-def _legend(axes: Any) -> None:
-    """Draw the legend above the axes, outside of the data."""
+def _draw_legend(axes: Any) -> None:
+    """Draw the legend above the axes, where it hides no data."""
     axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 0.99), borderpad=0.2)
 
 
-def _share(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return percentages."""
-    every = some + others
-    return np.asarray(np.divide(100 * some, every, out=np.full(len(some), np.nan), where=every > 0))
+def _percentage(part: NDArray[np.float64], rest: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return `part` in percent of `part` and `rest`; nan if both are 0."""
+    total = part + rest
+    return np.asarray(np.divide(100 * part, total, out=np.full(len(part), np.nan), where=total > 0))
 
 
-def _figure(title: str, height: float = PANEL) -> Any:
+def _make_figure(title: str, height: float = PANEL_INCHES) -> Any:
     figure = import_library("matplotlib.figure", "plot").Figure(
-        figsize=(WIDTH, height), layout="constrained"
+        figsize=(WIDTH_INCHES, height), layout="constrained"
     )
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     return figure

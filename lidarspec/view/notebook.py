@@ -1,9 +1,9 @@
 """HTML and SVG for notebooks.
 
-Scans and clouds are pictures, packets and explained frames tables, sensors packet diagrams.
-`lidarspec.notebook_display` calls the functions here by the kind of value. Their output is limited
-in size, escaped, and readable on light and dark pages: pictures have their own background, tables
-use the text colour of the page.
+Scans and clouds are shown as pictures, packets and explained frames as tables, sensors as packet
+diagrams. `lidarspec.notebook_display` calls the function for the kind of value. The output is
+escaped and limited in size. It is readable on light and dark pages: pictures have a background, and
+tables use the text colour of the page.
 """
 
 from __future__ import annotations
@@ -28,51 +28,55 @@ from lidarspec.sensor_operations import Sensor
 from lidarspec.spec.tree import FieldInfo
 from lidarspec.view.svg import svg
 
-#: size of a picture in pixels, and the maximum number of dots of a view.
-SIDE = 520
-DOTS = 12_000
-#: rows of packets at the beginning and at the end, maximum number of fields, and of rows of an
-#: explanation.
-ENDS = 5
-FIELDS = 24
-ROWS = 200
-#: degrees of hue between fields, and the height in pixels above which a table scrolls.
-HUE = 67
-TALL = 640
+#: size of a picture.
+PICTURE_PX = 520
+#: maximum number of dots of a view.
+MAX_DOTS = 12_000
+#: number of packets that are shown from the beginning, and from the end.
+END_ROWS = 5
+#: maximum number of fields of packets.
+MAX_FIELDS = 24
+#: maximum number of rows of an explanation.
+MAX_ROWS = 200
+#: difference of hue between two fields.
+HUE_STEP_DEG = 67
+#: higher tables scroll.
+MAX_TABLE_PX = 640
 _CELL = "text-align:{align};white-space:nowrap;padding:1px 8px;vertical-align:top"
 
 
 def scan(value: Scan) -> str:
-    """Return a scan from above, and from the side unless it is flat, as SVG."""
-    return _picture(value.points, f"{value.sensor.id}: {value}")
+    """Return a scan as SVG, from above, and if it is not flat also from the side."""
+    return _make_picture(value.points, f"{value.sensor.id}: {value}")
 
 
 def cloud(value: PointCloud) -> str | None:
-    """Return a cloud as SVG, None for a single point."""
+    """Return a cloud as SVG; None for a single point."""
     if np.ndim(value.x):
-        return _picture(value, str(value))
+        return _make_picture(value, str(value))
     return None
 
 
 def packets(value: Packets) -> str:
     """Return the first and the last packets as an HTML table.
 
-    It has offset, times and fields in their units; for arrays, number and span.
+    Its columns are offset, times, and fields in their units; an array is shown as the number and
+    the range of its values.
     """
     fields = {path: info for path, info in value.table.schema.fields.items() if info.const is None}
-    shown = dict(list(fields.items())[:FIELDS])
+    shown = dict(list(fields.items())[:MAX_FIELDS])
     columns: dict[str, list[str]] = {
-        "offset": [str(place) for place in value.offset[_ends(len(value))].tolist()]
+        "offset": [str(offset) for offset in value.offset[_end_indices(len(value))].tolist()]
     }
-    columns["time [s]"] = _since(value.time_ns)
+    columns["time [s]"] = _format_times(value.time_ns)
     if value.host_ns.any():
-        columns["arrival [s]"] = _since(value.host_ns)
-    ends = value.take(_ends(len(value)))
+        columns["arrival [s]"] = _format_times(value.host_ns)
+    ends = value.take(_end_indices(len(value)))
     for path, info in shown.items():
-        columns[f"{path} [{info.unit}]" if info.unit else path] = _values(ends[path], info)
+        columns[f"{path} [{info.unit}]" if info.unit else path] = _format_field(ends[path], info)
     rows = [list(row) for row in zip(*columns.values(), strict=True)]
-    if len(value) > 2 * ENDS:
-        rows.insert(ENDS, ["⋮"] * len(columns))
+    if len(value) > 2 * END_ROWS:
+        rows.insert(END_ROWS, ["⋮"] * len(columns))
     more = f"; {len(fields) - len(shown)} further fields" * (len(fields) > len(shown))
     if len(value):
         first = (
@@ -80,7 +84,7 @@ def packets(value: Packets) -> str:
         )
     else:
         first = ""
-    return _table(
+    return _make_table(
         f"{value}{first}{more}",
         list(columns),
         [[escape(cell) for cell in row] for row in rows],
@@ -94,12 +98,12 @@ def explanation(value: Explanation) -> str:
     Invalid values are red.
     """
     rows = []
-    for number, row in enumerate(value.rows[:ROWS]):
+    for number, row in enumerate(value.rows[:MAX_ROWS]):
         indent = "&nbsp;" * 2 * len(parents(row.path))
         name = escape(row.path.rpartition(".")[2])
         meaning = escape(printable(row.meaning))
         if row.right:
-            tint = f"hsl({number * HUE % 360} 70% 50% / .25)"
+            tint = f"hsl({number * HUE_STEP_DEG % 360} 70% 50% / .25)"
         else:
             tint = "hsl(0 90% 50% / .55)"
         data = "<br>".join(
@@ -120,26 +124,26 @@ def explanation(value: Explanation) -> str:
         )
     notes = [
         *value.notes,
-        *[f"{len(value.rows) - ROWS} further rows: print(...) shows them"]
-        * (len(value.rows) > ROWS),
+        *[f"{len(value.rows) - MAX_ROWS} further rows: print(...) shows them"]
+        * (len(value.rows) > MAX_ROWS),
     ]
     title = f"{value.sensor} {value.frame or 'skipped'}, {len(value.data)} bytes: {value.verdict}"
-    return _table("; ".join([title, *notes]), ["offset", "bytes", "field", "meaning"], rows)
+    return _make_table("; ".join([title, *notes]), ["offset", "bytes", "field", "meaning"], rows)
 
 
 def sensor(value: Sensor) -> str:
-    """Return the packet diagrams of a sensor as HTML; only those of data are open."""
+    """Return the packet diagrams of a sensor as HTML; only data frames are open."""
     head = (
         f"<b>{escape(printable(f'{value.vendor} {value.model}'))}</b>"
         f" <code>{escape(value.id)}</code>, verified by {escape(value.status)}"
     )
     source = f'<div style="opacity:.75">{escape(printable(value.source))}</div>'
     return "\n".join(
-        [f"<div>{head}{source}</div>", *(_diagram(value, name) for name in value.frames)]
+        [f"<div>{head}{source}</div>", *(_make_diagram(value, name) for name in value.frames)]
     )
 
 
-def _diagram(sensor: Sensor, name: str) -> str:
+def _make_diagram(sensor: Sensor, name: str) -> str:
     frame = sensor.frames[name]
     try:
         drawn = diagram(select_frame(sensor, name))
@@ -151,16 +155,20 @@ def _diagram(sensor: Sensor, name: str) -> str:
     )
 
 
-def _picture(points: PointCloud, title: str) -> str:
+def _make_picture(points: PointCloud, title: str) -> str:
     return svg(
-        points, fit_to_points(points, choose_appearance(points)), title, side=SIDE, most=DOTS
+        points,
+        fit_to_points(points, choose_appearance(points)),
+        title,
+        side=PICTURE_PX,
+        most=MAX_DOTS,
     )
 
 
-def _ends(number: int) -> NDArray[np.intp]:
-    """Return the indices of the first and the last rows."""
+def _end_indices(count: int) -> NDArray[np.intp]:
+    """Return the indices of the first and the last of `count` rows."""
     return np.array(
-        [index for index in range(number) if index < ENDS or index >= number - ENDS], np.intp
+        [index for index in range(count) if index < END_ROWS or index >= count - END_ROWS], np.intp
     )
 
 
@@ -170,41 +178,43 @@ def _clock(packets: Packets) -> str:
     return "sensor's"
 
 
-def _since(times: NDArray[np.int64]) -> list[str]:
-    """Return times of the first and the last packets, in seconds since the first.
+def _format_times(times: NDArray[np.int64]) -> list[str]:
+    """Return the times of the first and the last packets, in seconds since the first.
 
     An unknown time is "-".
     """
     return [
         f"{(at - int(times[0])) * 1e-9:.6f}" if at else "-"
-        for at in times[_ends(len(times))].tolist()
+        for at in times[_end_indices(len(times))].tolist()
     ]
 
 
-def _values(column: NDArray[np.float64], info: FieldInfo) -> list[str]:
-    """Return a field of some packets, (n, ...), as text."""
+def _format_field(column: NDArray[np.float64], info: FieldInfo) -> list[str]:
+    """Return the values of a field, (n, ...), as a text for each packet."""
     if info.kind == "bytes":
         return [f"{row.size} bytes" for row in column]
-    return [_number(float(row)) if not row.ndim else _span(row) for row in column]
+    return [_format_number(float(row)) if not row.ndim else _format_span(row) for row in column]
 
 
-def _span(values: NDArray[np.float64]) -> str:
+def _format_span(values: NDArray[np.float64]) -> str:
     finite = values[np.isfinite(values)]
     if len(finite):
-        return f"{len(finite)} x {_number(float(finite.min()))} to {_number(float(finite.max()))}"
+        low = _format_number(float(finite.min()))
+        high = _format_number(float(finite.max()))
+        return f"{len(finite)} x {low} to {high}"
     return "-"
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     if math.isfinite(value):
         return f"{value:.10g}"
     return "-"
 
 
-def _table(
+def _make_table(
     caption: str, heads: Iterable[str], rows: Iterable[Sequence[str]], *, align: str = "left"
 ) -> str:
-    """Return an HTML table; cells are HTML, caption and heads are text."""
+    """Return an HTML table; cells are HTML, but caption and heads are plain text."""
     cell = _CELL.format(align=align)
     head = "".join(f'<th style="{cell}">{escape(printable(name))}</th>' for name in heads)
     body = "\n".join(
@@ -212,8 +222,8 @@ def _table(
         for row in rows
     )
     return (
-        f'<div style="overflow:auto;max-height:{TALL}px;font-size:90%"><div style="padding:0 8px'
-        f' 4px">{escape(printable(caption))}</div>'
+        f'<div style="overflow:auto;max-height:{MAX_TABLE_PX}px;font-size:90%">'
+        f'<div style="padding:0 8px 4px">{escape(printable(caption))}</div>'
         "<table"
         f' style="border-collapse:collapse"><thead><tr>{head}</tr></thead>\n'
         f"<tbody>{body}</tbody></table></div>"

@@ -1,7 +1,7 @@
 """The interface of the server of `lidarspec view --web`, which is a plugin.
 
-The page and its server are a distribution of their own, `lidarspec-web`, because only they need a
-web framework.
+The page and its server are a separate distribution, `lidarspec-web`, because only they need a web
+framework.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ DISTRIBUTION = "lidarspec-web"
 
 
 class PageServer(AbstractContextManager["PageServer"], Protocol):
-    """Serves the page of a source while its context lasts, and then closes the source."""
+    """Serves the page of a source; a context manager that closes the source at its end."""
 
     @property
     def link(self) -> str:
@@ -34,21 +34,23 @@ class PageServer(AbstractContextManager["PageServer"], Protocol):
 
     @property
     def recordings(self) -> Sequence[tuple[str, int]]:
-        """Path of each recording that pages have made, and the bytes of the wire in it."""
+        """The recordings that pages have made: path, and number of recorded bytes."""
 
     @property
     def trouble(self) -> str:
-        """The reason why the last recording could not be started or written, "" if it could."""
+        """The reason why the last recording could not be written; "" if it could."""
 
     def opening_page(self) -> str:
-        """Return the URL of a file that leads to the link, to start a browser with.
+        """Write a file that redirects to `link`, and return its URL for a browser.
+
+        The command line of a browser is visible to other users, so it must not contain the token.
 
         Raises:
-            OSError: if it cannot be written.
+            OSError: if the file cannot be written.
         """
 
     def run(self, duration_s: float | None) -> None:
-        """Read the source for some time; None: until it is interrupted.
+        """Read the source for some seconds; if None, until an interrupt.
 
         Raises:
             LidarSpecError: if the source fails.
@@ -65,7 +67,16 @@ def open_page_server(
     control: bool,
     report: Callable[[str], None],
 ) -> PageServer:
-    """Open a source and return the server of its page, which the hook `lidarspec_page` makes.
+    """Open a source, and return the server of its page from the hook `lidarspec_page`.
+
+    Args:
+        source: the SOURCE.
+        sensor: the sensor, or its id; None to detect it.
+        selection: the scans to show.
+        host: the address to listen on.
+        port: the port to listen on; 0 for any free port.
+        control: whether pages may send commands.
+        report: called with messages for the user.
 
     Raises:
         UsageError: if no plugin serves the page.

@@ -1,6 +1,6 @@
 """Draw clouds in character cells, from above with range rings.
 
-Forward is up, and left is left. 3D clouds are also drawn from the right side.
+Forward is up; the view is not mirrored. 3D clouds are also drawn from the right side.
 """
 
 from __future__ import annotations
@@ -12,30 +12,31 @@ from numpy.typing import NDArray
 
 from lidarspec.points.appearance import MOST, CloudAppearance, ramp_positions, ring_step
 from lidarspec.points.cloud import PointCloud
-from lidarspec.view.canvas import ACROSS, DOWN, FAINT, LABEL, STRONG, Canvas, CellGrid
+from lidarspec.view.canvas import DOTS_ACROSS, DOTS_DOWN, FAINT, LABEL, STRONG, Canvas, CellGrid
 
-#: dots between two dots of a ring.
-RING_GAP = 4
-#: share of the height for the view from above if there are two views.
-ABOVE = 0.62
-#: possible exaggerations of heights, and the maximum share of the side view that they fill.
-HEIGHTS = (1, 2, 5, 10)
-FILLED = 0.9
+#: distance between two dots of a ring, in dots.
+RING_GAP_DOTS = 4
+#: share of the height of the window for the view from above, if there are two views.
+TOP_VIEW_SHARE = 0.62
+#: possible exaggerations of heights in the side view.
+HEIGHT_FACTORS = (1, 2, 5, 10)
+#: maximum share of the side view that the heights fill.
+MAX_FILLED_SHARE = 0.9
 
 
 def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppearance) -> CellGrid:
-    """Return the cloud in `width` by `height` cells, from above.
+    """Draw a cloud from above, in `width` by `height` cells.
 
-    Unless the look is flat, the view from its right side is below.
+    If the appearance is not flat, the view from the right side is below.
     """
     cloud = points[points.valid]
     if look.flat:
-        return _from_above(cloud, width, height, look)
-    above = max(round((height - 1) * ABOVE), 1)
+        return _draw_from_above(cloud, width, height, look)
+    above = max(round((height - 1) * TOP_VIEW_SHARE), 1)
     whole = CellGrid.blank(width, height)
-    whole.paste(0, 0, _from_above(cloud, width, above, look))
-    side, scale = _from_side(
-        cloud, width, max(height - 1 - above, 1), look, _scale(width, above, look.reach)
+    whole.paste(0, 0, _draw_from_above(cloud, width, above, look))
+    side, scale = _draw_from_side(
+        cloud, width, max(height - 1 - above, 1), look, _find_scale(width, above, look.reach)
     )
     title = "─ from the right, forward is right" + (f", heights x{scale} " if scale > 1 else " ")
     whole.write(above, 0, title.ljust(width, "─"), FAINT)
@@ -44,15 +45,15 @@ def draw_cloud(points: PointCloud, *, width: int, height: int, look: CloudAppear
     return whole
 
 
-def _scale(width: int, height: int, reach: float) -> float:
-    """Return the dots per metre with which `reach` fits into half of the canvas."""
-    return (min(width * ACROSS, height * DOWN) - 1) / 2 / reach
+def _find_scale(width: int, height: int, reach: float) -> float:
+    """Return the scale, in dots per metre, with which `reach` fits into half a canvas."""
+    return (min(width * DOTS_ACROSS, height * DOTS_DOWN) - 1) / 2 / reach
 
 
-def _from_above(cloud: PointCloud, width: int, height: int, look: CloudAppearance) -> CellGrid:
+def _draw_from_above(cloud: PointCloud, width: int, height: int, look: CloudAppearance) -> CellGrid:
     canvas = Canvas(width, height, look.ramp)
-    scale = _scale(width, height, look.reach)
-    middle = _middle(canvas)
+    scale = _find_scale(width, height, look.reach)
+    middle = _find_middle(canvas)
     across = middle[0] + look.middle[1] * scale
     down = middle[1] + look.middle[0] * scale
     canvas.plot(across - cloud.y * scale, down - cloud.x * scale, ramp_positions(cloud, look))
@@ -63,10 +64,10 @@ def _from_above(cloud: PointCloud, width: int, height: int, look: CloudAppearanc
     ]
     for radius in radii:
         turn = np.linspace(
-            0, 2 * np.pi, max(round(2 * np.pi * radius * scale / RING_GAP), 8), endpoint=False
+            0, 2 * np.pi, max(round(2 * np.pi * radius * scale / RING_GAP_DOTS), 8), endpoint=False
         )
         canvas.line(across + radius * scale * np.sin(turn), down - radius * scale * np.cos(turn))
-    home = (math.floor(down) // DOWN, math.floor(across) // ACROSS)
+    home = (math.floor(down) // DOTS_DOWN, math.floor(across) // DOTS_ACROSS)
     canvas.label(*home, "▲", STRONG, over=True)
     _label_directions(canvas, home)
     for radius in radii:
@@ -84,10 +85,10 @@ def _label_directions(canvas: Canvas, home: tuple[int, int]) -> None:
 
 
 def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: float) -> None:
-    """Write the range of a ring at the first free one of its crossings with the axes."""
+    """Write the range of a ring at the first crossing with an axis that has room."""
     text = f"{radius:g} m"
-    across = round(radius * scale / ACROSS)
-    down = round(radius * scale / DOWN)
+    across = round(radius * scale / DOTS_ACROSS)
+    down = round(radius * scale / DOTS_DOWN)
     row, column = home
     places = [
         (row, column + across - len(text)),
@@ -95,23 +96,30 @@ def _label_ring(canvas: Canvas, home: tuple[int, int], radius: float, scale: flo
         (row + down, column + 1),
         (row, column - across + 1),
     ]
-    any(canvas.label(*place, text) for place in places)
+    for label_row, label_column in places:
+        if canvas.label(label_row, label_column, text):
+            return
 
 
-def _from_side(
+def _draw_from_side(
     cloud: PointCloud, width: int, height: int, look: CloudAppearance, scale: float
 ) -> tuple[CellGrid, int]:
     """Return the view from the right side, and the exaggeration of heights.
 
-    Forward is right. The heights are centred on the points.
+    Forward is right. The view is vertically centred on the points.
     """
     canvas = Canvas(width, height, look.ramp)
     inside = np.abs(cloud.x - look.middle[0]) <= canvas.dots.shape[1] / 2 / scale
-    low, high = _heights(cloud.z[inside])
+    low, high = _find_heights(cloud.z[inside])
     larger = max(
-        (n for n in HEIGHTS if (high - low) * scale * n <= canvas.dots.shape[0] * FILLED), default=1
+        (
+            n
+            for n in HEIGHT_FACTORS
+            if (high - low) * scale * n <= canvas.dots.shape[0] * MAX_FILLED_SHARE
+        ),
+        default=1,
     )
-    middle = _middle(canvas)
+    middle = _find_middle(canvas)
     across = middle[0] - look.middle[0] * scale
     level = middle[1] + (low + high) / 2 * scale * larger
     canvas.plot(
@@ -122,20 +130,22 @@ def _from_side(
     first, last = (math.ceil(((low + high) / 2 + end * half) / step) for end in (-1, 1))
     for number in range(first, last + 1):
         line = level - number * step * scale * larger
-        gap = RING_GAP if number == 0 else 4 * RING_GAP
+        gap = RING_GAP_DOTS if number == 0 else 4 * RING_GAP_DOTS
         columns = np.arange(0, canvas.dots.shape[1], gap, dtype=np.float64)
         canvas.line(columns, np.full(len(columns), line))
         canvas.label(
-            math.floor(line) // DOWN, 0, "z 0 m" if number == 0 else f"{number * step:+.4g} m"
+            math.floor(line) // DOTS_DOWN, 0, "z 0 m" if number == 0 else f"{number * step:+.4g} m"
         )
-    canvas.label(math.floor(level) // DOWN, math.floor(across) // ACROSS, "▶", STRONG, over=True)
+    canvas.label(
+        math.floor(level) // DOTS_DOWN, math.floor(across) // DOTS_ACROSS, "▶", STRONG, over=True
+    )
     return canvas.cells(), larger
 
 
-def _heights(z: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the lowest and highest height that the side view has to show.
+def _find_heights(z: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the lowest and highest height in the side view.
 
-    That includes most of the points, and the sensor.
+    It shows the sensor and most of the points.
     """
     if not len(z):
         return 0.0, 0.0
@@ -143,6 +153,9 @@ def _heights(z: NDArray[np.float32]) -> tuple[float, float]:
     return min(low, 0.0), max(high, 0.0)
 
 
-def _middle(canvas: Canvas) -> tuple[float, float]:
-    """Return the middle of a canvas in dots, across and down, in the middle of a cell."""
-    return canvas.width // 2 * ACROSS + ACROSS / 2, canvas.height // 2 * DOWN + DOWN / 2
+def _find_middle(canvas: Canvas) -> tuple[float, float]:
+    """Return column and row of the middle of the middle cell of a canvas, in dots."""
+    return (
+        canvas.width // 2 * DOTS_ACROSS + DOTS_ACROSS / 2,
+        canvas.height // 2 * DOTS_DOWN + DOTS_DOWN / 2,
+    )

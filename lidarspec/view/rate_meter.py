@@ -18,29 +18,29 @@ from lidarspec.framing.results import Counters
 from lidarspec.packets.packets import Packets
 from lidarspec.scans.scan import Scan
 
-#: number of scans for means and medians.
-KEPT_SCANS = 1 << 12
+#: maximum number of scans for means and medians.
+MAX_KEPT_SCANS = 1 << 12
 Seconds = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class MeterReading:
-    """Figures over some time; None if they are not known.
+    """Figures over some time; None for an unknown figure.
 
     Attributes:
         seconds: the duration.
-        speed_hz: scans per second, by their own times.
-        scans: whole scans.
-        packets: packets.
+        speed_hz: scans per second, by the times of the scans.
+        scans: number of whole scans.
+        packets: number of packets.
         packet_rate_hz: packets per second.
         points: points per scan.
         valid: points with a return, per scan.
-        error_rate: frames with a wrong checksum, length or value, as a share of all, from 0 to 1.
-        skipped_rate: bytes in no frame and no declared filler, as a share of all.
-        loss_rate: lost packets, as a share of all; None if they are not counted.
-        jitter_s: standard deviation of the time between arrivals of packets.
+        error_rate: the share of frames with a wrong checksum, length or value, from 0 to 1.
+        skipped_rate: the share of bytes that are not in frames and are not fillers, from 0 to 1.
+        loss_rate: the share of lost packets, from 0 to 1; None if losses are not counted.
+        jitter_s: standard deviation of the time between the arrivals of packets.
         longest_gap_s: the longest time between two arrivals.
-        bytes_per_s: of input.
+        bytes_per_s: bytes of input per second.
     """
 
     seconds: float | None
@@ -80,18 +80,18 @@ NOTHING = MeterReading(
 
 
 class RateTally:
-    """Counts packets and scans from some moment on.
+    """Counts packets and scans from its creation on.
 
     Args:
-        counters: of the decoder at this moment.
+        counters: the current counters of the decoder.
     """
 
     def __init__(self, counters: Counters) -> None:
         self._totals_before = totals(counters)
         self.scans = 0
         self.packets = 0
-        self._rates = deque[float](maxlen=KEPT_SCANS)
-        self._sizes = deque[tuple[int, int]](maxlen=KEPT_SCANS)  # points, and valid ones
+        self._rates = deque[float](maxlen=MAX_KEPT_SCANS)
+        self._sizes = deque[tuple[int, int]](maxlen=MAX_KEPT_SCANS)  # points, and valid ones
         self._gap_count = 0
         self._gap_sum = 0.0
         self._gap_square_sum = 0.0
@@ -102,9 +102,9 @@ class RateTally:
         """Count packets.
 
         Args:
-            count: how many.
+            count: number of packets.
             gaps: seconds from each packet to the next, (n,).
-            by_host: whether these are times of arrival, and not of the sensor's clock.
+            by_host: whether the gaps are between arrival times, not times of the sensor's clock.
         """
         self.packets += count
         self._is_by_host = by_host
@@ -127,8 +127,8 @@ class RateTally:
         """Return the figures up to now.
 
         Args:
-            counters: of the decoder now.
-            seconds: the duration by the caller's clock; by default that of the packets.
+            counters: the current counters of the decoder.
+            seconds: the duration by the caller's clock; None for the sum of the gaps.
             counts_losses: whether lost packets are counted (`Sensor.counts_losses`).
         """
         duration = seconds or self._gap_sum or None
@@ -157,7 +157,7 @@ class RateTally:
         return self._gap_sum > 0 and self._is_by_host
 
     def _packet_rate(self, duration: float | None) -> float | None:
-        """Return packets per second, by their own times if they have them."""
+        """Return packets per second, by the times of packets if they are known."""
         if self._gap_sum:
             return self._gap_count / self._gap_sum
         if duration:
@@ -170,10 +170,10 @@ class RateTally:
 
 
 class RateMeter:
-    """Counts packets and scans.
+    """Counts packets and scans, since the last reading and from the beginning.
 
     Args:
-        counters: of the decoder now.
+        counters: the current counters of the decoder.
         counts_losses: whether lost packets are counted (`Sensor.counts_losses`).
     """
 
@@ -184,7 +184,7 @@ class RateMeter:
         self._all = RateTally(counters)
 
     def packets(self, packets: Packets) -> None:
-        """Count a batch."""
+        """Count a batch of packets."""
         arrivals = packets.host_ns[packets.host_ns > 0]
         if len(arrivals):
             self._add(len(packets), arrivals, by_host=True)
@@ -195,12 +195,13 @@ class RateMeter:
         """Count frames of several types.
 
         Args:
-            arrivals: ascending times, ns.
+            count: number of frames.
+            arrivals: their arrival times, ascending, (n,) ns.
         """
         self._add(count, arrivals, by_host=True)
 
     def _add(self, count: int, times: NDArray[np.int64], *, by_host: bool) -> None:
-        """Count packets, and the intervals between their ascending times in ns."""
+        """Count packets, and the gaps between their times, which are ascending, (n,) ns."""
         previous = np.array([] if self._last_ns is None else [self._last_ns], np.int64)
         gaps = np.diff(np.concatenate([previous, times])) * 1e-9
         if len(times):
@@ -209,7 +210,7 @@ class RateMeter:
             tally.add_packets(count, gaps, by_host=by_host)
 
     def scan(self, scan: Scan) -> None:
-        """Count a whole scan; pieces of a scan say nothing about speed and points."""
+        """Count a scan; ignore pieces, because they do not show speed and points."""
         if not scan.whole:
             return
         valid = int(scan.points.valid.sum())
@@ -217,7 +218,7 @@ class RateMeter:
             tally.add_scan(len(scan), valid, scan.rate_hz)
 
     def reading(self, counters: Counters, seconds: float | None = None) -> MeterReading:
-        """Return the figures since the last reading, and begin the next one."""
+        """Return the figures since the last reading, and start a new reading."""
         reading = self._recent.reading(counters, seconds=seconds, counts_losses=self._counts_losses)
         self._recent = RateTally(counters)
         return reading
@@ -228,7 +229,7 @@ class RateMeter:
 
 
 def totals(counters: Counters) -> dict[str, int]:
-    """Return the counts that the rates of a reading are made of."""
+    """Return the counts from which the rates of a reading are calculated."""
     rejected = (
         counters.bad_checksum + counters.bad_length + counters.bad_constant + counters.implausible
     )
@@ -242,16 +243,22 @@ def totals(counters: Counters) -> dict[str, int]:
 
 
 def format_figure(value: float | None, form: str, factor: float = 1) -> str:
-    """Return a figure times a factor as text, "-" if it is not known."""
+    """Return a figure as text; "-" if it is unknown.
+
+    Args:
+        value: the figure; None if unknown.
+        form: the format, for `str.format`.
+        factor: the factor by which the figure is multiplied.
+    """
     if value is None or not math.isfinite(value):
         return "-"
     return form.format(value * factor)
 
 
-def _share(some: int, others: int) -> float:
-    total = some + others
+def _share(part: int, rest: int) -> float:
+    total = part + rest
     if total > 0:
-        return some / total
+        return part / total
     return 0.0
 
 

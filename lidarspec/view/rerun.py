@@ -10,22 +10,29 @@ from lidarspec.errors import UsageError, suggest, system_errors
 from lidarspec.formats.rerun import RerunRecording
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 
-#: seconds between two readings of the statistics, by the time of the scans.
-FIGURES = 1.0
-#: the statistics that are logged; those of a scan are logged with it.
-FIGURED = ("packet_rate_hz", "error_rate", "skipped_rate", "loss_rate", "jitter_s", "bytes_per_s")
-#: beginnings of a viewer's URL.
+#: time between two readings of the statistics, by the stamps of the scans.
+STATISTICS_PERIOD_S = 1.0
+#: the statistics that are logged, except the statistics of a scan, which are logged with the scan.
+STATISTICS = (
+    "packet_rate_hz",
+    "error_rate",
+    "skipped_rate",
+    "loss_rate",
+    "jitter_s",
+    "bytes_per_s",
+)
+#: schemes of the URL of a viewer.
 SCHEMES = ("rerun://", "rerun+http://", "rerun+https://")
 
 
-def show(feed: LiveScans, target: str, *, ramp: str = "range", until: float) -> None:
-    """Log scans and statistics as they arrive, until the feed ends or a time.
+def show(live: LiveScans, target: str, *, ramp: str = "range", until: float) -> None:
+    """Log scans and statistics as they arrive.
 
     Args:
-        feed: of the open device.
-        target: a file to write, the URL of a running viewer, or "" to open one here.
+        live: the scans of the open device.
+        target: a file to write, the URL of a running viewer, or "" to open a viewer.
         ramp: the column that colours show.
-        until: a time of `time.monotonic`.
+        until: a time of `time.monotonic` at which this ends, if the input does not end before.
 
     Raises:
         UsageError: if no viewer can be opened, or the Rerun SDK is not installed.
@@ -35,17 +42,17 @@ def show(feed: LiveScans, target: str, *, ramp: str = "range", until: float) -> 
         _open(log, target)
         read_at = time.monotonic()
         last = None
-        while not feed.ended and time.monotonic() < until:
-            feed.read(time.monotonic() + LOOK_S)
-            for scan in feed.scans:
+        while not live.ended and time.monotonic() < until:
+            live.read(time.monotonic() + LOOK_S)
+            for scan in live.scans:
                 log.scan(scan)
-                if last is None or not 0 <= scan.stamp_ns - last < FIGURES * 1e9:
+                if last is None or not 0 <= scan.stamp_ns - last < STATISTICS_PERIOD_S * 1e9:
                     now = time.monotonic()
-                    is_live = feed.device.is_live
-                    reading = feed.meter.reading(
-                        feed.device.stats, now - read_at if is_live else None
+                    is_live = live.device.is_live
+                    reading = live.meter.reading(
+                        live.device.stats, now - read_at if is_live else None
                     )
-                    log.figures({name: getattr(reading, name) for name in FIGURED})
+                    log.log_statistics({name: getattr(reading, name) for name in STATISTICS})
                     read_at = now
                     last = scan.stamp_ns
 

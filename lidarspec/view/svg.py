@@ -1,6 +1,6 @@
 """Draw a cloud as SVG, with the same views as in the terminal.
 
-The picture follows the colour scheme of the reader: light or dark.
+The picture has the colours of the reader's colour scheme, light or dark.
 """
 
 from __future__ import annotations
@@ -17,23 +17,25 @@ from lidarspec.points.appearance import STEPS, CloudAppearance, find_bounds, ram
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp, to_hex
 
-#: in pixels: a side of the view from above, the margins, the header, a line above each view, and a
-#: dot.
-SIDE = 720
-MARGIN = 24
-HEAD = 58
-LINE = 18
-DOT = 1.6
-#: maximum share of a side for heights, and the margin in pixels between the content and the edge of
-#: the view from above.
-HIGHEST = 0.45
-NEAR = 24
-#: height of a text above its base line, and the width of a character, in pixels.
-FONT_HEIGHT = 11
-CHARACTER_WIDTH = 6.7
-#: distances between dots in pixels; the first one with few enough dots is used.
-GRIDS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
-#: colours of background, lines, text and headings: on light and on dark pages.
+#: side of the view from above.
+SIDE_PX = 720
+#: margins of the picture.
+MARGIN_PX = 24
+HEADER_PX = 58
+#: height of the title of a view.
+VIEW_TITLE_PX = 18
+#: diameter of a dot.
+DOT_PX = 1.6
+#: maximum height of the side view, as a share of the side of the view from above.
+MAX_HEIGHT_SHARE = 0.45
+#: margin between the content and the edges of the view from above.
+VIEW_MARGIN_PX = 24
+#: height of a text above its base line.
+FONT_HEIGHT_PX = 11
+CHARACTER_WIDTH_PX = 6.7
+#: possible distances between dots; the first distance that gives few enough dots is used.
+GRIDS_PX = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
+#: colours of `_PARTS` on light and on dark pages.
 _LIGHT, _DARK = ("#fff", "#ddd", "#555", "#222"), ("#14161b", "#34373f", "#9ea3ae", "#e4e6eb")
 _PARTS = ("ground", "line", "text", "head")
 
@@ -43,60 +45,66 @@ def svg(
     look: CloudAppearance,
     title: str,
     *,
-    side: int = SIDE,
+    side: int = SIDE_PX,
     most: int | None = None,
 ) -> str:
     """Return a cloud as an SVG document, from above and from its right side.
 
-    A flat look has only the view from above.
+    If the appearance is flat, there is only the view from above.
 
     Args:
-        side: pixels of a side of the view from above.
-        most: maximum number of dots of a view: one dot may stand for several returns.
+        points: the cloud.
+        look: the appearance.
+        title: the title of the picture.
+        side: side of the view from above, in pixels.
+        most: maximum number of dots of a view, of which each may represent several returns; None
+            for no limit.
     """
     cloud = points[points.valid]
     views = _ViewDrawer(cloud, look, side, most, ramp_indices(cloud, look))
     if look.flat:
-        shown = [views.above()]
+        shown = [views.draw_from_above()]
     else:
-        shown = [views.above(), views.beside()]
-    width = side + 2 * MARGIN
-    top = HEAD
+        shown = [views.draw_from_above(), views.draw_from_side()]
+    width = side + 2 * MARGIN_PX
+    top = HEADER_PX
     body: list[str] = []
     for view in shown:
-        body.append(f'<text x="{MARGIN}" y="{top + 12}" {_style_of("text")}>{view.title}</text>')
+        body.append(f'<text x="{MARGIN_PX}" y="{top + 12}" {_style_of("text")}>{view.title}</text>')
         box = f'viewBox="0 {view.top:.0f} {side} {view.height:.0f}"'
         body += [
-            f'<svg x="{MARGIN}" y="{top + LINE}" width="{side}" height="{view.height:.0f}" {box}>',
+            f'<svg x="{MARGIN_PX}" y="{top + VIEW_TITLE_PX}" width="{side}"'
+            f' height="{view.height:.0f}" {box}>',
             *view.parts,
             "</svg>",
         ]
-        top += round(view.height) + LINE + MARGIN
+        top += round(view.height) + VIEW_TITLE_PX + MARGIN_PX
     drawn = " and ".join(f"{view.dots:,}" for view in shown)
     head = [
         (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {top}" width="{width}"'
             f' height="{top}" font-family="system-ui, sans-serif" font-size="12">'
         ),
-        f"<style>{_style()}</style>",
+        f"<style>{_make_style()}</style>",
         f'<rect width="100%" height="100%" {_style_of("ground")}/>',
-        f'<text x="{MARGIN}" y="26" font-size="14" {_style_of("head")}>{escape(title)}</text>',
-        f'<text x="{MARGIN}" y="48" {_style_of("text")}>'
+        f'<text x="{MARGIN_PX}" y="26" font-size="14" {_style_of("head")}>{escape(title)}</text>',
+        f'<text x="{MARGIN_PX}" y="48" {_style_of("text")}>'
         f"{len(cloud):,} returns as {drawn} dots</text>",
-        *_legend(look, width - MARGIN),
+        *_iter_legend(look, width - MARGIN_PX),
     ]
     return "\n".join([*head, *body, "</svg>"]) + "\n"
 
 
 @dataclass(frozen=True)
 class _View:
-    """A view.
+    """One view of a cloud.
 
     Attributes:
-        title: its title.
-        parts: its SVG elements.
-        top, height: its vertical range in pixels.
-        dots: the number of dots.
+        title: the title.
+        parts: the SVG elements.
+        top: the upper end of the view, in pixels.
+        height: the height of the view, in pixels.
+        dots: number of dots.
     """
 
     title: str
@@ -108,9 +116,13 @@ class _View:
 
 @dataclass(frozen=True)
 class _ViewDrawer:
-    """The views of a cloud of valid points, in pixels.
+    """Draws the views of a cloud.
 
     Attributes:
+        cloud: the valid points.
+        look: the appearance.
+        side: side of the view from above, in pixels.
+        most: maximum number of dots of a view; None for no limit.
         colours: the step of the ramp of each point, (n,).
     """
 
@@ -124,9 +136,11 @@ class _ViewDrawer:
     def _scale(self) -> float:
         return self.side / 2 / self.look.reach
 
-    def above(self) -> _View:
-        """Return rings with their ranges, axes, points, and the sensor; forward is up."""
-        scale, side, (forward, left) = self._scale, self.side, self.look.middle
+    def draw_from_above(self) -> _View:
+        """Draw rings with their ranges, axes, points, and the sensor; forward is up."""
+        scale = self._scale
+        side = self.side
+        forward, left = self.look.middle
         across = side / 2 + left * scale
         down = side / 2 + forward * scale
         step = ring_step(self.look.reach)
@@ -141,9 +155,9 @@ class _ViewDrawer:
             for radius in radii
         )
         rows = down - self.cloud.x * scale
-        dots, paths = self._dots(across - self.cloud.y * scale, rows, side)
-        top = max(min(float(rows.min(initial=down)), down) - NEAR, 0)
-        bottom = min(max(float(rows.max(initial=down)), down) + NEAR, side)
+        dots, paths = self._draw_dots(across - self.cloud.y * scale, rows, side)
+        top = max(min(float(rows.min(initial=down)), down) - VIEW_MARGIN_PX, 0)
+        bottom = min(max(float(rows.max(initial=down)), down) + VIEW_MARGIN_PX, side)
         labels = _Labels(side, top, bottom)
         labels.write("0°", [(across + 6, top + 12)])
         labels.write("90°", [(2, down - 4)])
@@ -170,15 +184,17 @@ class _ViewDrawer:
         ]
         return _View("from above, forward is up", parts, top, bottom - top, dots)
 
-    def beside(self) -> _View:
-        """Return heights with their labels, and points; forward is right."""
+    def draw_from_side(self) -> _View:
+        """Draw labelled lines of equal height, points, and the sensor; forward is right."""
         scale = self._scale
         side = self.side
         lowest, highest = find_bounds(self.cloud)
         low = min(float(lowest[2]), 0.0)
         high = max(float(highest[2]), 0.0)
         span = max(high - low, 1e-3)
-        larger = max((n for n in (1, 2, 5, 10) if span * scale * n <= HIGHEST * side), default=1)
+        larger = max(
+            (n for n in (1, 2, 5, 10) if span * scale * n <= MAX_HEIGHT_SHARE * side), default=1
+        )
         steep = scale * larger
         top = high + 0.05 * span
         height = span * 1.1 * scale * larger
@@ -194,7 +210,7 @@ class _ViewDrawer:
         for mark in marks:
             labels.write(f"z {mark:.4g} m", [(2, level - mark * steep - 3)])
         title = f"from the right, forward is right{f', heights x{larger}' if larger > 1 else ''}"
-        dots, paths = self._dots(
+        dots, paths = self._draw_dots(
             across + self.cloud.x * scale, level - self.cloud.z * steep, height
         )
         parts = [
@@ -205,17 +221,21 @@ class _ViewDrawer:
         ]
         return _View(title, parts, 0, height, dots)
 
-    def _dots(
+    def _draw_dots(
         self, across: NDArray[np.float32], down: NDArray[np.float32], height: float
     ) -> tuple[int, list[str]]:
-        """Return the number of dots, and a path of dots for each colour.
+        """Return the number of dots, and the SVG paths, one for each colour.
 
         The finest grid with few enough dots is used.
+
+        Args:
+            across, down: coordinates of the points, (n,) pixels.
+            height: height of the view, in pixels.
         """
         inside = np.flatnonzero(
             (across >= 0) & (across <= self.side) & (down >= 0) & (down <= height)
         )
-        for grid in GRIDS:
+        for grid in GRIDS_PX:
             places = np.rint(np.stack([down[inside], across[inside]], axis=1) / grid).astype(
                 np.int64
             )
@@ -224,9 +244,9 @@ class _ViewDrawer:
                 break
         places = places[first]
         colours = self.colours[inside[first]]
-        width = max(DOT, grid * 1.3) / grid
+        width = max(DOT_PX, grid * 1.3) / grid
         paths = [
-            f'<path class="dots{step}" d="{_path(places[colours == step])}"'
+            f'<path class="dots{step}" d="{_make_path(places[colours == step])}"'
             f' stroke="{_COLOURS[step]}"/>'
             for step in np.unique(colours).tolist()
         ]
@@ -238,9 +258,13 @@ class _ViewDrawer:
 
 
 class _Labels:
-    """Texts of a view that neither leave it nor overlap.
+    """Places texts in a view, so that they neither leave it nor overlap.
 
-    Texts without room are left out.
+    If there is no room for a text, it is omitted.
+
+    Args:
+        side: width of the view, in pixels.
+        top, bottom: vertical limits of the view, in pixels.
 
     Attributes:
         parts: the texts as SVG elements.
@@ -254,10 +278,14 @@ class _Labels:
         self.parts: list[str] = []
 
     def write(self, text: str, places: Iterable[tuple[float, float]]) -> None:
-        """Write a text at the first place with room; each is the left end of its base line."""
+        """Write a text at the first position with room.
+
+        Args:
+            places: possible positions of the left end of the base line, in pixels.
+        """
         for left, base in places:
             right = left + _text_width(text)
-            top = base - FONT_HEIGHT
+            top = base - FONT_HEIGHT_PX
             if left < 0 or right > self._side or top < self._top or base > self._bottom:
                 continue
             if any(
@@ -272,17 +300,21 @@ class _Labels:
 
 def _text_width(text: str) -> float:
     """Return the approximate width of a text in pixels."""
-    return CHARACTER_WIDTH * len(text)
+    return CHARACTER_WIDTH_PX * len(text)
 
 
-def _path(places: NDArray[np.int64]) -> str:
-    """Return the path of dots at (row, column), as relative moves."""
-    steps = np.diff(places, axis=0, prepend=0)
+def _make_path(dots: NDArray[np.int64]) -> str:
+    """Return an SVG path of dots, as relative moves.
+
+    Args:
+        dots: row and column of each dot, (n, 2).
+    """
+    steps = np.diff(dots, axis=0, prepend=0)
     return "".join(f"m{across} {down}h0" for down, across in steps.tolist())
 
 
-def _legend(look: CloudAppearance, right: int) -> Iterator[str]:
-    """Yield a bar of the ramp with its column and values, which ends at `right`."""
+def _iter_legend(look: CloudAppearance, right: int) -> Iterator[str]:
+    """Yield the elements of the ramp with its column and values; it ends at `right`."""
     low, high = (escape(text) for text in look.ends)
     left = right - 7 * len(high) - 12 - STEPS * 6
     yield (
@@ -298,15 +330,19 @@ def _legend(look: CloudAppearance, right: int) -> Iterator[str]:
 
 
 def _style_of(part: str, attribute: str = "fill") -> str:
-    """Return the attributes of a part of the picture.
+    """Return the SVG attributes for the colour of a part of the picture.
 
-    They are its colour on light pages, and the class for its colour on dark ones.
+    The colour is for light pages; the class selects the colour for dark pages.
+
+    Args:
+        part: one of `_PARTS`.
+        attribute: "fill" or "stroke".
     """
     return f'class="{part}" {attribute}="{_LIGHT[_PARTS.index(part)]}"'
 
 
-def _style() -> str:
-    """Return the style for dark pages."""
+def _make_style() -> str:
+    """Return the CSS for dark pages."""
     inks = [to_hex(rgb) for rgb in make_ramp("dark", STEPS)]
     dots = [
         f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(inks)

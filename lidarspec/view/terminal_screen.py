@@ -1,8 +1,8 @@
 """Take over a terminal: the alternate screen, and single keys.
 
-Only changed cells are written. rich would write every cell of every picture, about 50 times as
-many, so it is only used for output that is printed once. Keys are read without waiting for a line:
-with termios on POSIX, with msvcrt on Windows.
+Only changed cells are written. rich would write all cells of each picture, about 50 times as many,
+so it is used only for output that is printed once. Single keys are read with termios on POSIX and
+with msvcrt on Windows.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rich.console import Console
 from lidarspec.transports.base import wait_readable
 from lidarspec.view.canvas import CellGrid, Depth, sgr
 
-#: codes of cursor keys: on POSIX after escape, on Windows after a prefix byte.
+#: code of a cursor key after escape, on POSIX -> its name.
 _POSIX = {
     "[A": "up",
     "[B": "down",
@@ -33,33 +33,35 @@ _POSIX = {
     "OC": "right",
     "OD": "left",
 }
-#: a cursor key, the sequence of another one, or a character.
+#: a cursor key, the sequence of an unknown key, or a character.
 _KEY = re.compile(r"\x1b([\[O][A-D])|\x1b[\[O][^A-Za-z~]*.?|(.)", re.DOTALL)
+#: code of a cursor key after a prefix byte, on Windows -> its name.
 _WINDOWS = {"H": "up", "P": "down", "M": "right", "K": "left"}
-#: seconds between two checks of the keyboard on Windows, which has nothing to wait on.
-_LOOK = 0.02
-#: escape sequences: alternate screen, no cursor, no wrapping; and the reverse.
+#: time between two checks of the keyboard on Windows, where a program cannot wait for a key.
+_POLL_S = 0.02
+#: escape sequences that take over the terminal (alternate screen, no cursor, no wrapping), and that
+#: restore it.
 ENTER = "\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J"
 LEAVE = "\x1b[?2026l\x1b[0m\x1b[?7h\x1b[?25h\x1b[?1049l"
-#: terminals that support it show the picture only when it is complete.
+#: escape sequences around a picture, so that terminals show it only when it is complete.
 BEGIN = "\x1b[?2026h"
 END = "\x1b[?2026l"
-#: maximum number of unchanged cells that are rewritten between two changed ones: moving the cursor
-#: costs as much.
-BRIDGED = 4
+#: maximum number of unchanged cells between two changed cells that are written as well, because
+#: moving the cursor needs the same number of bytes.
+MAX_BRIDGED_CELLS = 4
 
 
 class KeyReader:
-    """A keyboard, as a context manager that restores the terminal.
+    """A keyboard; a context manager that restores the terminal.
 
-    This base class has no keys, but waits like one.
+    This base class never returns keys, but waits like a keyboard.
     """
 
     def read(self, timeout: float) -> list[str]:
         """Return the keys pressed within some seconds.
 
         Returns:
-            Characters, "up", "down", "left", "right" and "escape"; empty if there were none.
+            Characters, "up", "down", "left", "right" and "escape"; empty if no key was pressed.
         """
         time.sleep(timeout)
         return []
@@ -96,7 +98,7 @@ if sys.platform == "win32":
             """Return the keys pressed within some seconds."""
             end = time.monotonic() + timeout
             while not msvcrt.kbhit() and time.monotonic() < end:
-                time.sleep(_LOOK)
+                time.sleep(_POLL_S)
             keys = []
             while msvcrt.kbhit():
                 key = msvcrt.getwch()
@@ -106,7 +108,7 @@ if sys.platform == "win32":
             return [key for key in keys if key]
 
     def keyboard(*, taken: bool = False) -> KeyReader:
-        """Return the keyboard of the console, or one without keys."""
+        """Return the keyboard of the console, or `KeyReader()` if there is none."""
         if sys.stdin.isatty() and not taken:
             return Keyboard()
         return KeyReader()
@@ -116,7 +118,7 @@ else:
     import tty
 
     class Keyboard(KeyReader):
-        """A terminal that returns single keys unechoed; Ctrl-C and Ctrl-Z stay signals."""
+        """Reads single keys of a terminal without echo; Ctrl-C and Ctrl-Z send signals."""
 
         def __init__(self, descriptor: int) -> None:
             self._descriptor = descriptor
@@ -145,10 +147,10 @@ else:
                 termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
     def keyboard(*, taken: bool = False) -> KeyReader:
-        """Return the keyboard of the terminal, or one without keys.
+        """Return the keyboard of the terminal, or `KeyReader()` if there is none.
 
         Args:
-            taken: whether standard input is the data: keys are then read from the terminal itself.
+            taken: whether standard input is the data. Keys are then read from /dev/tty.
         """
         try:
             if sys.stdin.isatty() and not taken:
@@ -162,7 +164,7 @@ class TerminatedError(BaseException):
     """Raised when a signal ends the process, so that resources are closed.
 
     Attributes:
-        code: the exit code that shells expect: 128 plus the signal's number.
+        code: the exit code for shells: 128 plus the number of the signal.
     """
 
     def __init__(self, number: int) -> None:
@@ -171,7 +173,7 @@ class TerminatedError(BaseException):
 
 
 def find_colour_depth(stream: TextIO) -> Depth:
-    """Return the colour depth of a terminal, by NO_COLOR, COLORTERM and TERM."""
+    """Return the colour depth of a terminal, from NO_COLOR, COLORTERM and TERM."""
     console = Console(file=stream)
     system = console.color_system
     if system is None or console.no_color:
@@ -183,7 +185,7 @@ def find_colour_depth(stream: TextIO) -> Depth:
     return "standard"
 
 
-def find_plain_characters(stream: TextIO) -> bool:
+def supports_braille(stream: TextIO) -> bool:
     """Return whether a stream supports braille characters."""
     try:
         "⣿▲│".encode(stream.encoding or "ascii")
@@ -193,19 +195,19 @@ def find_plain_characters(stream: TextIO) -> bool:
 
 
 class Screen:
-    """A terminal's screen, as a context manager that always restores it.
+    """The screen of a terminal; a context manager that always restores it.
 
-    This includes the end of the process by SIGTERM or SIGHUP, and its suspension by SIGTSTP.
+    It is also restored if the process is ended by SIGTERM or SIGHUP, or suspended by SIGTSTP.
     """
 
     def __init__(self, stream: TextIO, keys: KeyReader) -> None:
         self._stream = stream
         self.keys = keys
         self._depth = find_colour_depth(stream)
-        self._plain = not find_plain_characters(stream)
+        self._plain = not supports_braille(stream)
         self._shown: CellGrid | None = None
-        # number of times the terminal was taken over: this discards the shown picture, also during
-        # `show`
+        # How often the terminal was taken over again, which clears it. A signal may do this during
+        # `show`.
         self._taken = 0
         self._handlers: dict[int, Any] = {}
 
@@ -260,13 +262,14 @@ class Screen:
             self._stream.write(text)
             self._stream.flush()
             return
-        # bypasses the stream's buffer, which a signal handler must not enter during a write
+        # This bypasses the buffer of the stream, which a signal handler must not use during a
+        # write.
         data = text.encode(self._stream.encoding or "utf-8", "replace")
         while data:
             data = data[os.write(self._stream.fileno(), data) :]
 
     def _suspend(self, number: int, frame: FrameType | None) -> None:
-        """Restore the terminal, sleep until the process continues, and take it over again."""
+        """Restore the terminal, suspend the process, and take over the terminal again."""
         self._write(LEAVE)
         self.keys.__exit__(None, None, None)
         signal.signal(number, signal.SIG_DFL)
@@ -284,6 +287,7 @@ def encode_changes(before: CellGrid | None, after: CellGrid, depth: Depth) -> st
     Args:
         before: the shown picture; None for an empty screen.
         after: the new picture.
+        depth: the colour depth of the terminal.
     """
     if before is not None:
         old = before
@@ -294,7 +298,9 @@ def encode_changes(before: CellGrid | None, after: CellGrid, depth: Depth) -> st
     ink = -1
     for row in np.flatnonzero(changed.any(axis=1)).tolist():
         columns = np.flatnonzero(changed[row])
-        starts = np.flatnonzero(np.diff(columns, prepend=-BRIDGED - 2) > BRIDGED)
+        starts = np.flatnonzero(
+            np.diff(columns, prepend=-MAX_BRIDGED_CELLS - 2) > MAX_BRIDGED_CELLS
+        )
         for first, last in zip(
             columns[starts].tolist(),
             columns[np.append(starts[1:], len(columns)) - 1].tolist(),
@@ -316,5 +322,5 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 def is_interactive() -> bool:
-    """Return whether there is a screen to take over."""
+    """Return whether standard output is a terminal with a screen."""
     return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"

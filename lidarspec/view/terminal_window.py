@@ -1,8 +1,8 @@
 """The terminal window of a running sensor, drawn at most twelve times a second.
 
-`Window.run` waits for keys and data in turn. `ViewSettings` is the state that the keys change, and
-`Window.cells` draws the window anew from it, the newest scan and the figures; `Screen` writes the
-cells that changed.
+`Window.run` alternately waits for keys and data. Keys change the `ViewSettings`. `Window.cells`
+draws the window from these settings, the newest scan and the figures, and `Screen` writes the
+changed cells.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from lidarspec.view.terminal_window_parts import (
     write_title,
 )
 
-#: minimum seconds between two pictures.
+#: minimum time between two pictures.
 FRAME_PERIOD_S = 0.08
-#: seconds between two readings of the figures.
+#: time between two readings of the figures.
 FIGURES_PERIOD_S = 1.0
 #: zoom factor of one key press, and its limits.
 ZOOM_FACTOR = 1.25
@@ -39,13 +39,14 @@ MAX_ZOOM = 1e3
 MIN_ZOOM = 1e-2
 #: movement of one key press, as a share of the reach of the picture.
 MOVE_SHARE = 0.2
-#: axis and sign by key: forward is the first axis, left the second.
+#: key -> movement: forward, left.
 MOVES = {"up": (1, 0), "down": (-1, 0), "left": (0, 1), "right": (0, -1)}
-#: a picture is drawn larger when its points need less than this share of its reach.
+#: if the points need less than this share of the reach of the picture, the reach is reduced.
 MIN_USED_SHARE = 0.7
 #: width of the figures beside the picture, in columns.
 SIDE_COLUMNS = 25
-#: a window with less room for picture or lines has the figures in its last line.
+#: if the picture would be narrower, or the window has fewer lines, the figures are in the last
+#: line.
 MIN_PICTURE_COLUMNS = 36
 MIN_SIDE_LINES = 14
 #: error or loss rate above which a figure is an alarm.
@@ -55,15 +56,15 @@ DEFAULT_RAMPS = ("range", "intensity")
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """The choices that keys have made.
+    """The settings that keys change.
 
     Attributes:
         ramp: the column that colours show.
         zoom: magnification; 1.0 shows all points.
-        middle: of the picture, metres forward and left of the sensor.
-        paused: whether the picture stands still.
-        helped: whether the keys are listed.
-        done: whether the window closes.
+        middle: the middle of the picture, in metres forward and left of the sensor.
+        paused: whether the picture is paused.
+        helped: whether the list of keys is shown.
+        done: whether the window has to close.
     """
 
     ramp: str = "range"
@@ -76,11 +77,11 @@ class ViewSettings:
     def after_key(
         self, key: str, reach: float, ramps: Sequence[str] = DEFAULT_RAMPS
     ) -> ViewSettings:
-        """Return the choice after a key press.
+        """Return the settings after a key press.
 
         Args:
-            key: its name.
-            reach: of the picture, metres from its middle to its edge.
+            key: the name of the key.
+            reach: distance from the middle of the picture to its edge, in metres.
             ramps: the columns that colours can show.
         """
         if key in ("q", "Q"):
@@ -113,30 +114,30 @@ class ViewSettings:
 
 
 class Window:
-    """Shows the scans of a feed with its figures.
+    """Shows the scans of a device with figures.
 
     Args:
-        feed: of the open device.
-        source: as the user typed it.
+        live: the scans of the open device.
+        source: the SOURCE as typed by the user.
         ramp: the column that colours show at first.
-        record: records the source, if it is live.
-        duration: seconds after which the window closes; None leaves that to the keys.
+        record: switches the recording of a live source on and off; None for other sources.
+        duration: seconds after which the window closes; None to close it only by a key.
     """
 
     def __init__(
         self,
-        feed: LiveScans,
+        live: LiveScans,
         source: str,
         *,
         ramp: str = "range",
         record: RecordingSwitch | None = None,
         duration: float | None = None,
     ) -> None:
-        self._feed = feed
-        self._device = feed.device
+        self._live = live
+        self._device = live.device
         self._source = source
         self._record = record
-        self.choice = ViewSettings(ramp)
+        self.settings = ViewSettings(ramp)
         self._scan: Scan | None = None
         self._look: CloudAppearance | None = None
         self._reading: MeterReading | None = None
@@ -155,33 +156,30 @@ class Window:
         drawn_at = 0.0
         drawn_number = -1
         drawn_size = (0, 0)
-        while not self.choice.done and time.monotonic() < self._end:
+        while not self.settings.done and time.monotonic() < self._end:
             keys = self._wait(screen)
             for key in keys:
                 self._press(key)
             now = time.monotonic()
-            has_scan = self._feed.number != drawn_number and not self.choice.paused
+            has_scan = self._live.number != drawn_number and not self.settings.paused
             is_old = now - drawn_at >= FIGURES_PERIOD_S / 2
             size = screen.size()
             if keys or has_scan or is_old or size != drawn_size:
                 screen.show(self.cells(*size))
                 drawn_at = now
-                drawn_number = self._feed.number
+                drawn_number = self._live.number
                 drawn_size = size
 
     def _wait(self, screen: Screen) -> list[str]:
         """Read data until the next picture is due, and return the keys that were pressed."""
-        if self._feed.ended or (self.choice.paused and not self._device.is_live):
-            self._feed.read_rest()
+        if self._live.ended or (self.settings.paused and not self._device.is_live):
+            self._live.stop_clock()
             return screen.keys.read(FRAME_PERIOD_S)
-        self._feed.read(time.monotonic() + FRAME_PERIOD_S)
+        self._live.read(time.monotonic() + FRAME_PERIOD_S)
         return screen.keys.read(0)
 
     def cells(self, columns: int, lines: int) -> CellGrid:
-        """Return the window as it is now.
-
-        The figures are beside the picture, or in the last line if the window is narrow.
-        """
+        """Draw the window; the figures are in the last line if the window is small."""
         self._update_reading()
         self._update_scan()
         is_wide = columns > MIN_PICTURE_COLUMNS + SIDE_COLUMNS and lines >= MIN_SIDE_LINES
@@ -189,52 +187,52 @@ class Window:
         height = max(lines - (1 if is_wide else 2), 1)
         current_look = self._current_look()
         window = CellGrid.blank(columns, lines)
-        window.paste(1, 0, self._picture(width, height, current_look))
-        write_title(window, self._device.sensor.id, self._source, *self._state())
+        window.paste(1, 0, self._draw_picture(width, height, current_look))
+        write_title(window, self._device.sensor.id, self._source, *self._describe_state())
         if is_wide:
-            write_side(window, width, self._figures(), current_look)
+            write_side(window, width, self._list_figures(), current_look)
         else:
-            write_last_line(window, self._figures())
-        if self.choice.helped:
+            write_last_line(window, self._list_figures())
+        if self.settings.helped:
             _paste_in_middle(window, draw_keys(columns, lines))
         return window
 
-    def _picture(self, width: int, height: int, current_look: CloudAppearance) -> CellGrid:
-        """Return the picture of the scan, with what is wrong in its middle."""
+    def _draw_picture(self, width: int, height: int, current_look: CloudAppearance) -> CellGrid:
+        """Draw the scan, with a warning in the middle if there is one."""
         if self._scan is None:
             drawn = CellGrid.blank(width, height)
         else:
             drawn = draw_cloud(self._scan.points, width=width, height=height, look=current_look)
-        warning = self._warning()
+        warning = self._find_warning()
         if warning:
             _paste_in_middle(drawn, draw_message(width, warning))
         return drawn
 
     def _press(self, key: str) -> None:
         known = DEFAULT_RAMPS if self._scan is None else list_ramps(self._scan.points)
-        self.choice = self.choice.after_key(key, self._current_look().reach, known)
+        self.settings = self.settings.after_key(key, self._current_look().reach, known)
         if key in ("r", "R") and self._record is not None:
             self._record.toggle()
 
     def _update_reading(self) -> None:
-        """Read the figures once a second."""
+        """Read the figures if a second has passed since the last reading."""
         now = time.monotonic()
         duration = now - self._read_at
         if duration < FIGURES_PERIOD_S:
             return
         seconds = duration if self._device.is_live else None
-        self._reading = self._feed.meter.reading(self._device.stats, seconds)
+        self._reading = self._live.meter.reading(self._device.stats, seconds)
         self._read_at = now
 
     def _update_scan(self) -> None:
-        """Take the newest scan, on the scale of the one before if it fits."""
-        newest = self._feed.scan
+        """Use the newest scan, on the scale of the previous scan if that fits."""
+        newest = self._live.scan
         if newest is None or newest is self._scan:
             return
-        if self.choice.paused and self._scan is not None:
+        if self.settings.paused and self._scan is not None:
             return
         self._scan = newest
-        new = choose_appearance(newest.points, ramp=self.choice.ramp)
+        new = choose_appearance(newest.points, ramp=self.settings.ramp)
         old = self._look
         if old is not None and _fits(new.reach, old.reach):
             new = replace(new, reach=old.reach)
@@ -243,43 +241,43 @@ class Window:
         self._look = new
 
     def _current_look(self) -> CloudAppearance:
-        """Return the scale of the picture, as the keys have changed it."""
+        """Return the appearance of the picture, with the changes by keys."""
         if self._look is None:
             return CloudAppearance("range", 1.0, 1.0)
-        if self._scan is not None and self._look.ramp != self.choice.ramp:
-            new = choose_appearance(self._scan.points, ramp=self.choice.ramp)
+        if self._scan is not None and self._look.ramp != self.settings.ramp:
+            new = choose_appearance(self._scan.points, ramp=self.settings.ramp)
             self._look = replace(new, reach=self._look.reach)
-            self.choice = replace(self.choice, ramp=new.ramp)
-        reach = self._look.reach / self.choice.zoom
-        return replace(self._look, reach=reach, middle=self.choice.middle)
+            self.settings = replace(self.settings, ramp=new.ramp)
+        reach = self._look.reach / self.settings.zoom
+        return replace(self._look, reach=reach, middle=self.settings.middle)
 
-    def _state(self) -> tuple[str, int]:
-        """Return the state in a word, and its ink."""
+    def _describe_state(self) -> tuple[str, int]:
+        """Return the state in one or two words, and its ink."""
         if self._record is None:
             recording = None
         else:
             recording = self._record.recording
         if recording is not None:
             return f"● {recording[0]}", ALARM
-        if self.choice.paused:
+        if self.settings.paused:
             return "‖ paused", STRONG
         if self._device.is_live:
             state = self._device.state
             if state == "streaming":
                 return ("● live", GOOD)
             return (state, ALARM)
-        if self._feed.ended:
+        if self._live.ended:
             return ("end", STRONG)
         return ("▶ playing", GOOD)
 
-    def _figures(self) -> list[WindowFigure]:
-        """Return the figures of the last second and of the scan that is shown."""
+    def _list_figures(self) -> list[WindowFigure]:
+        """Return the figures of the last second and of the shown scan."""
         reading = self._reading or NOTHING
         figures = [
             WindowFigure("speed", format_figure(reading.speed_hz, "{:.1f} Hz"), STRONG),
             WindowFigure("packets", format_figure(reading.packet_rate_hz, "{:.0f} /s")),
             WindowFigure("input", format_figure(reading.bytes_per_s, "{:.1f} kB/s", 1e-3)),
-            *self._scan_figures(),
+            *self._list_scan_figures(),
             _rate_figure("errors", reading.error_rate if self._reading else None),
             _rate_figure("skipped", reading.skipped_rate if self._reading else None),
             self._lost_figure(reading),
@@ -289,8 +287,8 @@ class Window:
             figures.append(WindowFigure("queue", str(self._device.queued)))
         return figures
 
-    def _scan_figures(self) -> list[WindowFigure]:
-        """Return the figures of the scan that is shown."""
+    def _list_scan_figures(self) -> list[WindowFigure]:
+        """Return the figures of the shown scan."""
         if self._scan is None:
             return [
                 WindowFigure("points", "0"),
@@ -319,8 +317,8 @@ class Window:
             return WindowFigure("lost", str(lost), ALARM)
         return WindowFigure("lost", "-" if reading.loss_rate is None else "0")
 
-    def _warning(self) -> str:
-        """Return the message for the middle of the picture, "" if nothing is wrong."""
+    def _find_warning(self) -> str:
+        """Return the message for the middle of the picture; "" if there is no problem."""
         device = self._device
         if self._record is not None and self._record.trouble:
             return self._record.trouble
@@ -328,7 +326,7 @@ class Window:
         if failure is not None:
             return str(failure)
         warnings = device.warnings
-        if self._feed.ended:
+        if self._live.ended:
             if self._scan is not None:
                 return ""
             if warnings:
@@ -352,5 +350,5 @@ def _paste_in_middle(target: CellGrid, box: CellGrid) -> None:
 
 
 def _fits(needed: float, kept: float) -> bool:
-    """Return whether a scale can stay, so that the picture does not change with every scan."""
+    """Return whether the previous scale fits, so that the picture remains steady."""
     return MIN_USED_SHARE * kept <= needed <= kept

@@ -21,7 +21,7 @@ KEYS = (
 )
 HINTS = (("space pause", "c colour"), ("+ - zoom", "0 all"), ("? help", "q quit"))
 HINT_COLUMNS = 13
-#: columns of the margins, and of the longest key with its margin, on the page of keys.
+#: width of the margins and of the keys in the list of keys.
 KEY_COLUMNS = 14
 #: minimum room for the name of the source in the title.
 MIN_SOURCE_COLUMNS = 8
@@ -45,7 +45,12 @@ def write_title(window: CellGrid, sensor: str, source: str, state: str, ink: int
 
 
 def shorten_source(source: str, room: int) -> str:
-    """Return the source, or its end if it is longer than the room, "" if there is hardly any."""
+    """Return the source, or its end if it is too long, or "" if there is no room.
+
+    Args:
+        source: the source.
+        room: number of columns.
+    """
     if len(source) <= room:
         return source
     if room <= MIN_SOURCE_COLUMNS:
@@ -56,13 +61,13 @@ def shorten_source(source: str, room: int) -> str:
 def write_side(
     window: CellGrid, left: int, figures: Sequence[WindowFigure], look: CloudAppearance
 ) -> None:
-    """Write figures, colours and keys beside the picture, as far as there is room.
+    """Write figures, colours and keys beside the picture, if there is room for them.
 
     Args:
-        window: has the picture in its first columns.
-        left: the first column beside it.
-        figures: one a line.
-        look: the colours of the picture.
+        window: the window with the picture.
+        left: the first column to the right of the picture.
+        figures: the figures, one for each line.
+        look: the appearance of the picture.
     """
     columns, lines = window.size
     for row in range(1, lines):
@@ -80,7 +85,7 @@ def write_side(
 
 
 def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:
-    """Write the figures that are known into the last line, as far as there is room."""
+    """Write the known figures into the last line, if there is room for them."""
     columns, lines = window.size
     row = lines - 1
     column = 1
@@ -96,7 +101,7 @@ def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:
 
 
 def _write_ramp(window: CellGrid, row: int, column: int, look: CloudAppearance) -> None:
-    """Write a bar of the colours, and below it the values at its ends."""
+    """Write the colour ramp, with the values at its ends below."""
     for step in range(STEPS):
         window.write(row, column + step, "━", FIRST_STEP + step)
     low, high = look.ends
@@ -106,7 +111,7 @@ def _write_ramp(window: CellGrid, row: int, column: int, look: CloudAppearance) 
 
 
 def draw_keys(columns: int, lines: int) -> CellGrid:
-    """Return the page of keys, which fits into a window of this size."""
+    """Draw the list of keys for a window of this size."""
     width = min(max(len(text) for _, text in KEYS) + KEY_COLUMNS, columns)
     page = CellGrid.blank(width, min(len(KEYS) + 4, lines))
     page.write(0, 0, "─" * width, FAINT)
@@ -119,7 +124,7 @@ def draw_keys(columns: int, lines: int) -> CellGrid:
 
 
 def draw_message(columns: int, text: str) -> CellGrid:
-    """Return a message for the middle of a picture."""
+    """Draw a message for the middle of a picture with this width."""
     lines = textwrap.wrap(text, max(columns - 4, 1))
     width = min(max(map(len, lines)) + 4, columns)
     box = CellGrid.blank(width, len(lines) + 2)

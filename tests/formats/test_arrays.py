@@ -21,7 +21,7 @@ zarr = Library("zarr")
 def test_arrays_hold_the_columns_of_the_clouds_and_the_stamps(
     tmp_path: Path, every_point: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ours, "ROWS", 1000)
+    monkeypatch.setattr(ours, "POINT_CHUNK", 1000)
     scans = [
         scan(0),
         scan(1, points=2000),

@@ -51,7 +51,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
 def test_tables_hold_the_columns_of_the_clouds(
     tmp_path: Path, name: str, every_point: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tables, "ROWS", 1000)
+    monkeypatch.setattr(tables, "MIN_GROUP_ROWS", 1000)
     scans = [
         scan(0),
         scan(1, points=2000),

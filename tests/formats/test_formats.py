@@ -170,8 +170,8 @@ BINARY = [case for case in BUILT_IN if case.values[0] not in ("a.csv", "a.csv.gz
 def test_the_memory_does_not_grow_with_the_number_of_scans(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (tables, arrays):
-        monkeypatch.setattr(module, "ROWS", 10_000)
+    monkeypatch.setattr(tables, "MIN_GROUP_ROWS", 10_000)
+    monkeypatch.setattr(arrays, "POINT_CHUNK", 10_000)
     peaks = []
     for number in (20, 60):
         tracemalloc.start()

@@ -199,7 +199,7 @@ def test_noise_is_compressed_too(tmp_path: Path, points: int) -> None:
 def test_too_many_compressed_points_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lidarspec.formats.point_cloud_files._MOST_COMPRESSED", 1000)
+    monkeypatch.setattr("lidarspec.formats.point_cloud_files._MAX_COMPRESSED_BYTES", 1000)
     with pytest.raises(UsageError, match="4 GiB"):
         write(tmp_path / "a.lzf.pcd", [scan(0, 100)])
     assert not list(tmp_path.iterdir())

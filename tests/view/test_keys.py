@@ -66,6 +66,6 @@ def test_screens_of_the_docs_are_complete() -> None:
 
 
 def test_the_key_c_cycles_through_all_columns() -> None:
-    shown, choice = ["range", "velocity", "snr"], ViewSettings()
-    seen = [(choice := choice.after_key("c", 6, shown)).ramp for _ in range(3)]
+    shown, settings = ["range", "velocity", "snr"], ViewSettings()
+    seen = [(settings := settings.after_key("c", 6, shown)).ramp for _ in range(3)]
     assert seen == ["velocity", "snr", "range"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lidarspec.points.appearance import choose_appearance, fit_to_points
-from lidarspec.view.svg import SIDE, svg
+from lidarspec.view.svg import SIDE_PX, svg
 from tests.view.test_polar import cloud
 
 #: pixels above the base line of a text, and of a character, at least.
@@ -75,4 +75,4 @@ def test_a_few_far_points_do_not_shrink_the_picture() -> None:
             (int(across), int(down)) for across, down in re.findall(r"m(-?\d+) (-?\d+)h0", path)
         ]
         found.append(np.cumsum(moves, axis=0) * float(scale))
-    assert np.ptp(np.concatenate(found), axis=0).max() > 0.88 * SIDE
+    assert np.ptp(np.concatenate(found), axis=0).max() > 0.88 * SIDE_PX

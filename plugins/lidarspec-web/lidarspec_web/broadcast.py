@@ -278,7 +278,7 @@ class Broadcast:
             feed.speed = self.speed
             self._read(lambda: feed.read(time.monotonic() + LOOK_S))
         else:
-            feed.read_rest()
+            feed.stop_clock()
             self._has_request.wait(PAUSED_CHECK_S)
             self._has_request.clear()
 
