@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lidarspec.formats.common import select_columns
 from lidarspec.optional_libraries import import_library
-from lidarspec.points.appearance import STEPS, CloudAppearance, choose_appearance, ramp_indices
+from lidarspec.points.appearance import RAMP_STEPS, CloudAppearance, choose_appearance, ramp_indices
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp
 from lidarspec.scans.scan import Scan
@@ -271,7 +271,7 @@ class _Colours:
         shown = self._look or choose_appearance(cloud, ramp=ramp)
         if len(cloud):  # an empty cloud has no scale
             self._look = shown
-        colours = np.array(make_ramp("dark", STEPS), np.uint8)  # the viewer is dark
+        colours = np.array(make_ramp("dark", RAMP_STEPS), np.uint8)  # the viewer is dark
         return colours[ramp_indices(cloud, shown)]
 
 

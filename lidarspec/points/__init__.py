@@ -1,6 +1,6 @@
 """Convert packets to points by the sensor's `points` function, a batch at a time.
 
-In: `Packets`. Out: a `PointCloud`, whose columns are computed when they are first read. Three
+In: `Packets`. Out: a `PointCloud` that computes columns when they are first read. Three
 evaluators give the same columns: the reference evaluator, a NumPy plan, and compiled kernels.
 Modules in reading order:
 

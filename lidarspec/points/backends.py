@@ -1,7 +1,7 @@
 """Choose the back end that computes columns: NumPy, or compiled kernels once they pay.
 
 Loading Numba and compiling a kernel take about a second. With the back end "auto" a kernel is used
-after so many points that it saves this time.
+only for as many points as it takes to save this time.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from weakref import WeakKeyDictionary
 from lidarspec.points import numpy_plan
 from lidarspec.points.plan import ColumnMaker, Plan, PointsFunction
 
-#: points after which a kernel compiled before pays, and one that has to be compiled.
+#: the number of points from which a cached kernel, or a kernel yet to be compiled, saves time.
 MIN_WARM_KERNEL_POINTS = 1 << 26
 MIN_COLD_KERNEL_POINTS = 1 << 28
-#: a count of points that stays below these limits.
+#: a count of points that stays below these limits, so that no kernel is tried again.
 _NEVER = -(1 << 62)
 
 #: points computed so far, by the names of their columns.
@@ -36,14 +36,16 @@ def choose_maker(plan: Plan, names: tuple[str, ...], backend: str, frames: int) 
 
         return numba_kernels.compile(plan, names)
     if backend == "auto":
-        kernel = _paying_kernel(plan, names, frames)
+        kernel = _find_faster_kernel(plan, names, frames)
         if kernel is not None:
             return kernel
     return numpy_plan.compile(plan, names)
 
 
-def _paying_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
-    """Return a compiled kernel if it pays after the points of these frames, else None."""
+def _find_faster_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMaker | None:
+    """Count the points of these frames, and return a kernel if it saves time.
+
+    Returns None if it does not, or if Numba is missing or fails."""
     counts = _POINT_COUNTS.setdefault(plan.function, {})
     counts[names] = counts.get(names, 0) + frames * plan.width
     if counts[names] < MIN_WARM_KERNEL_POINTS:
@@ -57,7 +59,7 @@ def _paying_kernel(plan: Plan, names: tuple[str, ...], frames: int) -> ColumnMak
                 return None
             kernel.compile()
             return kernel
-    except Exception:  # NumPy does without Numba, whatever is wrong with it or its cache
+    except Exception:  # if Numba or its cache fails, NumPy is used
         pass
     counts[names] = _NEVER
     return None

@@ -1,9 +1,9 @@
 """The columns of the points of a batch, computed from plans when they are first read.
 
-`BatchColumns.columns` decides for which points columns are computed: for the whole batch, for a
-large scan alone, or for a block of points that small scans share. `_compute` decides which columns
-are computed together. A program of `points.numpy_plan` or a kernel of `points.numba_kernels` fills
-them for each `GroupPoints` of the batch.
+`BatchColumns.columns` decides for which points columns are computed: for the whole batch, for
+a large slice alone, or for a block of points that small slices share. `_compute` decides which
+columns are computed together. A program of `points.numpy_plan` or a kernel of
+`points.numba_kernels` fills them for each `GroupPoints` of the batch.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from lidarspec.points.reference_evaluator import PacketBatch
 
 #: columns that one program or kernel computes.
 COMPILED_TOGETHER = ("x", "y", "z", "intensity")
-#: points from which on a range has its columns computed for itself. Smaller ranges share those of a
-#: block of `BLOCK_POINTS` points.
+#: a slice of at least `MIN_OWN_POINTS` points has its own columns. Smaller slices share the columns
+#: of a block of `BLOCK_POINTS` points.
 MIN_OWN_POINTS = 1 << 14
 BLOCK_POINTS = 1 << 16
 
@@ -52,11 +52,11 @@ class BatchColumns(ColumnSource):
     """The columns of the points of a batch.
 
     Args:
-        packets: of the batch.
-        shares: the packets by their layouts.
-        size: the number of points, without those of packets that wait.
+        packets: the packets of the batch.
+        shares: the packets by layout.
+        size: the number of points, without the points of packets that wait.
         base: the time that times count from, ns.
-        grids, nominal: as of all sources.
+        grids, nominal: as in `ColumnSource`.
     """
 
     def __init__(
@@ -101,14 +101,14 @@ class BatchColumns(ColumnSource):
         is_whole = not self._is_regular or self.size <= BLOCK_POINTS or stop - start == self.size
         if is_whole or not missing:
             self._computed |= self._compute(missing, 0, self.size)
-            return _part(self._computed, names, slice(start, stop))
-        # A range at an end of the batch is a part of a scan over several batches.
+            return _slice_columns(self._computed, names, slice(start, stop))
+        # A slice at an end of the batch is a part of a scan over several batches.
         is_at_end = start == 0 or stop == self.size
         if is_at_end or stop - start >= MIN_OWN_POINTS:
             return self._compute(names, start, stop)
-        return self._from_blocks(names, start, stop)
+        return self._read_blocks(names, start, stop)
 
-    def _from_blocks(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
+    def _read_blocks(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         pieces: list[dict[str, NDArray[Any]]] = []
         index = start
         while index < stop:
@@ -116,14 +116,14 @@ class BatchColumns(ColumnSource):
             missing = [name for name in names if name not in block.computed]
             block.computed.update(self._compute(missing, block.start, block.stop))
             inside = slice(index - block.start, stop - block.start)
-            pieces.append(_part(block.computed, names, inside))
+            pieces.append(_slice_columns(block.computed, names, inside))
             index = block.stop
         if len(pieces) == 1:
             return pieces[0]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
     def _block_at(self, index: int) -> PointBlock:
-        """Return the block of points around an index. Blocks do not overlap."""
+        """Return the block of points around an index; blocks do not overlap."""
         place = bisect.bisect(self._blocks, index, key=lambda block: block.start)
         if place and index < self._blocks[place - 1].stop:
             return self._blocks[place - 1]
@@ -139,7 +139,10 @@ class BatchColumns(ColumnSource):
         return block
 
     def _compute(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Compute columns of the points from `start` to `stop`, all main ones or none."""
+        """Compute columns of the points from `start` to `stop`.
+
+        `names` has all columns that are compiled together, or none of them.
+        """
         main = [name for name in names if name in self._main_columns]
         sent = [name for name in names if all(name in share.plan.sent for share in self._shares)]
         if len(sent) + len(main) == 1 or self._turn is not None:
@@ -148,20 +151,20 @@ class BatchColumns(ColumnSource):
         if main or sent:
             columns = self._fill((*main, *sent), start, stop)
         if main and self._turn is not None:
-            columns |= _turn(columns, self._turn)
+            columns |= _turn_coordinates(columns, self._turn)
         for name in names:
             if name not in columns:
                 columns |= self._compute_single(name, start, stop)
         return columns
 
     def _compute_single(self, name: str, start: int, stop: int) -> dict[str, NDArray[Any]]:
-        """Compute a column by itself; nothing if the sensor does not have it."""
-        if name == "z":  # of a level source, else it is one of the main columns
+        """Compute one column; return no column if the sensor does not have it."""
+        if name == "z":  # of a level source; otherwise it is one of the main columns
             return {}
         if name == "time":
             first, last = self._packet_range(start, stop)
             times = [self._times(share, first, last) for share in self._shares]
-            return {name: self._flat(times, np.dtype(np.float64), start, stop)}
+            return {name: self._flatten(times, np.dtype(np.float64), start, stop)}
         if name in self._plan.expressions and name not in self._plan.sent:
             return self._compute_compiled(name, start, stop)
         if name in self._plan.parts:
@@ -184,7 +187,7 @@ class BatchColumns(ColumnSource):
     def _compute_plainly(self, name: str, start: int, stop: int) -> NDArray[Any]:
         first, last = self._packet_range(start, stop)
         values = [share.plain(name, first, last) for share in self._shares]
-        column = self._flat(values, np.result_type(*values), start, stop)
+        column = self._flatten(values, np.result_type(*values), start, stop)
         if name in self._plan.extra:
             return self._plan.extra[name].column(column)
         if name == "elevation":
@@ -200,24 +203,24 @@ class BatchColumns(ColumnSource):
             maker = choose_maker(share.plan, names, self._packets.backend, count)
             filled.append(share.fill(maker, first, last))
         return {
-            name: self._flat([columns[name] for columns in filled], column.dtype, start, stop)
+            name: self._flatten([columns[name] for columns in filled], column.dtype, start, stop)
             for name, column in filled[0].items()
         }
 
     def _packet_range(self, start: int, stop: int) -> tuple[int, int | None]:
-        """Return the range of packets of some points; all if they have several layouts."""
+        """Return the range of packets of some points; all packets if layouts differ."""
         if not self._is_regular:
             return 0, None
         width = self._plan.width
         return start // width, -(-stop // width)
 
-    def _flat(
+    def _flatten(
         self, values: Sequence[NDArray[Any]], dtype: np.dtype[Any], start: int, stop: int
     ) -> NDArray[Any]:
         """Return the points from `start` to `stop` in stream order.
 
         Args:
-            values: of all points of the packets of each share, see `_packet_range`.
+            values: for each layout, the values of all points of its packets in `_packet_range`.
         """
         if self._is_regular:
             skipped = start % self._plan.width
@@ -226,11 +229,11 @@ class BatchColumns(ColumnSource):
         column = np.empty(self.size, dtype)
         for share, part in zip(self._shares, values, strict=True):
             assert share.first is not None
-            spread_out(part, share.first, share.plan.width, column)
+            scatter_points(part, share.first, share.plan.width, column)
         return column
 
     def _times(self, share: GroupPoints, first: int, last: int | None) -> NDArray[np.float64]:
-        """Return the times of all points of some packets, (packets, *shape), s since `base`."""
+        """Return the times of the points of some packets, (packets, *shape), s from `base`."""
         times = self._packets.time_ns[share.group.where[first:last]]
         offsets = seconds_since(times, self.base)
         return np.asarray(
@@ -250,18 +253,22 @@ class BatchColumns(ColumnSource):
         return np.asarray(few.reshape(len(packets), -1)[np.arange(len(packets)), places] + offsets)
 
 
-def _part(
+def _slice_columns(
     columns: dict[str, NDArray[Any]], names: Sequence[str], part: slice
 ) -> dict[str, NDArray[Any]]:
     return {name: columns[name][part] for name in names if name in columns}
 
 
-def spread_out(
+def scatter_points(
     values: NDArray[Any], first: NDArray[np.intp], width: int, column: NDArray[Any]
 ) -> None:
-    """Write the points of packets, `width` each, at the index of each packet's first.
+    """Write the points of packets at the index of each packet's first point.
 
-    Index -1 leaves a packet out.
+    Args:
+        values: the points, `width` for each packet.
+        first: the index in `column` of each packet's first point; -1 leaves a packet out.
+        width: the number of points of a packet.
+        column: the array to write to.
     """
     has_points = first >= 0
     rows = np.ascontiguousarray(values.reshape(len(first), width), column.dtype)
@@ -277,8 +284,10 @@ def spread_out(
         windows[starts] = rows.view(piece).reshape(-1)
 
 
-def _turn(columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
-    """Return x, y and z in the vendor's axes, each one of REP-103's or its opposite."""
+def _turn_coordinates(
+    columns: dict[str, NDArray[Any]], turn: NDArray[np.float64]
+) -> dict[str, NDArray[Any]]:
+    """Return x, y and z in the vendor's axes, each an axis of REP-103 or its opposite."""
     turned = {}
     for axis, row in zip("xyz", turn, strict=True):
         source = int(np.flatnonzero(row)[0])

@@ -1,7 +1,7 @@
-"""Point clouds: flat arrays in SI units, REP-103 axes and REP-117 ranges.
+"""Point clouds: flat arrays in SI units, with REP-103 axes and REP-117 ranges.
 
-A `PointCloud` holds its columns. A `LazyCloud` takes each from a `ColumnSource` when it is first
-read, and keeps it. Columns under names of a sensor's own are in `extra`.
+A `PointCloud` holds its columns. A `LazyCloud` reads each column from a `ColumnSource` on first use
+and keeps it. Columns that only some sensors have are in `extra`.
 """
 
 from __future__ import annotations
@@ -31,25 +31,26 @@ class PointCloud:
 
     Attributes:
         x, y, z: (N,) float32 metres, REP-103 (x forward, y left, z up); nan unless `valid`.
-        range: (N,) float32 metres; inf for no return, nan where the sensor marks a point as wrong.
+        range: (N,) float32 metres; inf without a return, nan if the sensor marks the point as
+            invalid.
         azimuth: (N,) float32 radians in [-pi, pi), counter-clockwise.
         elevation: (N,) float32 radians above the horizon.
         time: (N,) float64 seconds since `stamp_ns`.
-        intensity: (N,) float32, the wire's number; None where the sensor has none.
-        ring: (N,) uint16, None where the sensor has none.
-        return_index: (N,) uint8, None where the sensor has none.
-        column: (N,) uint16, which column of its turn a point is in, None where the sensor does not
-            say.
+        intensity: (N,) float32, the raw value; None if the sensor sends no intensity.
+        ring: (N,) uint16; None if the sensor has no rings.
+        return_index: (N,) uint8; None if the sensor does not send several returns.
+        column: (N,) uint16, the index of the point's column in its revolution; None if the sensor
+            does not send it.
         valid: (N,) bool, True for real returns.
-        stamp_ns: int64 nanoseconds.
-        shape: (columns, rows) where the points are organised so, else None; several returns of a
-            place stand side by side: ``cloud.range.reshape(*cloud.shape, -1)`` is (columns, rows,
+        stamp_ns: the time that `time` counts from, int64 ns.
+        shape: (columns, rows) if the points are organised, else None. Several returns of one
+            direction are adjacent: ``cloud.range.reshape(*cloud.shape, -1)`` is (columns, rows,
             returns).
-        nominal: True where a default calibration stood in for the sensor's own.
-        extra: (N,) columns that the sensor gives besides, by name, such as "velocity"; each in its
+        nominal: True if the points use a default calibration instead of the sensor's own.
+        extra: (N,) further columns of the sensor by name, for example "velocity", each of its own
             type.
-        units: of those in `extra`, by name; "" for a plain number.
-        chosen: the columns that `columns` and files have, see `select_columns`; () for all.
+        units: the units of the columns in `extra`, by name; "" for a plain number.
+        chosen: the columns selected by `select_columns`; () for all.
     """
 
     x: Floats
@@ -72,7 +73,7 @@ class PointCloud:
     chosen: tuple[str, ...] = ()
 
     def __len__(self) -> int:
-        return np.size(self.x)  # 1 of `cloud[0]`
+        return np.size(self.x)  # 1 for a single point, `cloud[0]`
 
     def __repr__(self) -> str:
         if not np.ndim(self.x):
@@ -100,7 +101,7 @@ class PointCloud:
     def columns(self) -> Mapping[str, NDArray[Any]]:
         """The columns of this cloud by name, `extra` last.
 
-        Only the chosen ones, if columns were chosen.
+        After `select_columns`, only the selected columns.
         """
         names = self.chosen or (*COLUMNS, *self.extra)
         self.load(*names)
@@ -110,17 +111,17 @@ class PointCloud:
         return {name: column for name, column in columns.items() if column is not None}
 
     def has_column(self, name: str) -> bool:
-        """Return whether a column was chosen, or is a place, which every file of points has."""
+        """Return whether a column is selected; x, y and z always are."""
         return not self.chosen or name in (*self.chosen, "x", "y", "z")
 
     def select_columns(self, *names: str) -> PointCloud:
-        """Return the same points with these columns alone.
+        """Return the same points with only these columns.
 
-        They apply to `columns`, `to_structured` and files. x, y and z remain if a format requires
-        them.
+        The selection applies to `columns`, `to_structured` and files. x, y and z remain if a format
+        requires them.
 
         Raises:
-            UnknownName: for a column that the cloud has not; it names those that it has.
+            UnknownName: if the cloud does not have a column; it lists the columns of the cloud.
         """
         lacking = [
             name
@@ -138,17 +139,16 @@ class PointCloud:
     def load(self, *names: str) -> None:
         """Compute columns together, which is faster than one after another.
 
-        A column is computed when it is first read. Columns that the cloud has already and columns
-        that it does not have are ignored.
+        Columns that are already computed and columns that the cloud does not have are ignored.
         """
 
     def read(self, *names: str) -> dict[str, NDArray[Any]]:
-        """Return columns by name, including "valid" and those in `extra`.
+        """Return columns by name, including "valid" and columns in `extra`.
 
-        They are computed together, which is faster than one after another.
+        They are computed together, which is faster than computing each when it is first read.
 
         Raises:
-            UnknownName: for a column that the cloud has not.
+            UnknownName: if the cloud does not have a column.
         """
         self.load(*names)
         columns = {name: getattr(self, name) for name in names if name in (*COLUMNS, "valid")}
@@ -162,7 +162,7 @@ class PointCloud:
     def calibration(self) -> str:
         """The origin of the calibration.
 
-        "own" is the sensor's own, "nominal" means that defaults were used.
+        "own" is the sensor's own calibration, "nominal" a default one.
         """
         if self.nominal:
             return "nominal"
@@ -170,7 +170,7 @@ class PointCloud:
 
     @property
     def xyz(self) -> Floats:
-        """(N, 3) float32 metres."""
+        """The coordinates, (N, 3) float32 metres."""
         return np.stack([self.x, self.y, self.z], axis=-1)
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
@@ -179,7 +179,7 @@ class PointCloud:
         `to_structured` has the other columns too.
 
         Raises:
-            ValueError: with ``copy=False``, since x, y and z are columns of their own.
+            ValueError: with ``copy=False``, since x, y and z are separate columns.
         """
         if copy is False:
             raise ValueError("x, y and z of a PointCloud are separate columns, so xyz is a copy")
@@ -190,7 +190,8 @@ class PointCloud:
     def __getitem__(self, which: Any) -> PointCloud:
         """Return the points at a mask, indices or a slice.
 
-        The result is organised only if a slice holds whole columns. One index gives scalars.
+        The result is organised only if a slice selects whole columns. An integer gives one point
+        with scalar columns.
         """
         picked = {f.name: _select(getattr(self, f.name), which) for f in fields(self)}
         picked["extra"] = {name: column[which] for name, column in self.extra.items()}
@@ -203,23 +204,24 @@ class PointCloud:
         return PointCloud(**{**picked, "shape": shape})
 
     def organise(self, columns: int) -> PointCloud:
-        """Return the points as a picture of `columns` columns, placed by their number.
+        """Return the points as an image of `columns` columns, by their column numbers.
 
-        A missing column is a gap of invalid points.
+        A missing column becomes a gap of invalid points.
 
         Args:
-            columns: of a whole turn. The points are those of one turn at most.
+            columns: the number of columns of a revolution. The points must be of one revolution at
+                most.
 
         Raises:
-            UsageError: where they have no `column` or are not organised, or a number comes twice or
-                is too large.
+            UsageError: if the points have no `column` or are not organised, or if a number occurs
+                twice or is too large.
         """
         if self.shape is None or self.column is None:
             raise UsageError(
                 "an image requires organised points with a column number: Polar(..., column=...)"
             )
-        each = grid_of(self).column
-        numbers, counts = np.unique(self.column[::each], return_counts=True)
+        column_size = grid_of(self).column
+        numbers, counts = np.unique(self.column[::column_size], return_counts=True)
         wrong = numbers[(numbers >= columns) | (counts > 1)]
         if len(wrong):
             if wrong[0] < columns:
@@ -231,22 +233,23 @@ class PointCloud:
                 " number of columns"
             )
         place = np.full(columns, -1)
-        place[self.column[::each]] = np.arange(self.shape[0])
-        indices = np.where(place[:, None] < 0, -1, place[:, None] * each + np.arange(each))
-        numbered = np.repeat(np.arange(columns), each).astype(TYPES["column"])
+        place[self.column[::column_size]] = np.arange(self.shape[0])
+        indices = np.where(
+            place[:, None] < 0, -1, place[:, None] * column_size + np.arange(column_size)
+        )
+        numbered = np.repeat(np.arange(columns), column_size).astype(TYPES["column"])
         return replace(self._rearrange(indices), column=numbered, shape=(columns, self.shape[1]))
 
     def destagger(self, shifts: Sequence[int]) -> PointCloud:
-        """Return the points of a picture with each row shifted by some columns.
+        """Return the points of an image with each row shifted by a number of columns.
 
-        Rows wrap around. Afterwards one column has one direction.
+        Rows wrap around. Afterwards all points of a column have one direction.
 
         Args:
-            shifts: columns for each row, (rows,), as the sensor's metadata has them.
+            shifts: the shift of each row in columns, (rows,), as in the sensor's metadata.
 
         Raises:
-            UsageError: if the points are not organised (see `find_organised_shape`), or if there is
-                not one shift for each row.
+            UsageError: if the points are not organised, or if there is not one shift for each row.
         """
         if self.shape is None or np.shape(shifts) != (self.shape[1],):
             if self.shape:
@@ -265,12 +268,12 @@ class PointCloud:
     def _rearrange(self, indices: NDArray[np.intp]) -> PointCloud:
         """Return the points at some indices, which form whole columns.
 
-        Index -1 is an invalid point in its row.
+        Index -1 becomes an invalid point in its row.
         """
         indices = indices.reshape(-1)
-        each = grid_of(self).column
+        column_size = grid_of(self).column
         gaps = indices < 0
-        picked = self[np.where(gaps, np.arange(len(indices)) % each, indices)]
+        picked = self[np.where(gaps, np.arange(len(indices)) % column_size, indices)]
         if gaps.any():
             for column in (*picked.columns.values(), picked.valid):
                 if column.dtype.kind in "fb":
@@ -282,8 +285,8 @@ class PointCloud:
 
         The fields are x y z intensity ring time, itemsize 32. Missing values are 0.
 
-        The columns in `extra` follow from byte 32 on, each where its type allows, and the itemsize
-        is a multiple of 16.
+        The columns in `extra` follow from byte 32 on, aligned to their size, and the itemsize is a
+        multiple of 16.
         """
         names = [name for name in STRUCTURED.names or () if self.has_column(name)]
         self.load(*names, *self.extra)
@@ -297,16 +300,16 @@ class PointCloud:
         return structured
 
     def to_arrow(self, facts: Mapping[str, str] | None = None) -> Any:
-        """Return a `pyarrow.Table` with the columns of `columns`.
+        """Return a `pyarrow.Table` of `columns`.
 
         Columns are not copied, except bools. The metadata of each field has its unit.
 
         Args:
-            facts: further metadata of the schema, beside `units` as JSON, `calibration` ("nominal"
-                or "own") and `stamp_ns`.
+            facts: further metadata of the schema, added to `units` as JSON, `calibration`
+                ("nominal" or "own") and `stamp_ns`.
 
         Raises:
-            UsageError: where pyarrow is not installed.
+            UsageError: if pyarrow is not installed.
         """
         schema_facts = {
             "stamp_ns": str(self.stamp_ns),
@@ -318,32 +321,32 @@ class PointCloud:
         return import_library("pyarrow", "arrow").table(columns, schema)
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """The table of `to_arrow`, as DuckDB, Polars and pandas take it from the object itself."""
+        """Return the stream by which DuckDB, Polars and pandas read `to_arrow`."""
         return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     def to_pandas(self) -> Any:
-        """Return a `pandas.DataFrame` with the columns of `columns`, not copied.
+        """Return a `pandas.DataFrame` of `columns`, without copying them.
 
         `attrs` has "units" and "stamp_ns".
 
         Raises:
-            UsageError: where pandas is not installed.
+            UsageError: if pandas is not installed.
         """
         frame = import_library("pandas", "pandas").DataFrame(dict(self.columns), copy=False)
         frame.attrs.update(units=units_of(self), stamp_ns=self.stamp_ns)
         return frame
 
     def to_polars(self) -> Any:
-        """Return a `polars.DataFrame` with the columns of `columns`, which are not copied.
+        """Return a `polars.DataFrame` of `columns`, without copying them.
 
         Raises:
-            UsageError: where Polars is not installed.
+            UsageError: if Polars is not installed.
         """
         return import_library("polars", "polars").DataFrame(dict(self.columns))
 
 
 def units_of(cloud: PointCloud) -> dict[str, str]:
-    """The units of the columns that a cloud has, by name, those that are plain numbers left out."""
+    """Return the units of a cloud's columns, by name; plain numbers are left out."""
     return {
         name: unit for name in cloud.columns if (unit := UNITS.get(name) or cloud.units.get(name))
     }
@@ -363,7 +366,7 @@ def grid_of(cloud: PointCloud) -> Grid:
 
 
 def find_organised_shape(number: int, grid: Grid) -> tuple[int, int] | None:
-    """Return the shape of a cloud of so many points."""
+    """Return the (columns, rows) of a number of points; None if not organised."""
     if grid.rows:
         return (number // grid.column, grid.rows)
     return None
@@ -405,7 +408,7 @@ class CloudColumns(ColumnSource):
 
 
 class LazyCloud(PointCloud):
-    """A cloud whose columns are computed when they are first read.
+    """A cloud with columns that are computed when they are first read.
 
     Attributes:
         lazy: the columns. The cloud and its `extra` share them, without a reference cycle that
@@ -415,12 +418,16 @@ class LazyCloud(PointCloud):
     lazy: LazyColumns
 
     def __new__(cls, *args: Any, **columns: Any) -> PointCloud:  # type: ignore[misc]
-        """Return a cloud of given columns, which is not lazy: `dataclasses.replace` makes one."""
+        """Return a plain cloud of given columns, because `dataclasses.replace` calls this."""
         return PointCloud(*args, **columns)
 
     @classmethod
     def of(cls, source: ColumnSource, stamp_ns: int) -> LazyCloud:
-        """Return the cloud of a source; its times count from `stamp_ns`."""
+        """Return the cloud of a source.
+
+        Args:
+            stamp_ns: the time that the times of the source count from, ns.
+        """
         lazy = LazyColumns(source)
         cloud = object.__new__(cls)
         cloud.__dict__.update(
@@ -455,7 +462,7 @@ class LazyCloud(PointCloud):
 
 
 class ExtraColumns(Mapping[str, NDArray[Any]]):
-    """The columns of a cloud under names of the sensor's own, computed when they are first read."""
+    """The columns in `extra` of a cloud, computed when they are first read."""
 
     def __init__(self, lazy: LazyColumns) -> None:
         self._lazy = lazy

@@ -1,6 +1,6 @@
 """The colours of values, the same in every picture.
 
-Low values are blue, medium ones green and high ones yellow.
+Low values are blue, medium values green and high values yellow.
 
 The scale is a helix in the colour space OKLab, in which equal steps look equal. Its lightness rises
 all the way, so that readers who confuse red and green, or blue and yellow, still see the order.
@@ -19,7 +19,7 @@ from typing import Literal
 Rgb = tuple[int, int, int]
 Theme = Literal["dark", "light"]
 
-#: OKLab to the cube roots of the responses of the cones, and these responses to linear sRGB.
+#: matrices from OKLab to the cube roots of the cone responses, and from these responses to sRGB.
 _CONES = (
     (1.0, 0.3963377774, 0.2158037573),
     (1.0, -0.1055613458, -0.0638541728),
@@ -75,7 +75,7 @@ def _interpolate(ends: tuple[float, float], share: float) -> float:
 
 
 def _srgb(lightness: float, a: float, b: float) -> list[int]:
-    """Return a colour of OKLab as sRGB, limited to what a screen can show."""
+    """Return a colour of OKLab as sRGB, limited to the colours of a screen."""
     cones = [(row[0] * lightness + row[1] * a + row[2] * b) ** 3 for row in _CONES]
     parts = []
     for row in _LINEAR:

@@ -1,10 +1,10 @@
 """Sources of the columns of consecutive points.
 
-A cloud or a scan takes its columns from a `ColumnSource` when they are first read. A source has one
-method that computes columns for a range of points. The points of a batch of packets are a source
-(`batch_columns.BatchColumns`), those of a cloud that has its columns (`cloud.CloudColumns`), and
-stretches of other sources one after another (`JoinedColumns`), as slices and scans are. So scans
-are cut out of batches without computing a column.
+A cloud or a scan reads its columns from a `ColumnSource` when they are first used. A source has one
+method that computes columns for a slice of points. There are three kinds: the points of a batch of
+packets (`batch_columns.BatchColumns`), the points of a cloud that has its columns
+(`cloud.CloudColumns`), and slices of other sources, concatenated (`JoinedColumns`). Slices and
+scans use the third kind, so scans are cut out of batches without computing a column.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ class ColumnSource:
 
     Attributes:
         size: the number of points.
-        base: the time from which their times count, int64 ns.
-        grid: the organisation of the points, all together.
+        base: the time that times count from, int64 ns.
+        grid: the organisation of all points together.
         grids: the organisation of the points of each packet, if packets have several shapes.
-        nominal: whether a default calibration stood in for the sensor's own.
-        extra: the type and unit of the columns under names of the sensor's own, by name.
-        is_level: whether all points lie in the horizontal plane through the sensor.
+        nominal: whether a default calibration is used instead of the sensor's own.
+        extra: the types and units of the columns in `PointCloud.extra`, by name.
+        is_level: whether all points are in the horizontal plane through the sensor.
     """
 
     size: int
@@ -42,12 +42,12 @@ class ColumnSource:
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
         """Return columns of the points from `start` to `stop`, (stop - start,) each.
 
-        Columns that the sensor does not have are missing. Others that were computed together with
-        the requested ones may be included. A source may leave out "valid", which follows from x,
-        and leaves out "z" if it is level.
+        Columns that the sensor does not have are missing. Other columns that were computed together
+        with the requested columns may be included. A source may leave out "valid", which follows
+        from x. It leaves out "z" if it is level.
 
         Args:
-            names: of columns of `PointCloud`, or of columns in `extra`.
+            names: the names of columns of `PointCloud`, or of columns in `extra`.
         """
         raise NotImplementedError
 
@@ -58,10 +58,7 @@ class ColumnSource:
         return whole_columns(self.grid, start, stop - start)
 
     def times_at(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the times of the points at some indices, in their shape.
-
-        Times are in seconds since `base`.
-        """
+        """Return the times of the points at some indices, in seconds since `base`."""
         picked: NDArray[np.float64] = self.columns(("time",), 0, self.size)["time"][indices]
         return picked
 
@@ -74,8 +71,8 @@ class LazyColumns:
     """The columns of a source, each computed when it is first read.
 
     Attributes:
-        source: of the columns.
-        computed: the columns computed so far, by name; None for those that the sensor lacks.
+        source: the source.
+        computed: the columns computed so far, by name; None if the sensor does not have a column.
     """
 
     def __init__(self, source: ColumnSource) -> None:
@@ -83,24 +80,24 @@ class LazyColumns:
         self.computed: dict[str, NDArray[Any] | None] = {}
 
     def load(self, *names: str) -> None:
-        """Compute the columns that are missing, together."""
+        """Compute the columns that are not computed yet, together."""
         missing = [name for name in names if name not in self.computed]
         if not missing:
             return
         columns = self.source.columns(missing, 0, self.source.size)
         self.computed = dict.fromkeys(missing) | columns | self.computed
         if "z" in missing and self.source.is_level:
-            self.computed["z"] = level_z(self._x())
+            self.computed["z"] = level_z(self._read_x())
         if "valid" in missing and "valid" not in columns:
-            self.computed["valid"] = ~np.isnan(self._x())  # x is nan unless a point is valid
+            self.computed["valid"] = ~np.isnan(self._read_x())  # x is nan unless a point is valid
 
     def read(self, name: str) -> NDArray[Any] | None:
-        """Return a column, None if the sensor lacks it."""
+        """Return a column; None if the sensor does not have it."""
         if name not in self.computed:
             self.load(name)
         return self.computed[name]
 
-    def _x(self) -> NDArray[Any]:
+    def _read_x(self) -> NDArray[Any]:
         x = self.read("x")
         assert x is not None  # since every cloud has it
         return x
@@ -126,10 +123,12 @@ class SourcePart(NamedTuple):
 
 
 class JoinedColumns(ColumnSource):
-    """Stretches of sources, one after another, at least one.
+    """Slices of sources, concatenated.
 
     Args:
-        from_first: times count from the first point; else from the base of the first source.
+        parts: the slices, at least one.
+        from_first: whether times count from the first point; else from the base of the first
+            source.
     """
 
     def __init__(self, parts: Sequence[SourcePart], *, from_first: bool = False) -> None:
@@ -149,7 +148,7 @@ class JoinedColumns(ColumnSource):
         }
 
     def columns(self, names: Sequence[str], start: int, stop: int) -> dict[str, NDArray[Any]]:
-        pieces = [self._piece(part, names) for part in self._parts]
+        pieces = [self._read_part(part, names) for part in self._parts]
         columns = {
             name: _join([piece[name] for piece in pieces])
             for name in pieces[0]
@@ -159,8 +158,8 @@ class JoinedColumns(ColumnSource):
             columns["time"] = columns["time"] - columns["time"][0]
         return {name: column[start:stop] for name, column in columns.items()}
 
-    def _piece(self, part: SourcePart, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-        """Return columns of one stretch, with times since the base of the first source."""
+    def _read_part(self, part: SourcePart, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Return columns of one slice, with times since the base of the first source."""
         piece = part.source.columns(names, part.start, part.stop)
         if "time" in piece:
             piece["time"] = piece["time"] + part.source.seconds_after(self.base)

@@ -2,8 +2,8 @@
 
 They are REP-103 axes, REP-117 ranges, coordinates, types and organised shapes.
 
-The formulas take arrays (the plain evaluation) and traced columns (plans) alike, so that each is
-written once.
+The formulas accept both arrays (in the reference evaluator) and traced columns (in plans), so that
+each formula is written once.
 """
 
 from __future__ import annotations
@@ -29,30 +29,34 @@ TYPES: Mapping[str, Any] = {
     **{"time": np.float64, "ring": np.uint16, "return_index": np.uint8, "column": np.uint16},
 }
 
-#: their units, by name; those that are not here are plain numbers.
+#: units of columns by name; columns that are not listed are plain numbers.
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("x", "y", "z", "range"), "m"),
     **dict.fromkeys(("azimuth", "elevation"), "rad"),
     "time": "s",
 }
 
-#: where x, y and z point by REP-103.
+#: the directions of x, y and z by REP-103.
 REP_103 = ("forward", "left", "up")
 
 #: largest float32 below pi: azimuths stay in [-pi, pi) in either precision.
 _PI = np.nextafter(np.float32(np.pi), np.float32(0))
 
-#: metres up to which float32 holds a place.
-FARTHEST = float(np.finfo(np.float32).max)
+#: the largest coordinate that float32 can hold, metres.
+MAX_COORDINATE_M = float(np.finfo(np.float32).max)
 
-#: radians from which on taking off whole turns loses precision.
-_FAR = 1e6
+#: angles larger than this lose precision if whole turns are subtracted, radians.
+_MAX_SUBTRACTED_RAD = 1e6
 
 
 def shown_range(measured: Any, invalid: Any) -> Any:
-    """Return the range that a cloud shows, metres (REP-117).
+    """Return the range in a cloud, metres (REP-117).
 
     It is inf without a return, and nan if the sensor marks the point as invalid.
+
+    Args:
+        measured: the measured range, metres; 0 without a return.
+        invalid: whether the sensor marks the point as invalid.
     """
     return mark_invalid(
         np.where(measured == 0, np.inf, np.where(measured < 0, np.nan, measured)), invalid
@@ -60,9 +64,9 @@ def shown_range(measured: Any, invalid: Any) -> Any:
 
 
 def returned_range(measured: Any) -> Any:
-    """Return the range of a return, metres, nan without a return.
+    """Return the range of a return, metres; nan without a return.
 
-    A traced value gets a single step that compilers know.
+    For a traced column the function is one node, which the compilers recognize.
     """
     if isinstance(measured, TracedColumn):
         return measured.apply_function(returned_range, measured)
@@ -70,7 +74,7 @@ def returned_range(measured: Any) -> Any:
 
 
 def mark_invalid(measured: Any, invalid: Any) -> Any:
-    """Ranges, nan where the sensor marks a point as wrong."""
+    """Return ranges, nan if the sensor marks the point as invalid."""
     if isinstance(invalid, TracedColumn) or np.any(invalid):
         return np.where(invalid, np.nan, measured)
     return measured
@@ -79,12 +83,12 @@ def mark_invalid(measured: Any, invalid: Any) -> Any:
 def coordinates(
     distance: Any, azimuth: Any, elevation: Any, origin: Sequence[Any]
 ) -> tuple[Any, Any, Any]:
-    """x, y and z of points, metres, from where their beams start.
+    """Return x, y and z of points, metres.
 
     Args:
         distance: metres along the beam.
         azimuth, elevation: radians.
-        origin: x, y and z of where the beam starts.
+        origin: x, y and z of the start of the beam, metres.
     """
     level: Any = np.cos(elevation)
     sides = [np.cos(azimuth), np.sin(azimuth)]
@@ -101,24 +105,24 @@ def coordinates(
 
 
 def place_points(coordinates: Sequence[Any], invalid: Any) -> list[Any]:
-    """Return the coordinates of points that are given by coordinates, metres.
+    """Return the x, y and z of a `Cartesian` result, metres, nan for invalid points.
 
-    They are nan without a return, if one is not finite, or if the sensor marks the point as
-    invalid.
+    A point is invalid if it is at the origin (no return), if a coordinate is not finite, or if the
+    sensor marks it as invalid.
 
     Args:
-        coordinates: x, y and z as `Cartesian` has them.
-        invalid: where the sensor marks a point as wrong.
+        coordinates: x, y and z of the result.
+        invalid: whether the sensor marks the point as invalid.
     """
     away = sum(abs(place) for place in coordinates if not is_zero(place))
-    lost = np.logical_not((away > 0) & (away <= FARTHEST))
+    lost = np.logical_not((away > 0) & (away <= MAX_COORDINATE_M))
     if isinstance(invalid, TracedColumn) or np.any(invalid):
         lost = lost | invalid
     return [np.where(lost, np.nan, place) for place in coordinates]
 
 
 def find_direction(x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-    """Range, azimuth and elevation of points that are given by coordinates: metres and radians."""
+    """Return the range, azimuth and elevation of coordinates, metres and radians."""
     level = np.hypot(x, y)
     return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
 
@@ -132,26 +136,27 @@ def _product(first: Any, second: Any) -> Any:
 def _is_row(value: Any) -> bool:
     """Return whether a value is a row of a table.
 
-    Computations with such rows are done once, for the table.
+    Computations with table rows are done once, for the whole table.
     """
     return isinstance(value, TracedColumn) and value.node.kind == "rows"
 
 
 def is_zero(value: Any) -> bool:
-    """Return whether a number or an array, which no data decides, is 0."""
+    """Return whether a value is 0 everywhere and does not depend on data."""
     return not isinstance(value, TracedColumn) and bool(np.all(np.asarray(value) == 0))
 
 
 def seconds_since(time_ns: NDArray[np.int64], base: int) -> NDArray[np.float64]:
-    """Return the times of packets, (n,) nanoseconds, as seconds since one of them."""
+    """Return the times of packets, (n,) ns, as seconds since `base`."""
     return np.multiply(time_ns - base, 1e-9, dtype=np.float64)
 
 
 class Grid(NamedTuple):
     """The organisation of the points of a packet.
 
-    `rows` is the number of places in a column, 0 if the points are not organised. The `returns` of
-    one place are side by side.
+    Attributes:
+        rows: the number of directions in a column; 0 if the points are not organised.
+        returns: the number of returns of each direction, which are adjacent.
     """
 
     rows: int = 0
@@ -159,7 +164,7 @@ class Grid(NamedTuple):
 
     @property
     def column(self) -> int:
-        """The points of a column."""
+        """The number of points of a column."""
         return self.rows * self.returns
 
 
@@ -178,12 +183,12 @@ def grid_of(shape: Sequence[int], axes: Sequence[str | None]) -> Grid:
 
 
 class Grids(NamedTuple):
-    """The organisation of the points of packets of several shapes, in stream order.
+    """The organisation of the points of packets with several shapes, in stream order.
 
     Attributes:
-        ends: (n,) the point after the last one of each packet.
-        which: (n,) the one of `grids` that a packet has; of one without points it says nothing.
-        grids: these.
+        ends: (n,) the index after the last point of each packet.
+        which: (n,) the index in `grids` of each packet; any index for a packet without points.
+        grids: the different organisations.
     """
 
     ends: NDArray[np.intp]
@@ -207,9 +212,14 @@ class Grids(NamedTuple):
 
 
 def whole_columns(grid: Grid, first: int, number: int) -> Grid:
-    """Return the organisation of `number` points of organised ones.
+    """Return the organisation of a slice of organised points.
 
-    They begin `first` points after a column, and are not organised if they are not whole columns.
+    The slice is not organised unless it consists of whole columns.
+
+    Args:
+        grid: the organisation of all points.
+        first: the number of points between the start of a column and the slice.
+        number: the number of points of the slice.
     """
     if grid.rows and first % grid.column == 0 and number % grid.column == 0:
         return grid
@@ -224,7 +234,7 @@ class ExtraType(NamedTuple):
 
     @classmethod
     def of(cls, extra: Extra, values: Any) -> ExtraType:
-        """Return the declared type and unit; those of the field if the values are a field."""
+        """Return the declared type and unit, by default the type and unit of the field."""
         is_own = isinstance(values, Column) and not values.frame
         if is_own:
             info = values.batch.table.schema.fields.get(values.source)
@@ -247,21 +257,22 @@ class ExtraType(NamedTuple):
         )
 
     def column(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values in the type, of the same shape."""
+        """Return values converted to the type, of the same shape."""
         if self.dtype.kind == "f":
             return values.astype(self.dtype, copy=False)
         return convert_numbers(values, self.dtype)
 
 
 def convert_numbers(values: NDArray[Any], dtype: Any) -> NDArray[Any]:
-    """Return a column of numbers in its type, of the same shape; nan is 0."""
+    """Return numbers converted to a type, of the same shape; nan becomes 0."""
     return np.asarray(np.nan_to_num(values) if values.dtype.kind == "f" else values, dtype)
 
 
 def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
     """Return the (3, 3) matrix from REP-103 coordinates to named axes.
 
-    The axes are named by the directions of x, y and z.
+    Args:
+        axes: the directions of x, y and z, for example ("forward", "left", "up").
     """
     matrix = np.zeros((3, 3))
     for row, name in enumerate(axes):
@@ -271,9 +282,9 @@ def axis_matrix(axes: Sequence[str]) -> NDArray[np.float64]:
 
 
 def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
-    """Return the directions of x, y and z of a sensor's points.
+    """Return the directions of the x, y and z axes of a sensor's points.
 
-    They follow REP-103, or the vendor's axes if these are configured.
+    They follow REP-103, unless the vendor's axes are configured.
     """
     if sensor.options.get("frame") == "vendor":
         wanted = sensor.vendor_axes
@@ -286,7 +297,7 @@ def find_axes(sensor: SensorDescription) -> tuple[str, str, str]:
 def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
     """Return the (3, 3) matrix from REP-103 to the configured axes.
 
-    Returns None if these are the axes of REP-103.
+    Returns None if the configured axes follow REP-103.
     """
     axes = find_axes(sensor)
     if axes == REP_103:
@@ -295,20 +306,22 @@ def vendor_turn(sensor: SensorDescription) -> NDArray[np.float64] | None:
 
 
 def turn_azimuth(angles: NDArray[Any], turn: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return azimuths of the same directions in turned axes, radians in [-pi, pi].
+    """Return azimuths of the same directions in rotated axes, radians in [-pi, pi].
 
-    The shape is that of `angles`. `turn` is (3, 3).
+    Args:
+        angles: the azimuths, radians.
+        turn: the (3, 3) rotation matrix.
     """
     direction = turn[:2, :2] @ np.stack([np.cos(angles), np.sin(angles)])
     return np.asarray(np.arctan2(direction[1], direction[0]))
 
 
 def narrow_angle(angle: NDArray[np.float64]) -> Floats:
-    """Angles in radians as float32 in [-pi, pi), of the same shape."""
+    """Return angles in radians as float32 in [-pi, pi), of the same shape."""
     turned = angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
-    far = np.abs(angle) > _FAR
+    far = np.abs(angle) > _MAX_SUBTRACTED_RAD
     if far.any():
         turned[far] = (
             np.mod(angle[far] + np.pi, 2 * np.pi) - np.pi
-        )  # exact however many turns it is, and slow
+        )  # exact for any number of turns, but slow
     return np.clip(turned.astype(np.float32), -_PI, _PI)

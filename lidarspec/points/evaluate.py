@@ -1,8 +1,8 @@
-"""Packets to points: by plans where `points` can be traced, else by its plain evaluation.
+"""Evaluate packets to points: by plans if `points` can be traced, else by the reference evaluator.
 
-What a batch is asked for at once is what later batches need: values that remember other packets,
-and whether the plans hold. What the columns of its cloud cost is paid when they are read. The
-values of a packet do not depend on the batch it is in.
+Only the work that later batches depend on is done at once: stateful values are computed, and the
+conditions of plans are checked. Columns are computed when they are first read. The values of
+a packet do not depend on the batch that contains it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lidarspec.frames.frame_table import CompiledTable, LayoutRows
 from lidarspec.points.batch_columns import BatchColumns
 from lidarspec.points.conventions import Grids, grid_of
 from lidarspec.points.layout_groups import GroupPoints, PlainValues
-from lidarspec.points.plan import MODERATE, REMEMBERING, Plan, plan_for
+from lidarspec.points.plan import MODERATE_SIZES, STATEFUL_KINDS, Plan, plan_for
 from lidarspec.points.reference_evaluator import (
     EvaluatedPoints,
     PacketBatch,
@@ -30,8 +30,8 @@ from lidarspec.points.reference_evaluator import (
     find_stamp,
 )
 
-#: numbers that are checked together, so that they stay in the cache.
-CHECKED_AT_ONCE = 1 << 15
+#: how many numbers are checked together, so that they stay in the cache.
+NUMBERS_CHECKED_TOGETHER = 1 << 15
 
 
 def evaluate(
@@ -43,16 +43,16 @@ def evaluate(
 ) -> EvaluatedPoints:
     """Return the points of a batch by the fastest applicable evaluation.
 
-    The columns equal those of `evaluate_plainly` within a few units in the last place.
+    The columns equal the columns of `evaluate_plainly` within a few units in the last place.
 
     Args:
-        carry: what the batch before left.
-        final: nothing follows; what depends on it becomes nan (by `following`), and no packet
-            waits.
-        epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
+        carry: the state left by the previous batch.
+        final: whether no packets follow. Values that depend on following packets (`following`) are
+            then nan, and no packet waits.
+        epoch: the stamp of the cloud, int64 ns; by default the time of the first packet.
 
     Raises:
-        PluginError: where the plugin's function fails or returns columns that do not fit; the cause
+        PluginError: if the plugin's function fails or returns columns of a wrong shape; the cause
             is chained.
     """
     planned = _evaluate_by_plans(packets, carry, final=final, epoch=epoch)
@@ -64,7 +64,7 @@ def evaluate(
 def _evaluate_by_plans(
     packets: PacketBatch, carry: Carry | None, *, final: bool, epoch: int | None
 ) -> EvaluatedPoints | None:
-    """Return the points of a batch by plans, None if there are none for these packets."""
+    """Return the points of a batch by plans; None if no valid plan exists."""
     table = packets.table
     if not isinstance(table, CompiledTable) or not table.groups:
         return None
@@ -78,14 +78,16 @@ def _evaluate_by_plans(
                 return None
             plans.append(plan)
     except Exception:
-        return None  # the plain evaluation reports what is wrong
+        return None  # the reference evaluator reports the error
     whole = PlainValues(batch)
     try:
         remembered = {
-            node.number: whole.column(node) for node in plans[0].eager if node.kind in REMEMBERING
+            node.number: whole.column(node)
+            for node in plans[0].eager
+            if node.kind in STATEFUL_KINDS
         }
         shares = [
-            _share(plan, batch, group, whole, remembered)
+            _make_group(plan, batch, group, whole, remembered)
             for plan, group in zip(plans, table.groups, strict=True)
         ]
         are_valid = all(_is_valid(share) for share in shares)
@@ -96,19 +98,24 @@ def _evaluate_by_plans(
     ready = len(packets)
     if not final:
         ready = min((column.ready for column in remembered.values()), default=ready)
-    source = _source_of(packets, shares, batch, ready, find_stamp(packets, epoch))
-    counts = _counts(shares, len(packets))[:ready]
+    source = _make_source(packets, shares, batch, ready, find_stamp(packets, epoch))
+    counts = _count_points(shares, len(packets))[:ready]
     return EvaluatedPoints(source, ready, counts, plans[0].axes, batch)
 
 
-def _share(
+def _make_group(
     plan: Plan,
     batch: Batch,
     group: LayoutRows,
     whole: PlainValues,
     remembered: Mapping[int, Column],
 ) -> GroupPoints:
-    """Return the share of a group; values that use other packets are those of the whole batch."""
+    """Return the packets of a group with their plan.
+
+    Args:
+        whole: the values of the whole batch.
+        remembered: the values of stateful nodes for the whole batch, by node number.
+    """
     is_whole = len(group.where) == len(batch) and group.is_in_order
     if is_whole:
         return GroupPoints(plan, group, whole, batch)
@@ -118,7 +125,7 @@ def _share(
 def _is_valid(share: GroupPoints) -> bool:
     """Return whether a plan is valid for its packets.
 
-    Their counts, and the values of factors and floating-point fields, are checked.
+    This checks the lengths of axes, the sign of factors, and the size of floating-point fields.
     """
     values = share.plain_values
     for node, number in share.plan.tape.steps:
@@ -140,7 +147,7 @@ def _is_moderate(share: GroupPoints, node: Node) -> bool:
     if leaf is None:
         return False
     rows = share.group.rows
-    step = max(CHECKED_AT_ONCE // max(math.prod(leaf.shape), 1), 1)
+    step = max(NUMBERS_CHECKED_TOGETHER // max(math.prod(leaf.shape), 1), 1)
     return all(
         _are_moderate(leaf.load(rows[start : start + step])) for start in range(0, len(rows), step)
     )
@@ -149,16 +156,18 @@ def _is_moderate(share: GroupPoints, node: Node) -> bool:
 def _are_moderate(values: NDArray[Any]) -> bool:
     """Return whether floating-point numbers are all 0 or of moderate size.
 
-    Without the sign, their bits are integers in the same order.
+    Without the sign bit, their bits compare like integers, which is faster.
     """
     kind = np.dtype(f"u{values.dtype.itemsize}")
-    least, most = np.clip(MODERATE, 0, np.finfo(values.dtype).max).astype(values.dtype).view(kind)
+    least, most = (
+        np.clip(MODERATE_SIZES, 0, np.finfo(values.dtype).max).astype(values.dtype).view(kind)
+    )
     sizes = values.view(kind) & np.array(np.iinfo(kind).max >> 1, kind)
     odd = sizes - least > most - least
     return not (odd.any() and sizes[odd].any())
 
 
-def _source_of(
+def _make_source(
     packets: PacketBatch, shares: list[GroupPoints], batch: Batch, ready: int, stamp_ns: int
 ) -> BatchColumns:
     """Return the columns of the points of the first `ready` packets."""
@@ -181,8 +190,8 @@ def _source_of(
     return BatchColumns(packets, shares, size, stamp_ns, grids=grids, nominal=nominal)
 
 
-def _counts(shares: list[GroupPoints], number: int) -> NDArray[Any]:
-    """Return 1 for each point, with the axes of the arrays, and 0 in their padding."""
+def _count_points(shares: list[GroupPoints], number: int) -> NDArray[Any]:
+    """Return an array with 1 for each point, by packet and axis, and 0 in padding."""
     if len(shares) == 1 or len({share.plan.shape for share in shares}) == 1:
         return repeat(1, number, *shares[0].plan.shape)
     shape = tuple(
@@ -198,14 +207,14 @@ def _counts(shares: list[GroupPoints], number: int) -> NDArray[Any]:
 def evaluate_guarded(
     packets: PacketBatch, carry: Carry | None = None, *, final: bool, epoch: int
 ) -> EvaluatedPoints | None:
-    """Return the points of a batch of a stream, None if the plugin fails.
+    """Return the points of a batch of a stream; None if the plugin fails.
 
-    Failures are counted in the `Counters` of the packets.
+    Errors are counted in the `Counters` of the packets.
 
     Args:
-        carry: what the batch before left.
-        final: nothing follows, so that no packet waits.
-        epoch: the time that the cloud's stamp is, int64 ns.
+        carry: the state left by the previous batch.
+        final: whether no packets follow, so that no packet waits.
+        epoch: the stamp of the cloud, int64 ns.
     """
     try:
         points = evaluate(packets, carry, final=final, epoch=epoch)

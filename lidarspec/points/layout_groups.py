@@ -1,7 +1,7 @@
-"""The packets of one layout in a batch, with their plan and plain results.
+"""The packets of one layout in a batch, with their plan and their values.
 
-A batch has a `GroupPoints` for each layout. `PlainValues` evaluates nodes of the plan plainly for
-its packets, each node once.
+A batch has a `GroupPoints` for each layout. `PlainValues` evaluates nodes of the plan for its
+packets by the reference evaluator, each node once.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from lidarspec.expressions.columns import Batch, Column, Fields, field_array
 from lidarspec.expressions.graph import Node, compute
 from lidarspec.frames.arrays import add_axes
 from lidarspec.frames.frame_table import LayoutRows
-from lidarspec.points.plan import REMEMBERING, ColumnMaker, Plan
+from lidarspec.points.plan import STATEFUL_KINDS, ColumnMaker, Plan
 
-#: bytes of an integer that float64 holds exactly.
+#: integers of up to this size are exact in float64.
 MAX_EXACT_BYTES = 4
 
 
 class PlainValues:
-    """The plain results of nodes for one batch, each computed once.
+    """The values of nodes for one batch, computed once by the reference evaluator.
 
-    Results are columns if axes have to be named, else arrays.
+    Values are columns if the names of axes are needed, else arrays.
     """
 
     def __init__(self, batch: Batch) -> None:
@@ -36,25 +36,24 @@ class PlainValues:
         self._arrays: dict[Node, Any] = {}
 
     def column(self, node: Node) -> Column:
-        """Return the result of a node."""
+        """Return the value of a node as a column."""
         if node not in self._columns:
             with np.errstate(all="ignore"):
                 compute(node, self._columns, self._read)
         return self._columns[node]  # type: ignore[no-any-return]
 
     def array(self, node: Node) -> NDArray[Any]:
-        """Return the array of a node's result, (n or 1, ...)."""
+        """Return the value of a node as an array, (n or 1, ...)."""
         if node not in self._arrays:
             with np.errstate(all="ignore"):
                 compute(node, self._arrays, self._load)
         return self._arrays[node]  # type: ignore[no-any-return]
 
     def sent(self, node: Node, first: int, stop: int) -> NDArray[Any] | None:
-        """Return the whole numbers of a field as sent, (n, ...).
+        """Return the integers of a field as they were sent, (n, ...).
 
-        They are those of the packets from `first` to `stop`.
-
-        None for what is no such field, or not in every packet.
+        They are from packet `first` up to packet `stop`. Returns None if the node is not an
+        unscaled integer field that every packet has.
         """
         if node.kind == "field":
             info = self._table.schema.fields.get(node.path)
@@ -76,8 +75,8 @@ class PlainValues:
             some = self._table.take(np.arange(first, stop))
         return field_array(info, some, self._table.schema.depth(), raw=True)
 
-    def know(self, node: Node, column: Column) -> None:
-        """Take a result as given."""
+    def set_value(self, node: Node, column: Column) -> None:
+        """Set the value of a node."""
         self._columns[node] = column
 
     def _read(self, node: Node) -> Any:
@@ -99,9 +98,11 @@ class PlainValues:
 
 @dataclass(eq=False)
 class GroupPoints:
-    """The packets of one layout in a batch, with their plan and plain results.
+    """The packets of one layout in a batch, with their plan and their values.
 
-    `first` is the index of the first point of each packet, -1 for none.
+    Attributes:
+        first: the index of the first point of each packet, (n,); -1 for a packet that waits. None
+            if the batch has one layout, in order.
     """
 
     plan: Plan
@@ -114,7 +115,11 @@ class GroupPoints:
         return len(self.group.where)
 
     def fill(self, maker: ColumnMaker, first: int, stop: int | None) -> dict[str, NDArray[Any]]:
-        """Return columns of the packets from `first` to `stop` (None: all)."""
+        """Return columns of the packets from `first` to `stop` (None: all).
+
+        Args:
+            maker: computes the columns.
+        """
         rows = self.group.rows[first:stop]
         columns = maker.columns(len(rows))
 
@@ -128,14 +133,11 @@ class GroupPoints:
         return columns
 
     def plain(self, name: str, first: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Return a part of the result of `points`, evaluated plainly.
+        """Return a part of the `points` result by the reference evaluator.
 
-        It has every point of the packets from `first` to `stop` (None: all).
-
-        Its shape is that of the plan, behind the packets.
-
-        A further column of whole numbers that is a field as it stands is of their type, all others
-        of float64.
+        The shape is (packets from `first` to `stop`, *the shape of the plan); `stop` None means
+        all. A column in `extra` that is a field as it was sent has the type of the field; all other
+        parts are float64.
         """
         stop = len(self) if stop is None else stop
         part = self.plan.parts[name]
@@ -159,10 +161,10 @@ class GroupPoints:
     def part(
         cls, plan: Plan, batch: Batch, group: LayoutRows, remembered: Mapping[int, Column]
     ) -> GroupPoints:
-        """Return the share of some packets of a batch.
+        """Return the group of some packets of a batch.
 
         Args:
-            remembered: results for all packets, by the number of a node that uses other packets.
+            remembered: the values of stateful nodes for all packets of the batch, by node number.
         """
         own = batch.of(group)
         share = cls(plan, group, PlainValues(own), own)
@@ -173,15 +175,15 @@ class GroupPoints:
             else:
                 array = column.array
             corner = (slice(None), *(slice(0, length) for length in node.shape))
-            share.plain_values.know(node, Column(array[corner], node.sample.axes, own))
+            share.plain_values.set_value(node, Column(array[corner], node.sample.axes, own))
         return share
 
     def some(self, which: NDArray[np.intp]) -> GroupPoints:
-        """Return the share of some of the packets, by index, with what is known of them plainly."""
+        """Return the group of some of the packets, by index, with their known values."""
         remembered = {
             node.number: self.plain_values.column(node)
             for node in self.plan.eager
-            if node.kind in REMEMBERING
+            if node.kind in STATEFUL_KINDS
         }
         return GroupPoints.part(
             self.plan,

@@ -1,13 +1,12 @@
-"""Tables of fields by the one or two bytes that hold them: their windows.
+"""Tabulate expressions of one field for all values of its bytes.
 
-A table has the result of an expression of one field for every value of these bytes.
+If a field is in at most two bytes (its window), an expression of this field alone has at most
+65,536 values. The table is made by evaluating the expression for every value of the window. Looking
+up a value while decoding then includes byte order, bits, scale, "0 is no return", sines and
+cosines, without a special case for each. Both compilers of points use these tables, and the plan
+uses them to find out whether an expression can be infinite or nan.
 
-An expression of one such field is a table of at most 65,536 entries by the raw value of its window,
-made by evaluating the expression for every value: byte order, bits, scale, "0 is no return", sines
-and cosines then cost nothing while decoding, and need no rule each. Both compilers of points use
-these tables, and the plan asks them whether an expression can be anything but a number.
-
-Windows of frames with a wire form are those of their structs.
+For frames with a wire form, windows refer to the bytes of the struct.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import Expression, Node, get_only_field
 from lidarspec.frames.layout import Leaf
 
-#: what costs hardly more than looking its result up; with these, whatever is made of numbers stays
-#: a number.
+#: functions that are hardly slower than a lookup. Of finite numbers their results are finite
+#: (overflow apart).
 CHEAP: set[Any] = {
     np.add,
     np.subtract,
@@ -37,7 +36,7 @@ CHEAP: set[Any] = {
     np.maximum,
 }
 CHEAP |= {np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal, np.where}
-#: dividing by one of these numbers, or the rest of it, is a number too.
+#: functions with a finite result if the divisor is a constant other than 0.
 _DIVISIONS = {np.true_divide, np.mod}
 
 
@@ -45,7 +44,8 @@ _DIVISIONS = {np.true_divide, np.mod}
 class FieldWindow:
     """The bytes of a field in its element, little-endian.
 
-    They are `size` bytes from `offset` of the frame on. Tables are indexed by one or two bytes.
+    The window has `size` bytes, 1 or 2, and begins at `offset` of the frame. Its value is the index
+    in a table.
     """
 
     offset: int
@@ -53,14 +53,14 @@ class FieldWindow:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """The type it is loaded as."""
+        """The type as which the window is loaded."""
         return np.dtype(f"<u{self.size}")
 
 
 def find_window(leaf: Leaf) -> FieldWindow | None:
     """Return the window of a field.
 
-    Returns None if it takes more than two bytes, or if it is an array inside a bit block.
+    Returns None if the field is in more than two bytes, or if it is an array inside a bit block.
     """
     if leaf.wire is not None:
         if leaf.wire.itemsize <= 2 and leaf.wire.kind in "iu":
@@ -75,7 +75,9 @@ def find_window(leaf: Leaf) -> FieldWindow | None:
 
 
 def raw_values(leaf: Leaf, field_window: FieldWindow) -> NDArray[Any]:
-    """Return the raw values of a field for every value of its window: (256,) or (65536,)."""
+    """Return the raw value of a field for every value of its window.
+
+    The shape is (256,) or (65536,)."""
     codes = np.arange(1 << (8 * field_window.size)).astype(field_window.dtype)
     frames = np.zeros((len(codes), leaf.size), np.uint8)
     start = field_window.offset - leaf.offset
@@ -86,7 +88,7 @@ def raw_values(leaf: Leaf, field_window: FieldWindow) -> NDArray[Any]:
     return single.load(frames)
 
 
-def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
+def tabulate_values(node: Node, leaf: Leaf) -> NDArray[Any] | None:
     """Return an expression of one field for every value of its window.
 
     The shape is (256,) or (65536,). Returns None if the field has no window.
@@ -101,7 +103,7 @@ def every_value(node: Node, leaf: Leaf) -> NDArray[Any] | None:
 def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any] | None:
     """Return all values that an expression can have, (256,) or (65536,).
 
-    Returns None if it is not an expression of one field with a window.
+    Returns None unless it is an expression of one field with a window.
     """
     source = get_only_field(node)
     if source is not None:
@@ -109,14 +111,18 @@ def list_possible_values(node: Node, leaves: Mapping[str, Leaf]) -> NDArray[Any]
     else:
         leaf = None
     if leaf is not None:
-        return every_value(node, leaf)
+        return tabulate_values(node, leaf)
     return None
 
 
 def is_number(value: Any, leaves: Any) -> bool:
     """Return whether an expression is finite if its fields are.
 
-    The layout has to have the fields, and the operations have to be safe.
+    Returns False if this is not certain.
+
+    Args:
+        value: a node, or an array that does not depend on data.
+        leaves: the fields of the layout, by path.
     """
     if not isinstance(value, Node):
         return bool(np.isfinite(value).all())

@@ -1,4 +1,4 @@
-"""The mounting of a sensor on its carrier: it turns and moves the points of a cloud."""
+"""Rotate and move the points of a cloud by the mounting of the sensor on its carrier."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from lidarspec.points.conventions import narrow_angle
 class Mount:
     """Position and orientation of a sensor on its carrier; both have REP-103 axes.
 
-    The sensor is turned over first if it is `inverted`, then by roll, pitch and yaw about the
+    The sensor is turned over if it is `inverted`, then rotated by roll, pitch and yaw about the
     carrier's fixed axes.
 
     Attributes:
         x, y, z: the sensor's origin, metres forward, left and up.
-        roll_deg, pitch_deg, yaw_deg: about x, y and z, right-handed: a yaw of 90 makes the sensor
-            look to the left.
-        inverted: whether it hangs upside down, turned by half a turn about its forward axis.
+        roll_deg, pitch_deg, yaw_deg: degrees about x, y and z, right-handed: with a yaw of 90
+            the sensor faces to the left.
+        inverted: whether it hangs upside down: rotated by half a turn about its forward axis.
     """
 
     x: float = 0.0
@@ -51,11 +51,14 @@ class Mount:
         return np.asarray(about_z @ about_y @ about_x)
 
     def apply(self, cloud: PointCloud) -> PointCloud:
-        """Return a cloud, given in the sensor's axes, in those of the carrier.
+        """Return a cloud in the axes of the carrier.
+
+        Args:
+            cloud: in the axes of the sensor.
 
         Returns:
-            x y z from the carrier's origin; azimuth and elevation of the beams in its axes. `range`
-            stays what the sensor measured, from the sensor.
+            The cloud with x, y and z from the carrier's origin, and azimuth and elevation of the
+            beams in its axes. `range` remains the distance from the sensor.
         """
         turn = self.rotation
         azimuth = cloud.azimuth.astype(np.float64)
@@ -68,8 +71,7 @@ class Mount:
             [[self.x], [self.y], [self.z]]
         )
         x, y, z = xyz.astype(np.float32)
-        # arcsin is coarse where beams point straight up; the other two sides of the triangle are
-        # not
+        # arctan2 is precise even if a beam points straight up; arcsin is not
         raised = np.arctan2(beam[2], np.hypot(beam[0], beam[1])).astype(np.float32)
         same = {f.name: getattr(cloud, f.name) for f in fields(cloud)}
         turned = {

@@ -1,16 +1,20 @@
-"""The plan of a sensor's points: `points` traced once for a layout, and its columns as expressions.
+"""Plan the columns of a sensor's points as expressions of its fields.
 
-`Plan` knows how points become coordinates (by `points.conventions`, as the plain evaluation does),
-and which values have to be known of a batch before they are computed. It computes nothing: a
-`ColumnMaker` does, which a back end compiles from it (`points.numpy_plan`, `points.numba_kernels`).
-Plans are kept with the layout that they are for, so a stream of packets traces nothing again.
+The `points` function is traced once for a layout. `Plan` converts its result to columns by the
+formulas of `points.conventions`, which the reference evaluator uses too, and lists the conditions
+that each batch has to meet. It computes nothing: a back end (`points.numpy_plan`,
+`points.numba_kernels`) compiles it to a `ColumnMaker`. A layout keeps its plans, so a stream of
+packets is traced once.
 
-Points by coordinates are three expressions and a mask (`conventions.place_points`), their range and
-angles further ones. They are exact: computed in float64 as they are written, whatever
-floating-point fields hold. Points by direction are computed in another order and partly in float32:
-their plan holds where what a batch has in floating-point fields is of moderate size (`MODERATE`).
-Columns under names of a sensor's own are further expressions where they are float32, exact too, or
-whole numbers of a field as it was sent; others are what `points` says, in their type.
+Points of a `Cartesian` result are three expressions and a mask (`conventions.place_points`); their
+range and angles are further expressions. They are exact: computed in float64 in the order in which
+they are written, for any values of floating-point fields.
+
+Points of a `Polar` result are computed in another order and partly in float32. Their plan is valid
+if the floating-point fields of a batch are of moderate size (`MODERATE_SIZES`).
+
+Columns in `extra` are compiled if they are float32 (exact too), or integers of a field as they were
+sent. All others are evaluated by the reference evaluator and converted to their type.
 """
 
 from __future__ import annotations
@@ -51,56 +55,56 @@ from lidarspec.spec.vocabulary import AlongAxis, row_numbers
 
 PointsFunction = Callable[[Any], Any]
 
-#: the plain result of a node for the frames under way, shape (n or 1, ...).
+#: returns the value of a node by the reference evaluator, shape (n or 1, ...).
 Values = Callable[[Node], NDArray[Any]]
 
-#: steps that remember something between packets or batches, or that other frames decide.
-REMEMBERING = ("shift", "latest", "state")
+#: kinds of nodes that depend on other packets, other batches or other frames.
+STATEFUL_KINDS = ("shift", "latest", "state")
 
-#: the least and the most that a floating-point field may hold, if it is not 0, where float32 and
-#: another order of sums have to do no harm.
-MODERATE = 2.0**-60, 2.0**60
+#: the smallest and the largest absolute value, other than 0, of floating-point fields for which
+#: float32 and another order of sums are precise enough.
+MODERATE_SIZES = 2.0**-60, 2.0**60
 
 
 class ColumnMaker(Protocol):
-    """Makes some columns of the points of frames of one layout."""
+    """A compiled program that computes some columns of frames of one layout."""
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """Return the columns of so many frames, by name, to be filled: (number * width,) each."""
+        """Return empty arrays for the columns of `number` frames, (number * width,) each."""
 
     def run(self, rows: Bytes2D, values: Values, columns: Mapping[str, NDArray[Any]]) -> None:
         """Fill the columns of all frames.
 
         Args:
-            rows: the frames, at one distance from each other.
-            values: the plain result of a node for these frames, shape (n or 1, ...).
-            columns: flat, contiguous and as long as `columns` makes them.
+            rows: the frames, with one stride.
+            values: returns the value of a node by the reference evaluator, shape (n or 1, ...).
+            columns: the arrays to fill, flat and contiguous, as `columns` returns them.
         """
 
 
 class Plan:
-    """The plan by which the points of frames of one layout are computed.
+    """The plan of the points of frames of one layout.
 
     Attributes:
         function: the `points` function.
-        layout: of the frames.
-        tape: what `points` computes.
-        parts: what it returned, by name, as nodes or as what no data decides.
-        shape: of the points of a packet, one length for each axis in `axes`.
-        expressions: the columns that back ends make, by name, as nodes or as what no data decides.
-        extra: what the columns under names of the sensor's own hold, by name.
-        sent: those of `extra` that are whole numbers of a field as they were sent, and the field's
-            place.
-        exact: whether coordinates and range are computed in float64 as they are written, as all
-            other columns are.
-        positive: nodes whose values have to be positive numbers, or the plan does not hold.
-        nominal: whether a default calibration stands in for the sensor's own.
+        layout: the layout of the frames.
+        tape: the traced operations of `points`.
+        parts: the parts of its result, by name, as nodes, or as arrays if they do not depend on
+            data.
+        shape: the shape of the points of a packet, one length for each axis in `axes`.
+        expressions: the columns that back ends compute, by name, as nodes or arrays.
+        extra: the types of the columns in `extra`, by name.
+        sent: the fields of columns in `extra` that are integers as they were sent, by name.
+        exact: whether coordinates and range are computed in float64 as they are written. All other
+            columns are.
+        positive: nodes that have to be positive numbers, or the plan is not valid.
+        nominal: whether a default calibration is used instead of the sensor's own.
         varying: the arrays whose lengths differ from frame to frame.
-        tables: those of back ends, by what they are of, shared by the plans of the function.
-        programs, kernels: what back ends made, by the names of the columns.
+        tables: the lookup tables of back ends, shared by the plans of the function.
+        programs, kernels: the compiled programs of back ends, by the names of their columns.
 
     Raises:
-        Untraceable: where only plain evaluation can do it; the text says why.
+        UntraceableError: if only the reference evaluator can compute the points; the text says why.
     """
 
     def __init__(self, function: PointsFunction, sample: Batch, layout: Layout) -> None:
@@ -142,9 +146,9 @@ class Plan:
             name: part for name, part in list_parts(result).items() if isinstance(part, AlongAxis)
         }
         if self.exact:
-            expressions = self._by_coordinates(parts)
+            expressions = self._make_cartesian_columns(parts)
         else:
-            expressions = self._by_direction(parts, named)
+            expressions = self._make_polar_columns(parts, named)
         intensity = parts.get("intensity")
         if intensity is not None:
             if self._may_be_nan(intensity):
@@ -157,19 +161,19 @@ class Plan:
         self.sent = {
             name: leaf
             for name, kind in self.extra.items()
-            if (leaf := self._sent(self.parts[name], kind.dtype)) is not None
+            if (leaf := self._find_sent_field(self.parts[name], kind.dtype)) is not None
         }
         expressions |= {name: self.parts[name] for name in self.sent}
         self.expressions = {name: graph.get_node(value) for name, value in expressions.items()}
 
     @cached_property
     def width(self) -> int:
-        """Points of a packet."""
+        """The number of points of a packet."""
         return math.prod(self.shape)
 
     @cached_property
     def level(self) -> bool:
-        """Whether all points lie in the horizontal plane through the sensor."""
+        """Whether all points are in the horizontal plane through the sensor."""
         upright = [self.parts[name] for name in (["z"] if self.exact else ["elevation", "oz"])]
         return all(not isinstance(part, Node) and is_zero(part) for part in upright)
 
@@ -181,18 +185,18 @@ class Plan:
         """
         if self.exact:
             return []
-        return self._floats_of(
+        return self._list_floats(
             *(part for name, part in self.parts.items() if not self.is_exact(name))
         )
 
     def is_exact(self, name: str) -> bool:
-        """Return whether a column is computed in float64 as it is written, and rounded then."""
+        """Return whether a column is computed in float64 as it is written, then rounded."""
         return self.exact or name == "intensity" or name in self.extra
 
-    def _sent(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
-        """Return the place of the field that is equal to a further column.
+    def _find_sent_field(self, part: Any, dtype: np.dtype[Any]) -> Leaf | None:
+        """Return the field that is equal to a column in `extra`, value by value.
 
-        Returns None unless each point has its own value of such a field, of the same type.
+        Returns None unless each point has its own value of an integer field, of the same type.
         """
         if isinstance(part, Node) and part.kind == "field":
             leaf = self.layout.leaves.get(part.path)
@@ -213,8 +217,8 @@ class Plan:
             return leaf
         return None
 
-    def _floats_of(self, *values: Any) -> list[Node]:
-        """Return the floating-point fields that values are made of."""
+    def _list_floats(self, *values: Any) -> list[Node]:
+        """Return the floating-point fields that values depend on."""
         return [
             node
             for node in graph.traverse(*values)
@@ -223,28 +227,30 @@ class Plan:
 
     def _may_be_nan(self, value: Any) -> bool:
         return isinstance(value, TracedColumn) and (
-            bool(self._floats_of(value)) or not is_number(value.node, self.layout.leaves)
+            bool(self._list_floats(value)) or not is_number(value.node, self.layout.leaves)
         )
 
     @cached_property
     def eager(self) -> list[Node]:
-        """The nodes to compute for every batch.
+        """The nodes to compute for every batch, in order.
 
-        They remember values between batches, or are inputs of such nodes.
+        They remember values between batches, are inputs of these nodes, or are checked for each
+        batch.
         """
-        wanted = [node for node in self.tape.nodes if node.kind in REMEMBERING]
+        wanted = [node for node in self.tape.nodes if node.kind in STATEFUL_KINDS]
         wanted += [node for node, _ in self.tape.steps] + self.positive
         return sorted(graph.traverse(*wanted), key=lambda node: node.number)
 
-    def _by_direction(
+    def _make_polar_columns(
         self, parts: Mapping[str, Any], named: Mapping[str, AlongAxis]
     ) -> dict[str, Any]:
-        """Return the columns that back ends make from the parts of `Polar`.
+        """Return the columns of a `Polar` result.
 
         Args:
-            named: the parts with named arrays.
+            parts: the parts of the result.
+            named: the parts that are arrays along a named axis.
         """
-        distance = mark_invalid(self._distance(parts["range"]), parts["invalid"])
+        distance = mark_invalid(self._mark_distance(parts["range"]), parts["invalid"])
         azimuth, elevation, *origin = (
             named.get(name, parts[name]) for name in ("azimuth", "elevation", "ox", "oy", "oz")
         )
@@ -255,8 +261,8 @@ class Plan:
         }
         return dict(zip("xyz", places, strict=True)) | columns
 
-    def _by_coordinates(self, parts: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the columns that back ends make, of the parts of `Cartesian`."""
+    def _make_cartesian_columns(self, parts: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the columns of a `Cartesian` result."""
         places = parts["x"], parts["y"], parts["z"]
         measured, azimuth, elevation = find_direction(*places)
         columns = {
@@ -266,10 +272,10 @@ class Plan:
         }
         return dict(zip("xyz", place_points(places, parts["invalid"]), strict=True)) | columns
 
-    def _distance(self, measured: TracedColumn) -> Any:
-        """Return the distance of a return, nan without a return.
+    def _mark_distance(self, measured: TracedColumn) -> Any:
+        """Return the distance of a return; nan without a return.
 
-        If a low value only scales the distance, that value has to be positive.
+        If a value that is not full scales the distance, it is added to `positive`.
         """
         node = measured.node
         if get_only_field(node) is None and node.kind == "call" and node.function is np.multiply:
@@ -289,7 +295,10 @@ class Plan:
     def safe(self, values: Callable[[Node], NDArray[Any]]) -> bool:
         """Return whether all directions are finite if their inputs are.
 
-        In that case a nan marks all coordinates alike.
+        Then a nan in one coordinate of a point is a nan in all of them.
+
+        Args:
+            values: returns the value of a node for the batch.
         """
         if not self._may_be_safe:
             return False
@@ -306,13 +315,13 @@ class Plan:
     def _may_be_safe(self) -> bool:
         """Whether all values of the directions that are known in advance are finite.
 
-        Values that are known only with a batch are not checked.
+        Values that are known only with a batch are checked by `safe`.
         """
         fixed = all(
             isinstance(part, Node) or np.isfinite(part).all() for part in self._directions_given
         )
         return fixed and all(
-            np.isfinite(term.row).all() and (term.full is None or self._finite(term.full))
+            np.isfinite(term.row).all() and (term.full is None or self._is_finite(term.full))
             for term in self._directions
         )
 
@@ -322,7 +331,7 @@ class Plan:
 
     @property
     def directed(self) -> list[Node]:
-        """Azimuth and elevation, as far as data decides them."""
+        """Azimuth and elevation, if they depend on data."""
         return [part for part in self._directions_given if isinstance(part, Node)]
 
     @property
@@ -331,28 +340,28 @@ class Plan:
             return ()
         return (self.parts["azimuth"], self.parts["elevation"])
 
-    def _finite(self, node: Node) -> bool:
-        """Return whether an expression is a number for every value that its field can have."""
-        if node.kind == "rows":  # of a table of numbers, if the indices are in it
+    def _is_finite(self, node: Node) -> bool:
+        """Return whether an expression is finite for all values of its field."""
+        if node.kind == "rows":  # the last row, for indices outside of the table, is nan
             return bool(np.isfinite(node.args[1][:-1]).all())
         options = graph.find_choice(node, self.width)
         if options is not None:
             return all(
-                self._finite(option) if isinstance(option, Node) else bool(np.isfinite(option))
+                self._is_finite(option) if isinstance(option, Node) else bool(np.isfinite(option))
                 for option in options[1:]
             )
         return is_number(node, self.layout.leaves)
 
 
-#: tables by what they are of, shared by the plans of a `points` function, which several sensors may
-#: have: a field is told by its info.
+#: lookup tables by their contents, shared by the plans of a `points` function. Several sensors may
+#: share a function, so the info of a field identifies it.
 _TABLES: WeakKeyDictionary[PointsFunction, dict[Any, NDArray[Any]]] = WeakKeyDictionary()
 
 
 def plan_for(function: PointsFunction, batch: Batch, group: LayoutRows) -> Plan | UntraceableError:
     """Return the plan for frames of a group's layout, or the reason why there is none.
 
-    The layout keeps it.
+    The layout keeps the result.
     """
     notes = group.layout.notes
     if function not in notes:

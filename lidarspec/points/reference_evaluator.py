@@ -1,11 +1,11 @@
-"""Evaluate points plainly: the reference evaluator.
+"""Evaluate points with ordinary NumPy: the reference evaluator.
 
-The sensor's `points` function is called once per batch with ordinary NumPy, and its result is
-flattened.
+The sensor's `points` function is called once per batch with columns as NumPy arrays, and its result
+is flattened.
 
-This is the reference. It serves where `points` cannot be traced, and the tests as the second
-engine; plans (`points.plan`) take the parts of a result and the meaning of columns from here and
-from `points.conventions`.
+This evaluator is used if `points` cannot be traced, and as the reference in tests. Plans
+(`points.plan`) use its names for the parts of a result, and the same formulas
+(`points.conventions`).
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class PacketBatch(Protocol):
     """Packets of one frame type in stream order, as evaluation needs them.
 
     Attributes:
-        sensor, frame: whose, and of which type.
-        table: their raw columns.
+        sensor, frame: the sensor, and the name of the frame type.
+        table: the raw columns of the frames.
         time_ns: (n,) int64.
         stats: the counters of the decoder.
-        backend: what makes points of them, "auto", "numpy" or "jit".
+        backend: the back end that computes points: "auto", "numpy" or "jit".
     """
 
     sensor: SensorDescription
@@ -53,7 +53,7 @@ class PacketBatch(Protocol):
     def __len__(self) -> int: ...
 
     def batch(self, carry: Carry | None = None) -> Batch:
-        """Return the packets as functions of a plugin receive them, through `Fields`.
+        """Return the batch that plugin functions read through `Fields`.
 
         Args:
             carry: the state left by the previous batch.
@@ -65,10 +65,9 @@ class EvaluatedPoints:
     """The points of the first `ready` packets of a batch.
 
     Attributes:
-        source: their columns, flat, in stream order.
-        ready: how many packets they are of; the others wait for what follows.
-        counts: (ready, ...) points of each packet, with an axis for each array level, padding left
-            out.
+        source: the columns of the points, flat, in stream order.
+        ready: the number of these packets; the others wait for the next packets.
+        counts: (ready, ...) 1 for each point and 0 in padding, with an axis for each array level.
         axes: names of the axes of `counts` after the first.
         batch: all packets of the batch.
     """
@@ -81,12 +80,12 @@ class EvaluatedPoints:
 
     @cached_property
     def cloud(self) -> LazyCloud:
-        """A cloud of the points."""
+        """The cloud of the points."""
         return LazyCloud.of(self.source, self.source.base)
 
     @property
     def carry(self) -> Carry:
-        """The values that the next batch needs, which starts with packet `ready`."""
+        """The state for the next batch, which starts with packet `ready`."""
         return self.batch.carry_over(self.ready)
 
     @property
@@ -102,16 +101,16 @@ def evaluate_plainly(
     final: bool = True,
     epoch: int | None = None,
 ) -> EvaluatedPoints:
-    """Return the points of a batch.
+    """Return the points of a batch, computed by the reference evaluator.
 
     Args:
-        carry: what the batch before left.
-        final: nothing follows; what depends on it becomes nan (by `following`), and no packet
-            waits.
-        epoch: the time that the cloud's stamp is, int64 ns; by default that of the first packet.
+        carry: the state left by the previous batch.
+        final: whether no packets follow. Values that depend on following packets (`following`) are
+            then nan, and no packet waits.
+        epoch: the stamp of the cloud, int64 ns; by default the time of the first packet.
 
     Raises:
-        PluginError: where the plugin's function fails or returns columns that do not fit; the cause
+        PluginError: if the plugin's function fails or returns columns of a wrong shape; the cause
             is chained.
     """
     batch = packets.batch(carry)
@@ -123,11 +122,11 @@ def evaluate_plainly(
         result = function(Fields(batch))
         if not isinstance(result, Polar | Cartesian):
             raise TypeError(f"must return Polar or Cartesian, not {type(result).__name__}")
-        return _flatten(packets, result, batch, find_stamp(packets, epoch), final=final)
+        return _make_points(packets, result, batch, find_stamp(packets, epoch), final=final)
 
 
 def find_stamp(packets: PacketBatch, epoch: int | None) -> int:
-    """The stamp of a batch's cloud, int64 ns: a given one, else the time of the first packet."""
+    """Return the stamp of a cloud, int64 ns: `epoch` or the time of the first packet."""
     if epoch is not None:
         return epoch
     if len(packets):
@@ -152,11 +151,15 @@ def list_parts(result: Points) -> dict[str, Any]:
 
 
 def list_extra_types(result: Points, parts: Mapping[str, Any]) -> dict[str, ExtraType]:
-    """Return the types of the additional columns, by name; `parts`: those of the result."""
+    """Return the types of the columns in `extra`, by name.
+
+    Args:
+        parts: the parts of the result.
+    """
     return {name: ExtraType.of(extra, parts[name]) for name, extra in result.extra.items()}
 
 
-def _flatten(
+def _make_points(
     packets: PacketBatch, result: Points, batch: Batch, stamp_ns: int, *, final: bool
 ) -> EvaluatedPoints:
     parts = list_parts(result)
@@ -183,16 +186,16 @@ def _flatten(
     )
     grids = None
     if mask is not None:
-        grids = _grids(inside, axes)
+        grids = _find_grids(inside, axes)
     counts = inside[:ready].astype(np.intp)
     return EvaluatedPoints(CloudColumns(cloud, grids), ready, counts, axes, batch)
 
 
-def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:
+def _find_grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventions.Grids:
     """Return the organisation of the points of packets.
 
     Args:
-        inside: which elements of their arrays, (n, ...), are not padding.
+        inside: whether an element of the arrays is a point, not padding, (n, ...).
     """
     inner = range(1, inside.ndim)
     lengths = np.stack(
@@ -203,7 +206,7 @@ def _grids(inside: NDArray[np.bool_], axes: tuple[str | None, ...]) -> conventio
         axis=1,
     )
     counts = inside.sum(axis=tuple(inner))
-    lengths[lengths.prod(axis=1) != counts] = 0  # rows of several lengths in one packet are no grid
+    lengths[lengths.prod(axis=1) != counts] = 0  # a packet with rows of several lengths has no grid
     shapes, which = np.unique(lengths, axis=0, return_inverse=True)
     grids = [conventions.grid_of(shape, axes) for shape in shapes.tolist()]
     return conventions.Grids(np.cumsum(counts), which.reshape(-1), grids)
@@ -214,7 +217,7 @@ def flatten_valid(
 ) -> NDArray[Any]:
     """Return an array that broadcasts to a shape, (n, ...), flattened, (N,).
 
-    Only the first `ready` packets count. Padding is left out.
+    Only the first `ready` packets are included. Padding is left out.
     """
     full = np.broadcast_to(array, shape)[:ready]
     if mask is None:
@@ -232,16 +235,16 @@ def make_cloud(
 
     Args:
         flat: the parts of `Polar` (with ox, oy, oz) or `Cartesian`, (N,) each.
-        turn: the matrix that turns REP-103 coordinates into the axes that are asked for.
-        kinds: what its further columns hold.
+        turn: the (3, 3) matrix from REP-103 to the configured axes; None if these follow REP-103.
+        kinds: the types of the columns in `extra`, by name.
         facts: `stamp_ns`, `shape` and `nominal` of the cloud.
     """
     with np.errstate(all="ignore"):
-        distance, azimuth, elevation, xyz = (_by_coordinates if "x" in flat else _by_direction)(
+        distance, azimuth, elevation, xyz = (_place_cartesian if "x" in flat else _place_polar)(
             flat, flat["invalid"].astype(np.bool_)
         )
         is_finite = np.isfinite(azimuth) & np.isfinite(elevation) & np.isfinite(xyz).all(axis=0)
-        valid = is_finite & (np.abs(distance) <= conventions.FARTHEST)
+        valid = is_finite & (np.abs(distance) <= conventions.MAX_COORDINATE_M)
         if turn is not None:
             xyz = turn @ np.where(valid, xyz, 0)
             azimuth = conventions.turn_azimuth(azimuth, turn)
@@ -267,11 +270,11 @@ def make_cloud(
         return PointCloud(**columns, extra=extra, units=units, **facts)
 
 
-#: range, azimuth and elevation of points, and their coordinates, (3, N).
-_Places = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.float64]]
+#: range, azimuth and elevation of points, (N,) each, and their coordinates, (3, N).
+_Placement = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.float64]]
 
 
-def _by_direction(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Places:
+def _place_polar(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Placement:
     measured, azimuth, elevation = (
         flat[name].astype(np.float64) for name in ("range", "azimuth", "elevation")
     )
@@ -279,10 +282,10 @@ def _by_direction(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> 
     places = conventions.coordinates(
         distance, azimuth, elevation, [flat[name] for name in ("ox", "oy", "oz")]
     )
-    return distance, azimuth, elevation, np.stack(places) + 0.0  # no -0.0
+    return distance, azimuth, elevation, np.stack(places) + 0.0  # -0.0 becomes 0.0
 
 
-def _by_coordinates(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Places:
+def _place_cartesian(flat: dict[str, NDArray[Any]], invalid: NDArray[np.bool_]) -> _Placement:
     places = [flat[name].astype(np.float64) for name in "xyz"]
     measured, azimuth, elevation = conventions.find_direction(*places)
     return (

@@ -25,7 +25,7 @@ ALIGNMENT_BYTES = 16
 
 
 def structured_type(extra: Mapping[str, np.dtype[Any]]) -> np.dtype[Any]:
-    """Return PCL's layout with further columns behind it, each aligned to its size."""
+    """Return PCL's layout followed by further columns, each aligned to its size."""
     formats = {name: place[:2] for name, place in (STRUCTURED.fields or {}).items()}
     end = STRUCTURED.itemsize
     for name, dtype in extra.items():
@@ -50,12 +50,12 @@ def arrow_schema(
     Float columns are not nullable, which is faster to write: nan marks a missing value.
 
     Args:
-        units: the units of columns by name, without plain numbers. The metadata of each field has
-            its unit, that of the schema all of them as JSON.
+        units: the units of columns by name, without plain numbers. They are stored in the metadata
+            of each field, and together as JSON in the metadata of the schema.
         facts: further metadata of the schema.
 
     Raises:
-        UsageError: pyarrow is not installed.
+        UsageError: if pyarrow is not installed.
     """
     arrow = import_library("pyarrow", "arrow")
     fields = [

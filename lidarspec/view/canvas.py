@@ -18,7 +18,7 @@ from rich.color import Color, ColorSystem
 from rich.text import Text
 
 from lidarspec.errors import printable
-from lidarspec.points.appearance import STEPS
+from lidarspec.points.appearance import RAMP_STEPS
 from lidarspec.points.colours import Rgb, make_ramp
 
 Depth = Literal["truecolor", "256", "standard", "none"]
@@ -81,8 +81,8 @@ _FIXED = (
 #: the first ink of the ramp, for its lowest values.
 FIRST_STEP = len(_FIXED)
 _SCALE = tuple(
-    TextStyle(rgb, _STANDARD[step * len(_STANDARD) // STEPS])
-    for step, rgb in enumerate(make_ramp("dark", STEPS))
+    TextStyle(rgb, _STANDARD[step * len(_STANDARD) // RAMP_STEPS])
+    for step, rgb in enumerate(make_ramp("dark", RAMP_STEPS))
 )
 INKS: tuple[TextStyle, ...] = (*_FIXED, *_SCALE)
 
@@ -225,8 +225,8 @@ class Canvas:
         """
         across, down, inside = self._to_dots(column, row)
         self.dots[down, across] = True
-        steps = np.clip(shade[inside] * STEPS, 0, STEPS - 1).astype(np.uint8)
-        order = np.argsort(STEPS - steps if self.ramp == "range" else steps, kind="stable")
+        steps = np.clip(shade[inside] * RAMP_STEPS, 0, RAMP_STEPS - 1).astype(np.uint8)
+        order = np.argsort(RAMP_STEPS - steps if self.ramp == "range" else steps, kind="stable")
         self.steps[down[order] // DOTS_DOWN, across[order] // DOTS_ACROSS] = steps[order]
 
     def line(self, column: NDArray[Any], row: NDArray[Any]) -> None:

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.points.appearance import MOST, CloudAppearance, ramp_positions, ring_step
+from lidarspec.points.appearance import REACH_PERCENTILE, CloudAppearance, ramp_positions, ring_step
 from lidarspec.points.cloud import PointCloud
 from lidarspec.view.canvas import DOTS_ACROSS, DOTS_DOWN, FAINT, LABEL, STRONG, Canvas, CellGrid
 
@@ -149,7 +149,9 @@ def _find_heights(z: NDArray[np.float32]) -> tuple[float, float]:
     """
     if not len(z):
         return 0.0, 0.0
-    low, high = (float(value) for value in np.percentile(z, (100 - MOST, MOST)))
+    low, high = (
+        float(value) for value in np.percentile(z, (100 - REACH_PERCENTILE, REACH_PERCENTILE))
+    )
     return min(low, 0.0), max(high, 0.0)
 
 

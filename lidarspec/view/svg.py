@@ -13,7 +13,13 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec.points.appearance import STEPS, CloudAppearance, find_bounds, ramp_indices, ring_step
+from lidarspec.points.appearance import (
+    RAMP_STEPS,
+    CloudAppearance,
+    find_bounds,
+    ramp_indices,
+    ring_step,
+)
 from lidarspec.points.cloud import PointCloud
 from lidarspec.points.colours import make_ramp, to_hex
 
@@ -316,13 +322,13 @@ def _make_path(dots: NDArray[np.int64]) -> str:
 def _iter_legend(look: CloudAppearance, right: int) -> Iterator[str]:
     """Yield the elements of the ramp with its column and values; it ends at `right`."""
     low, high = (escape(text) for text in look.ends)
-    left = right - 7 * len(high) - 12 - STEPS * 6
+    left = right - 7 * len(high) - 12 - RAMP_STEPS * 6
     yield (
         f'<g {_style_of("text")}><text x="{left - 8}" y="48" text-anchor="end">{escape(look.ramp)},'
         f" {low}</text>"
     )
     yield f'<text x="{right}" y="48" text-anchor="end">{high}</text></g>'
-    for step in range(STEPS):
+    for step in range(RAMP_STEPS):
         yield (
             f'<rect class="ramp{step}" x="{left + step * 6}" y="40" width="6" height="8"'
             f' fill="{_COLOURS[step]}"/>'
@@ -343,7 +349,7 @@ def _style_of(part: str, attribute: str = "fill") -> str:
 
 def _make_style() -> str:
     """Return the CSS for dark pages."""
-    inks = [to_hex(rgb) for rgb in make_ramp("dark", STEPS)]
+    inks = [to_hex(rgb) for rgb in make_ramp("dark", RAMP_STEPS)]
     dots = [
         f".dots{step}{{stroke:{ink}}}.ramp{step}{{fill:{ink}}}" for step, ink in enumerate(inks)
     ]
@@ -354,4 +360,4 @@ def _make_style() -> str:
     return f"@media(prefers-color-scheme:dark){{{''.join([*parts, *dots])}}}"
 
 
-_COLOURS = [to_hex(rgb) for rgb in make_ramp("light", STEPS)]
+_COLOURS = [to_hex(rgb) for rgb in make_ramp("light", RAMP_STEPS)]

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from lidarspec.points.appearance import STEPS, CloudAppearance
+from lidarspec.points.appearance import RAMP_STEPS, CloudAppearance
 from lidarspec.view.canvas import ALARM, FAINT, FIRST_STEP, LABEL, PLAIN, STRONG, CellGrid
 
 KEYS = (
@@ -102,12 +102,12 @@ def write_last_line(window: CellGrid, figures: Sequence[WindowFigure]) -> None:
 
 def _write_ramp(window: CellGrid, row: int, column: int, look: CloudAppearance) -> None:
     """Write the colour ramp, with the values at its ends below."""
-    for step in range(STEPS):
+    for step in range(RAMP_STEPS):
         window.write(row, column + step, "━", FIRST_STEP + step)
     low, high = look.ends
     window.write(row + 1, column, low, LABEL)
-    window.write(row + 1, column + (STEPS - len(look.ramp)) // 2, look.ramp, LABEL)
-    window.write(row + 1, column + STEPS - len(high), high, LABEL)
+    window.write(row + 1, column + (RAMP_STEPS - len(look.ramp)) // 2, look.ramp, LABEL)
+    window.write(row + 1, column + RAMP_STEPS - len(high), high, LABEL)
 
 
 def draw_keys(columns: int, lines: int) -> CellGrid:

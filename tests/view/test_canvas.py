@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from lidarspec.points.appearance import STEPS
+from lidarspec.points.appearance import RAMP_STEPS
 from lidarspec.view.canvas import (
     ALARM,
     BLANK,
@@ -129,7 +129,7 @@ def test_colours_match_the_terminal() -> None:
     assert sgr(FIRST_STEP, "none") == "\x1b[0m"
     assert sgr(FAINT, "none") == "\x1b[0;2m"
     assert style(FIRST_STEP) == "#635cad"
-    steps = range(FIRST_STEP, FIRST_STEP + STEPS)
-    assert len({sgr(step, "truecolor") for step in steps}) == STEPS
+    steps = range(FIRST_STEP, FIRST_STEP + RAMP_STEPS)
+    assert len({sgr(step, "truecolor") for step in steps}) == RAMP_STEPS
     assert len({sgr(step, "standard") for step in steps}) == 4
     assert all("38;2" not in sgr(ink, "256") for ink in range(len(INKS)))

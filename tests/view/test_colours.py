@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarspec.points.appearance import STEPS, choose_appearance
+from lidarspec.points.appearance import RAMP_STEPS, choose_appearance
 from lidarspec.points.colours import SCALES, Theme, colour, make_ramp, to_hex
 from lidarspec.view.canvas import FIRST_STEP, INKS
 from lidarspec.view.svg import svg
@@ -35,11 +35,11 @@ def test_lightness_rises_and_every_colour_is_readable(theme: Theme) -> None:
 
 
 def test_terminal_and_svg_have_the_scale() -> None:
-    assert [ink.rgb for ink in INKS[FIRST_STEP:]] == make_ramp("dark", STEPS)
+    assert [ink.rgb for ink in INKS[FIRST_STEP:]] == make_ramp("dark", RAMP_STEPS)
     points = cloud(*((x, 0, 0) for x in np.linspace(0.1, 5, 100)))
     picture = svg(points, choose_appearance(points), "title")
     for step, (dark, light) in enumerate(
-        zip(make_ramp("dark", STEPS), make_ramp("light", STEPS), strict=True)
+        zip(make_ramp("dark", RAMP_STEPS), make_ramp("light", RAMP_STEPS), strict=True)
     ):
         assert f".dots{step}{{stroke:{to_hex(dark)}}}" in picture
         assert f'class="ramp{step}"' in picture

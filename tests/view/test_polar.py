@@ -12,7 +12,7 @@ import pytest
 from lidarspec import PointCloud
 from lidarspec.errors import UnknownName
 from lidarspec.points.appearance import (
-    STEPS,
+    RAMP_STEPS,
     CloudAppearance,
     choose_appearance,
     find_bounds,
@@ -183,7 +183,7 @@ def test_a_fitted_picture_shows_the_sensor_if_that_costs_little() -> None:
 
 def test_colours_go_from_near_to_far_and_from_weak_to_strong() -> None:
     points = cloud((0.1, 0.1, 0), (3.4, 3.4, 0), intensity=(200, 1))
-    for ramp, last in (("range", [0, STEPS - 1]), ("intensity", [STEPS - 1, 0])):
+    for ramp, last in (("range", [0, RAMP_STEPS - 1]), ("intensity", [RAMP_STEPS - 1, 0])):
         inks = draw_cloud(
             points,
             width=60,

@@ -31,7 +31,12 @@ from lidarspec.expressions.graph import (
 )
 from lidarspec.frames.layout import Leaf
 from lidarspec.points.conventions import returned_range
-from lidarspec.points.lookup_tables import every_value, find_window, is_number, list_possible_values
+from lidarspec.points.lookup_tables import (
+    find_window,
+    is_number,
+    list_possible_values,
+    tabulate_values,
+)
 from lidarspec.points.numba_kernels.writer import (
     TEMPLATES,
     KernelArguments,
@@ -372,7 +377,7 @@ class Expressions(KernelWriter):
             leaf = None
         if leaf is None or source is None or find_window(leaf) is None:
             return None
-        values = every_value(node, leaf)
+        values = tabulate_values(node, leaf)
         assert values is not None
         straight = line(leaf, values, exact=exact)
         raw = self.raw(leaf) if straight is not None else None

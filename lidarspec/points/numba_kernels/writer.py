@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lidarspec.expressions.graph import FACTORS, Node, last_axis, make_key, traverse
 from lidarspec.frames.layout import Layout, Leaf
 from lidarspec.points.conventions import returned_range
-from lidarspec.points.lookup_tables import CHEAP, every_value, find_window, raw_values
+from lidarspec.points.lookup_tables import CHEAP, find_window, raw_values, tabulate_values
 from lidarspec.spec.bits import whole_bytes
 
 _SIGNS = {
@@ -475,7 +475,7 @@ class KernelWriter:
         )
         if name not in self._tables:
             self._tables[name] = np.ascontiguousarray(
-                np.asarray(every_value(node, leaf)) * factor, kind
+                np.asarray(tabulate_values(node, leaf)) * factor, kind
             )
         return self._tables[name]
 
@@ -494,7 +494,7 @@ class KernelWriter:
         """
         name = ("kernel", "both", leaf.info, leaf.size, make_key(node.args[0]))
         if name not in self._tables:
-            angles = np.asarray(every_value(node.args[0], leaf))
+            angles = np.asarray(tabulate_values(node.args[0], leaf))
             self._tables[name] = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(
                 np.float32
             )

@@ -28,7 +28,7 @@ from lidarspec.expressions.graph import (
 )
 from lidarspec.frames.arrays import add_axes
 from lidarspec.frames.layout import Leaf, view_elements
-from lidarspec.points.lookup_tables import CHEAP, FieldWindow, every_value, find_window
+from lidarspec.points.lookup_tables import CHEAP, FieldWindow, find_window, tabulate_values
 from lidarspec.points.numpy_plan.program import TYPES, Program, ProgramRun, RegisterRead
 from lidarspec.points.plan import Plan
 from lidarspec.spec.vocabulary import row_numbers
@@ -248,7 +248,7 @@ class Compiler:
             make_key(node),
         )
         if name not in self._tables:
-            values = every_value(node, leaf)
+            values = tabulate_values(node, leaf)
             self._tables[name] = np.ascontiguousarray(values, TYPES[kind])
         return self._tables[name]
 
