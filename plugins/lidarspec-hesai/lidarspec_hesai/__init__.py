@@ -18,7 +18,7 @@ from lidarspec_hesai.xt import XT16, XT32, XT32M
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Hesai sensors."""
+    """Return the Hesai sensors."""
     return [
         PANDAR40P,
         PANDAR64,

@@ -1,18 +1,18 @@
-"""Hesai AT128: protocol 4.3, a header, 2 blocks of 128 channels with a finer azimuth, 1086 bytes,
-1118 with a signature.
+"""Hesai AT128: protocol 4.3, a header, 2 blocks of 128 channels with a finer azimuth.
 
-A mirror with three faces sweeps the beams over 120 degrees to the front; a scan is what one face
-sees. The azimuth of a block is the mirror's, which turns the beam by twice as much: from the start
-of the face, plus that of the channel, plus what the unit's file says for the channel in steps of
-two degrees of the mirror. Between faces nothing is sent, and the azimuth jumps by some 60 degrees.
+A packet has 1086 bytes, 1118 with a signature. A mirror with three faces sweeps the beams over 120
+degrees to the front; a scan is the sweep of one face. The azimuth of a block is the mirror's, and
+the beam turns by twice as much. So the azimuth of a point is twice the mirror's angle from the
+start of the face, plus that of the channel, plus a correction from the unit's file for the channel
+in steps of two degrees of the mirror. Between faces the sensor sends nothing, and the azimuth jumps
+by about 60 degrees.
 
-The CRCs are those of a QT128, as far as is known; no packet of this model was seen, so they are not
-held.
+The CRCs are probably those of a QT128. No captured packet was available, so they are not verified.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v4_3.h, udp4_3_parser.cc: packet, correction file 1.5, jump
 of 10 degrees, axes as in its code; correction files of an AT128E2X); tier4/nebula (times, 1 to 180
-m, three scans in each turn of 200 rpm). The SDK takes the steps of the corrections by halves,
-nebula evenly, as here.
+m, three scans in each revolution at 200 rpm). The SDK interpolates the corrections in halves of a
+step, nebula linearly, as here.
 """
 
 from __future__ import annotations
@@ -40,33 +40,27 @@ from construct import (
 
 from lidarspec import UsageError
 from lidarspec.spec import Fields, Frame, Learned, OnJump, Polar, Scaled, take
-from lidarspec_hesai.calibration import Calibration, Table, content
-from lidarspec_hesai.family import spinning
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, returns_of, turning
-from lidarspec_hesai.sealed import (
+from lidarspec_hesai.calibration import Calibration, Table, read_content
+from lidarspec_hesai.crc_packets import (
     BLOCKS,
     LASERS,
     UNSEEN,
     distance,
-    in_body,
-    longest,
-    packet,
+    make_packet,
+    max_packet_bytes,
+    packet_values,
     plausible,
 )
+from lidarspec_hesai.family import make_spinning_sensor
+from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, count_returns, rotation_values
 
-STEPS = 256 * 100  # of the finer azimuth in a degree
-EVERY = 2  # degrees of the mirror between corrections
-LAST = -9.249e-6
-SHOT = (
-    41.666e-6  # seconds from the packet's time to the end of the last shot, and from shot to shot
-)
-JUMP = 10.0  # degrees of the mirror
-SHOTS, AHEAD = (
-    1200,
-    15.0,
-    # of a simulated scan, which begins so many degrees of the mirror after the face:
-    # 0.1 degrees from shot to shot
-)
+AZIMUTH_STEPS_PER_DEG = 256 * 100  # per degree, with the finer azimuth
+CORRECTION_STEP_DEG = 2  # from correction to correction, of the mirror
+LAST_SHOT_S = -9.249e-6  # from the packet's time to the end of the last shot
+SHOT_PERIOD_S = 41.666e-6  # from shot to shot
+MIN_JUMP_DEG = 10.0  # of the mirror
+SIMULATED_SHOTS = 1200  # of a scan, 0.1 degrees apart
+SIMULATED_START_DEG = 15.0  # of the mirror, from the face to the first shot
 
 # fmt: off
 FIRING_US = (
@@ -103,8 +97,8 @@ class Mirror(Calibration):
 
     Attributes:
         faces: (faces,) azimuths at which they begin, degrees of the mirror.
-        azimuth_adjust, elevation_adjust: (181, channels) degrees to be added, in steps of 2 degrees
-            of the mirror; None: nothing.
+        azimuth_adjust, elevation_adjust: (181, channels) degrees to add, in steps of 2 degrees of
+            the mirror; None for no correction.
     """
 
     faces: Table = dataclasses.field(default_factory=lambda: np.array([23.075, 143.44, 263.133]))
@@ -112,12 +106,12 @@ class Mirror(Calibration):
     elevation_adjust: Table | None = None
 
     def with_file(self, path: str | Path | Learned) -> Mirror:
-        """With the angles of one unit, out of its file (.dat), or out of what it said.
+        """Return the table with one unit's angles, from its file (.dat) or its reply.
 
         Raises:
-            UsageError: for a file that cannot be read, or is none of this model.
+            UsageError: if the file cannot be read, or belongs to another model.
         """
-        data = content(path)
+        data = read_content(path)
         try:
             file = FILE.parse(data)
         except ConstructError as error:
@@ -129,21 +123,21 @@ class Mirror(Calibration):
             raise UsageError(
                 f"{path!s}: the correction file is corrupt: its SHA-256 does not match"
             )
-        unit = file.resolution / STEPS
+        step_deg = file.resolution / AZIMUTH_STEPS_PER_DEG
         return dataclasses.replace(
             self,
-            faces=np.array(file.start) * unit,
-            azimuth=-np.array(file.azimuth) * unit,
-            elevation=np.array(file.elevation) * unit,
-            azimuth_adjust=_steps(file.azimuth_adjust, file.resolution),
-            elevation_adjust=_steps(file.elevation_adjust, file.resolution),
+            faces=np.array(file.start) * step_deg,
+            azimuth=-np.array(file.azimuth) * step_deg,
+            elevation=np.array(file.elevation) * step_deg,
+            azimuth_adjust=parse_adjustments(file.azimuth_adjust, file.resolution),
+            elevation_adjust=parse_adjustments(file.elevation_adjust, file.resolution),
             nominal=False,
         )
 
     def to_file(self) -> bytes:
-        """Return the angles as a unit says them: its file."""
-        start = np.rint(self.faces * STEPS).astype(int).tolist()
-        none = bytes(LASERS * 180)
+        """Return the angles in the unit's file format."""
+        start = np.rint(self.faces * AZIMUTH_STEPS_PER_DEG).astype(int).tolist()
+        no_adjustment = bytes(LASERS * 180)
         values = {
             "faces": len(start),
             "fields": len(start),
@@ -151,27 +145,28 @@ class Mirror(Calibration):
             "resolution": 1,
             "start": start,
             "end": start[1:] + start[:1],
-            "azimuth": np.rint(-self.azimuth * STEPS).astype(int).tolist(),
-            "elevation": np.rint(self.elevation * STEPS).astype(int).tolist(),
-            "azimuth_adjust": none,
-            "elevation_adjust": none,
+            "azimuth": np.rint(-self.azimuth * AZIMUTH_STEPS_PER_DEG).astype(int).tolist(),
+            "elevation": np.rint(self.elevation * AZIMUTH_STEPS_PER_DEG).astype(int).tolist(),
+            "azimuth_adjust": no_adjustment,
+            "elevation_adjust": no_adjustment,
         }
         data: bytes = FILE.build(values | {"sha256": bytes(32)})[:-32]
         return data + hashlib.sha256(data).digest()
 
-    def find_adjustment(self, table: Table | None, azimuth: Any) -> Any:
-        """What is added at azimuths of the mirror: degrees, for every channel; evenly between the
-        steps.
+    def interpolate_adjustment(self, table: Table | None, azimuth: Any) -> Any:
+        """Return the degrees to add for each channel at azimuths of the mirror.
+
+        Values between two steps are interpolated linearly.
         """
         if table is None:
             return 0.0
-        step = np.floor(azimuth / EVERY)
-        part = azimuth / EVERY - step
-        return take(table, step) * (1 - part) + take(table, step + 1) * part
+        step = np.floor(azimuth / CORRECTION_STEP_DEG)
+        fraction = azimuth / CORRECTION_STEP_DEG - step
+        return take(table, step) * (1 - fraction) + take(table, step + 1) * fraction
 
 
-def _steps(data: bytes, resolution: int) -> Table:
-    """The corrections of a file by steps of the mirror, once around, (181, channels) degrees."""
+def parse_adjustments(data: bytes, resolution: int) -> Table:
+    """Return corrections in degrees, (181, channels), the last row equal to the first."""
     degrees = np.frombuffer(data, np.int8).reshape(LASERS, 180).T * (resolution / 100)
     return np.concatenate([degrees, degrees[:1]])
 
@@ -195,27 +190,32 @@ TAIL = (
 
 
 def points(f: Fields, channels: Mirror) -> Polar:
-    """Shots up to the packet's time (tier4/nebula); azimuths from the face behind, clockwise from
-    the left.
+    """Return the points of a packet, with shots up to its time (tier4/nebula).
+
+    Azimuths count from the last face, clockwise from the left.
     """
     blocks = f.body.blocks
     block = np.arange(BLOCKS)[:, None]
-    returns = returns_of(f.return_mode)
-    mirror = blocks.azimuth + blocks.fine_azimuth / STEPS
-    turned = np.mod(mirror - channels.faces[0], 360)
+    returns = count_returns(f.return_mode)
+    mirror = blocks.azimuth + blocks.fine_azimuth / AZIMUTH_STEPS_PER_DEG
+    face_angle = np.mod(mirror - channels.faces[0], 360)
     for face in channels.faces[1:]:
-        turned = np.minimum(turned, np.mod(mirror - face, 360))
+        face_angle = np.minimum(face_angle, np.mod(mirror - face, 360))
     azimuth = (
-        2 * turned + channels.azimuth + channels.find_adjustment(channels.azimuth_adjust, mirror)
+        2 * face_angle
+        + channels.azimuth
+        + channels.interpolate_adjustment(channels.azimuth_adjust, mirror)
     )
     return Polar(
         range=distance(f),
         azimuth=np.deg2rad(90 - azimuth),
         elevation=np.deg2rad(
-            channels.elevation + channels.find_adjustment(channels.elevation_adjust, mirror)
+            channels.elevation + channels.interpolate_adjustment(channels.elevation_adjust, mirror)
         ),
         intensity=blocks.channels.reflectivity,
-        time=LAST - SHOT * ((BLOCKS - block + returns - 1) // returns) + channels.firing,
+        time=LAST_SHOT_S
+        - SHOT_PERIOD_S * ((BLOCKS - block + returns - 1) // returns)
+        + channels.firing,
         ring=np.arange(LASERS),
         return_index=block % returns,
         nominal=channels.nominal,
@@ -223,18 +223,23 @@ def points(f: Fields, channels: Mirror) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i at 10 scans a second with single return; the mirror turns on while no packet is
-    sent, which the time leaves out.
+    """Return the values of simulated packet i, 10 scans a second, single return.
+
+    The mirror rotates while no packet is sent; the simulated time omits that interval.
     """
     shot = i * BLOCKS + np.arange(BLOCKS)
-    azimuth = TABLE.faces[shot // SHOTS % len(TABLE.faces)] + AHEAD + shot % SHOTS * (60 / SHOTS)
+    azimuth = (
+        TABLE.faces[shot // SIMULATED_SHOTS % len(TABLE.faces)]
+        + SIMULATED_START_DEG
+        + shot % SIMULATED_SHOTS * (60 / SIMULATED_SHOTS)
+    )
     values = {
-        **turning(i, BLOCKS, SHOTS),
+        **rotation_values(i, BLOCKS, SIMULATED_SHOTS),
         "blocks.azimuth": np.floor(azimuth * 100) / 100,
         "motor_speed": 200,
     }
     return {
-        **in_body(values, confidence=1),
+        **packet_values(values, confidence=1),
         "body.blocks.fine_azimuth": np.floor(azimuth * 100 % 1 * 256),
     }
 
@@ -245,13 +250,13 @@ TABLE = Mirror(
     firing=np.array(FIRING_US) * 1e-6,
 )
 
-AT128 = spinning(
+AT128 = make_spinning_sensor(
     "hesai-at128",
     {
         "data": Frame(
-            packet(VERSION, CHANNEL[LASERS], TAIL, block=Int8ul, safety=False),
+            make_packet(VERSION, CHANNEL[LASERS], TAIL, block=Int8ul, safety=False),
             data=True,
-            max_length=longest(BLOCKS, 3 + 4 * LASERS),
+            max_length=max_packet_bytes(BLOCKS, 3 + 4 * LASERS),
             plausible=plausible,
         )
     },
@@ -259,7 +264,7 @@ AT128 = spinning(
     TABLE,
     sweep,
     model="AT128",
-    scan=OnJump("body.blocks.azimuth", JUMP),
+    scan=OnJump("body.blocks.azimuth", MIN_JUMP_DEG),
     vendor_axes=("forward", "left", "up"),
     turn=(10.0, 10.0),
     range_limits=(1.0, 180.0),

@@ -22,26 +22,24 @@ from lidarspec.spec import Learned, Points, Sensor
 
 Table = NDArray[np.float64]
 
-#: bytes of a correction file at most; characters of it that a message repeats.
-LARGEST = 1_000_000
-QUOTED = 60
-#: what stands above the headings of some files, and below the table.
-MARK = "EEFF"
-HASH = re.compile(r"[0-9a-fA-F]{8,}")
-#: how many times as far as the model's own values those of a unit may spread, or how little:
-#: radians do 57 times less than degrees.
-UNLIKE = 10
+MAX_FILE_BYTES = 1_000_000
+MAX_QUOTED_CHARACTERS = 60  # of a file in a message
+MARK = "EEFF"  # above the headings of some files
+HASH = re.compile(r"[0-9a-fA-F]{8,}")  # below the table of some files
+#: The spread of a unit's values may differ from the model's by this factor; radians instead of
+#: degrees differ by 57.
+MAX_SPREAD_RATIO = 10
 
 
 @dataclass(frozen=True)
 class Column:
-    """What a file says of each channel.
+    """A column of a correction file.
 
     Attributes:
-        name: in words.
-        headings: its letters, in small ones and without what stands in parentheses.
-        low, high: between which values are.
-        units: spellings of the one that they are in, which may stand in parentheses.
+        name: the name of the column in messages.
+        headings: possible headings: letters in lower case, without parentheses.
+        low, high: the limits of its values.
+        units: spellings of its unit, which may follow the heading in parentheses.
     """
 
     name: str
@@ -61,7 +59,7 @@ FIRING = Column(
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What each channel adds to its block.
+    """The corrections of each channel.
 
     Attributes:
         elevation, azimuth: (channels,) degrees; azimuth clockwise, as the vendor counts it.
@@ -78,16 +76,17 @@ class Calibration:
         return len(self.elevation)
 
     def with_file(self, path: str | Path | Learned) -> Calibration:
-        """With the angles of one unit, out of a correction file or out of what it said.
+        """Return the table with one unit's angles, from a correction file or its reply.
 
         Raises:
-            UsageError: for a file that cannot be read, or is none of this model; with its place.
+            UsageError: if the file cannot be read, or belongs to another model; with line and
+                column.
         """
-        elevation, azimuth = columns(path, {ELEVATION: self.elevation, AZIMUTH: self.azimuth})
+        elevation, azimuth = read_columns(path, {ELEVATION: self.elevation, AZIMUTH: self.azimuth})
         return dataclasses.replace(self, elevation=elevation, azimuth=azimuth, nominal=False)
 
     def to_file(self) -> bytes:
-        """Return the angles as a unit says them: a file of corrections."""
+        """Return the angles in the unit's file format."""
         rows = zip(self.elevation, self.azimuth, strict=True)
         return "".join(
             [
@@ -97,7 +96,7 @@ class Calibration:
         ).encode()
 
 
-def nominal(
+def make_nominal_table(
     elevation: Iterable[float], azimuth: Iterable[float], firing_us: Iterable[float]
 ) -> Calibration:
     """Return the table of a model; firing times in microseconds."""
@@ -115,20 +114,20 @@ def configure(
     calibration: str | Path | Learned | None = None,
     firing_times: str | Path | None = None,
 ) -> Sensor:
-    """The sensor with a unit's own tables in place of the model's; a file named in an earlier
-    `configure` stays.
+    """Return the sensor with a unit's tables instead of the model's.
 
-    A unit whose angles stand in a file is not asked for them.
+    A file given to an earlier `configure` remains in use. If the angles are read from a file,
+    opening the sensor does not request them.
 
     Args:
         points: the model's function of `Fields` and the channels' `Calibration`.
         table: the model's channels.
         calibration: CSV with the headings Channel (or Laser id), Elevation and Azimuth, in degrees,
-            in any order, or the binary file of a model that has one; or what the unit said.
+            in any order, or the binary file of a model that has one; or the unit's reply.
         firing_times: CSV with the headings Channel and Fire time, in microseconds.
 
     Raises:
-        UsageError: for a file that cannot be read, or is none of this model; with line and column.
+        UsageError: if a file cannot be read, or belongs to another model; with line and column.
     """
     angles = calibration or sensor.options.get("calibration")
     times = firing_times or sensor.options.get("firing_times")
@@ -136,65 +135,72 @@ def configure(
         table = table.with_file(angles)
     if times:
         table = dataclasses.replace(
-            table, firing=columns(times, {FIRING: table.firing * 1e6})[0] * 1e-6
+            table, firing=read_columns(times, {FIRING: table.firing * 1e6})[0] * 1e-6
         )
-    asked = () if angles and not isinstance(angles, Learned) else sensor.on_open
-    return dataclasses.replace(sensor, points=partial(points, channels=table), on_open=asked)
+    on_open = () if angles and not isinstance(angles, Learned) else sensor.on_open
+    return dataclasses.replace(sensor, points=partial(points, channels=table), on_open=on_open)
 
 
-def columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[Table]:
-    """Columns of a correction file by their headings, each (channels,), in the order of the
-    channels.
+def read_columns(path: str | Path | Learned, wanted: Mapping[Column, Table]) -> list[Table]:
+    """Return columns of a correction file by their headings, in the order of channels.
 
-    The mark EEFF above the headings and the hash below the table are passed over, as the vendor's
-    reader does.
+    Each column has the shape (channels,). The mark EEFF above the headings and the hash below the
+    table are ignored, as in the vendor's reader.
 
     Args:
-        wanted: the model's own values of each column, which those of a unit are of a kind with.
+        wanted: the columns, with the model's values, whose spread the unit's must resemble.
 
     Raises:
-        UsageError: with line and column, where the file cannot be read, or does not hold these
-            columns for every channel of the model once.
+        UsageError: if the file cannot be read, or does not have these columns for every channel of
+            the model once; with line and column.
     """
-    (line, headings), *rows = _rows(path)
-    places = [_place(path, line, headings, column) for column in (CHANNEL, *wanted)]
+    (line, headings), *rows = read_rows(path)
+    indexes = [find_column(path, line, headings, column) for column in (CHANNEL, *wanted)]
     channels = len(next(iter(wanted.values())))
-    listed: dict[int, tuple[int, list[float]]] = {}
+    values_by_channel: dict[int, tuple[int, list[float]]] = {}
     for line, cells in rows:
         channel, *values = (
-            _value(path, line, cells, place, column)
-            for place, column in zip(places, (CHANNEL, *wanted), strict=True)
+            parse_value(path, line, cells, index, column)
+            for index, column in zip(indexes, (CHANNEL, *wanted), strict=True)
         )
         if channel != int(channel) or not 1 <= channel <= channels:
-            raise _fault(
+            raise make_error(
                 path,
                 line,
-                places[0],
+                indexes[0],
                 f"channel {channel:g} is out of range: this model has channels 1 to {channels}",
             )
-        if channel in listed:
-            raise _fault(
+        if channel in values_by_channel:
+            raise make_error(
                 path,
                 line,
-                places[0],
-                f"channel {channel:g} is already in line {listed[int(channel)][0]}",
+                indexes[0],
+                f"channel {channel:g} is already in line {values_by_channel[int(channel)][0]}",
             )
-        listed[int(channel)] = line, values
-    if missing := [channel for channel in range(1, channels + 1) if channel not in listed]:
+        values_by_channel[int(channel)] = line, values
+    if missing := [
+        channel for channel in range(1, channels + 1) if channel not in values_by_channel
+    ]:
         raise UsageError(
-            f"{path!s}: contains {len(listed)} channels, expected 1 to {channels}; channel"
-            f" {missing[0]} is the first missing one"
+            f"{path!s}: contains {len(values_by_channel)} channels, expected 1 to {channels};"
+            f" channel {missing[0]} is the first missing one"
         )
-    tables = list(np.array([listed[channel][1] for channel in sorted(listed)]).T)
-    for (column, own), table, place in zip(wanted.items(), tables, places[1:], strict=True):
-        _compare(path, rows[0][0], place, column, table, own)
+    tables = list(
+        np.array([values_by_channel[channel][1] for channel in sorted(values_by_channel)]).T
+    )
+    for (column, nominal_values), table, index in zip(
+        wanted.items(), tables, indexes[1:], strict=True
+    ):
+        check_spread(path, rows[0][0], index, column, table, nominal_values)
     return tables
 
 
-def _rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
-    """Return the headings and the table, each row with its line."""
+def read_rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
+    """Return the headings and the table, each row with its line number."""
     try:
-        reader = csv.reader(io.StringIO(content(path).decode("utf-8-sig", "replace"), newline=""))
+        reader = csv.reader(
+            io.StringIO(read_content(path).decode("utf-8-sig", "replace"), newline="")
+        )
         rows = [
             (reader.line_num, [cell.strip() for cell in cells])
             for cells in reader
@@ -208,79 +214,91 @@ def _rows(path: str | Path | Learned) -> list[tuple[int, list[str]]]:
     return rows[:-1] if len(rows) > 1 and HASH.fullmatch(",".join(rows[-1][1])) else rows
 
 
-def content(path: str | Path | Learned) -> bytes:
-    """What the unit said, or stands in a file.
+def read_content(path: str | Path | Learned) -> bytes:
+    """Return the unit's reply, or the bytes of the file.
 
     Raises:
-        UsageError: for a file that cannot be read, or is longer than one can be.
+        UsageError: if the file cannot be read, or is too long.
     """
     if isinstance(path, Learned):
         return path
     try:
         with open(path, "rb") as file:
-            data = file.read(LARGEST + 1)
+            data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise UsageError(f"{path!s}: not a correction file: {error}") from error
-    if len(data) > LARGEST:
+    if len(data) > MAX_FILE_BYTES:
         raise UsageError(
-            f"{path!s}: not a correction file: it is larger than {LARGEST // 1_000_000} MB"
+            f"{path!s}: not a correction file: it is larger than {MAX_FILE_BYTES // 1_000_000} MB"
         )
     return data
 
 
-def _place(path: str | Path | Learned, line: int, headings: list[str], column: Column) -> int:
-    """Where a column stands, from 0."""
-    for place, heading in enumerate(headings):
+def find_column(path: str | Path | Learned, line: int, headings: list[str], column: Column) -> int:
+    """Return the index of a column, from 0."""
+    for index, heading in enumerate(headings):
         name, _, unit = heading.lower().partition("(")
         if re.sub(r"[^a-z]", "", name) in column.headings:
             if unit.strip(" )") not in ("", *column.units):
-                raise _fault(path, line, place, f"{heading!r} must be in {column.units[0]}")
-            return place
+                raise make_error(path, line, index, f"{heading!r} must be in {column.units[0]}")
+            return index
     raise UsageError(
         f"{path!s}: line {line}: no column is named {column.name!r}; the names are"
-        f" {', '.join(headings)[:QUOTED]!r}"
+        f" {', '.join(headings)[:MAX_QUOTED_CHARACTERS]!r}"
     )
 
 
-def _value(
-    path: str | Path | Learned, line: int, cells: list[str], place: int, column: Column
+def parse_value(
+    path: str | Path | Learned, line: int, cells: list[str], index: int, column: Column
 ) -> float:
-    text = cells[place] if place < len(cells) else ""
+    text = cells[index] if index < len(cells) else ""
     try:
         value = float(text)
     except ValueError:
-        raise _fault(
-            path, line, place, f"{column.name} must be a number, got {text[:QUOTED]!r}"
-        ) from None
-    if not column.low <= value <= column.high:  # nor nan
-        raise _fault(
+        raise make_error(
             path,
             line,
-            place,
+            index,
+            f"{column.name} must be a number, got {text[:MAX_QUOTED_CHARACTERS]!r}",
+        ) from None
+    if not column.low <= value <= column.high:  # nor nan
+        raise make_error(
+            path,
+            line,
+            index,
             f"{column.name} {value:g} is outside {column.low:g} .. {column.high:g}"
             f" {column.units[0]}",
         )
     return value
 
 
-def _compare(
-    path: str | Path | Learned, line: int, place: int, column: Column, table: Table, own: Table
+def check_spread(
+    path: str | Path | Learned,
+    line: int,
+    index: int,
+    column: Column,
+    table: Table,
+    nominal_values: Table,
 ) -> None:
-    """Nothing, where the values spread like the model's own, to a factor of ten, or those spread
-    too little to tell by.
+    """Raise a UsageError if the spread of values is unlike the model's.
+
+    Values of a model with a spread of at most 1 are not checked.
     """
     spread = float(np.ptp(table))
-    usual = float(np.ptp(own))
-    if usual > 1 and not usual / UNLIKE < spread < usual * UNLIKE:
-        told = f"have a spread of {spread:g}" if spread else f"are all {table[0]:g}"
-        raise _fault(
+    nominal_spread = float(np.ptp(nominal_values))
+    if (
+        nominal_spread > 1
+        and not nominal_spread / MAX_SPREAD_RATIO < spread < nominal_spread * MAX_SPREAD_RATIO
+    ):
+        description = f"have a spread of {spread:g}" if spread else f"are all {table[0]:g}"
+        raise make_error(
             path,
             line,
-            place,
-            f"the {column.name}s {told}, but those of this model have a spread of {usual:g}"
-            f" {column.units[0]}: does the file belong to another unit?",
+            index,
+            f"the {column.name}s {description}, but those of this model have a spread of"
+            f" {nominal_spread:g} {column.units[0]}: does the file belong to another unit?",
         )
 
 
-def _fault(path: str | Path | Learned, line: int, place: int, reason: str) -> UsageError:
-    return UsageError(f"{path!s}: line {line}, column {place + 1}: {reason}")
+def make_error(path: str | Path | Learned, line: int, index: int, reason: str) -> UsageError:
+    return UsageError(f"{path!s}: line {line}, column {index + 1}: {reason}")

@@ -1,4 +1,4 @@
-"""A sensor of the family: the links, commands, clock and files that all of them have."""
+"""Construction of sensors: links, commands, clock and files that all spinning models share."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 from lidarspec.spec import Clock, Frame, OnWrap, Points, Sensor, Sequence, Simulation, Udp
 from lidarspec_hesai import ptc
 from lidarspec_hesai.calibration import Calibration, configure
-from lidarspec_hesai.parts import TURN, clock
+from lidarspec_hesai.parts import SPEED_LIMITS_HZ, clock
 
 
-def spinning(
+def make_spinning_sensor(
     id: str,
     data: Mapping[str, Frame],
     points: Callable[..., Points],
@@ -21,18 +21,19 @@ def spinning(
     azimuth: str = "blocks.azimuth",
     **facts: Any,
 ) -> Sensor:
-    """Return a sensor that turns, and is asked for its angles when it is opened.
+    """Return a rotating sensor, whose angles are requested when it is opened.
 
     Args:
+        id: the id of the sensor.
         data: its data frames.
         points: a function of `Fields` and the channels' `Calibration`.
         table: the model's channels.
         sweep: the values of simulated packet i.
-        azimuth: the field that passes 0 where a scan ends.
-        facts: what else a `Sensor` has.
+        azimuth: the field that passes 0 at the end of a scan.
+        facts: further arguments of `Sensor`.
     """
     defaults: dict[str, Any] = {
-        "turn": TURN,
+        "turn": SPEED_LIMITS_HZ,
         "clock": Clock(clock),
         "scan": OnWrap(azimuth),
         "vendor_axes": ("right", "forward", "up"),
@@ -43,7 +44,7 @@ def spinning(
         frames={**data, **ptc.FRAMES},
         points=partial(points, channels=table),
         links={"data": Udp(2368), "control": ptc.CONTROL},
-        commands=ptc.commands((300, 1200)),
+        commands=ptc.make_commands((300, 1200)),
         on_open=("get_calibration",),
         sequence=Sequence("sequence"),
         simulation=Simulation(

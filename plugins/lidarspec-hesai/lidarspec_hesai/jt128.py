@@ -1,9 +1,9 @@
-"""Hesai JT128: the packet of a Pandar128E3X with a status from 137 on, blocks as many as its header
-says.
+"""Hesai JT128: the packet of a Pandar128E3X with a status of at least 137.
 
-What it has of its own: a speed in steps of 0.1 rpm, and a time that is 1.888 ms after the last
-shot. How many blocks there are in a packet, how far it measures and how fast it turns stands in no
-source at hand: it is read as its packets say, and simulated with 2 blocks at 10 Hz.
+The number of blocks is in the header. Other differences: the motor speed has steps of 0.1 rpm, and
+the time is 1.888 ms after the last shot. The usual number of blocks, the range limits and the
+rotation speed are not public: packets are read by their header, and simulated with 2 blocks at 10
+Hz.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc; angle and firing-time files of
 the model).
@@ -16,26 +16,26 @@ from typing import Any
 from construct import Int8ul
 
 from lidarspec.spec import Fields, Frame, Polar
-from lidarspec_hesai.calibration import Calibration, nominal
-from lidarspec_hesai.family import spinning
-from lidarspec_hesai.headed import block_numbers
-from lidarspec_hesai.pandar128 import CHANNEL, FIRST_JT128, VERSION, relatives, tail
-from lidarspec_hesai.parts import beams, returns_of, turning
-from lidarspec_hesai.sealed import (
+from lidarspec_hesai.calibration import Calibration, make_nominal_table
+from lidarspec_hesai.crc_packets import (
     BLOCKS,
     LASERS,
     UNSEEN,
     distance,
-    in_body,
-    longest,
-    packet,
+    make_packet,
+    max_packet_bytes,
+    packet_values,
     plausible,
 )
+from lidarspec_hesai.family import make_spinning_sensor
+from lidarspec_hesai.header_packets import block_numbers
+from lidarspec_hesai.pandar128 import CHANNEL, MIN_JT128_STATUS, VERSION, make_tail, relatives
+from lidarspec_hesai.parts import count_returns, make_points, rotation_values
 
-MOST = 8  # blocks of the longest packet that would go into one datagram
-PER_TURN = 900  # blocks in a turn at 10 Hz: 0.4 degrees, by the time of a block
-LAST_SHOT = -1.888e-3
-SHOT = 111e-6  # seconds from the packet's time to the last shot, and from shot to shot
+MAX_BLOCKS = 8  # more do not fit into one datagram
+BLOCKS_PER_TURN = 900  # at 10 Hz: 0.4 degrees, from the time of a block
+LAST_SHOT_S = -1.888e-3  # from the packet's time to the last shot
+SHOT_PERIOD_S = 111e-6  # from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -72,40 +72,43 @@ FIRING_US = (
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots up to 1.888 ms before the packet's time (HesaiLidar_SDK_2.0)."""
+    """Return the points of a packet.
+
+    Shots end 1.888 ms before the packet's time (HesaiLidar_SDK_2.0).
+    """
     block = block_numbers(f)
-    returns = returns_of(f.return_mode)
-    fired = LAST_SHOT - SHOT * ((f.block_count - 1 - block) // returns)
-    return beams(
+    returns = count_returns(f.return_mode)
+    fired = LAST_SHOT_S - SHOT_PERIOD_S * ((f.block_count - 1 - block) // returns)
+    return make_points(
         f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
     )
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i at 10 Hz with single return."""
+    """Return the values of simulated packet i, at 10 Hz with single return."""
     return {
-        **in_body(turning(i, BLOCKS, PER_TURN), imu=1),
-        "status_version": FIRST_JT128,
+        **packet_values(rotation_values(i, BLOCKS, BLOCKS_PER_TURN), imu=1),
+        "status_version": MIN_JT128_STATUS,
         "block_count": BLOCKS,
     }
 
 
-JT128 = spinning(
+JT128 = make_spinning_sensor(
     "hesai-jt128",
     {
         "data": Frame(
-            packet(VERSION, CHANNEL[LASERS], tail(0.1), blocks=Int8ul, imu=True),
+            make_packet(VERSION, CHANNEL[LASERS], make_tail(0.1), blocks=Int8ul, imu=True),
             data=True,
-            max_length=longest(MOST, 2 + 6 * LASERS),
+            max_length=max_packet_bytes(MAX_BLOCKS, 2 + 6 * LASERS),
             plausible=plausible,
         )
     },
     points,
-    nominal(ELEVATION, AZIMUTH, FIRING_US),
+    make_nominal_table(ELEVATION, AZIMUTH, FIRING_US),
     sweep,
     "body.blocks.azimuth",
     model="JT128",
-    range_limits=(0.0, 262.14),  # what packets can say in steps of 4 mm
+    range_limits=(0.0, 262.14),  # the limits of the field with steps of 4 mm
     relatives=relatives("hesai-jt128"),
     status="manual",
     source=f"HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, JT128 correction files); {UNSEEN}",

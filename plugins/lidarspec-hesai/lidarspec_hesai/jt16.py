@@ -1,17 +1,17 @@
-"""Hesai JT16: 16 channels over a serial line, 80 bytes for each azimuth, and 34 for each sample of
-the IMU.
+"""Hesai JT16: 16 channels over a serial line.
+
+An azimuth is a packet of 80 bytes, an IMU sample a packet of 34:
 
     EE FF 01 08  time_version  00 | date, microseconds | azimuth, 16 x (distance, reflectivity),
     dirt, state, sequence | CRC EE FF 01 08  time_version  01 | date, microseconds | acceleration,
     rate, sequence | CRC
 
-No packet of this model was seen. How many azimuths there are in a turn, and how fast it turns,
-stands in no source at hand: 600 by 5 Hz are simulated, as fine as the grid of the vendor's code,
-and as many as the line carries. The axes of the IMU are not documented, so its samples are fields
-alone.
+No captured packet was available. The azimuths per revolution and the rotation speed are not public:
+600 at 5 Hz are simulated, the grid of the vendor's code and the limit of the baud rate. The axes of
+the IMU are not documented, so its samples are available as fields only.
 
-Left out: commands, which go over a second line (RS232, 9600 baud) and bear random numbers; with
-them a unit would say its angles.
+Not supported: commands, which use a second line (RS232, 9600 baud) and contain random numbers. They
+could read a unit's angles.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_8.h, udp1_8_parser.cc: fields, steps of 4 mm, angles,
 CRC; serial_source.cc: lengths; parameter_introduction.md: 3,125,000 baud; JT16 correction file).
@@ -39,12 +39,12 @@ from lidarspec.spec import (
     Simulation,
     ZeroPadded,
 )
-from lidarspec_hesai.calibration import Calibration, configure, nominal
-from lidarspec_hesai.parts import UTC, clock, turning
-from lidarspec_hesai.sealed import CRC
+from lidarspec_hesai.calibration import Calibration, configure, make_nominal_table
+from lidarspec_hesai.crc_packets import CRC
+from lidarspec_hesai.parts import UTC, clock, rotation_values
 
 CHANNELS = 16
-PER_TURN = 600
+BLOCKS_PER_TURN = 600
 RATE_HZ = 5.0
 
 ELEVATION = (
@@ -57,8 +57,8 @@ AZIMUTH = (
 )  # fmt: skip
 
 
-def packet(data_type: int, *body: Any) -> Struct:
-    """Return a packet of this type: its head, and the body with the CRC."""
+def make_packet(data_type: int, *body: Any) -> Struct:
+    """Return the struct of a packet of this type."""
     return Struct(
         "sync" / Const(b"\xee\xff\x01\x08"),
         "time_version" / Int8ul,
@@ -71,7 +71,7 @@ def packet(data_type: int, *body: Any) -> Struct:
 
 
 DATA = Checksummed(
-    packet(
+    make_packet(
         0,
         "azimuth" / Scaled(Int16ul, 0.01, "deg"),
         "channels"
@@ -95,7 +95,7 @@ DATA = Checksummed(
     CRC,
 )
 IMU = Checksummed(
-    packet(
+    make_packet(
         1,
         "acceleration"
         / Array(3, Scaled(Int16sl, 1 / 8192, "g"))
@@ -109,7 +109,7 @@ IMU = Checksummed(
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Return the shots of one azimuth, all at the packet's time."""
+    """Return the points of one azimuth, all at the packet's time."""
     return Polar(
         range=f.channels.distance,
         azimuth=-np.deg2rad(f.azimuth + channels.azimuth),
@@ -121,17 +121,21 @@ def points(f: Fields, channels: Calibration) -> Polar:
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i."""
-    values = turning(i, 1, PER_TURN, RATE_HZ)
-    kept = {
+    """Return the values of simulated packet i."""
+    values = rotation_values(i, 1, BLOCKS_PER_TURN, RATE_HZ)
+    date_and_time = {
         name: value
         for name, value in values.items()
         if name == "timestamp" or name.startswith("utc.")
     }
-    return {**kept, "azimuth": float(values["blocks.azimuth"][0]), "sequence": i % (1 << 16)}
+    return {
+        **date_and_time,
+        "azimuth": float(values["blocks.azimuth"][0]),
+        "sequence": i % (1 << 16),
+    }
 
 
-TABLE = nominal(ELEVATION, AZIMUTH, np.zeros(CHANNELS))
+TABLE = make_nominal_table(ELEVATION, AZIMUTH, np.zeros(CHANNELS))
 
 JT16 = Sensor(
     "hesai-jt16",
@@ -148,7 +152,7 @@ JT16 = Sensor(
     sequence=Sequence("sequence"),
     simulation=Simulation(sweep),
     configure=partial(configure, points, TABLE),
-    range_limits=(0.0, 262.14),  # what packets can say
+    range_limits=(0.0, 262.14),  # the limits of the field
     vendor_axes=("right", "forward", "up"),
     status="manual",
     source=(

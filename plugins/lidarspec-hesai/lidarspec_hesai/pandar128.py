@@ -1,20 +1,20 @@
-"""Hesai Pandar128E3X and OT128: protocol 1.4, 2 blocks of 128 channels, 861 bytes, 893 with a
-signature.
+"""Hesai Pandar128E3X and OT128: protocol 1.4, 2 blocks of 128 channels.
+
+A packet has 861 bytes, 893 with a signature:
 
     EE FF 01 04  status 00 | 80 02 first_return unit return_count flags
     2 x [azimuth, 128 x (distance, reflectivity [, confidence] [, weight] [, environment])], CRC
     [safety], tail [, sequence] [, IMU], CRC [, signature]
 
-What the status says tells the models apart. The CRCs are those of a QT128, as far as is known; no
-packet of these models was seen, so they are not held. Which channels fire, and when, depends on the
-operational state and on the azimuth state of the block: sixteen groups of eight channels share
-their times. Nearer than 2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than said
-here.
+The status distinguishes the models. The CRCs are probably those of a QT128. No captured packet was
+available, so they are not verified. The operational state and the azimuth state of the block
+determine which channels fire and when: sixteen groups of eight channels share their times. Below
+2.85 m, 32 channels of a Pandar128E3X fire 0.8 to 16.7 us later than in these tables.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: which model it is, block and
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v1_4.h, udp1_4_parser.cc: status of each model, block and
 firing times; angle and firing-time files of sample units); Pandar128E3X user manual (lengths; the
-firing times hold for "standard" and "energy saving" states alike). For an OT128 tier4/nebula has
-other times.
+firing times apply to both the "standard" and the "energy saving" state). tier4/nebula has other
+times for an OT128.
 """
 
 from __future__ import annotations
@@ -27,25 +27,32 @@ import numpy as np
 from construct import Bytes, Const, If, Int8ul, Int16ul, Int32ul, Struct, this
 
 from lidarspec.spec import Fields, Frame, Polar, Relative, Scaled, take
-from lidarspec_hesai.calibration import Calibration, nominal
-from lidarspec_hesai.family import spinning
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
-from lidarspec_hesai.sealed import (
+from lidarspec_hesai.calibration import Calibration, make_nominal_table
+from lidarspec_hesai.crc_packets import (
     BLOCKS,
     LASERS,
     UNSEEN,
     distance,
-    in_body,
-    longest,
-    packet,
+    make_packet,
+    max_packet_bytes,
+    packet_values,
     plausible,
 )
+from lidarspec_hesai.family import make_spinning_sensor
+from lidarspec_hesai.parts import (
+    FACTORY,
+    RETURN_MODES,
+    UTC,
+    count_returns,
+    make_points,
+    rotation_values,
+)
 
-PER_TURN = 1800  # blocks in a turn at 10 Hz and single return, of the standard state: 0.2 degrees
-SHOT = 27.778e-6  # seconds from shot to shot, twice that in other operational states than 0
-STANDARD = 2  # the operational state that is simulated
-FIRST_OT128 = 128  # status of the first OT128, and of the first JT128
-FIRST_JT128 = 137
+BLOCKS_PER_TURN = 1800  # 0.2 degrees, at 10 Hz and single return, in the standard state
+SHOT_PERIOD_S = 27.778e-6  # in operational state 0; twice as long in other states
+STANDARD_STATE = 2  # the simulated operational state
+MIN_OT128_STATUS = 128
+MIN_JT128_STATUS = 137
 
 # fmt: off
 ELEVATION = (
@@ -148,8 +155,8 @@ CHANNEL = Struct(
 VERSION = ("major" / Const(1, Int8ul), "minor" / Const(4, Int8ul))
 
 
-def tail(speed: float) -> Any:
-    """Return the tail, with the motor's speed in steps of so many rpm."""
+def make_tail(speed: float) -> Any:
+    """Return the fields of the tail, with the motor's speed in steps of `speed` rpm."""
     return (
         "tail_reserved" / Bytes(9),
         "azimuth_state" / Int16ul * "two bits per block, first block in the highest bits",
@@ -164,68 +171,75 @@ def tail(speed: float) -> Any:
 
 FRAMES = {
     "data": Frame(
-        packet(VERSION, CHANNEL[LASERS], tail(1), imu=True),
+        make_packet(VERSION, CHANNEL[LASERS], make_tail(1), imu=True),
         data=True,
-        max_length=longest(BLOCKS, 2 + 6 * LASERS),
+        max_length=max_packet_bytes(BLOCKS, 2 + 6 * LASERS),
         plausible=plausible,
     )
 }
 
 
 def points(f: Fields, channels: Calibration, last: float, times: Any) -> Polar:
-    """Shots up to the packet's time (HesaiLidar_SDK_2.0), channels by the state of their block.
+    """Return the points of a packet.
+
+    Shots end at the packet's time (HesaiLidar_SDK_2.0); firing times depend on the state of the
+    block.
 
     Args:
         last: seconds from the packet's time to the last shot.
-        times: seconds of each channel, a row for each state.
+        times: seconds of each channel, a row for each state, (states, channels).
     """
     block = np.arange(BLOCKS)[:, None]
-    returns = returns_of(f.return_mode)
-    slow = np.where(f.operational_state == 0, 1, 2)
+    returns = count_returns(f.return_mode)
+    duration_factor = np.where(f.operational_state == 0, 1, 2)
     state = np.mod(np.floor(f.azimuth_state / 4.0 ** (7 - block)), 4)
-    within = take(times, np.where(f.operational_state == 0, state, 4 + np.mod(state, 2)))
-    fired = last - SHOT * slow * ((BLOCKS - 1 - block) // returns) + within
-    return beams(
+    delay = take(times, np.where(f.operational_state == 0, state, 4 + np.mod(state, 2)))
+    fired = last - SHOT_PERIOD_S * duration_factor * ((BLOCKS - 1 - block) // returns) + delay
+    return make_points(
         f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
     )
 
 
 def sweep(i: int, status: int) -> dict[str, Any]:
-    """Packet i at 10 Hz with single return."""
-    values = in_body(turning(i, BLOCKS, PER_TURN), imu=1, safety=1)
+    """Return the values of simulated packet i, at 10 Hz with single return."""
+    values = packet_values(rotation_values(i, BLOCKS, BLOCKS_PER_TURN), imu=1, safety=1)
     return {
         **values,
         "status_version": status,
-        "operational_state": STANDARD,
+        "operational_state": STANDARD_STATE,
         "azimuth_state": 0x1000,
     }
 
 
-def by_channel(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
-    """Seconds of each channel, (states, channels)."""
+def channel_times(groups: str, times_us: Mapping[str, Sequence[float]]) -> Any:
+    """Return the seconds of each channel, (states, channels)."""
     return np.array([times_us[group] for group in groups]).T * 1e-6
 
 
 def relatives(own: str) -> dict[str, Relative]:
-    """Return the others that send these packets, and how their status tells them."""
+    """Return the other models with these packets, recognized by their status."""
     others = {
-        "hesai-pandar128": Relative("a status below 128", lambda f: f.status_version < FIRST_OT128),
+        "hesai-pandar128": Relative(
+            "a status below 128", lambda f: f.status_version < MIN_OT128_STATUS
+        ),
         "hesai-ot128": Relative("a status from 128 to 136", is_ot128),
-        "hesai-jt128": Relative("a status from 137 on", lambda f: f.status_version >= FIRST_JT128),
+        "hesai-jt128": Relative(
+            "a status from 137 on", lambda f: f.status_version >= MIN_JT128_STATUS
+        ),
     }
     return {id: other for id, other in others.items() if id != own}
 
 
 def is_ot128(f: Fields) -> Any:
-    """Return whether a status is that of an OT128."""
-    return (f.status_version >= FIRST_OT128) & (f.status_version < FIRST_JT128)
+    """Return whether the status is that of an OT128."""
+    return (f.status_version >= MIN_OT128_STATUS) & (f.status_version < MIN_JT128_STATUS)
 
 
-PANDAR128 = spinning(
+PANDAR128 = make_spinning_sensor(
     "hesai-pandar128",
     FRAMES,
-    partial(points, last=3.148e-6, times=by_channel(GROUPS, TIMES_US)),
-    nominal(ELEVATION, AZIMUTH, np.zeros(LASERS)),
+    partial(points, last=3.148e-6, times=channel_times(GROUPS, TIMES_US)),
+    make_nominal_table(ELEVATION, AZIMUTH, np.zeros(LASERS)),
     partial(sweep, status=0),
     "body.blocks.azimuth",
     model="Pandar128E3X",
@@ -238,12 +252,12 @@ PANDAR128 = spinning(
     ),
 )
 
-OT128 = spinning(
+OT128 = make_spinning_sensor(
     "hesai-ot128",
     FRAMES,
-    partial(points, last=0.0, times=by_channel(OT128_GROUPS, OT128_TIMES_US)),
-    nominal(OT128_ELEVATION, OT128_AZIMUTH, np.zeros(LASERS)),
-    partial(sweep, status=FIRST_OT128),
+    partial(points, last=0.0, times=channel_times(OT128_GROUPS, OT128_TIMES_US)),
+    make_nominal_table(OT128_ELEVATION, OT128_AZIMUTH, np.zeros(LASERS)),
+    partial(sweep, status=MIN_OT128_STATUS),
     "body.blocks.azimuth",
     model="OT128",
     range_limits=(0.3, 200.0),

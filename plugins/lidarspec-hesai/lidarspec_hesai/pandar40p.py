@@ -1,10 +1,9 @@
-"""Hesai Pandar40P: 40 channels, a packet without header, of 1262 bytes, or 1266 with the UDP
-sequence.
+"""Hesai Pandar40P: 40 channels, packets without header, of 1262 or 1266 bytes.
 
     10 x [FF EE, azimuth, 40 x (distance, reflectivity)], tail(22) [, sequence]
 
-Nothing in the packet says whether the sequence is there, only its length does: so there are two
-frame types, and `decode` reads by the one that arrives first.
+Packets with the UDP sequence have 1266 bytes. Only the length shows whether the sequence is
+present, so there are two frame types, and `decode` uses the type that arrives first.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_p40.h; angle and firing-time files of a sample unit);
 tier4/nebula.
@@ -19,15 +18,15 @@ import numpy as np
 from construct import Array, Const, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Clock, Fields, Frame, Polar, Scaled
-from lidarspec_hesai.calibration import Calibration, nominal
-from lidarspec_hesai.family import spinning
-from lidarspec_hesai.parts import TAIL_40P, beams, clock, returns_of, turning
+from lidarspec_hesai.calibration import Calibration, make_nominal_table
+from lidarspec_hesai.family import make_spinning_sensor
+from lidarspec_hesai.parts import TAIL_40P, clock, count_returns, make_points, rotation_values
 
 BLOCKS = 10
 CHANNELS = 40
-PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
-LAST_SHOT = -28.58e-6
-SHOT = 55.56e-6  # seconds from the packet's time to the last shot, and from shot to shot
+BLOCKS_PER_TURN = 1800  # at 10 Hz and single return: 0.2 degrees
+LAST_SHOT_S = -28.58e-6  # from the packet's time to the last shot
+SHOT_PERIOD_S = 55.56e-6  # from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -47,7 +46,7 @@ FIRING_US = (
 )
 # fmt: on
 
-PLAIN = Struct(
+DATA = Struct(
     "blocks"
     / Array(
         BLOCKS,
@@ -66,22 +65,23 @@ PLAIN = Struct(
     ),
     *TAIL_40P,
 )
-COUNTED = Struct(*PLAIN.subcons, "sequence" / Int32ul)
+DATA_WITH_SEQUENCE = Struct(*DATA.subcons, "sequence" / Int32ul)
 
 
 def plausible(f: Fields) -> Any:
-    """Azimuths below 360 degrees and a known factory byte."""
+    """Return whether azimuths are below 360 degrees and the factory byte is known."""
     return (f.blocks.azimuth < 360) & ((f.factory == 0x42) | (f.factory == 0x43))
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are
-    one shot.
+    """Return the points of a packet, with shots before its time (HesaiLidar_SDK_2.0).
+
+    With dual return, a pair of blocks is one shot.
     """
     block = np.arange(BLOCKS)[:, None]
-    returns = returns_of(f.return_mode)
-    fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
-    return beams(
+    returns = count_returns(f.return_mode)
+    fired = LAST_SHOT_S - SHOT_PERIOD_S * ((BLOCKS - 1 - block) // returns)
+    return make_points(
         f.blocks,
         channels,
         distance=f.blocks.channels.distance,
@@ -92,33 +92,33 @@ def points(f: Fields, channels: Calibration) -> Polar:
 
 
 def pace(f: Fields, blocks: int) -> Any:
-    """Return the seconds that the shots of a packet take (HesaiLidar_SDK_2.0)."""
-    return SHOT * blocks / returns_of(f.return_mode)
+    """Return the seconds of the shots of a packet (HesaiLidar_SDK_2.0)."""
+    return SHOT_PERIOD_S * blocks / count_returns(f.return_mode)
 
 
-def paced_clock(blocks: int) -> Clock:
-    """Return the clock of packets with so many blocks, which may lack the sequence."""
+def make_clock(blocks: int) -> Clock:
+    """Return the clock of packets with `blocks` blocks, which may lack the sequence."""
     return Clock(clock, pace=partial(pace, blocks=blocks))
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i at 10 Hz with single return."""
-    return turning(i, BLOCKS, PER_TURN)
+    """Return the values of simulated packet i, at 10 Hz with single return."""
+    return rotation_values(i, BLOCKS, BLOCKS_PER_TURN)
 
 
-TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
+TABLE = make_nominal_table(ELEVATION, AZIMUTH, FIRING_US)
 
-PANDAR40P = spinning(
+PANDAR40P = make_spinning_sensor(
     "hesai-pandar40p",
     {
-        "data": Frame(PLAIN, data=True, plausible=plausible),
-        "data_sequence": Frame(COUNTED, data=True, plausible=plausible),
+        "data": Frame(DATA, data=True, plausible=plausible),
+        "data_sequence": Frame(DATA_WITH_SEQUENCE, data=True, plausible=plausible),
     },
     points,
     TABLE,
     sweep,
     model="Pandar40P",
-    clock=paced_clock(BLOCKS),
+    clock=make_clock(BLOCKS),
     range_limits=(0.3, 200.0),
     status="capture",
     source=(

@@ -1,9 +1,9 @@
-"""Hesai Pandar64: 64 channels, a header of eight bytes, six blocks, 1194 bytes, or 1198 with the
-UDP sequence.
+"""Hesai Pandar64: 64 channels, a header of eight bytes, six blocks, 1194 or 1198 bytes.
 
     EE FF 40 06 00 unit 00 00, 6 x [azimuth, 64 x (distance, reflectivity)], tail(22) [, sequence]
 
-As with the Pandar40P, whose tail it has, its length alone says whether the sequence is there.
+Packets with the UDP sequence have 1198 bytes. The tail is that of a Pandar40P, and only the length
+shows whether the sequence is present.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_p64.h; angle and firing-time files of a sample unit); one
 captured packet of tier4/nebula, in which the year counts from 1900.
@@ -17,16 +17,16 @@ import numpy as np
 from construct import Array, Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Fields, Frame, Polar, Scaled
-from lidarspec_hesai.calibration import Calibration, nominal
-from lidarspec_hesai.family import spinning
-from lidarspec_hesai.headed import USUAL_UNIT, distance
-from lidarspec_hesai.pandar40p import SHOT, paced_clock
-from lidarspec_hesai.parts import TAIL_40P, beams, returns_of, turning
+from lidarspec_hesai.calibration import Calibration, make_nominal_table
+from lidarspec_hesai.family import make_spinning_sensor
+from lidarspec_hesai.header_packets import SIMULATED_UNIT_MM, distance
+from lidarspec_hesai.pandar40p import SHOT_PERIOD_S, make_clock
+from lidarspec_hesai.parts import TAIL_40P, count_returns, make_points, rotation_values
 
 BLOCKS = 6
 CHANNELS = 64
-PER_TURN = 1800  # blocks in a turn at 10 Hz and single return: 0.2 degrees
-LAST_SHOT = -42.58e-6  # seconds from the packet's time to the last shot
+BLOCKS_PER_TURN = 1800  # at 10 Hz and single return: 0.2 degrees
+LAST_SHOT_S = -42.58e-6  # from the packet's time to the last shot
 
 # fmt: off
 ELEVATION = (
@@ -53,7 +53,7 @@ FIRING_US = (
 CHANNEL = Struct(
     "distance" / Int16ul * "in steps of dis_unit; 0: no return", "reflectivity" / Int8ul
 )
-PLAIN = Struct(
+DATA = Struct(
     "sync" / Const(b"\xee\xff"),
     "lasers" / Const(CHANNELS, Int8ul),
     "block_count" / Const(BLOCKS, Int8ul),
@@ -70,46 +70,47 @@ PLAIN = Struct(
     ),
     *TAIL_40P,
 )
-COUNTED = Struct(*PLAIN.subcons, "sequence" / Int32ul)
+DATA_WITH_SEQUENCE = Struct(*DATA.subcons, "sequence" / Int32ul)
 
 
 def plausible(f: Fields) -> Any:
-    """Return a unit, azimuths below 360 degrees and a known factory byte."""
+    """Return whether unit, azimuths and factory byte are valid."""
     return (
         (f.dis_unit >= 1) & (f.blocks.azimuth < 360) & ((f.factory == 0x42) | (f.factory == 0x43))
     )
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots before the packet's time (HesaiLidar_SDK_2.0); with dual return, pairs of blocks are
-    one shot.
+    """Return the points of a packet, with shots before its time (HesaiLidar_SDK_2.0).
+
+    With dual return, a pair of blocks is one shot.
     """
     block = np.arange(BLOCKS)[:, None]
-    returns = returns_of(f.return_mode)
-    fired = LAST_SHOT - SHOT * ((BLOCKS - 1 - block) // returns)
-    return beams(
+    returns = count_returns(f.return_mode)
+    fired = LAST_SHOT_S - SHOT_PERIOD_S * ((BLOCKS - 1 - block) // returns)
+    return make_points(
         f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
     )
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i at 10 Hz with single return."""
-    return {"dis_unit": USUAL_UNIT, **turning(i, BLOCKS, PER_TURN)}
+    """Return the values of simulated packet i, at 10 Hz with single return."""
+    return {"dis_unit": SIMULATED_UNIT_MM, **rotation_values(i, BLOCKS, BLOCKS_PER_TURN)}
 
 
-TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
+TABLE = make_nominal_table(ELEVATION, AZIMUTH, FIRING_US)
 
-PANDAR64 = spinning(
+PANDAR64 = make_spinning_sensor(
     "hesai-pandar64",
     {
-        "data": Frame(PLAIN, data=True, plausible=plausible),
-        "data_sequence": Frame(COUNTED, data=True, plausible=plausible),
+        "data": Frame(DATA, data=True, plausible=plausible),
+        "data_sequence": Frame(DATA_WITH_SEQUENCE, data=True, plausible=plausible),
     },
     points,
     TABLE,
     sweep,
     model="Pandar64",
-    clock=paced_clock(BLOCKS),
+    clock=make_clock(BLOCKS),
     range_limits=(0.3, 200.0),
     status="vectors",
     source=(

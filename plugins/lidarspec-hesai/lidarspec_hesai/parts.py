@@ -1,5 +1,4 @@
-"""What all packets of the family have in common: the date, the return modes, and how a shot becomes
-points.
+"""Parts of all packets of the family: the date, the return modes, and the points of a shot.
 
 Source: HesaiLidar_SDK_2.0 (year rule, return modes, timing) and tier4/nebula (geometry, which
 reproduces its published clouds).
@@ -22,11 +21,10 @@ RETURN_MODES = (
 )
 FACTORY = "42 or 43"
 EPOCH = datetime.datetime(2024, 1, 1)  # of simulated packets
-TURN = (
+#: 300 to 1200 rpm (tier4/nebula, rotation_speed of all models).
+SPEED_LIMITS_HZ = (
     5.0,
     20.0,
-    # turns a second, slowest and fastest:
-    # 300 to 1200 rpm (tier4/nebula, rotation_speed of all models)
 )
 
 UTC = Struct(
@@ -44,7 +42,7 @@ UTC = Struct(
 )
 
 
-#: the tail of a Pandar40P and a Pandar64.
+#: The tail of a Pandar40P and a Pandar64.
 TAIL_40P = (
     "reserved" / Bytes(5),
     "shutdown" / Int8ul * "1: overheated, about to shut down",
@@ -57,8 +55,8 @@ TAIL_40P = (
 )
 
 
-def returns_of(mode: Any) -> Any:
-    """How many blocks in a row are echoes of one shot, in this return mode."""
+def count_returns(mode: Any) -> Any:
+    """Return the number of consecutive blocks with returns of one shot."""
     dual = (mode == 0x39) | (mode == 0x3B) | (mode == 0x3C)
     return np.where(mode == 0x3D, 3, np.where(dual, 2, 1))
 
@@ -72,17 +70,17 @@ def clock(f: Fields) -> tuple[Any, Any]:
     return np.where(utc.year == 0, unix, date), f.timestamp
 
 
-def beams(
+def make_points(
     blocks: Fields, channels: Calibration, *, distance: Any, block: Any, returns: Any, fired: Any
 ) -> Polar:
     """Return the points of a packet.
 
     Args:
         blocks: the blocks of the frame.
-        channels: what each channel adds to its block.
+        channels: the corrections of each channel.
         distance: metres, (n, blocks, channels).
         block: the number of each block, (blocks, 1) or (n, blocks, 1).
-        returns: how many blocks in a row are echoes of one shot.
+        returns: the number of consecutive blocks with returns of one shot.
         fired: seconds from the packet's time to the shot of each block.
     """
     return Polar(
@@ -97,10 +95,10 @@ def beams(
     )
 
 
-def turning(i: int, blocks: int, per_turn: int, rate_hz: float = 10.0) -> dict[str, Any]:
-    """Return azimuths, speed and time of packet i of a rotating sensor.
+def rotation_values(i: int, blocks: int, per_turn: int, rate_hz: float = 10.0) -> dict[str, Any]:
+    """Return azimuths, speed and time of packet i of a simulated rotating sensor.
 
-    The sensor fires `per_turn` blocks in each turn.
+    The sensor fires `per_turn` blocks per revolution.
     """
     shots = i * blocks + np.arange(blocks)
     now = EPOCH + datetime.timedelta(

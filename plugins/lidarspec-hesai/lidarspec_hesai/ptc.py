@@ -1,9 +1,9 @@
-"""PTC, the commands of the family, over TCP port 9347; all of it big-endian.
+"""PTC, the commands of the family, over TCP port 9347, big-endian.
 
     47 74  code  result | length(4) | payload
 
-A unit is asked for its angles when it is opened. Units that speak TLS alone, or PTC 2.0 (57 75), do
-not answer.
+The angles of a unit are requested when it is opened. Units with only TLS or PTC 2.0 (57 75) do not
+reply.
 
 Source: HesaiLidar_SDK_2.0 (ptc_client.h, ptc_1_0_parser.h: frame and codes); tier4/nebula
 (hesai_common.hpp: numbers of the return modes).
@@ -19,7 +19,7 @@ from construct import Bytes, Const, Construct, Int8ub, Int16ub, Int32ub, Struct,
 from lidarspec.spec import Address, Command, Fields, Frame, Scaled, SizeOf, Tcp
 
 CONTROL = Tcp(9347)
-LARGEST = 1 << 16  # bytes of a payload; the longest known, the angles of an AT128, has 47,176
+MAX_PAYLOAD_BYTES = 1 << 16  # the longest known payload, the angles of an AT128, has 47,176
 
 RESULTS = (
     "0 done, 1 bad parameter, 2 connection, 3 data, 4 memory, 5 not supported, 6 FPGA, 7 other"
@@ -41,8 +41,8 @@ SETTINGS = {
 }
 
 
-def message(payload: Construct) -> Struct:
-    """Return a request or an answer with this payload."""
+def make_message(payload: Construct) -> Struct:
+    """Return the struct of a request or a reply with this payload."""
     return Struct(
         "sync" / Const(b"\x47\x74"),
         "code" / Int8ub,
@@ -53,23 +53,23 @@ def message(payload: Construct) -> Struct:
 
 
 def plausible(f: Fields) -> Any:
-    """Return a result that there is, and a payload as long as one can be."""
-    return (f.result <= 7) & (f.length <= LARGEST)
+    """Return whether the result is known and the payload is not too long."""
+    return (f.result <= 7) & (f.length <= MAX_PAYLOAD_BYTES)
 
 
 FRAMES = {
     "answer": Frame(
-        message(Bytes(this.length)),
-        max_length=8 + LARGEST,
+        make_message(Bytes(this.length)),
+        max_length=8 + MAX_PAYLOAD_BYTES,
         plausible=plausible,
     ),
     "request": Frame(
-        message(Switch(this.code, SETTINGS, default=Bytes(0))), direction="out", max_length=16
+        make_message(Switch(this.code, SETTINGS, default=Bytes(0))), direction="out", max_length=16
     ),
 }
 
 
-def _command(code: int, **more: Any) -> Command:
+def make_command(code: int, **more: Any) -> Command:
     fixed = {"code": code, "result": 0, **({} if code in SETTINGS else {"payload": b""})}
     return Command(
         "request",
@@ -83,20 +83,20 @@ def _command(code: int, **more: Any) -> Command:
     )
 
 
-def commands(rates: tuple[int, int]) -> Mapping[str, Command]:
-    """What can be asked of a unit that turns at these rates, rpm, slowest and fastest."""
+def make_commands(rates: tuple[int, int]) -> Mapping[str, Command]:
+    """Return the commands of a unit; `rates` are its lowest and highest speed in rpm."""
     return {
-        "get_calibration": _command(
+        "get_calibration": make_command(
             0x05, learns=lambda reply: {"calibration": bytes(reply.payload)}
         ),
-        "get_firing_times": _command(0xA9),
-        "get_inventory": _command(0x07),
-        "get_status": _command(0x09),
-        "reboot": _command(0x10),
-        "speed": _command(0x17, args={"rate": ("payload.rate", *rates)}),
-        "standby": _command(0x1C, args={"standby": ("payload.standby", 0, 1)}),
-        "return_mode": _command(0x1E, args={"mode": ("payload.mode", 0, 5)}),
-        "send_to": _command(
+        "get_firing_times": make_command(0xA9),
+        "get_inventory": make_command(0x07),
+        "get_status": make_command(0x09),
+        "reboot": make_command(0x10),
+        "speed": make_command(0x17, args={"rate": ("payload.rate", *rates)}),
+        "standby": make_command(0x1C, args={"standby": ("payload.standby", 0, 1)}),
+        "return_mode": make_command(0x1E, args={"mode": ("payload.mode", 0, 5)}),
+        "send_to": make_command(
             0x20,
             args={
                 "host": ("payload.host", Address()),

@@ -1,9 +1,11 @@
-"""Hesai QT128C2X: protocol 3.2, a header, 2 blocks of 128 channels, CRCs over blocks, functional
-safety and tail, 1127 bytes.
+"""Hesai QT128C2X: protocol 3.2, a header, 2 blocks of 128 channels, 1127 bytes.
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h; angle and firing-time files of a sample unit); the
-CRCs hold for a capture of tier4/nebula, as the fact that the second block follows the first by
-111.11 us (nebula has it the other way round). By turns two loops fire 92 of the channels each.
+CRCs cover the blocks, the functional safety part and the tail.
+
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h; angle and firing-time files of a sample unit). The
+CRCs are verified with a capture of tier4/nebula. It also shows that the second block follows the
+first by 111.11 us (nebula has the opposite order). Two loops alternate, each of which fires 92 of
+the channels.
 """
 
 from __future__ import annotations
@@ -14,23 +16,30 @@ import numpy as np
 from construct import Bytes, Const, Int8ul, Int16ul, Int32ul, Struct
 
 from lidarspec.spec import Fields, Frame, Polar, Scaled
-from lidarspec_hesai.calibration import Calibration, nominal
-from lidarspec_hesai.family import spinning
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
-from lidarspec_hesai.sealed import (
+from lidarspec_hesai.calibration import Calibration, make_nominal_table
+from lidarspec_hesai.crc_packets import (
     ACKNOWLEDGED,
     BLOCKS,
     LASERS,
     distance,
-    in_body,
-    longest,
-    packet,
+    make_packet,
+    max_packet_bytes,
+    packet_values,
     plausible,
 )
+from lidarspec_hesai.family import make_spinning_sensor
+from lidarspec_hesai.parts import (
+    FACTORY,
+    RETURN_MODES,
+    UTC,
+    count_returns,
+    make_points,
+    rotation_values,
+)
 
-PER_TURN = 900  # blocks in a turn at 10 Hz and single return: 0.4 degrees
-FIRST_SHOT = 9e-6
-SHOT = 111.11e-6  # seconds from the packet's time to the first shot, and from shot to shot
+BLOCKS_PER_TURN = 900  # at 10 Hz and single return: 0.4 degrees
+FIRST_SHOT_S = 9e-6  # from the packet's time to the first shot
+SHOT_PERIOD_S = 111.11e-6  # from shot to shot
 
 # fmt: off
 ELEVATION = (
@@ -63,7 +72,7 @@ AZIMUTH = (
     -7.61231176, -7.74288787, -7.8848012, -8.03961095, -8.20921068, -8.3959205, -8.60260573, -8.83289966, -9.09143333, -9.38426583,
     -9.71950367, -10.108306,
 )
-#: microseconds of each channel in the loops that take turns; 0: it does not fire.
+#: Firing times of the channels in the two alternating loops; 0: the channel does not fire.
 LOOP_1_US = (
     0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 27.656, 53, 2.312, 78.344, 81.512,
     5.48, 56.168, 30.824, 33.992, 59.336, 8.648, 84.68, 87.848, 11.816, 62.504, 37.16, 40.328, 65.672, 14.984, 91.016, 94.184, 18.152,
@@ -103,35 +112,37 @@ TAIL = (
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots after the packet's time (HesaiLidar_SDK_2.0); channels by the loop, which changes with
-    each shot.
+    """Return the points of a packet, with shots after its time (HesaiLidar_SDK_2.0).
+
+    Firing times depend on the loop, which changes with each shot.
     """
     block = np.arange(BLOCKS)[:, None]
-    returns = returns_of(f.return_mode)
+    returns = count_returns(f.return_mode)
     loop = np.where(returns > 1, np.mod(f.mode_flag, 2), block % 2)
-    fired = FIRST_SHOT + SHOT * (block // returns) + np.where(loop == 0, 0, 1) * LATER
-    return beams(
+    fired = (
+        FIRST_SHOT_S + SHOT_PERIOD_S * (block // returns) + np.where(loop == 0, 0, 1) * LOOP_DELAY_S
+    )
+    return make_points(
         f.body.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
     )
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i at 10 Hz with single return."""
-    return in_body(turning(i, BLOCKS, PER_TURN), confidence=1)
+    """Return the values of simulated packet i, at 10 Hz with single return."""
+    return packet_values(rotation_values(i, BLOCKS, BLOCKS_PER_TURN), confidence=1)
 
 
-TABLE = nominal(ELEVATION, AZIMUTH, LOOP_1_US)
-LATER = (
-    np.array(LOOP_2_US) - np.array(LOOP_1_US)
-) * 1e-6  # seconds by which channels fire later in the second loop
+TABLE = make_nominal_table(ELEVATION, AZIMUTH, LOOP_1_US)
+#: Seconds from the firing of each channel in the first loop to that in the second.
+LOOP_DELAY_S = (np.array(LOOP_2_US) - np.array(LOOP_1_US)) * 1e-6
 
-QT128 = spinning(
+QT128 = make_spinning_sensor(
     "hesai-qt128",
     {
         "data": Frame(
-            packet(VERSION, CHANNEL[LASERS], TAIL, held=True),
+            make_packet(VERSION, CHANNEL[LASERS], TAIL, verify_crc=True),
             data=True,
-            max_length=longest(BLOCKS, 2 + 4 * LASERS),
+            max_length=max_packet_bytes(BLOCKS, 2 + 4 * LASERS),
             plausible=plausible,
             acknowledged=ACKNOWLEDGED,
         )

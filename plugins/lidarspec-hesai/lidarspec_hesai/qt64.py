@@ -1,5 +1,6 @@
-"""Hesai PandarQT64: protocol 3.1, a header, up to 4 blocks of 64 channels, 1072 bytes with the UDP
-sequence.
+"""Hesai PandarQT64: protocol 3.1, a header, up to 4 blocks of 64 channels.
+
+A packet has 1072 bytes with the UDP sequence.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_1.h; angle and firing-time files of the model).
 """
@@ -11,16 +12,30 @@ from typing import Any
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
 from lidarspec.spec import Fields, Frame, Polar, Scaled, take
-from lidarspec_hesai.calibration import Calibration, nominal
-from lidarspec_hesai.family import spinning
-from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
+from lidarspec_hesai.calibration import Calibration, make_nominal_table
+from lidarspec_hesai.family import make_spinning_sensor
+from lidarspec_hesai.header_packets import (
+    block_numbers,
+    distance,
+    make_packet,
+    max_packet_bytes,
+    plausible,
+    simulated_header,
+)
+from lidarspec_hesai.parts import (
+    FACTORY,
+    RETURN_MODES,
+    UTC,
+    count_returns,
+    make_points,
+    rotation_values,
+)
 
 BLOCKS = 4
 CHANNELS = 64
-PER_TURN = 600  # blocks in a turn at 10 Hz and single return: 0.6 degrees
-FIRST_SHOT = 25.71e-6
-SHOTS = (0.0, 166.67e-6, 333.33e-6, 500.0e-6)  # seconds from the packet's time
+BLOCKS_PER_TURN = 600  # at 10 Hz and single return: 0.6 degrees
+FIRST_SHOT_S = 25.71e-6  # from the packet's time to the first shot
+SHOT_TIMES_S = (0.0, 166.67e-6, 333.33e-6, 500.0e-6)  # from the first shot
 
 # fmt: off
 ELEVATION = (
@@ -55,29 +70,32 @@ TAIL = (
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Four shots, or two with dual return, after the packet's time (HesaiLidar_SDK_2.0)."""
+    """Return the points of a packet, with shots after its time (HesaiLidar_SDK_2.0).
+
+    A packet has four shots, or two with dual return.
+    """
     block = block_numbers(f)
-    returns = returns_of(f.return_mode)
-    fired = FIRST_SHOT + take(SHOTS, block // returns)
-    return beams(
+    returns = count_returns(f.return_mode)
+    fired = FIRST_SHOT_S + take(SHOT_TIMES_S, block // returns)
+    return make_points(
         f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
     )
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i at 10 Hz with single return."""
-    return {**header(BLOCKS), **turning(i, BLOCKS, PER_TURN)}
+    """Return the values of simulated packet i, at 10 Hz with single return."""
+    return {**simulated_header(BLOCKS), **rotation_values(i, BLOCKS, BLOCKS_PER_TURN)}
 
 
-TABLE = nominal(ELEVATION, AZIMUTH, FIRING_US)
+TABLE = make_nominal_table(ELEVATION, AZIMUTH, FIRING_US)
 
-QT64 = spinning(
+QT64 = make_spinning_sensor(
     "hesai-qt64",
     {
         "data": Frame(
-            packet(3, 1, CHANNELS, TAIL),
+            make_packet(3, 1, CHANNELS, TAIL),
             data=True,
-            max_length=longest(CHANNELS, BLOCKS),
+            max_length=max_packet_bytes(CHANNELS, BLOCKS),
             plausible=plausible,
         )
     },

@@ -1,5 +1,6 @@
-"""Hesai PandarXT-32, PandarXT-16 and XT32M2X: protocol 6.1, a header, up to 8 blocks, 1080 and 568
-bytes; 6 blocks, 820, of the last.
+"""Hesai PandarXT-32, PandarXT-16 and XT32M2X: protocol 6.1, a header, up to 8 blocks.
+
+Packets have 1080 and 568 bytes with 8 blocks; those of an XT32M2X have 820 with 6 blocks.
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_v6_1.h; correction files of the models, which give whole
 degrees and no offsets).
@@ -14,14 +15,28 @@ import numpy as np
 from construct import Bytes, Int8ul, Int16ul, Int32ul
 
 from lidarspec.spec import Fields, Frame, Polar, Relative, Scaled
-from lidarspec_hesai.calibration import Calibration, nominal
-from lidarspec_hesai.family import spinning
-from lidarspec_hesai.headed import block_numbers, distance, header, longest, packet, plausible
-from lidarspec_hesai.parts import FACTORY, RETURN_MODES, UTC, beams, returns_of, turning
+from lidarspec_hesai.calibration import Calibration, make_nominal_table
+from lidarspec_hesai.family import make_spinning_sensor
+from lidarspec_hesai.header_packets import (
+    block_numbers,
+    distance,
+    make_packet,
+    max_packet_bytes,
+    plausible,
+    simulated_header,
+)
+from lidarspec_hesai.parts import (
+    FACTORY,
+    RETURN_MODES,
+    UTC,
+    count_returns,
+    make_points,
+    rotation_values,
+)
 
 BLOCKS = 8
-PER_TURN = 2000  # blocks in a turn at 10 Hz and single return: 0.18 degrees
-SHOT = 50e-6  # seconds from shot to shot; the last one is at the packet's time
+BLOCKS_PER_TURN = 2000  # at 10 Hz and single return: 0.18 degrees
+SHOT_PERIOD_S = 50e-6  # the last shot is at the packet's time
 
 TAIL = (
     "reserved" / Bytes(10),
@@ -34,20 +49,21 @@ TAIL = (
 
 
 def points(f: Fields, channels: Calibration) -> Polar:
-    """Shots up to the packet's time (HesaiLidar_SDK_2.0); the header says how many returns there
-    can be, not how many there are.
+    """Return the points of a packet, with shots up to its time (HesaiLidar_SDK_2.0).
+
+    The header has the maximum number of returns, not the actual number.
     """
     block = block_numbers(f)
-    returns = returns_of(f.return_mode)
-    fired = -SHOT * ((f.block_count - 1 - block) // returns)
-    return beams(
+    returns = count_returns(f.return_mode)
+    fired = -SHOT_PERIOD_S * ((f.block_count - 1 - block) // returns)
+    return make_points(
         f.blocks, channels, distance=distance(f), block=block, returns=returns, fired=fired
     )
 
 
 def sweep(i: int, blocks: int = BLOCKS) -> dict[str, Any]:
-    """Packet i at 10 Hz with single return."""
-    return {**header(blocks), **turning(i, blocks, PER_TURN)}
+    """Return the values of simulated packet i, at 10 Hz with single return."""
+    return {**simulated_header(blocks), **rotation_values(i, blocks, BLOCKS_PER_TURN)}
 
 
 # fmt: off
@@ -64,22 +80,28 @@ AZIMUTH_XT32M = (
 # fmt: on
 
 
-TABLE_32 = nominal(15.0 - np.arange(32), np.zeros(32), 6.0 + 1.512 * np.arange(32))
-TABLE_16 = nominal(15.0 - 2.0 * np.arange(16), np.zeros(16), 6.0 + 3.024 * np.arange(16))
-TABLE_XT32M = nominal(ELEVATION_XT32M, AZIMUTH_XT32M, 6.0 + 2.888 * (np.arange(32) % 16))
+TABLE_32 = make_nominal_table(15.0 - np.arange(32), np.zeros(32), 6.0 + 1.512 * np.arange(32))
+TABLE_16 = make_nominal_table(15.0 - 2.0 * np.arange(16), np.zeros(16), 6.0 + 3.024 * np.arange(16))
+TABLE_XT32M = make_nominal_table(ELEVATION_XT32M, AZIMUTH_XT32M, 6.0 + 2.888 * (np.arange(32) % 16))
 
 FRAMES_32 = {
     "data": Frame(
-        packet(6, 1, 32, TAIL), data=True, max_length=longest(32, BLOCKS), plausible=plausible
+        make_packet(6, 1, 32, TAIL),
+        data=True,
+        max_length=max_packet_bytes(32, BLOCKS),
+        plausible=plausible,
     )
 }
 FRAMES_16 = {
     "data": Frame(
-        packet(6, 1, 16, TAIL), data=True, max_length=longest(16, BLOCKS), plausible=plausible
+        make_packet(6, 1, 16, TAIL),
+        data=True,
+        max_length=max_packet_bytes(16, BLOCKS),
+        plausible=plausible,
     )
 }
 
-XT32 = spinning(
+XT32 = make_spinning_sensor(
     "hesai-xt32",
     FRAMES_32,
     points,
@@ -99,7 +121,7 @@ XT32 = spinning(
     ),
 )
 
-XT16 = spinning(
+XT16 = make_spinning_sensor(
     "hesai-xt16",
     FRAMES_16,
     points,
@@ -114,7 +136,7 @@ XT16 = spinning(
     ),
 )
 
-XT32M = spinning(
+XT32M = make_spinning_sensor(
     "hesai-xt32m",
     FRAMES_32,
     points,

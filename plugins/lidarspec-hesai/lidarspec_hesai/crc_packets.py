@@ -1,12 +1,14 @@
-"""Packets with CRCs of their own over blocks, functional safety and tail (QT128, Pandar128, OT128,
-JT128, AT128).
+"""Packets with CRCs over blocks, functional safety and tail.
+
+The models are QT128, Pandar128, OT128, JT128 and AT128.
 
     EE FF  major minor  status reserved | lasers blocks first_return dis_unit return_num flags
     2 x [azimuth, channels], CRC [, functional safety] , tail [, sequence], [, IMU], CRC [,
     signature]
 
-Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, udp_protocol_v1_4.h); what the CRCs cover was found
-in a capture of a QT128, and is assumed of the others, where they are not held.
+Source: HesaiLidar_SDK_2.0 (udp_protocol_v3_2.h, udp_protocol_v1_4.h). The bytes that each CRC
+covers were found in a capture of a QT128. They are assumed to be the same for the other models,
+where CRCs are not verified.
 """
 
 from __future__ import annotations
@@ -31,18 +33,18 @@ from construct import (
 )
 
 from lidarspec.spec import Checksummed, Crc, Fields, Scaled
-from lidarspec_hesai.headed import USUAL_UNIT
+from lidarspec_hesai.header_packets import SIMULATED_UNIT_MM
 
 LASERS = 128
 BLOCKS = 2
-TWO = Const(BLOCKS, Int8ul)
+TWO_BLOCKS = Const(BLOCKS, Int8ul)
 CRC = Crc(32, poly=0x04C11DB7, init=0xFFFFFFFF)  # CRC-32/MPEG-2
 
-UNCHECKED = "not checked: the covered bytes are unknown for this model"
+UNCHECKED_NOTE = "not checked: the covered bytes are unknown for this model"
 
 
-def safety_part(crc: Construct) -> Construct:
-    """Return the part on functional safety."""
+def make_safety_part(crc: Construct) -> Construct:
+    """Return the struct of the functional safety part."""
     return Struct(
         "version" / Int8ul,
         "status" / Int8ul * "bits 7 to 5 state, 4 and 3 fault type, 2 to 0 counter",
@@ -53,7 +55,7 @@ def safety_part(crc: Construct) -> Construct:
     )
 
 
-SAFE = ("status", "fault_number", "fault_code", "reserved")  # what its CRC covers
+SAFETY_CRC_FIELDS = ("status", "fault_number", "fault_code", "reserved")
 FLAGS = BitStruct(
     "reserved" / BitsInteger(1),
     "environment" / BitsInteger(1),
@@ -74,37 +76,37 @@ IMU = Struct(
 )
 
 
-def packet(
+def make_packet(
     version: Sequence[Construct],
     channels: Construct,
     tail: Sequence[Construct],
     *,
     block: Construct | None = None,
-    blocks: Construct = TWO,
+    blocks: Construct = TWO_BLOCKS,
     imu: bool = False,
     safety: bool = True,
-    held: bool = False,
+    verify_crc: bool = False,
 ) -> Construct:
-    """Return the packet of a protocol version.
+    """Return the struct of a packet of a protocol version.
 
     Args:
         version: the fields major and minor.
-        channels: those of a block, an array.
-        tail: what stands between functional safety and sequence.
-        block: what stands between the azimuth of a block and its channels.
-        blocks: how many there are.
-        imu, safety: whether there can be one.
-        held: whether CRCs are held; where nobody has seen what they cover, they are fields like
-            others.
+        channels: the array of channels in a block.
+        tail: the fields between functional safety and sequence.
+        block: the type of the finer azimuth, between azimuth and channels; None if absent.
+        blocks: the type of the number of blocks.
+        imu, safety: whether the packet can have this part.
+        verify_crc: whether CRCs are verified; otherwise they are plain fields, for models without a
+            known coverage.
     """
-    crc = Int32ul if held else Int32ul * UNCHECKED
-    safety_struct = safety_part(crc)
-    finer = [] if block is None else ["fine_azimuth" / block]
+    crc = Int32ul if verify_crc else Int32ul * UNCHECKED_NOTE
+    safety_struct = make_safety_part(crc)
+    fine_azimuth = [] if block is None else ["fine_azimuth" / block]
     body = Struct(
         "blocks"
         / Array(
             this._.block_count,
-            Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), *finer, "channels" / channels),
+            Struct("azimuth" / Scaled(Int16ul, 0.01, "deg"), *fine_azimuth, "channels" / channels),
         ),
         "crc" / crc,
     )
@@ -121,13 +123,15 @@ def packet(
         "dis_unit" / Scaled(Int8ul, 1, "mm") * "step of a distance",
         "return_count" / Int8ul * "returns per shot; for some models the maximum",
         "flags" / FLAGS,
-        "body" / (Checksummed(body, "crc", CRC) if held else body),
+        "body" / (Checksummed(body, "crc", CRC) if verify_crc else body),
         *(
             [
                 "safety"
                 / If(
                     this.flags.safety == 1,
-                    Checksummed(safety_struct, "crc", CRC, over=SAFE) if held else safety_struct,
+                    Checksummed(safety_struct, "crc", CRC, over=SAFETY_CRC_FIELDS)
+                    if verify_crc
+                    else safety_struct,
                 )
             ]
             if safety
@@ -141,23 +145,28 @@ def packet(
     )
     names = [part.name for part in frame.subcons]
     covered = names[names.index("body") + 1 + safety : names.index("tail_crc")]
-    return Checksummed(frame, "tail_crc", CRC, over=covered) if held else frame
+    return Checksummed(frame, "tail_crc", CRC, over=covered) if verify_crc else frame
 
 
-def longest(blocks: int, block: int) -> int:
-    """The length of a packet with all that there can be, and so many blocks of so many bytes."""
+def max_packet_bytes(blocks: int, block: int) -> int:
+    """Return the bytes of a packet with all parts.
+
+    Args:
+        blocks: the number of blocks.
+        block: bytes per block.
+    """
     return 12 + blocks * block + 4 + 17 + 32 + 4 + 22 + 4 + 32
 
 
 def plausible(f: Fields) -> Any:
-    """Blocks, one to three returns, a unit, and azimuths below 360 degrees."""
-    counted = (
+    """Return whether counts, unit and azimuths are in their ranges."""
+    has_valid_counts = (
         (f.block_count >= 1) & (f.dis_unit >= 1) & (f.return_count >= 1) & (f.return_count <= 3)
     )
-    return counted & (f.body.blocks.azimuth < 360)
+    return has_valid_counts & (f.body.blocks.azimuth < 360)
 
 
-#: findings of the kit that hold for these packets.
+#: Findings of `lidarspec check` that apply to these packets.
 UNSEEN = (
     "not tested with packets of this model: the bytes covered by its CRCs are unknown, so they"
     " are not checked"
@@ -171,15 +180,15 @@ ACKNOWLEDGED = {
 
 
 def distance(f: Fields) -> Any:
-    """Metres, (n, blocks, lasers), by the unit that the header states."""
+    """Return distances in metres, (n, blocks, lasers), by the unit in the header."""
     return f.body.blocks.channels.distance * (f.dis_unit * 0.001)
 
 
-def in_body(values: dict[str, Any], **more: int) -> dict[str, Any]:
-    """The values of a simulated packet with single return and a sequence: of its header, and these,
-    its azimuths in the body.
+def packet_values(values: dict[str, Any], **more: int) -> dict[str, Any]:
+    """Return the values of a simulated packet with single return and a sequence.
 
     Args:
+        values: values of the packet; azimuths are moved into the body.
         more: flags, and fields of the header.
     """
     flags = {
@@ -190,7 +199,7 @@ def in_body(values: dict[str, Any], **more: int) -> dict[str, Any]:
             if name in ("confidence", "imu", "safety")
         },
     }
-    header = {"first_return": 1, "dis_unit": USUAL_UNIT, "return_count": 1, **flags}
+    header = {"first_return": 1, "dis_unit": SIMULATED_UNIT_MM, "return_count": 1, **flags}
     return {
         **header,
         **{name.replace("blocks.", "body.blocks."): value for name, value in values.items()},

@@ -1,9 +1,9 @@
-"""Packets whose header says how many blocks they hold and in which unit (PandarQT64, Pandar XT).
+"""Packets with the number of blocks and the distance unit in the header (PandarQT64, Pandar XT).
 
     EE FF  major minor  reserved(2) | lasers blocks first_return dis_unit return_num flags
 
 Source: HesaiLidar_SDK_2.0 (udp_protocol_header.h, udp_protocol_v3_1.h, udp_protocol_v6_1.h); the
-length rule holds for captures of both.
+length rule is verified with captures of both.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from construct import (
 
 from lidarspec.spec import Fields, Scaled
 
-#: the unit of distances that every known firmware states, in millimetres; used for simulation only.
-USUAL_UNIT = 4
+#: The distance unit of every known firmware; used for simulation only.
+SIMULATED_UNIT_MM = 4
 
 
-def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> Struct:
-    """Return the packet of a protocol version with so many lasers in each block."""
+def make_packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> Struct:
+    """Return the struct of a packet with `lasers` channels per block."""
     header: list[Construct] = [
         "sync" / Const(b"\xee\xff"),
         "major" / Const(major, Int8ul),
@@ -56,13 +56,13 @@ def packet(major: int, minor: int, lasers: int, tail: Sequence[Construct]) -> St
     return Struct(*header, "blocks" / Array(this.block_count, block), *tail, sequence)
 
 
-def longest(lasers: int, blocks: int) -> int:
-    """Return the length of a packet with so many blocks: header, blocks, tail and sequence."""
+def max_packet_bytes(lasers: int, blocks: int) -> int:
+    """Return the bytes of a packet: header, blocks, tail and sequence."""
     return 12 + blocks * (2 + 4 * lasers) + 24 + 4
 
 
 def plausible(f: Fields) -> Any:
-    """Return a block, one to three returns, a unit, and azimuths below 360 degrees."""
+    """Return whether counts, unit and azimuths are in their ranges."""
     return (
         (f.block_count >= 1)
         & (f.dis_unit >= 1)
@@ -73,7 +73,7 @@ def plausible(f: Fields) -> Any:
 
 
 def distance(f: Fields) -> Any:
-    """Metres, (n, blocks, lasers), by the unit that the header states."""
+    """Return distances in metres, (n, blocks, lasers), by the unit in the header."""
     return f.blocks.channels.distance * (f.dis_unit * 0.001)
 
 
@@ -82,12 +82,12 @@ def block_numbers(f: Fields) -> Any:
     return f.block_count.steps()[:, None]
 
 
-def header(blocks: int) -> dict[str, Any]:
-    """Return the header of a simulated packet with single return."""
+def simulated_header(blocks: int) -> dict[str, Any]:
+    """Return the header values of a simulated packet with single return."""
     return {
         "block_count": blocks,
         "first_return": 1,
-        "dis_unit": USUAL_UNIT,
+        "dis_unit": SIMULATED_UNIT_MM,
         "return_count": 1,
         "flags.sequence": 1,
     }
