@@ -1,16 +1,17 @@
-"""LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars over a UART, high byte
-first; the C16 is in `c16`.
+"""LSLIDAR N10, N10P and the M10 family: 360 degree time-of-flight lidars, high byte first.
+
+They send over a UART. The C16 is in `c16`.
 
 Source: the vendor's ROS drivers (lslidar_driver.cc of the edition for the N10P;
-lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). The N10 and N10P are sealed by a sum; packets of
-the M10 family have no checksum, only marks at both ends. What the older driver calls the speed is
-the time of 15 degrees in microseconds: 4167 at 10 turns a second, and 3460 to 3490 of an M10P at
-12.
+lslidar_x10_driver.cpp of Lslidar_ROS2_driver V5). Packets of the N10 and N10P end with a sum;
+packets of the M10 family have no checksum, only marks at both ends. The value called speed in the
+older driver is the time of 15 degrees in microseconds: 4167 at 10 revolutions a second, and 3460 to
+3490 for an M10P at 12.
 
-Known contradictions: the older driver draws angles clockwise, as it is done here, the newer one
-counter-clockwise; both spread the samples of an M10 over 15 degrees by the number of those that are
-not FFFF, which comes to the same where all of them are there. What bytes 103 and 104 of an N10P
-are, nobody says.
+Known contradictions: angles are clockwise in the older driver and in this module, counter-clockwise
+in the newer driver. Both drivers spread the samples of an M10 over 15 degrees by the number of
+samples that are not FFFF, which gives the same result if no sample is FFFF. The meaning of bytes
+103 and 104 of an N10P is not documented.
 """
 
 from __future__ import annotations
@@ -58,9 +59,9 @@ from lidarspec_lslidar.c16 import C16, DATE
 
 N_SAMPLES = 16
 M_SAMPLES = 42
-SPAN = 15.0
-PACKETS = 24  # degrees of a packet, and packets a turn
-MOST = 200  # samples of an M10P's packet: more than twice what the driver takes for sound
+SPAN_DEG = 15.0  # of a packet
+PACKETS_PER_TURN = 24
+MAX_SAMPLES = 200  # of an M10P's packet: more than twice the limit of the driver
 
 START = Const(b"\xa5\x5a")
 MARK = Const(b"\xa5\x5a\x55")
@@ -85,7 +86,7 @@ CLOCK = Clock(
 
 
 def make_packet(size: Construct, samples: Construct, *rest: Construct) -> Frame:
-    """Return a packet of the N family: 16 samples between two angles."""
+    """Return the frame of a packet of the N family: 16 samples between two angles."""
     struct = Struct(
         "header" / START,
         "size" / size,
@@ -97,39 +98,39 @@ def make_packet(size: Construct, samples: Construct, *rest: Construct) -> Frame:
         "sum" / Int8ub,
     )
     return Frame(
-        Checksummed(struct, field="sum", algorithm=Sum(8)), data=True, plausible=n_plausible
+        Checksummed(struct, field="sum", algorithm=Sum(8)), data=True, plausible=is_plausible_n
     )
 
 
-def n_plausible(f: Fields) -> Any:
-    """Angles of the circle, and a motor that turns."""
+def is_plausible_n(f: Fields) -> Any:
+    """Return whether angles are at most 360 degrees and the motor rotates."""
     return (f.start_angle <= 360) & (f.end_angle <= 360) & (f.period > 0)
 
 
-def m_plausible(f: Fields) -> Any:
-    """Return an angle of the circle."""
+def is_plausible_m(f: Fields) -> Any:
+    """Return whether the angle is at most 360 degrees."""
     return f.start_angle <= 360
 
 
-def sized_plausible(f: Fields) -> Any:
-    """Return an angle of the circle, and two bytes to the sample."""
+def is_plausible_m10p(f: Fields) -> Any:
+    """Return whether the angle is at most 360 degrees and samples have two bytes."""
     return (f.start_angle <= 360) & (f.length > 20) & (f.length % 2 == 0)
 
 
 def mask_no_return(distance: Any) -> Any:
-    """Return a distance, 0 where all its bits say that there is none."""
+    """Return the distance, replaced by 0 if all its bits are set."""
     return np.where(distance >= 65.535, 0, distance)
 
 
-def from_to(f: Fields) -> tuple[Any, Any]:
-    """Angles in radians, counter-clockwise, and seconds after the first sample, of the N family."""
-    swept = spread(f.start_angle, f.end_angle, N_SAMPLES, full=360.0)  # degrees, (n, 16)
-    return -np.deg2rad(wrap(swept, 360.0)), (swept - f.start_angle) / SPAN * f.period
+def sample_directions(f: Fields) -> tuple[Any, Any]:
+    """Return azimuths in radians and seconds after the first sample, of the N family."""
+    clockwise = spread(f.start_angle, f.end_angle, N_SAMPLES, full=360.0)  # degrees, (n, 16)
+    return -np.deg2rad(wrap(clockwise, 360.0)), (clockwise - f.start_angle) / SPAN_DEG * f.period
 
 
 def n10_points(f: Fields) -> Polar:
-    """Even steps from the start angle to the end angle."""
-    azimuth, time = from_to(f)
+    """Return points at even steps from the start angle to the end angle."""
+    azimuth, time = sample_directions(f)
     return Polar(
         range=mask_no_return(f.samples.distance),
         azimuth=azimuth,
@@ -139,8 +140,8 @@ def n10_points(f: Fields) -> Polar:
 
 
 def n10p_points(f: Fields) -> Polar:
-    """Return the same with two returns of each sample."""
-    azimuth, time = from_to(f)
+    """Return points as of an N10, with two returns of each sample."""
+    azimuth, time = sample_directions(f)
     return Polar(
         range=stack(mask_no_return(f.samples.first), mask_no_return(f.samples.second)),
         azimuth=azimuth,
@@ -151,37 +152,49 @@ def n10p_points(f: Fields) -> Polar:
 
 
 def m_points(f: Fields, count: Callable[[Fields], Any]) -> Polar:
-    """Even steps through 15 degrees from the start angle on; what reflects strongly has an
-    intensity of 255, as the driver gives it.
+    """Return points at even steps through 15 degrees from the start angle on.
+
+    Strongly reflecting points have the intensity 255, as in the driver. `count` returns the samples
+    of a packet.
     """
-    number = count(f)
-    swept = spread(f.start_angle, f.start_angle + SPAN - SPAN / number, number, full=360.0)
+    samples = count(f)
+    clockwise = spread(
+        f.start_angle, f.start_angle + SPAN_DEG - SPAN_DEG / samples, samples, full=360.0
+    )
     return Polar(
         range=np.where(
             (f.samples.distance >= 32.767) & (f.samples.bright == 1), 0, f.samples.distance
         ),
-        azimuth=-np.deg2rad(wrap(swept, 360.0)),
+        azimuth=-np.deg2rad(wrap(clockwise, 360.0)),
         intensity=f.samples.bright * 255,
-        time=(swept - f.start_angle) / SPAN * f.period,
+        time=(clockwise - f.start_angle) / SPAN_DEG * f.period,
     )
 
 
 def n_sweep(i: int, packets: int) -> dict[str, float]:
-    """Packet i of turns at 10 Hz with so many packets."""
+    """Return the values of simulated packet i at 10 Hz.
+
+    `packets` is the number of packets per revolution.
+    """
     step = 360 / packets / N_SAMPLES
     first = i % packets * N_SAMPLES * step
     return {
         "start_angle": first,
         "end_angle": first + (N_SAMPLES - 1) * step,
-        "period": 0.1 / PACKETS,
+        "period": 0.1 / PACKETS_PER_TURN,
     }
 
 
 def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dict[str, float]:
-    """Packet i of turns of 24 packets, so many a second, with a count of samples and the time where
-    it has them.
+    """Return the values of simulated packet i, 24 packets per revolution.
+
+    Args:
+        i: the number of the packet.
+        hertz: revolutions per second.
+        count: samples of a packet that contains its length, else 0.
+        timed: whether packets have a time.
     """
-    seconds, microseconds = divmod(round(i * 1e6 / (hertz * PACKETS)), 1_000_000)
+    seconds, microseconds = divmod(round(i * 1e6 / (hertz * PACKETS_PER_TURN)), 1_000_000)
     clock = {
         "second": seconds % 60,
         "minute": seconds // 60 % 60 * 60,
@@ -191,11 +204,11 @@ def m_sweep(i: int, hertz: float, count: int = 0, *, timed: bool = False) -> dic
         "year": 26,
     }
     parts = {"millisecond": microseconds // 1000 / 1000, "microsecond": microseconds % 1000 / 1e6}
-    sized = {"length": 20 + 2 * count} if count else {}
+    length = {"length": 20 + 2 * count} if count else {}
     return {
-        "start_angle": i % PACKETS * SPAN,
-        "period": 1 / (hertz * PACKETS),
-        **sized,
+        "start_angle": i % PACKETS_PER_TURN * SPAN_DEG,
+        "period": 1 / (hertz * PACKETS_PER_TURN),
+        **length,
         **(clock | parts if timed else {}),
     }
 
@@ -216,14 +229,14 @@ N10P_DATA = make_packet(
     ),
     "reserved" / Bytes(2),
 )
-M10_HEAD = (
+M10_FIELDS = (
     "header" / START,
     "start_angle" / ANGLE,
     "period" / PERIOD,
     "samples" / Array(M_SAMPLES, SAMPLE),
 )
-M10_DATA = Frame(Struct(*M10_HEAD, "end" / END), data=True, plausible=m_plausible)
-M10_GPS_DATA = Frame(Struct(*M10_HEAD, *TIME, "end" / END), data=True, plausible=m_plausible)
+M10_DATA = Frame(Struct(*M10_FIELDS, "end" / END), data=True, plausible=is_plausible_m)
+M10_GPS_DATA = Frame(Struct(*M10_FIELDS, *TIME, "end" / END), data=True, plausible=is_plausible_m)
 M10P_DATA = Frame(
     Struct(
         "header" / START,
@@ -235,8 +248,8 @@ M10P_DATA = Frame(
         "end" / END,
     ),
     data=True,
-    max_length=20 + 2 * MOST,
-    plausible=sized_plausible,
+    max_length=20 + 2 * MAX_SAMPLES,
+    plausible=is_plausible_m10p,
 )
 INFO = Frame(
     Struct(
@@ -267,26 +280,35 @@ COMMAND = Frame(
 )
 
 
-def asking(code: int, argument: int, filtered: int = 0, **more: Any) -> Command:
-    """Return the command of this code, argument and filter."""
-    return Command("command", {"code": code, "argument": argument, "filter": filtered}, **more)
+def make_command(code: int, argument: int, scan_filter: int = 0, **more: Any) -> Command:
+    """Return the command with this code, argument and filter."""
+    return Command("command", {"code": code, "argument": argument, "filter": scan_filter}, **more)
 
 
-RUNNING = {"start": asking(1, 1, starts=True), "stop": asking(1, 0, stops=True)}
-N_COMMANDS = RUNNING | {"set_speed": asking(0x0A, 1, args={"speed": ("turns", 6, 12)})}
-M_COMMANDS = RUNNING | {
-    "stop_motor": asking(3, 0, stops=True),
-    "filter_none": asking(6, 1, filtered=0x0A),
-    "filter_normal": asking(6, 1, filtered=0x0B),
-    "filter_near": asking(6, 1, filtered=0x0C),
-    "get_info": asking(8, 1, reply="info", retries=1),
+RUN_COMMANDS = {"start": make_command(1, 1, starts=True), "stop": make_command(1, 0, stops=True)}
+N_COMMANDS = RUN_COMMANDS | {"set_speed": make_command(0x0A, 1, args={"speed": ("turns", 6, 12)})}
+M_COMMANDS = RUN_COMMANDS | {
+    "stop_motor": make_command(3, 0, stops=True),
+    "filter_none": make_command(6, 1, scan_filter=0x0A),
+    "filter_normal": make_command(6, 1, scan_filter=0x0B),
+    "filter_near": make_command(6, 1, scan_filter=0x0C),
+    "get_info": make_command(8, 1, reply="info", retries=1),
 }
 
 
 @dataclass(frozen=True)
 class Model:
-    """One row of the table of models: its packet, points, sweep, baud, turns a second, clock and
-    status.
+    """One row of the table of models.
+
+    Attributes:
+        name: the name of the model.
+        data: the frame of its packets.
+        points: its points function.
+        sweep: its simulated values.
+        baud: the baud rate.
+        hertz: the lowest and the highest revolutions per second.
+        clock: its clock.
+        status: the status of the sensor.
     """
 
     name: str
@@ -299,8 +321,8 @@ class Model:
     status: str = "vectors"
 
 
-OF_42 = partial(m_points, count=lambda f: M_SAMPLES)
-OF_LENGTH = partial(m_points, count=lambda f: (f.length - 20) / 2)
+M10_POINTS = partial(m_points, count=lambda f: M_SAMPLES)
+M10P_POINTS = partial(m_points, count=lambda f: (f.length - 20) / 2)
 MODELS = {
     "lslidar-n10": Model(
         "N10", N10_DATA, n10_points, partial(n_sweep, packets=28), 230_400, (6, 12)
@@ -308,14 +330,19 @@ MODELS = {
     "lslidar-n10p": Model(
         "N10P", N10P_DATA, n10p_points, partial(n_sweep, packets=34), 460_800, (6, 12)
     ),
-    "lslidar-m10": Model("M10", M10_DATA, OF_42, partial(m_sweep, hertz=10), 460_800),
+    "lslidar-m10": Model("M10", M10_DATA, M10_POINTS, partial(m_sweep, hertz=10), 460_800),
     "lslidar-m10gps": Model(
-        "M10GPS", M10_GPS_DATA, OF_42, partial(m_sweep, hertz=10, timed=True), 460_800, clock=CLOCK
+        "M10GPS",
+        M10_GPS_DATA,
+        M10_POINTS,
+        partial(m_sweep, hertz=10, timed=True),
+        460_800,
+        clock=CLOCK,
     ),
     "lslidar-m10p": Model(
         "M10P",
         M10P_DATA,
-        OF_LENGTH,
+        M10P_POINTS,
         partial(m_sweep, hertz=12, count=70, timed=True),
         500_000,
         clock=CLOCK,
@@ -323,9 +350,11 @@ MODELS = {
 }
 
 
-def lidar(name: str) -> Sensor:
-    """One row of the table as a sensor; they turn as soon as they have power, and are not stopped
-    on closing: drivers rely on it.
+def make_lidar(name: str) -> Sensor:
+    """Return the sensor of one row of `MODELS`.
+
+    The lidars rotate as soon as they have power. They are not stopped on closing, because drivers
+    rely on that.
     """
     model = MODELS[name]
     family = name.startswith("lslidar-n")
@@ -355,10 +384,10 @@ def lidar(name: str) -> Sensor:
     )
 
 
-N10, N10P, M10, M10_GPS, M10P = SENSORS = [lidar(name) for name in MODELS]
+N10, N10P, M10, M10_GPS, M10P = SENSORS = [make_lidar(name) for name in MODELS]
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The LSLIDAR sensors."""
+    """Return the LSLIDAR sensors."""
     return [*SENSORS, C16]

@@ -1,16 +1,17 @@
-"""LSLIDAR C16, the edition with packets of 1212 bytes: a rotating lidar of 16 lasers over UDP, low
-byte first.
+"""LSLIDAR C16 with packets of 1212 bytes: a rotating lidar with 16 lasers over UDP.
 
-Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); where
-the fields of the device information stand, the user manual of the C32. The times of the lasers are
-3.125 us apart, as for the edition before it, which comes to the steps of 0.36 degrees of a captured
-packet at 20 turns a second. Firings end at the time of their packet, as the driver has it.
+Numbers have the low byte first.
+
+Source: the vendor's ROS driver (Lslidar_ROS2_driver, branch C16_V4.0, lslidar_driver.cpp); the user
+manual of the C32 for the offsets of the device information. The times of the lasers are 3.125 us
+apart, as for the edition before, which agrees with the steps of 0.36 degrees of a captured packet
+at 20 revolutions a second. Firings end at the time of their packet, as in the driver.
 
 The clock is read as with GPS: date and nanoseconds. With PTP the same bytes are seconds, with NTP
-the last part has microseconds; only the device information says which. A C16 of the edition before
-sends packets of 1206 bytes, which are a Velodyne's but for their angles: they are not read here.
-Configuration, which is the whole device information sent back, is left out, and so are angles that
-a unit measured itself.
+the last part has microseconds; only the device information contains the time source. A C16 of the
+edition before sends packets of 1206 bytes, which equal a Velodyne's except for their angles: they
+are not supported. Not supported either: configuration, for which the whole device information is
+sent back, and angles that a unit measured itself.
 """
 
 from __future__ import annotations
@@ -42,16 +43,16 @@ GROUPS = 2
 LASERS = 16
 STRONGEST = 0x37
 DUAL = 0x39
-LASER = 3.125e-6  # seconds from laser to laser
-BLOCK = GROUPS * LASERS * LASER
-CENTRE = 0.0361  # metres from the axis to the optical centre
-ASIDE = 20.25  # degrees by which the optical centre lies to the left of the azimuth
-TURN = (5.0, 20.0)  # turns per second, the slowest and the fastest
-FASTEST = TURN[1] * 360  # degrees per second
-UNITS = (0.4, 0.25)  # centimetres of a step of distance, by the unit
+LASER_PERIOD_S = 3.125e-6  # from laser to laser
+BLOCK_PERIOD_S = GROUPS * LASERS * LASER_PERIOD_S
+OPTICAL_RADIUS_M = 0.0361  # from the axis to the optical centre
+OPTICAL_ANGLE_DEG = 20.25  # of the optical centre to the left of the azimuth
+SPEED_LIMITS_HZ = (5.0, 20.0)  # lowest and highest revolutions per second
+MAX_SPEED_DEG_S = SPEED_LIMITS_HZ[1] * 360
+DISTANCE_STEPS_CM = (0.4, 0.25)  # depends on the unit
 ELEVATION = np.array([-16.0, 0, -14, 2, -12, 4, -10, 6, -8, 8, -6, 10, -4, 12, -2, 14])
 
-#: as the packets of this vendor have it.
+#: The date in the packets of this vendor.
 DATE = (
     "year" / Int8ub * "years since 2000",
     "month" / Int8ub,
@@ -108,69 +109,80 @@ DIFOP = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Azimuths of the circle, a known way of return, and a C16."""
-    known = (f.return_mode == STRONGEST) | (f.return_mode == DUAL)
+    """Return whether azimuths, return mode, model, month and nanoseconds are valid."""
+    has_known_mode = (f.return_mode == STRONGEST) | (f.return_mode == DUAL)
     return (
         (f.blocks.azimuth < 360)
-        & known
+        & has_known_mode
         & ((f.model == 0x10) | (f.model == 0x12))
         & (f.month <= 12)
         & (f.nanosecond < 1)
     )
 
 
-def points(f: Fields, unit: float = UNITS[0]) -> Polar:
-    """Clockwise from ahead, on the way from block to block; from an optical centre that turns with
-    the lasers, beside the axis.
+def points(f: Fields, unit: float = DISTANCE_STEPS_CM[0]) -> Polar:
+    """Return points clockwise from ahead, with azimuths between those of the blocks.
+
+    The origin is an optical centre beside the axis, which rotates with the lasers. `unit` is the
+    distance step in centimetres.
     """
     dual = f.return_mode == DUAL
     block = np.arange(BLOCKS)[:, None, None]
     slot = np.arange(GROUPS)[:, None] * LASERS + np.arange(LASERS)
-    rotor = np.deg2rad(f.blocks.azimuth + rotor_step(f, dual) * (slot / (GROUPS * LASERS)))
+    clockwise = np.deg2rad(f.blocks.azimuth + block_step(f, dual) * (slot / (GROUPS * LASERS)))
     firing = np.where(dual, block // 2 - (BLOCKS // 2 - 1), block - (BLOCKS - 1))
     channels = f.blocks.groups.channels
-    aside = np.deg2rad(ASIDE)
+    optical_angle = np.deg2rad(OPTICAL_ANGLE_DEG)
     return Polar(
-        range=channels.distance * (unit / UNITS[0]),
-        azimuth=-rotor,
+        range=channels.distance * (unit / DISTANCE_STEPS_CM[0]),
+        azimuth=-clockwise,
         elevation=np.deg2rad(ELEVATION),
         intensity=channels.intensity,
-        time=firing * BLOCK + (slot - (GROUPS * LASERS - 1)) * LASER,
+        time=firing * BLOCK_PERIOD_S + (slot - (GROUPS * LASERS - 1)) * LASER_PERIOD_S,
         ring=np.searchsorted(np.sort(ELEVATION), ELEVATION),
         return_index=np.where(dual, block % 2, 0),
-        origin=(CENTRE * np.cos(aside - rotor), CENTRE * np.sin(aside - rotor), 0),
+        origin=(
+            OPTICAL_RADIUS_M * np.cos(optical_angle - clockwise),
+            OPTICAL_RADIUS_M * np.sin(optical_angle - clockwise),
+            0,
+        ),
     )
 
 
 def pace(f: Fields) -> Any:
-    """Return the seconds that the blocks of a packet take; with dual return, two are one firing."""
-    return np.where(f.return_mode == DUAL, BLOCKS // 2, BLOCKS) * BLOCK
+    """Return the seconds of the blocks of a packet.
+
+    With dual return, two blocks are one firing.
+    """
+    return np.where(f.return_mode == DUAL, BLOCKS // 2, BLOCKS) * BLOCK_PERIOD_S
 
 
-def rotor_step(f: Fields, dual: Any) -> Any:
-    """Return the degrees from each firing's azimuth to the next one's."""
+def block_step(f: Fields, dual: Any) -> Any:
+    """Return the degrees from each block's azimuth to the next azimuth."""
     azimuth = f.blocks.azimuth
     ahead = np.where(dual, following(azimuth, 2), following(azimuth))
-    return between_blocks(azimuth, ahead, fastest=FASTEST * BLOCK)
+    return between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * BLOCK_PERIOD_S)
 
 
 def configure(sensor: Sensor, /, *, distance_unit: float) -> Sensor:
-    """The sensor with steps of distance of so many centimetres, as the driver's parameter of that
-    name: 0.4, or 0.25 for some units.
+    """Return the sensor with distance steps of 0.4 or, for some units, 0.25 cm.
+
+    The driver has a parameter of the same name.
 
     Raises:
-        UsageError: for another unit.
+        UsageError: for another step.
     """
-    if distance_unit not in UNITS:
+    if distance_unit not in DISTANCE_STEPS_CM:
         raise UsageError(f"{sensor.id}: distance_unit must be 0.4 or 0.25, not {distance_unit!r}")
     return dataclasses.replace(sensor, points=partial(points, unit=distance_unit))
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i of 10 turns a second."""
-    seconds = i * BLOCKS * BLOCK
+    """Return the values of simulated packet i, at 10 revolutions a second."""
+    seconds = i * BLOCKS * BLOCK_PERIOD_S
     return {
-        "blocks.azimuth": np.round((i * BLOCKS + np.arange(BLOCKS)) * BLOCK * 3600, 2) % 360,
+        "blocks.azimuth": np.round((i * BLOCKS + np.arange(BLOCKS)) * BLOCK_PERIOD_S * 3600, 2)
+        % 360,
         **{
             "year": 26,
             "month": 1,
@@ -205,7 +217,7 @@ C16 = Sensor(
     configure=configure,
     range_limits=(0.3, 200.0),  # the defaults of the driver
     vendor_axes=("right", "forward", "up"),
-    turn=TURN,
+    turn=SPEED_LIMITS_HZ,
     info={"model": "data.model"},
     status="vectors",
     source=(
