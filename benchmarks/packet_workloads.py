@@ -24,7 +24,7 @@ import lidarspec as ls
 from lidarspec.packets.packets import Packets
 from lidarspec.points.reference_evaluator import evaluate_plainly
 from lidarspec.simulation.simulator import make_opening_frame
-from lidarspec_ouster import nominal
+from lidarspec_ouster import make_nominal_unit
 
 Others = dict[str, Callable[[], Timed]]
 Facts = dict[str, float]
@@ -217,7 +217,9 @@ def ouster(inputs: Inputs) -> Work:
     rows[:, -8:] = 0
     frames = [row.tobytes() for row in rows]
     points = len(sensor.decode(rows).points())
-    metadata = json.loads(nominal("OS1", 128, 1024, "RNG19_RFL8_SIG16_NIR16").to_metadata())
+    metadata = json.loads(
+        make_nominal_unit("OS1", 128, 1024, "RNG19_RFL8_SIG16_NIR16").to_metadata()
+    )
 
     def ours(backend: str) -> Any:
         cloud = sensor.decode(rows, backend=backend).points()

@@ -1,14 +1,14 @@
-"""Ouster OS0, OS1, OS2 and OSDome: columns of pixels over UDP, whose layout and directions come
-with the unit's metadata.
+"""Ouster OS0, OS1, OS2 and OSDome: columns of pixels over UDP.
 
-The metadata are a file, `configure(metadata=path)`, or are fetched from the sensor's web server
-when it is opened. Without them a layout can be named (`rows`, `turn`, `profile`), and the angles
-are those of an ideal sensor, evenly over its field of view: `nominal`.
+Layout and directions come with the unit's metadata, from a file, `configure(metadata=path)`, or
+from the sensor's web server when the sensor is opened. Without metadata a layout can be given
+(`rows`, `turn`, `profile`). The angles are then those of an ideal sensor, evenly spread over its
+field of view, and marked as nominal.
 
 Source: Software User Manual of firmware 2.x and 3.x (coordinates, HTTP API); ouster-sdk
 (parsing.cpp, xyzlut.cpp, sensor_http_imp.cpp). The fields of view, and the offsets of OS0, OS1 and
-OS2, are those of the data sheets and of one captured unit each; the limits of range are the data
-sheets', for bright targets.
+OS2, are those of the data sheets and of one captured unit each; the range limits are from the data
+sheets, for bright targets.
 """
 
 from __future__ import annotations
@@ -42,62 +42,76 @@ from lidarspec.spec import (
     stack,
     take,
 )
-from lidarspec_ouster.metadata import STILL, Table, Unit, read
-from lidarspec_ouster.packets import COLUMNS, ENCODER, PROFILES, VALID, imu, lidar
+from lidarspec_ouster.metadata import IDENTITY, Table, Unit, read_unit
+from lidarspec_ouster.packets import (
+    COLUMNS,
+    ENCODER_COUNTS_PER_TURN,
+    PROFILES,
+    VALID,
+    make_imu_frame,
+    make_lidar_frame,
+)
 from lidarspec_ouster.recognition import recognise
 
-#: model -> product line, degrees of the lowest and the highest beam, mm where beams leave and of
-#: the lidar's height, limits of range in m.
+#: Model -> product line, elevation of the lowest and the highest beam in degrees, beam origin and
+#: height of the lidar in mm, range limits in m.
 MODELS = {
     "OS0": ("OS-0", -45.0, 45.0, 27.67, 36.18, (0.3, 100.0)),
     "OS1": ("OS-1", -22.5, 22.5, 15.806, 36.18, (0.3, 200.0)),
     "OS2": ("OS-2", -11.25, 11.25, 13.762, 74.296, (0.8, 500.0)),
     "OSDome": ("OS-DOME", 0.0, 90.0, 0.0, 36.18, (0.3, 45.0)),
 }
-#: of the extra columns, those that each return has for itself.
-EXTRA = ("signal", "near_ir", "flags", "window", "zone_mask", "red", "green", "blue")
-TOLD_BY = "identical packets; see the model in the metadata"
+#: Pixel fields that become extra columns.
+EXTRA_FIELDS = ("signal", "near_ir", "flags", "window", "zone_mask", "red", "green", "blue")
+METADATA_ONLY = "identical packets; see the model in the metadata"
 
 
 def points(f: Fields, unit: Unit) -> Polar:
-    """Pixels by the tables of the unit; of two returns, side by side."""
+    """Return the points of the pixels by the tables of the unit.
+
+    Two returns of a pixel are next to each other.
+    """
     columns = f.columns
     bits = PROFILES[unit.profile]
     names = dict.fromkeys(name for name in bits if name[0] != "_" and name[-1] != "2")
 
-    def each(name: str) -> Any:
+    def pixel_values(name: str) -> Any:
         column = getattr(columns.pixels, name)
         if "range2" in bits:
             return stack(column, getattr(columns.pixels, f"{name}2", column))
         return column
 
-    number = columns.measurement_id
-    legacy = unit.profile == "LEGACY"
+    column_number = columns.measurement_id
+    is_legacy = unit.profile == "LEGACY"
 
-    def table(rows: Table) -> Any:
+    def column_table(rows: Table) -> Any:
         if np.ptp(rows, axis=0).max() < 1e-12:
             return along("pixels", rows[0])
-        return take(rows, number)
+        return take(rows, column_number)
 
-    directions, starts = unit.beams()
+    directions, starts = unit.compute_beams()
     return Polar(
-        range=each("range"),
-        azimuth=table(np.arctan2(directions[..., 1], directions[..., 0])),
-        elevation=table(np.arcsin(directions[..., 2])),
-        intensity=each("reflectivity"),
+        range=pixel_values("range"),
+        azimuth=column_table(np.arctan2(directions[..., 1], directions[..., 0])),
+        elevation=column_table(np.arcsin(directions[..., 2])),
+        intensity=pixel_values("reflectivity"),
         time=(columns.timestamp - columns[0].timestamp) * 1e-9,
         ring=columns.pixels.index,
         return_index=np.arange(2) if "range2" in bits else None,
-        invalid=(columns.status != VALID) if legacy else (columns.status % 2 != 1),
-        origin=(table(starts[..., 0]), table(starts[..., 1]), table(starts[..., 2])),
+        invalid=(columns.status != VALID) if is_legacy else (columns.status % 2 != 1),
+        origin=(
+            column_table(starts[..., 0]),
+            column_table(starts[..., 1]),
+            column_table(starts[..., 2]),
+        ),
         nominal=unit.nominal,
-        column=number,
-        extra={name: each(name) for name in names if name in EXTRA},
+        column=column_number,
+        extra={name: pixel_values(name) for name in names if name in EXTRA_FIELDS},
     )
 
 
 def pace(f: Fields, columns: int) -> Any:
-    """Return the seconds from a packet to the next, by the times of its columns.
+    """Return the seconds from a packet to the next, from the times of its columns.
 
     Each column has a timestamp in nanoseconds (Software User Manual, lidar data packet format).
     """
@@ -106,15 +120,15 @@ def pace(f: Fields, columns: int) -> Any:
 
 
 def sweep(unit: Unit, i: int) -> dict[str, Any]:
-    """Packet i, at ten turns a second where nothing else is said."""
+    """Return the values of simulated packet i, at ten revolutions a second by default."""
     numbers = unit.columns * i + np.arange(unit.columns)
-    places = numbers % unit.turn
+    turn_numbers = numbers % unit.turn
     times = numbers * (1_000_000_000 // (unit.turn * int(unit.rate or 10)))
-    shared = {"columns.timestamp": times, "columns.measurement_id": places}
+    shared = {"columns.timestamp": times, "columns.measurement_id": turn_numbers}
     if unit.profile == "LEGACY":
         shared |= {
             "columns.frame_id": numbers // unit.turn % 65536,
-            "columns.encoder": places * (ENCODER // unit.turn),
+            "columns.encoder": turn_numbers * (ENCODER_COUNTS_PER_TURN // unit.turn),
         }
         return {**shared, "columns.status": np.full(unit.columns, VALID)}
     return {
@@ -125,21 +139,21 @@ def sweep(unit: Unit, i: int) -> dict[str, Any]:
     }
 
 
-def with_unit(sensor: Sensor, unit: Unit) -> Sensor:
+def apply_unit(sensor: Sensor, unit: Unit) -> Sensor:
     """Return the sensor with the layout and the beams of a unit."""
-    turned = tuple(map(tuple, unit.imu[:3, :3].tolist()))
+    rotation = tuple(map(tuple, unit.imu[:3, :3].tolist()))
     frames = {
-        "data": lidar(unit.profile, unit.rows, unit.columns, unit.turn),
-        "imu": imu(unit.samples, turned),
+        "data": make_lidar_frame(unit.profile, unit.rows, unit.columns, unit.turn),
+        "imu": make_imu_frame(unit.samples, rotation),
         **HTTP,
     }
-    legacy = unit.profile == "LEGACY"
+    is_legacy = unit.profile == "LEGACY"
     return dataclasses.replace(
         sensor,
         frames=frames,
         points=partial(points, unit=unit),
         scan=OnChange(
-            "columns[0].frame_id" if legacy else "frame_id",
+            "columns[0].frame_id" if is_legacy else "frame_id",
             angle="columns[0].measurement_id",
             full=unit.turn,
         ),
@@ -147,7 +161,7 @@ def with_unit(sensor: Sensor, unit: Unit) -> Sensor:
             "columns[0].timestamp",
             pace=partial(pace, columns=unit.columns) if unit.columns > 1 else None,
         ),
-        info={} if legacy else {"serial": "data.serial"},
+        info={} if is_legacy else {"serial": "data.serial"},
         simulation=Simulation(
             partial(sweep, unit),
             answers={"get_metadata": (("reply", {"status": 200, "body": unit.to_metadata()}),)},
@@ -155,14 +169,14 @@ def with_unit(sensor: Sensor, unit: Unit) -> Sensor:
     )
 
 
-def nominal(model: str, rows: int, turn: int, profile: str) -> Unit:
-    """Return a unit as the data sheet has it."""
-    line, low, high, out, height, _ = MODELS[model]
-    beam = np.eye(4)
-    lifted = np.diag([-1.0, -1.0, 1.0, 1.0])
-    beam[0, 3], lifted[2, 3] = out, height
-    still = np.array(STILL).reshape(4, 4)
-    level = np.zeros(rows)
+def make_nominal_unit(model: str, rows: int, turn: int, profile: str) -> Unit:
+    """Return a unit with the values of the data sheet."""
+    line, low, high, beam_origin, height, _ = MODELS[model]
+    beam_transform = np.eye(4)
+    lidar_transform = np.diag([-1.0, -1.0, 1.0, 1.0])
+    beam_transform[0, 3], lidar_transform[2, 3] = beam_origin, height
+    imu_transform = np.array(IDENTITY).reshape(4, 4)
+    azimuth = np.zeros(rows)
     shifts = np.zeros(rows, np.int64)
     elevation = np.linspace(high, low, rows)
     window = (0, turn - 1)
@@ -173,11 +187,11 @@ def nominal(model: str, rows: int, turn: int, profile: str) -> Unit:
         window,
         10.0,
         elevation,
-        level,
+        azimuth,
         shifts,
-        beam,
-        lifted,
-        still,
+        beam_transform,
+        lidar_transform,
+        imu_transform,
         product=f"{line}-{rows}",
         nominal=True,
     )
@@ -191,19 +205,17 @@ def configure(
     turn: int | None = None,
     profile: str | None = None,
 ) -> Sensor:
-    """The sensor with the layout and the beams of a unit; or with a layout alone, and nominal
-    beams.
+    """Return the sensor with the layout and beams of a unit, or with a nominal unit.
 
     Args:
-        metadata: the JSON file of the unit, such as its web server gives at
-            /api/v1/sensor/metadata.
-        rows: pixels of a column, 16 to 128.
-        turn: columns of a turn, 512 to 4096.
+        metadata: the unit's JSON file, as its web server returns it at /api/v1/sensor/metadata.
+        rows: pixels per column, 16 to 128.
+        turn: columns per revolution, 512 to 4096.
         profile: how pixels are packed, RNG19_RFL8_SIG16_NIR16 and others.
 
     Raises:
-        UsageError: for metadata that cannot be read, or are of another model; for a layout that
-            there is not.
+        UsageError: if the metadata cannot be read or are of another model, or the layout does not
+            exist.
     """
     given = {"rows": rows, "turn": turn, "profile": profile}
     given = {name: value for name, value in given.items() if value is not None}
@@ -213,35 +225,35 @@ def configure(
             raise UsageError(
                 f"{sensor.id}: the metadata contain {' and '.join(given)}: omit this option"
             )
-        unit = read(metadata)
-        known = [
+        unit = read_unit(metadata)
+        models = [
             name for name, (line, *_) in MODELS.items() if unit.product.upper().startswith(line)
         ]
-        if known and known[0] != sensor.model:
+        if models and models[0] != sensor.model:
             raise UsageError(
                 f"{sensor.id}: the metadata belong to an {unit.product}: use -s"
-                f" ouster-{known[0].lower()}"
+                f" ouster-{models[0].lower()}"
             )
-        return dataclasses.replace(with_unit(sensor, unit), on_open=())
+        return dataclasses.replace(apply_unit(sensor, unit), on_open=())
     layout = {
-        **LAYOUT,
-        **{name: value for name, value in sensor.options.items() if name in LAYOUT},
+        **DEFAULT_LAYOUT,
+        **{name: value for name, value in sensor.options.items() if name in DEFAULT_LAYOUT},
         **given,
     }
-    for name, most in (("rows", 128), ("turn", 4096)):
-        if not 16 <= layout[name] <= most or layout[name] % 16:
+    for name, maximum in (("rows", 128), ("turn", 4096)):
+        if not 16 <= layout[name] <= maximum or layout[name] % 16:
             raise UsageError(
-                f"{sensor.id}: {name} must be a multiple of 16 up to {most}, not {layout[name]}"
+                f"{sensor.id}: {name} must be a multiple of 16 up to {maximum}, not {layout[name]}"
             )
     if layout["profile"] not in PROFILES:
         raise UsageError(
             f"{sensor.id}: profile must be one of {', '.join(PROFILES)}, not {layout['profile']!r}"
         )
-    return with_unit(sensor, nominal(sensor.model, **layout))
+    return apply_unit(sensor, make_nominal_unit(sensor.model, **layout))
 
 
-#: a layout to begin with: few rows, so that a simulation of it is quick.
-LAYOUT: dict[str, Any] = {"rows": 16, "turn": 1024, "profile": "RNG19_RFL8_SIG16_NIR16"}
+#: The default layout: few rows make a simulation fast.
+DEFAULT_LAYOUT: dict[str, Any] = {"rows": 16, "turn": 1024, "profile": "RNG19_RFL8_SIG16_NIR16"}
 HTTP = {
     "ask": Frame(HttpRequest, direction="out", max_length=65_536),
     "reply": Frame(HttpReply, max_length=1 << 18),
@@ -249,7 +261,7 @@ HTTP = {
 
 
 def make_request(method: str, path: str, body: str = "", **more: Any) -> Command:
-    """Return a request to the web server."""
+    """Return the command for a request to the web server."""
     values = {"method": method, "path": f"/api/v1/{path}".encode(), "body": body.encode()}
     return Command("ask", values, reply="reply", link="http", timeout=6.0, **more)
 
@@ -272,11 +284,11 @@ COMMANDS = {
 }
 
 
-def model(name: str, status: str) -> Sensor:
-    """Return a model of the family."""
+def make_model(name: str, status: str) -> Sensor:
+    """Return the sensor of a model of the family."""
     limits = MODELS[name][-1]
-    unit = nominal(name, **LAYOUT)
-    bare = Sensor(
+    unit = make_nominal_unit(name, **DEFAULT_LAYOUT)
+    sensor = Sensor(
         f"ouster-{name.lower()}",
         vendor="Ouster",
         model=name,
@@ -291,23 +303,23 @@ def model(name: str, status: str) -> Sensor:
         range_limits=limits,
         vendor_axes=("forward", "left", "up"),
         turn=(5, 20),
-        relatives={f"ouster-{other.lower()}": TOLD_BY for other in MODELS if other != name},
+        relatives={f"ouster-{other.lower()}": METADATA_ONLY for other in MODELS if other != name},
         status=status,
         source=(
             "Ouster Software User Manual 2.x and 3.x; ouster-sdk, parsing.cpp, xyzlut.cpp and its"
             " captures"
         ),
     )
-    return with_unit(bare, unit)
+    return apply_unit(sensor, unit)
 
 
 OS0, OS1, OS2, OSDOME = (
-    model(name, status)
+    make_model(name, status)
     for name, status in zip(MODELS, ("capture", "capture", "capture", "manual"), strict=True)
 )
 
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Ouster sensors."""
+    """Return the Ouster sensors."""
     return [OS0, OS1, OS2, OSDOME]

@@ -1,8 +1,7 @@
-"""What a unit says of itself: the layout of its packets and where its beams point, from its
-metadata (JSON).
+"""The layout of a unit's packets and the directions of its beams, from its metadata (JSON).
 
-Source: ouster-sdk (metadata.cpp, xyzlut.cpp). Files of firmware up to 2.4 are flat, later ones, and
-the sensor's own web server, have sections; both are read.
+Source: ouster-sdk (metadata.cpp, xyzlut.cpp). Files of firmware up to 2.4 are flat; later files,
+and the sensor's web server, have sections. Both are read.
 """
 
 from __future__ import annotations
@@ -22,11 +21,10 @@ from lidarspec_ouster.packets import COLUMNS, PROFILES
 
 Table = NDArray[np.float64]
 
-#: the most of each that a sensor has: pixels of a column, columns of a turn.
-ROWS = 256
-TURN = 4096
-STILL = tuple(np.eye(4).ravel())
-# Stands in where metadata lack it, as in ouster-sdk (metadata.cpp): half a turn, and 36.18 mm up.
+MAX_ROWS = 256  # pixels per column
+MAX_COLUMNS_PER_TURN = 4096
+IDENTITY = tuple(np.eye(4).ravel())
+#: The default transform, as in ouster-sdk (metadata.cpp): rotated by 180 degrees and 36.18 mm up.
 LIDAR_TO_SENSOR = (
     -1.0,
     0.0,
@@ -45,31 +43,31 @@ LIDAR_TO_SENSOR = (
     0.0,
     1.0,
 )
-# Millimetres from the axis of rotation to where beams leave, by the beginning of the product line;
-# others, the first generation of the OS1 among them, have the last one (ouster-sdk,
-# sensor_info.cpp).
+#: Distance from the axis of rotation to the beam origin, by the beginning of the product line. All
+#: others, including the first generation of the OS1, have the last value (ouster-sdk,
+#: sensor_info.cpp).
 BEAM_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 BEAM_ORIGIN_GENERATION_1_MM = 12.163
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """One sensor as its metadata describe it.
+    """One sensor as described by its metadata.
 
     Attributes:
-        profile: how its pixels are packed, of `PROFILES`.
-        turn: columns of a turn.
-        columns: of a packet.
+        profile: how its pixels are packed, a key of `PROFILES`.
+        turn: columns per revolution.
+        columns: columns per packet.
         window: the first and the last column that it sends.
-        rate: turns a second; 0 where nobody says it.
-        elevation, azimuth: (rows,) degrees, of each beam; azimuth counted clockwise.
-        shifts: (rows,) by how many columns each row lies behind, for a picture:
+        rate: revolutions per second; 0 if unknown.
+        elevation, azimuth: (rows,) degrees of each beam; azimuth is clockwise.
+        shifts: (rows,) columns by which each row lags behind in a picture:
             `PointCloud.destagger`.
-        beam, lidar, imu: (4, 4), millimetres: where the beams leave in the lidar, the lidar in the
-            sensor, and the IMU in it.
-        samples: of an IMU packet; 0 for those of LEGACY.
-        product, serial: as the metadata have them, "" where they do not.
-        nominal: whether values of the model stand in for those of the unit.
+        beam, lidar, imu: transforms (4, 4) with millimetres: from beam to lidar, from lidar to
+            sensor, and from IMU to sensor.
+        samples: samples per IMU packet; 0 for those of LEGACY.
+        product, serial: as in the metadata, "" if missing.
+        nominal: whether values of the model replace missing values of the unit.
     """
 
     profile: str
@@ -90,12 +88,15 @@ class Unit:
 
     @property
     def rows(self) -> int:
-        """Pixels of a column."""
+        """Pixels per column."""
         return len(self.elevation)
 
-    def beams(self) -> tuple[Table, Table]:
-        """Directions (turn, rows, 3), and where each beam would begin if it were straight from
-        range 0 on, (turn, rows, 3) in metres.
+    def compute_beams(self) -> tuple[Table, Table]:
+        """Return the direction of each pixel's beam and the point where it begins.
+
+        Returns:
+            directions: (turn, rows, 3) unit vectors.
+            starts: (turn, rows, 3) metres, the points at range 0.
         """
         encoder = 2 * np.pi * (1 - np.arange(self.turn) / self.turn)[:, None]
         azimuth = encoder - np.deg2rad(self.azimuth)
@@ -105,15 +106,18 @@ class Unit:
             [np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation) + 0 * azimuth],
             axis=-1,
         )
-        out = self.beam[0, 3]
-        up = self.beam[2, 3]
-        lens = np.stack([out * np.cos(encoder), out * np.sin(encoder), up + 0 * encoder], axis=-1)
-        starts = lens - directions * np.hypot(out, up)
-        turned = self.lidar[:3, :3].T
-        return directions @ turned, (starts @ turned + self.lidar[:3, 3]) / 1000
+        origin_x = self.beam[0, 3]
+        origin_z = self.beam[2, 3]
+        lens = np.stack(
+            [origin_x * np.cos(encoder), origin_x * np.sin(encoder), origin_z + 0 * encoder],
+            axis=-1,
+        )
+        starts = lens - directions * np.hypot(origin_x, origin_z)
+        rotation = self.lidar[:3, :3].T
+        return directions @ rotation, (starts @ rotation + self.lidar[:3, 3]) / 1000
 
     def to_metadata(self) -> bytes:
-        """Return the metadata, as the web server of such a sensor would give them."""
+        """Return the metadata as the web server of this unit would send them."""
         first, last = self.window
         return json.dumps(
             {
@@ -140,11 +144,11 @@ class Unit:
         ).encode()
 
 
-def read(metadata: str | Path | Learned) -> Unit:
-    """Return the unit that a file, or the sensor itself, describes.
+def read_unit(metadata: str | Path | Learned) -> Unit:
+    """Return the unit described by a file or by the sensor itself.
 
     Raises:
-        UsageError: for what cannot be read, or lacks what the points need; with the key.
+        UsageError: if it cannot be read, or a key that the points need is missing.
     """
     name = "the sensor's metadata" if isinstance(metadata, Learned) else str(metadata)
     try:
@@ -156,15 +160,15 @@ def read(metadata: str | Path | Learned) -> Unit:
             f"{name}: not the metadata of an Ouster sensor: expected an object, got"
             f" {type(data).__name__}"
         )
-    return Facts(name, merge_sections(data)).unit()
+    return MetadataKeys(name, merge_sections(data)).to_unit()
 
 
 def merge_sections(data: dict[str, Any]) -> dict[str, Any]:
     """Return the keys of all sections in one mapping.
 
-    Firmware differs in the section that holds a key: `imu_measurements_per_packet` stands in
-    `lidar_data_format` or in `imu_data_format`. What the sensor reports of itself takes precedence
-    over `config_params`, the user's settings.
+    The section of a key depends on the firmware: `imu_measurements_per_packet` is in
+    `lidar_data_format` or in `imu_data_format`. Values reported by the sensor take precedence over
+    `config_params`, the user's settings.
     """
     sections = [
         section
@@ -178,8 +182,8 @@ def merge_sections(data: dict[str, Any]) -> dict[str, Any]:
     return keys
 
 
-def usual_beam_origin_mm(product: str) -> float:
-    """Return how far from the axis the beams of a product line leave, in millimetres."""
+def default_beam_origin_mm(product: str) -> float:
+    """Return the distance of a product line's beam origin from the axis, in mm."""
     for prefix, distance_mm in BEAM_ORIGINS_MM.items():
         if product.startswith(prefix):
             return distance_mm
@@ -187,108 +191,120 @@ def usual_beam_origin_mm(product: str) -> float:
 
 
 @dataclass(frozen=True)
-class Facts:
-    """Metadata without their sections, and where they come from."""
+class MetadataKeys:
+    """The keys of metadata without sections, and the name of their source."""
 
     name: str
     data: Mapping[str, Any]
 
-    def unit(self) -> Unit:
+    def to_unit(self) -> Unit:
         """Return the unit.
 
         Raises:
-            UsageError: for a key that is missing, or has a value that cannot be.
+            UsageError: if a key is missing or has an impossible value.
         """
-        elevation = self._numbers("beam_altitude_angles", None)
+        elevation = self._read_numbers("beam_altitude_angles", None)
         rows = len(elevation)
         mode = str(self.data.get("lidar_mode", ""))
         turn, _, rate = mode.partition("x")
-        columns = self._whole("columns_per_packet", COLUMNS, COLUMNS)
-        width = self._whole("columns_per_frame", TURN, int(turn) if turn.isdecimal() else None)
-        if self._whole("pixels_per_column", ROWS, rows) != rows:
-            raise self._fault(
+        columns = self._read_integer("columns_per_packet", COLUMNS, COLUMNS)
+        width = self._read_integer(
+            "columns_per_frame", MAX_COLUMNS_PER_TURN, int(turn) if turn.isdecimal() else None
+        )
+        if self._read_integer("pixels_per_column", MAX_ROWS, rows) != rows:
+            raise self.make_error(
                 "beam_altitude_angles",
                 f"has {rows} angles, expected {self.data['pixels_per_column']} (pixels_per_column)",
             )
         if width % columns:
-            raise self._fault(
+            raise self.make_error(
                 "columns_per_frame",
                 f"{width} is not a multiple of columns_per_packet, which is {columns}",
             )
-        first, last = map(int, self._numbers("column_window", 2, (0, width - 1)))
+        first, last = map(int, self._read_numbers("column_window", 2, (0, width - 1)))
         product = str(self.data.get("prod_line", ""))
         is_nominal = "lidar_to_sensor_transform" not in self.data
-        beam = self._transform("beam_to_lidar_transform", None)
+        beam = self._read_transform("beam_to_lidar_transform", None)
         if beam is None:
             is_nominal = is_nominal or "lidar_origin_to_beam_origin_mm" not in self.data
             beam = np.eye(4)
-            beam[0, 3] = self._numbers(
-                "lidar_origin_to_beam_origin_mm", 1, (usual_beam_origin_mm(product),)
+            beam[0, 3] = self._read_numbers(
+                "lidar_origin_to_beam_origin_mm", 1, (default_beam_origin_mm(product),)
             )[0]
         measured = self.data.get("udp_profile_imu", "LEGACY") == "ACCEL32_GYRO32_NMEA"
         return Unit(
-            profile=self._profile(),
+            profile=self._read_profile(),
             turn=width,
             columns=columns,
             window=(first, last),
             rate=float(rate) if rate.isdecimal() else 0.0,
             elevation=elevation,
-            azimuth=self._numbers("beam_azimuth_angles", rows),
-            shifts=self._numbers("pixel_shift_by_row", rows, (0,) * rows).astype(np.int64),
+            azimuth=self._read_numbers("beam_azimuth_angles", rows),
+            shifts=self._read_numbers("pixel_shift_by_row", rows, (0,) * rows).astype(np.int64),
             beam=beam,
-            lidar=self._transform("lidar_to_sensor_transform", LIDAR_TO_SENSOR),
-            imu=self._transform("imu_to_sensor_transform", STILL),
-            samples=self._whole("imu_measurements_per_packet", ROWS, None) if measured else 0,
+            lidar=self._read_transform("lidar_to_sensor_transform", LIDAR_TO_SENSOR),
+            imu=self._read_transform("imu_to_sensor_transform", IDENTITY),
+            samples=self._read_integer("imu_measurements_per_packet", MAX_ROWS, None)
+            if measured
+            else 0,
             product=product,
             serial=str(self.data.get("prod_sn", "")),
             nominal=is_nominal,
         )
 
-    def _profile(self) -> str:
+    def _read_profile(self) -> str:
         profile = str(self.data.get("udp_profile_lidar", "LEGACY"))
         if profile not in PROFILES:
-            raise self._fault(
+            raise self.make_error(
                 "udp_profile_lidar",
                 f"{profile[:60]} is not supported: expected one of {', '.join(PROFILES)}",
             )
         return profile
 
-    def _numbers(
-        self, key: str, count: int | None, usual: tuple[float, ...] | None = None
+    def _read_numbers(
+        self, key: str, count: int | None, default: tuple[float, ...] | None = None
     ) -> Table:
-        """So many finite numbers; `usual` where the key is missing."""
-        given = self.data.get(key, usual)
+        """Return `count` finite numbers, or any number of them if `count` is None.
+
+        `default` is used if the key is missing.
+        """
+        value = self.data.get(key, default)
         try:
-            numbers = np.atleast_1d(np.array(given, np.float64))
+            numbers = np.atleast_1d(np.array(value, np.float64))
         except (TypeError, ValueError):
             numbers = np.array([np.nan])
         if (
-            given is None
+            value is None
             or numbers.ndim != 1
-            or not 1 <= len(numbers) <= ROWS
+            or not 1 <= len(numbers) <= MAX_ROWS
             or not np.isfinite(numbers).all()
         ):
-            raise self._fault(key, "is missing" if given is None else "must be a list of numbers")
+            raise self.make_error(
+                key, "is missing" if value is None else "must be a list of numbers"
+            )
         if count is not None and len(numbers) != count:
-            raise self._fault(key, f"has {len(numbers)} numbers, expected {count}")
+            raise self.make_error(key, f"has {len(numbers)} numbers, expected {count}")
         return numbers
 
-    def _whole(self, key: str, most: int, usual: int | None) -> int:
-        number = self.data.get(key, usual)
-        if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= most:
-            raise self._fault(key, "is missing" if number is None else f"must be 1 to {most}")
+    def _read_integer(self, key: str, maximum: int, default: int | None) -> int:
+        number = self.data.get(key, default)
+        if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= maximum:
+            raise self.make_error(
+                key, "is missing" if number is None else f"must be 1 to {maximum}"
+            )
         return number
 
-    def _transform(self, key: str, usual: tuple[float, ...] | None) -> Any:
-        """(4, 4), of 16 numbers in a row or in four; None where the key is missing and `usual` is
-        None.
-        """
-        if usual is None and key not in self.data:
-            return None
-        given = self.data.get(key, usual)
-        if isinstance(given, list) and all(isinstance(row, list) for row in given):
-            given = [number for row in given for number in row]
-        return Facts(self.name, {key: given})._numbers(key, 16).reshape(4, 4)
+    def _read_transform(self, key: str, default: tuple[float, ...] | None) -> Any:
+        """Return a matrix (4, 4) from 16 numbers in one list or in four.
 
-    def _fault(self, key: str, reason: str) -> UsageError:
+        Returns None if both the key and the default are missing.
+        """
+        if default is None and key not in self.data:
+            return None
+        value = self.data.get(key, default)
+        if isinstance(value, list) and all(isinstance(row, list) for row in value):
+            value = [number for row in value for number in row]
+        return MetadataKeys(self.name, {key: value})._read_numbers(key, 16).reshape(4, 4)
+
+    def make_error(self, key: str, reason: str) -> UsageError:
         return UsageError(f"{self.name}: not the metadata of an Ouster sensor: {key} {reason}")

@@ -5,11 +5,11 @@ All values are little-endian.
     header | 16 columns: column header, H pixels, column footer | footer
     (LEGACY has no header and no footer)
 
-How many pixels a column has, and how they are packed, no packet says: the metadata do.
+The metadata, not the packets, contain the number of pixels per column and their packing.
 
-Source: ouster-sdk, parsing.cpp; the bits of LEGACY, RNG19 (single and dual) and RNG15 hold for
-captures, whose every field has the MD5 of the vendor's digests; those of FUSA for one captured
-packet. The other profiles, and the IMU packets with NMEA, are read off alone.
+Source: ouster-sdk, parsing.cpp. The bits of LEGACY, RNG19 (single and dual) and RNG15 are verified
+with captures: each field has the MD5 of the vendor's digests. Those of FUSA are verified with one
+captured packet. The other profiles, and the IMU packets with NMEA, follow the source code only.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from construct import (
 from lidarspec.spec import Checksummed, Clock, Crc, Fields, Frame, Imu, Scaled, Simulation
 
 Bits = dict[str, int]
-#: bits of the fields of a pixel, from bit 0 on; those whose name begins with _ are not used.
+#: Bits of the fields of a pixel, from bit 0 on; names that begin with _ are unused bits.
 WIDE = {"range": 19, "flags": 5}
 FIRST = {**WIDE, "reflectivity": 8}
 SECOND = {"range2": 19, "flags2": 5, "reflectivity2": 8}
 SMALL = {"range": 15, "flags": 1, "reflectivity": 8, "near_ir": 8}
 SMALL_SECOND = {"range2": 15, "flags2": 1, "reflectivity2": 8, "window": 8}
 RGB = {"red": 16, "green": 16, "blue": 16}
-#: profile -> a pixel.
+#: Profile -> the fields of a pixel.
 PROFILES: dict[str, Bits] = {
     "LEGACY": {
         "range": 20,
@@ -108,15 +108,14 @@ PROFILES: dict[str, Bits] = {
     },
 }
 
-COLUMNS = 16  # of a packet, unless the metadata say otherwise
-VALID = 0xFFFFFFFF  # status of a valid column of LEGACY; of others bit 0 says it
-ENCODER = 90_112  # counts of a turn
-LIDAR = 1
-IMU = 2  # packet types
+COLUMNS = 16  # per packet, unless the metadata differ
+VALID = 0xFFFFFFFF  # status of a valid column in LEGACY; other profiles use bit 0
+ENCODER_COUNTS_PER_TURN = 90_112
+LIDAR = 1  # packet type
+IMU = 2  # packet type
 GRAVITY = 9.80665  # m/s2, one g of the IMU
-#: values of the footer's CRC that mean that none is filled in: of firmware 2.2, and of 2.3 up to
-#: 3.1.
-NOT_FILLED = (0, 0xDEADBEEF0000C0DE)
+#: CRC values of firmware without a CRC: of 2.2, and of 2.3 up to 3.1.
+ABSENT_CRCS = (0, 0xDEADBEEF0000C0DE)
 ONES = (1 << 64) - 1
 CRC = Crc(64, 0x42F0E1EBA9EA3693, init=ONES, refin=True, refout=True, xorout=ONES)  # CRC-64/XZ
 SERIAL = BytesInteger(5, swapped=True)
@@ -146,24 +145,26 @@ STATE = (
 FOOTER = ("reserved_footer" / Bytes(24), "crc" / Int64ul)
 
 
-def size(profile: str, rows: int, columns: int = COLUMNS) -> int:
+def packet_bytes(profile: str, rows: int, columns: int = COLUMNS) -> int:
     """Return the bytes of a lidar packet."""
-    head, column = (0, 20) if profile == "LEGACY" else (64, 12)
-    return head + columns * (column + rows * sum(PROFILES[profile].values()) // 8)
+    header, column = (0, 20) if profile == "LEGACY" else (64, 12)
+    return header + columns * (column + rows * sum(PROFILES[profile].values()) // 8)
 
 
-def pixel(profile: str) -> Construct:
-    """One pixel as one number, whose bits are the fields."""
+def make_pixel(profile: str) -> Construct:
+    """Return the struct of a pixel: one number whose bits are the fields."""
     fields = (
         (f"reserved{name}" if name[0] == "_" else name, bits)
         for name, bits in reversed(PROFILES[profile].items())
     )
-    return ByteSwapped(BitStruct(*(name / _field(name, bits) for name, bits in fields)))
+    return ByteSwapped(BitStruct(*(name / make_field(name, bits) for name, bits in fields)))
 
 
-def _field(name: str, bits: int) -> Construct:
-    """Return a field of a pixel: ranges have steps of 8 mm where they have 15 bits, else of 1 mm;
-    near-infrared of 8 bits lacks its low 4.
+def make_field(name: str, bits: int) -> Construct:
+    """Return the type of a pixel's field.
+
+    Ranges of 15 bits have steps of 8 mm, others of 1 mm; near-infrared of 8 bits lacks its low 4
+    bits.
     """
     if name.startswith("range"):
         return Scaled(BitsInteger(bits), 0.008 if bits == 15 else 0.001, "m")
@@ -172,51 +173,69 @@ def _field(name: str, bits: int) -> Construct:
     return BitsInteger(bits)
 
 
-def packet(profile: str, rows: int, columns: int) -> Construct:
-    """Return a lidar packet."""
-    pixels = "pixels" / Array(rows, pixel(profile))
-    began = (
+def make_packet(profile: str, rows: int, columns: int) -> Construct:
+    """Return the struct of a lidar packet."""
+    pixels = "pixels" / Array(rows, make_pixel(profile))
+    column_start = (
         "timestamp" / TIME,
         "measurement_id" / Scaled(Int16ul, 1, "") * "index of the column in its revolution",
     )
     if profile == "LEGACY":
-        head = (*began, "frame_id" / Int16ul, "encoder" / Int32ul * "90112 counts per revolution")
+        column_header = (
+            *column_start,
+            "frame_id" / Int16ul,
+            "encoder" / Int32ul * "90112 counts per revolution",
+        )
         return Struct(
             "columns"
-            / Array(columns, Struct(*head, pixels, "status" / Int32ul * "0xffffffff: valid"))
+            / Array(
+                columns, Struct(*column_header, pixels, "status" / Int32ul * "0xffffffff: valid")
+            )
         )
-    body = "columns" / Array(columns, Struct(*began, "status" / Int16ul * "bit 0: valid", pixels))
+    body = "columns" / Array(
+        columns, Struct(*column_start, "status" / Int16ul * "bit 0: valid", pixels)
+    )
     if profile.startswith("FUSA"):
         return Struct("type" / Const(LIDAR, Int8ul), *FUSA_HEADER, *STATE, body, *FOOTER)
     return Checksummed(
         Struct("type" / Const(LIDAR, Int16ul), *HEADER, *STATE, body, *FOOTER),
         "crc",
         CRC,
-        absent=NOT_FILLED,
+        absent=ABSENT_CRCS,
     )
 
 
 @functools.cache
-def lidar(profile: str, rows: int, columns: int, turn: int) -> Frame:
-    """Return the data frame, with so many columns in a turn."""
-    plausible = partial(legacy_plausible if profile == "LEGACY" else plausible_columns, turn=turn)
-    return Frame(packet(profile, rows, columns), data=True, plausible=plausible)
+def make_lidar_frame(profile: str, rows: int, columns: int, turn: int) -> Frame:
+    """Return the data frame of lidar packets.
+
+    Args:
+        profile: a key of `PROFILES`.
+        rows: pixels per column.
+        columns: columns per packet.
+        turn: columns per revolution.
+    """
+    plausible = partial(is_legacy_plausible if profile == "LEGACY" else is_plausible, turn=turn)
+    return Frame(make_packet(profile, rows, columns), data=True, plausible=plausible)
 
 
-def plausible_columns(f: Fields, turn: int) -> Any:
-    """Columns of a turn that follow one another."""
-    number = f.columns.measurement_id
-    return (number < turn) & (number == f.columns[0].measurement_id + f.columns.index)
+def is_plausible(f: Fields, turn: int) -> Any:
+    """Return whether the columns have consecutive numbers below `turn`."""
+    column_number = f.columns.measurement_id
+    return (column_number < turn) & (column_number == f.columns[0].measurement_id + f.columns.index)
 
 
-def legacy_plausible(f: Fields, turn: int) -> Any:
-    """The same, and all of one turn, valid or not: nothing else tells these packets from noise."""
+def is_legacy_plausible(f: Fields, turn: int) -> Any:
+    """Return whether a LEGACY packet is plausible: also status, encoder and frame id.
+
+    These packets have no type, so stricter rules distinguish them from noise.
+    """
     columns = f.columns
-    status = (columns.status == VALID) | (columns.status == 0)
+    has_known_status = (columns.status == VALID) | (columns.status == 0)
     return (
-        plausible_columns(f, turn)
-        & status
-        & (columns.encoder < ENCODER)
+        is_plausible(f, turn)
+        & has_known_status
+        & (columns.encoder < ENCODER_COUNTS_PER_TURN)
         & (columns.frame_id == columns[0].frame_id)
     )
 
@@ -229,8 +248,8 @@ LEGACY_IMU = Struct(
     *(f"acceleration_{axis}" / Scaled(Float32l, GRAVITY, "m/s2") * "sent in g" for axis in AXES),
     *(f"gyro_{axis}" / Scaled(Float32l, 1, "deg/s") for axis in AXES),
 )
-# One measurement of an ACCEL32_GYRO32_NMEA packet. Captured values are multiples of 9.80665/2048
-# and of (pi/180)/16.4: the sensor sends m/s2 and rad/s, and ouster-sdk hands them out unchanged.
+#: One measurement of an ACCEL32_GYRO32_NMEA packet. Captured values are multiples of 9.80665/2048
+#: and of (pi/180)/16.4: the sensor sends m/s2 and rad/s, and ouster-sdk returns them unchanged.
 SAMPLE = Struct(
     "timestamp" / TIME,
     "measurement_id" / Int16ul,
@@ -242,13 +261,16 @@ Rotation = tuple[tuple[float, float, float], ...]
 
 
 @functools.cache
-def imu(samples: int, turned: Rotation) -> Frame:
-    """The frame of the IMU: LEGACY where `samples` is 0, else with NMEA and so many samples; and
-    how the IMU is turned in the sensor.
+def make_imu_frame(samples: int, rotation: Rotation) -> Frame:
+    """Return the frame of the IMU.
+
+    Args:
+        samples: samples per packet with NMEA; 0 for a LEGACY packet.
+        rotation: rotation from the IMU to the sensor.
     """
-    felt = partial(feel, path="samples" if samples else "", turned=turned)
+    read_imu = partial(imu_samples, path="samples" if samples else "", rotation=rotation)
     if not samples:
-        at_rest = Simulation(
+        simulation = Simulation(
             lambda i: dict.fromkeys(
                 ("timestamp", "acceleration_timestamp", "gyro_timestamp"), i * 10_000_000
             ),
@@ -256,34 +278,34 @@ def imu(samples: int, turned: Rotation) -> Frame:
         )
         return Frame(
             LEGACY_IMU,
-            imu=felt,
+            imu=read_imu,
             clock=Clock("gyro_timestamp"),
-            plausible=steady,
-            simulation=at_rest,
+            plausible=has_near_times,
+            simulation=simulation,
         )
     body = ("nmea_timestamp" / TIME, "nmea" / Bytes(92), "samples" / Array(samples, SAMPLE))
-    head = Struct("type" / Const(IMU, Int16ul), *HEADER, *STATE, *body, *FOOTER)
-    sealed = Checksummed(head, "crc", CRC, absent=NOT_FILLED)
+    struct = Struct("type" / Const(IMU, Int16ul), *HEADER, *STATE, *body, *FOOTER)
+    checked_struct = Checksummed(struct, "crc", CRC, absent=ABSENT_CRCS)
     return Frame(
-        sealed,
-        imu=felt,
+        checked_struct,
+        imu=read_imu,
         clock=Clock("samples[0].timestamp"),
         simulation=Simulation(partial(sample_times, samples), rate=100),
     )
 
 
 def sample_times(samples: int, i: int) -> dict[str, Any]:
-    """Return the times of packet i, 100 a second."""
+    """Return the times of samples in simulated packet i, 100 packets a second."""
     return {"samples.timestamp": (i + np.arange(samples) / samples) * 10_000_000}
 
 
-def feel(f: Fields, path: str, turned: Rotation) -> Imu:
+def imu_samples(f: Fields, path: str, rotation: Rotation) -> Imu:
     """Return the IMU measurements in the axes of the sensor: rad/s, m/s2 and seconds.
 
     Args:
         path: array of measurements in an ACCEL32_GYRO32_NMEA packet; "" for the single one of a
             LEGACY packet.
-        turned: rotation from the IMU to the sensor.
+        rotation: rotation from the IMU to the sensor.
     """
     if path:
         values = getattr(f, path)
@@ -294,20 +316,20 @@ def feel(f: Fields, path: str, turned: Rotation) -> Imu:
         time = 0
         rates = [np.deg2rad(getattr(values, f"gyro_{axis}")) for axis in AXES]
     accelerations = [getattr(values, f"acceleration_{axis}") for axis in AXES]
-    return Imu(rotate(turned, rates), rotate(turned, accelerations), time)
+    return Imu(rotate(rotation, rates), rotate(rotation, accelerations), time)
 
 
-def rotate(turned: Rotation, vector: Any) -> tuple[Any, ...]:
-    """Return a vector of columns, turned."""
+def rotate(rotation: Rotation, vector: Any) -> tuple[Any, ...]:
+    """Return a rotated vector of columns."""
     parts = list(vector)
     return tuple(
         sum(weight * part for weight, part in zip(row, parts, strict=True) if weight)
-        for row in turned
+        for row in rotation
     )
 
 
-def steady(f: Fields) -> Any:
-    """Times within a second of one another."""
+def has_near_times(f: Fields) -> Any:
+    """Return whether the three times are within one second."""
     return (abs(f.acceleration_timestamp - f.timestamp) < 1e9) & (
         abs(f.gyro_timestamp - f.timestamp) < 1e9
     )

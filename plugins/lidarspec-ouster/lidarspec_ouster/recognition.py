@@ -1,12 +1,11 @@
-"""Which layout packets have, that do not say it: by their length, the bits that nobody uses, and
-neighbours that are alike.
+"""Recognition of the layout of packets, which do not contain it.
 
-Several layouts have one length: 32 pixels of 16 bytes, 64 of 8 and 128 of 4. In one that is too
-fine, every other or every fourth range is some other number, so that their means are far apart. Of
-layouts that are as fine, the first of `PROFILES` is taken whose unused bits are 0 in most pixels:
-some cannot be told apart by anything in them. How many columns a turn has is told by the encoder of
-LEGACY; of others by the largest number seen, and by the time from column to column at ten turns a
-second, as they leave the factory.
+Several layouts have the same packet length: 32 pixels of 16 bytes, 64 of 8 and 128 of 4. If a
+layout has too many pixels, every other or every fourth range is another field, so the mean ranges
+of four adjacent rows differ. Among layouts with equally many pixels, the first of `PROFILES` with
+unused bits that are 0 in most pixels is used; some layouts cannot be distinguished. The columns per
+revolution follow from the encoder in LEGACY. In other profiles they follow from the largest column
+number and the time from column to column, at ten revolutions a second, the factory setting.
 """
 
 from __future__ import annotations
@@ -17,114 +16,131 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarspec_ouster.packets import COLUMNS, ENCODER, PROFILES, VALID, size
+from lidarspec_ouster.packets import COLUMNS, ENCODER_COUNTS_PER_TURN, PROFILES, VALID, packet_bytes
 
-ROWS = (16, 32, 64, 128)
-TURNS = (512, 1024, 2048, 4096)
-#: packets that are looked into; nanoseconds of a turn as they leave the factory.
-LOOKED_AT = 256
-TEN_TURNS = 100_000_000
-#: share of the pixels in which a captured OS2 sets bits that have no name stays below it.
-SET = 0.1
+ROW_COUNTS = (16, 32, 64, 128)
+COLUMNS_PER_TURN = (512, 1024, 2048, 4096)
+MAX_EXAMINED_PACKETS = 256
+FACTORY_TURN_NS = 100_000_000  # ten revolutions a second
+#: Maximum share of pixels with unused bits set; a captured OS2 stays below.
+MAX_UNUSED_SHARE = 0.1
 Bytes2D = NDArray[np.uint8]
 
 
 def recognise(datagrams: Sequence[bytes]) -> dict[str, Any]:
-    """The options of `configure` under which most of the datagrams are lidar packets; {} where they
-    are none.
+    """Return the options of `configure` that fit most of the datagrams.
+
+    Returns {} if the datagrams are not lidar packets.
     """
     lengths = [len(data) for data in datagrams]
-    layouts = {(profile, rows): size(profile, rows) for profile in PROFILES for rows in ROWS}
-    known = [length for length in lengths if length in layouts.values()]
-    if not known:
+    layouts = {
+        (profile, rows): packet_bytes(profile, rows) for profile in PROFILES for rows in ROW_COUNTS
+    }
+    known_lengths = [length for length in lengths if length in layouts.values()]
+    if not known_lengths:
         return {}
-    usual = max(set(known), key=known.count)
-    some = [data for data in datagrams if len(data) == usual][:LOOKED_AT]
-    packets = np.frombuffer(b"".join(some), np.uint8).reshape(len(some), usual)
+    most_frequent = max(set(known_lengths), key=known_lengths.count)
+    sample = [data for data in datagrams if len(data) == most_frequent][:MAX_EXAMINED_PACKETS]
+    packets = np.frombuffer(b"".join(sample), np.uint8).reshape(len(sample), most_frequent)
     finest_first = sorted(
-        (layout for layout, length in layouts.items() if length == usual),
+        (layout for layout, length in layouts.items() if length == most_frequent),
         key=lambda layout: -layout[1],
     )
     columns = {
         layout: body
         for layout in finest_first
-        if (body := _columns(packets, layout[0])) is not None
+        if (body := split_columns(packets, layout[0])) is not None
     }
-    fitting = {layout: _likeness(body, *layout) for layout, body in columns.items()}
-    if not fitting:
+    similarities = {layout: row_similarity(body, *layout) for layout, body in columns.items()}
+    if not similarities:
         return {}
-    likely = next(
-        found
-        for least in (0.5, 0, -1)
-        if (found := [layout for layout in fitting if fitting[layout] >= least])
+    candidates = next(
+        layouts_above
+        for min_similarity in (0.5, 0, -1)
+        if (
+            layouts_above := [
+                layout for layout in similarities if similarities[layout] >= min_similarity
+            ]
+        )
     )
-    profile, rows = likely[0]
-    return {"profile": profile, "rows": rows, "turn": _turn(columns[likely[0]], profile)}
+    profile, rows = candidates[0]
+    return {
+        "profile": profile,
+        "rows": rows,
+        "turn": estimate_turn(columns[candidates[0]], profile),
+    }
 
 
-def _turn(columns: Bytes2D, profile: str) -> int:
-    """Columns of a turn, as far as they tell it."""
-    number = _word(columns, 8, 2)
-    time = _word(columns, 0, 8)
-    if profile == "LEGACY" and number.any():
+def estimate_turn(columns: Bytes2D, profile: str) -> int:
+    """Return the most likely number of columns per revolution."""
+    numbers = read_numbers(columns, 8, 2)
+    times = read_numbers(columns, 0, 8)
+    if profile == "LEGACY" and numbers.any():
         guess = float(
             np.median(
-                ENCODER * number[number > 0] / np.maximum(_word(columns, 12, 4)[number > 0], 1)
+                ENCODER_COUNTS_PER_TURN
+                * numbers[numbers > 0]
+                / np.maximum(read_numbers(columns, 12, 4)[numbers > 0], 1)
             )
         )
     else:
-        guess = TEN_TURNS / max(float(np.median(np.diff(time))), 1.0)
+        guess = FACTORY_TURN_NS / max(float(np.median(np.diff(times))), 1.0)
     return min(
-        (turn for turn in TURNS if turn > number.max()), key=lambda turn: abs(np.log(turn / guess))
+        (turn for turn in COLUMNS_PER_TURN if turn > numbers.max()),
+        key=lambda turn: abs(np.log(turn / guess)),
     )
 
 
-def _columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
-    """The columns of packets, (n * 16, bytes), where their headers can be those of a profile."""
-    framed = profile != "LEGACY"
-    if framed and not (packets[:, 0] == 1).all():
+def split_columns(packets: Bytes2D, profile: str) -> Bytes2D | None:
+    """Return the columns, (n * 16, bytes), or None if their headers do not fit."""
+    has_header = profile != "LEGACY"
+    if has_header and not (packets[:, 0] == 1).all():
         return None
-    if framed and (packets[:, 1] == 0).all() == profile.startswith(
+    if has_header and (packets[:, 1] == 0).all() == profile.startswith(
         "FUSA"
     ):  # of the type, or of the number of the start
         return None
-    body = packets[:, 32:-32] if framed else packets
+    body = packets[:, 32:-32] if has_header else packets
     columns = body.reshape(len(packets) * COLUMNS, -1)
-    numbers = _word(columns, 8, 2).reshape(-1, COLUMNS)
-    steady = (np.diff(numbers, axis=1) == 1).all() and numbers.max() < TURNS[-1]
-    if not framed:
-        status = _word(columns, columns.shape[1] - 4, 4)
-        steady = steady and bool(
-            ((status == VALID) | (status == 0)).all() and (_word(columns, 12, 4) < ENCODER).all()
+    numbers = read_numbers(columns, 8, 2).reshape(-1, COLUMNS)
+    is_plausible = (np.diff(numbers, axis=1) == 1).all() and numbers.max() < COLUMNS_PER_TURN[-1]
+    if not has_header:
+        status = read_numbers(columns, columns.shape[1] - 4, 4)
+        is_plausible = is_plausible and bool(
+            ((status == VALID) | (status == 0)).all()
+            and (read_numbers(columns, 12, 4) < ENCODER_COUNTS_PER_TURN).all()
         )
-    return columns if steady else None
+    return columns if is_plausible else None
 
 
-def _likeness(columns: Bytes2D, profile: str, rows: int) -> float:
-    """The mean range of every fourth row, the least by the largest of the four; -1 where unused
-    bits are set in many pixels.
+def row_similarity(columns: Bytes2D, profile: str, rows: int) -> float:
+    """Return the smallest mean range of rows modulo four, divided by the largest.
+
+    The result is -1 if unused bits are set in many pixels.
     """
     start = 16 if profile == "LEGACY" else 12
     bits = PROFILES[profile]
     step = sum(bits.values()) // 8
-    spot = 0
+    bit_offset = 0
     pixels = columns[:, start : start + rows * step].reshape(len(columns), rows, step)
     for name, width in bits.items():
-        if name[0] == "_" and (_bits(pixels, spot, width) != 0).mean() > SET:
+        if name[0] == "_" and (read_bits(pixels, bit_offset, width) != 0).mean() > MAX_UNUSED_SHARE:
             return -1.0
-        spot += width
-    means = _bits(pixels, 0, bits["range"]).reshape(len(columns), -1, 4).mean(axis=(0, 1))
+        bit_offset += width
+    means = read_bits(pixels, 0, bits["range"]).reshape(len(columns), -1, 4).mean(axis=(0, 1))
     return float(means.min() / max(means.max(), 1e-9))
 
 
-def _bits(rows: NDArray[Any], spot: int, width: int) -> NDArray[np.int64]:
-    """Return the bits of the little-endian numbers in the last axis from `spot` on."""
-    return _word(rows, spot // 8, -(-(spot % 8 + width) // 8)) >> spot % 8 & ((1 << width) - 1)
+def read_bits(rows: NDArray[Any], bit_offset: int, width: int) -> NDArray[np.int64]:
+    """Return bits of the little-endian numbers in the last axis, from `bit_offset` on."""
+    return read_numbers(
+        rows, bit_offset // 8, -(-(bit_offset % 8 + width) // 8)
+    ) >> bit_offset % 8 & ((1 << width) - 1)
 
 
-def _word(rows: NDArray[Any], start: int, count: int) -> NDArray[np.int64]:
-    """Little-endian numbers out of the last axis."""
-    found: NDArray[np.int64] = (
+def read_numbers(rows: NDArray[Any], start: int, count: int) -> NDArray[np.int64]:
+    """Return little-endian numbers of `count` bytes from the last axis."""
+    numbers: NDArray[np.int64] = (
         rows[..., start : start + count].astype(np.int64) << (8 * np.arange(count))
     ).sum(axis=-1)
-    return found
+    return numbers

@@ -20,9 +20,9 @@ from lidarspec import simulate
 from lidarspec.captures.pcap import CaptureReader
 from lidarspec.detect.identification import identify_senders
 from lidarspec.spec import Learned
-from lidarspec_ouster import nominal
-from lidarspec_ouster.metadata import read
-from lidarspec_ouster.packets import NOT_FILLED, PROFILES, size
+from lidarspec_ouster import make_nominal_unit
+from lidarspec_ouster.metadata import read_unit
+from lidarspec_ouster.packets import ABSENT_CRCS, PROFILES, packet_bytes
 from lidarspec_ouster.recognition import recognise
 from tests.evidence import capture, decode, vector_bytes, vectors
 
@@ -136,7 +136,7 @@ def test_a_capture_is_read_whole(name: str) -> None:
 def test_published_packets(name: str) -> None:
     vector, data = vectors(FILE)[f"ouster_{name}"], vector_bytes(FILE, f"ouster_{name}")
     params, expected = vector["params"], vector["expected"]
-    assert size(params["profile"], params["H"]) == len(data)
+    assert packet_bytes(params["profile"], params["H"]) == len(data)
     sensor = OS0.configure(metadata=Learned(json.dumps(metadata_of(params)).encode()))
     packets = decode(sensor, [data])
     fields = packets.raw["columns"]["pixels"]
@@ -203,7 +203,7 @@ def test_a_wrong_crc_is_rejected_and_an_absent_one_accepted() -> None:
     damaged = sealed[:100] + bytes([sealed[100] ^ 1]) + sealed[101:]
     assert len(sensor.decode([sealed])) == 1
     assert len(sensor.decode([damaged])) == 0
-    for crc in NOT_FILLED:
+    for crc in ABSENT_CRCS:
         assert len(sensor.decode([damaged[:-8] + crc.to_bytes(8, "little")])) == 1
 
 
@@ -277,13 +277,15 @@ def test_metadata_are_learned_from_the_web_server_of_a_simulated_sensor() -> Non
 
 
 def test_older_and_newer_metadata_are_equivalent(tmp_path: Path) -> None:
-    made = dataclasses.replace(nominal("OS1", 16, 512, "LEGACY"), nominal=False, serial="7")
+    made = dataclasses.replace(
+        make_nominal_unit("OS1", 16, 512, "LEGACY"), nominal=False, serial="7"
+    )
     sections = json.loads(made.to_metadata())
     flat = {key: value for section in sections.values() for key, value in section.items()}
     flat["data_format"] = {key: flat.pop(key) for key in sections["lidar_data_format"]}
     for name, data in (("new", sections), ("old", flat)):
         (tmp_path / name).write_text(json.dumps(data))
-    new, old = read(tmp_path / "new"), read(tmp_path / "old")
+    new, old = read_unit(tmp_path / "new"), read_unit(tmp_path / "old")
     assert new.to_metadata() == old.to_metadata() == made.to_metadata()
     assert (
         OS1.configure(metadata=tmp_path / "old").configure(frame="vendor").frames["data"]
@@ -292,13 +294,13 @@ def test_older_and_newer_metadata_are_equivalent(tmp_path: Path) -> None:
 
 
 def test_keys_are_read_from_whichever_section_has_them(tmp_path: Path) -> None:
-    unit = dataclasses.replace(nominal("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=8)
+    unit = dataclasses.replace(make_nominal_unit("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=8)
     data = json.loads(unit.to_metadata())
     data["imu_data_format"] = {
         "imu_measurements_per_packet": data["lidar_data_format"].pop("imu_measurements_per_packet")
     }
     (tmp_path / "unit.json").write_text(json.dumps(data))
-    assert read(tmp_path / "unit.json").samples == 8
+    assert read_unit(tmp_path / "unit.json").samples == 8
 
 
 @pytest.mark.parametrize(
@@ -315,12 +317,12 @@ def test_missing_offsets_are_those_of_the_model_and_nominal(
     tmp_path: Path, product: str, distance_mm: float
 ) -> None:
     """The values that ouster-sdk takes (sensor_info.cpp, metadata.cpp)."""
-    data = json.loads(nominal("OS1", 16, 512, "LEGACY").to_metadata())
+    data = json.loads(make_nominal_unit("OS1", 16, 512, "LEGACY").to_metadata())
     data["sensor_info"]["prod_line"] = product
     del data["beam_intrinsics"]["beam_to_lidar_transform"]
     del data["lidar_intrinsics"]
     (tmp_path / "unit.json").write_text(json.dumps(data))
-    unit = read(tmp_path / "unit.json")
+    unit = read_unit(tmp_path / "unit.json")
     assert unit.nominal
     assert unit.beam[0, 3] == distance_mm
     assert unit.lidar.tolist() == [[-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 36.18], [0, 0, 0, 1]]
@@ -328,7 +330,7 @@ def test_missing_offsets_are_those_of_the_model_and_nominal(
 
 def test_imu_measurements_come_in_si_units() -> None:
     """Captured values of ACCEL32_GYRO32_NMEA are multiples of 9.80665/2048 and (pi/180)/16.4."""
-    unit = dataclasses.replace(nominal("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=2)
+    unit = dataclasses.replace(make_nominal_unit("OS1", 16, 512, "RNG15_RFL8_NIR8"), samples=2)
     sensor = OS1.configure(metadata=Learned(unit.to_metadata()))
     gravity = 2048 * 9.80665 / 2048
     rate = 164 * np.deg2rad(1) / 16.4
@@ -370,7 +372,9 @@ def test_metadata_that_cannot_be_are_refused_by_name(
 ) -> None:
     data = {
         key: value
-        for section in json.loads(nominal("OS1", 16, 512, "LEGACY").to_metadata()).values()
+        for section in json.loads(
+            make_nominal_unit("OS1", 16, 512, "LEGACY").to_metadata()
+        ).values()
         for key, value in section.items()
     }
     (tmp_path / "unit.json").write_text(json.dumps({**data, **change}))
