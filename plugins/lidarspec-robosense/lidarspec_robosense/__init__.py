@@ -15,6 +15,6 @@ from lidarspec_robosense.solid import E1, M2, MX
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The RoboSense sensors."""
+    """Return the RoboSense sensors."""
     rotating = [HELIOS_16P, HELIOS_32, HELIOS_5515, RS16, RS32, BPEARL, BPEARL_V4, AIRY]
     return [M1, *rotating, RS128, RS80, RS48, RUBY_PLUS_128, RUBY_PLUS_80, RUBY_PLUS_48, M2, MX, E1]

@@ -1,19 +1,18 @@
 """RoboSense Airy: rotating lidar of 96 lasers from the horizon to the zenith over UDP, with an IMU.
 
 Two blocks of 48 lasers share an azimuth, the first with the lower half of the lasers; with dual
-return two such pairs.
+return two such pairs do.
 
 Source: Airy user manual 1.3: Tables 8 to 13 and 32 (packets, angles, emission times), appendix C
-(registers of DIFOP); from the vendor's rs_driver (decoder_RSAIRY.hpp): the optical centre, where it
-differs by how the sensor stands when its lasers fire, the bits of a distance, dual return, the time
-in a packet of the IMU.
+(registers of DIFOP). From the vendor's rs_driver (decoder_RSAIRY.hpp): the optical centre, firing
+times that depend on how the sensor is mounted, the bits of a distance, dual return, and the time in
+a packet of the IMU.
 
-Contradictions: the manual's formula has x with the sine of the azimuth and the sensor turns towards
-y; rs_driver has x with its cosine
-and y with its sine turned round, as in all models, which is what stands here. Whether the integers
-of the IMU are big-endian nobody says: assumed, as all else is. Assumed too: the order of the blocks
-of dual return, which rs_driver reads by their places alone. Models of 48 and 192 lasers (bytes 1
-and 3) send other packets, and are refused.
+Contradictions: in the manual's formula x has the sine of the azimuth and the sensor turns towards
+y. In rs_driver x has its cosine and y its negative sine, as for all models; this module follows
+rs_driver. Assumed: the integers of the IMU are big-endian, as all others are; the order of blocks
+with dual return, which rs_driver derives from their position only. Models of 48 and 192 lasers
+(bytes 1 and 3) send other packets, which are not accepted.
 """
 
 from __future__ import annotations
@@ -51,51 +50,52 @@ from lidarspec.spec import (
     take,
 )
 from lidarspec_robosense.rotor import (
-    BLOCK,
+    BLOCK_FLAG,
     COMMON,
     DIFOP_HEAD,
     DIFOP_TAIL,
     DIFOP_TIME,
     DIFOP_UNIT,
+    FACTORY_SPEED_HZ,
     TEMPERATURE,
     TIME,
-    TURNS,
     Rotor,
-    angles,
-    beams,
     laser_degrees,
-    signs,
-    sweep,
+    make_angles,
+    make_points,
+    rotation_values,
+    split_angles,
     sweep_difop,
 )
 
-TYPE = 0x31
+AIRY_TYPE = 0x31
 MODEL_96 = 2
 DUAL = 3
 BLOCKS = 8
-HALF = 48
-IMU_RATE = 200  # a second, as delivered (manual 4.4.4)
+HALF_LASERS = 48
+IMU_RATE_HZ = 200  # factory setting (manual 4.4.4)
 GRAVITY = 9.80665
 
 
-def emission(*times: float) -> Any:
-    """(blocks, lasers) seconds at which groups of eight lasers fire, after the azimuth of a pair of
-    blocks.
+def make_firing_times(*times: float) -> Any:
+    """Return the seconds from the azimuth to each laser's firing, (blocks, lasers).
+
+    `times` are microseconds of groups of eight lasers in a pair of blocks.
     """
-    return np.tile(np.repeat(times, 8).reshape(2, HALF), (BLOCKS // 2, 1)) * 1e-6
+    return np.tile(np.repeat(times, 8).reshape(2, HALF_LASERS), (BLOCKS // 2, 1)) * 1e-6
 
 
-UPRIGHT = emission(
+UPRIGHT_DELAY_S = make_firing_times(
     0, 5.712, 12.376, 19.04, 25.704, 33.32, 41.888, 50.456, 59.024, 70.448, 81.872, 93.296
 )  # Table 32
-SIDEWAYS = emission(
+SIDEWAYS_DELAY_S = make_firing_times(
     0, 11.424, 22.848, 34.272, 45.696, 54.264, 62.832, 71.4, 79.016, 85.68, 92.344, 99.008
 )  # rs_driver
-AIRY_M = emission(
+AIRY_M_DELAY_S = make_firing_times(
     0, 7.616, 16.184, 24.752, 33.32, 42.84, 52.36, 61.88, 71.4, 79.968, 88.536, 97.104
 )  # rs_driver
 # fmt: off
-VERTICAL = np.array([  # Table 32
+ELEVATION_DEG = np.array([  # Table 32
     -0.07, 0.88, 1.81, 2.76, 3.69, 4.62, 5.54, 6.48, 7.41, 8.34, 9.27, 10.21, 11.15, 12.09, 13.03, 13.98, 14.92, 15.87, 16.82, 17.77, 18.72,
     19.67, 20.62, 21.57, 22.51, 23.45, 24.4, 25.33, 26.28, 27.21, 28.15, 29.08, 30.02, 30.95, 31.88, 32.82, 33.74, 34.68, 35.62, 36.55,
     37.5, 38.43, 39.37, 40.31, 41.25, 42.21, 43.16, 44.09, 45.05, 46.0, 46.95, 47.9, 48.85, 49.8, 50.73, 51.69, 52.62, 53.56, 54.5, 55.45,
@@ -104,11 +104,11 @@ VERTICAL = np.array([  # Table 32
 ])
 # fmt: on
 ROTOR = Rotor(
-    delay=UPRIGHT,
+    delay=UPRIGHT_DELAY_S,
     period=111.08e-6,
     lens=float(np.hypot(0.0075, 0.00664)),
     height=0.04532,
-    vertical=VERTICAL,
+    vertical=ELEVATION_DEG,
 )
 
 ECHO = BitStruct(
@@ -124,7 +124,7 @@ DATA = Struct(
     "reserved_18" / Bytes(2),
     *TIME,
     "reserved_30" / Bytes(1),
-    "lidar_type" / Const(TYPE, Int8ub) * "0x31 Airy",
+    "lidar_type" / Const(AIRY_TYPE, Int8ub) * "0x31 Airy",
     "lidar_model" / Const(MODEL_96, Int8ub) * "1 48 lasers, 2 96 lasers, 3 192 lasers",
     "reserved_33" / Bytes(5),
     "temperature" / TEMPERATURE,
@@ -133,11 +133,11 @@ DATA = Struct(
     / Array(
         BLOCKS,
         Struct(
-            "flag" / BLOCK,
+            "flag" / BLOCK_FLAG,
             "azimuth"
             / Scaled(Int16ub, 0.01, "deg")
             * "angle of the rotor, clockwise, at the first laser of a pair of blocks",
-            "channels" / Array(HALF, Struct("echo" / ECHO, "intensity" / Int8ub)),
+            "channels" / Array(HALF_LASERS, Struct("echo" / ECHO, "intensity" / Int8ub)),
         ),
     ),
     "tail" / Bytes(6) * "reserved, and 00 FF",
@@ -155,10 +155,10 @@ DIFOP = Struct(
     "reserved_313" / Bytes(60),
     "measured_rpm" / Scaled(Int16ub, 1, "rpm"),
     "reserved_375" / Bytes(93),
-    "vertical_low" / angles(HALF),
-    "vertical_high" / angles(HALF),
-    "horizontal_low" / angles(HALF),
-    "horizontal_high" / angles(HALF),
+    "vertical_low" / make_angles(HALF_LASERS),
+    "vertical_high" / make_angles(HALF_LASERS),
+    "horizontal_low" / make_angles(HALF_LASERS),
+    "horizontal_high" / make_angles(HALF_LASERS),
     "board_voltage" / Scaled(Int16ub, 0.01, "V"),
     "reserved_1046" / Bytes(20),
     "voltage" / Scaled(Int16ub, 0.01, "V"),
@@ -188,31 +188,35 @@ IMU = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Azimuths below 360 degrees."""
+    """Return whether azimuths are below 360 degrees."""
     return f.blocks.azimuth < 360
 
 
-def plausible_imu(f: Fields) -> Any:
-    """Known ranges."""
+def is_plausible_imu(f: Fields) -> Any:
+    """Return whether ranges and data rate are known."""
     return (f.acceleration_range <= 3) & (f.rotation_range <= 3) & (f.data_rate <= 4)
 
 
 def points(f: Fields) -> Polar:
-    """96 lasers in pairs of blocks, the upper half in the second."""
+    """Return the points of 96 lasers in pairs of blocks, the upper half in the second."""
     azimuth = f.blocks.azimuth
     block = f.blocks.index
     difop = f.state.difop
     dual = f.returns == DUAL
-    low = f.blocks.index % 2 == 0
+    is_lower_half = f.blocks.index % 2 == 0
     ahead = np.where(dual, following(azimuth, 4), following(azimuth, 2))
-    vertical = np.where(low, laser_degrees(difop.vertical_low), laser_degrees(difop.vertical_high))
+    vertical = np.where(
+        is_lower_half, laser_degrees(difop.vertical_low), laser_degrees(difop.vertical_high)
+    )
     horizontal = np.where(
-        low, laser_degrees(difop.horizontal_low), laser_degrees(difop.horizontal_high)
+        is_lower_half, laser_degrees(difop.horizontal_low), laser_degrees(difop.horizontal_high)
     )
     delay = np.where(
-        difop.install_mode == 1, SIDEWAYS, np.where(difop.install_mode == 2, AIRY_M, UPRIGHT)
+        difop.install_mode == 1,
+        SIDEWAYS_DELAY_S,
+        np.where(difop.install_mode == 2, AIRY_M_DELAY_S, UPRIGHT_DELAY_S),
     )
-    polar = beams(
+    polar = make_points(
         f,
         f.blocks.channels,
         ROTOR,
@@ -223,45 +227,49 @@ def points(f: Fields) -> Polar:
         shot=np.where(dual, block // 4, block // 2),
         echo=np.where(dual, block // 2 % 2, 0),
         distance=f.blocks.channels.echo.distance,
-        ring=np.arange(2 * HALF).reshape(2, HALF)[np.arange(BLOCKS) % 2],
+        ring=np.arange(2 * HALF_LASERS).reshape(2, HALF_LASERS)[np.arange(BLOCKS) % 2],
     )
     return dataclasses.replace(polar, extra={"feature": f.blocks.channels.echo.feature})
 
 
 def imu(f: Fields) -> Imu:
-    """Steps of a range that the packet names, 32768 of them (manual, Table 13)."""
-    force = take(GRAVITY * np.array([2, 4, 8, 16]) / 32768, f.acceleration_range)
-    rate = take(np.deg2rad(np.array([250, 500, 1000, 2000]) / 32768), f.rotation_range)
+    """Return the IMU sample; a step is 1/32768 of the range in the packet (Table 13)."""
+    acceleration_step = take(GRAVITY * np.array([2, 4, 8, 16]) / 32768, f.acceleration_range)
+    rotation_step = take(np.deg2rad(np.array([250, 500, 1000, 2000]) / 32768), f.rotation_range)
     return Imu(
-        (f.rotation_x * rate, f.rotation_y * rate, f.rotation_z * rate),
-        (f.acceleration_x * force, f.acceleration_y * force, f.acceleration_z * force),
+        (f.rotation_x * rotation_step, f.rotation_y * rotation_step, f.rotation_z * rotation_step),
+        (
+            f.acceleration_x * acceleration_step,
+            f.acceleration_y * acceleration_step,
+            f.acceleration_z * acceleration_step,
+        ),
     )
 
 
 def sweep_data(i: int) -> dict[str, Any]:
-    """Packet i: four azimuths, of two blocks each."""
-    values = sweep(i, BLOCKS // 2, ROTOR.period, packet_count=i % (1 << 32))
+    """Return the values of simulated packet i: four azimuths, of two blocks each."""
+    values = rotation_values(i, BLOCKS // 2, ROTOR.period, packet_count=i % (1 << 32))
     return {**values, "blocks.azimuth": np.repeat(values["blocks.azimuth"], 2)}
 
 
 def sweep_imu(i: int) -> dict[str, Any]:
-    """Sample i of an IMU with the ranges as delivered."""
+    """Return the values of IMU sample i, with the factory's ranges."""
     codes = {"data_rate": 3, "acceleration_range": 1, "rotation_range": 1}
     return {
-        "seconds": i // IMU_RATE,
-        "microseconds": i % IMU_RATE / IMU_RATE,
+        "seconds": i // IMU_RATE_HZ,
+        "microseconds": i % IMU_RATE_HZ / IMU_RATE_HZ,
         "count": (i + 1) % (1 << 32),
         **codes,
     }
 
 
-LOW, HIGH = np.split(VERTICAL, 2)
-NONE = np.zeros(HALF)
-STATE = {
-    **signs("vertical_low", LOW),
-    **signs("vertical_high", HIGH),
-    **signs("horizontal_low", NONE),
-    **signs("horizontal_high", NONE),
+LOWER_HALF, UPPER_HALF = np.split(ELEVATION_DEG, 2)
+NO_OFFSETS = np.zeros(HALF_LASERS)
+DEFAULT_ANGLES = {
+    **split_angles("vertical_low", LOWER_HALF),
+    **split_angles("vertical_high", UPPER_HALF),
+    **split_angles("horizontal_low", NO_OFFSETS),
+    **split_angles("horizontal_high", NO_OFFSETS),
 }
 
 AIRY = Sensor(
@@ -273,12 +281,15 @@ AIRY = Sensor(
             DIFOP, simulation=Simulation(partial(sweep_difop, speed="measured_rpm"), rate=1)
         ),
         "imu": Frame(
-            IMU, imu=imu, plausible=plausible_imu, simulation=Simulation(sweep_imu, rate=IMU_RATE)
+            IMU,
+            imu=imu,
+            plausible=is_plausible_imu,
+            simulation=Simulation(sweep_imu, rate=IMU_RATE_HZ),
         ),
     },
     points=points,
     sequence=Sequence("packet_count"),
-    state={"difop": {"rpm": TURNS * 60, "install_mode": 0, **STATE}},
+    state={"difop": {"rpm": FACTORY_SPEED_HZ * 60, "install_mode": 0, **DEFAULT_ANGLES}},
     simulation=Simulation(sweep_data),
     range_limits=(0.1, 60.0),  # Table 1
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware"},
@@ -286,5 +297,9 @@ AIRY = Sensor(
         "Airy user manual 1.3, chapter 4.4 and appendices C and D; rs_driver"
         " (decoder_RSAIRY.hpp); not tested with packets"
     ),
-    **{**COMMON, "links": {"data": Udp(6699, 7788, 6688)}, "turn": (TURNS, TURNS)},
+    **{
+        **COMMON,
+        "links": {"data": Udp(6699, 7788, 6688)},
+        "turn": (FACTORY_SPEED_HZ, FACTORY_SPEED_HZ),
+    },
 )

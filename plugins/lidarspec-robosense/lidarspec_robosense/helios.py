@@ -1,25 +1,26 @@
-"""RoboSense RS-Helios: rotating lidars of 16 and of 32 lasers over UDP; their own angles come with
-the device information (DIFOP).
+"""RoboSense RS-Helios: rotating lidars of 16 and of 32 lasers over UDP.
+
+A unit's own angles come with the device information (DIFOP).
 
 Source: RS-Helios-16P user manual: 5.4.2 (return modes), 6.2 and Table 9 (MSOP), 6.3 and Table 11
 (DIFOP), appendix B.3 to B.13 (registers). From the vendor's rs_driver (decoder_RSHELIOS.hpp,
-decoder_RSHELIOS_16P.hpp): coordinates, optical centre, temperature, where the horizontal angles
-stand, the times of 32 lasers. From nebula's former decoder of the 16P: the times of its lasers, by
-which the azimuths of the point clouds that it published come out to their last digit.
+decoder_RSHELIOS_16P.hpp): coordinates, optical centre, temperature, offset of the horizontal
+angles, the times of 32 lasers. From nebula's former decoder of the 16P: the times of its lasers,
+which reproduce the azimuths of its published point clouds to the last digit.
 
 Known errors and contradictions: the manual's worked distance, 320 steps of 0.25 cm, is printed as 8
 m and is 0.8 m; its vertical angle 00 05 d6, printed as 14.95 degrees, is 14.94, and its horizontal
-one, 01 01 96, needs brackets (-4.06); appendix B.13 has nanoseconds in the second part of a time,
-Table 9 and the capture have microseconds; the manual of the Helios-1610 has the type at byte 31,
-rs_driver and the capture at 30. rs_driver gives the second firing of a 16P 27.68 us after the first
-one; the manual's azimuth in between (half the step) and about 100 us from block to block ask for
-55.56 us. The times of 32 lasers are rs_driver's, 1.73 us apart; nebula has the 16P's and other
-ones, up to 48 us.
+one, 01 01 96, needs brackets (-4.06). Appendix B.13 has nanoseconds in the second part of a time,
+Table 9 and the capture have microseconds. The manual of the Helios-1610 has the type at byte 31,
+rs_driver and the capture at 30. In rs_driver the second firing of a 16P is 27.68 us after the
+first; the manual's azimuth in between (half the step) and about 100 us from block to block require
+55.56 us. The times of 32 lasers are rs_driver's, 1.73 us apart; nebula has the 16P's and others, up
+to 48 us.
 
-The published capture under the 16P's name says type 6, Helios-5515, and its DIFOP has 32 different
-angles, at single return: it is of a 5515. Read as 16P, as it was published, the second half of each
-block gets directions that its lasers did not have, and the times of a packet run twice as long as
-it took.
+The published capture named after the 16P has type 6, Helios-5515, and its DIFOP has 32 different
+angles, at single return: it is of a 5515. Decoded as 16P, as it was published, the second half of
+each block gets directions of the wrong lasers, and the times of a packet take twice as long as the
+packet.
 """
 
 from __future__ import annotations
@@ -39,16 +40,16 @@ from lidarspec_robosense.rotor import (
     DIFOP_TIME,
     DIFOP_UNIT,
     DIFOP_VERSIONS,
+    FACTORY_SPEED_HZ,
     TEMPERATURE,
     TIME,
-    TURNS,
     Rotor,
-    angles,
-    blocks,
-    directions,
-    halves,
-    pairs,
-    sweep,
+    laser_angles,
+    make_angles,
+    make_blocks,
+    points_of_firings,
+    points_of_groups,
+    rotation_values,
     sweep_difop,
 )
 
@@ -56,11 +57,11 @@ BLOCKS = 12
 LASERS = 32
 DUAL = 0
 STRONGEST = 4  # return modes (manual 5.4.2)
-PERIOD = 55.56e-6  # seconds from one firing of all lasers to the next (rs_driver, nebula)
+FIRING_PERIOD_S = 55.56e-6  # from one firing of all lasers to the next (rs_driver, nebula)
 TYPE_5515 = 6
-TYPE_1615 = 7  # of the 16P too
-#: microseconds from the start of a firing to each laser of a 16P (nebula's decoder).
-TIMES_16P = (
+TYPE_1615 = 7  # and 16P
+#: Microseconds from the start of a firing to each laser of a 16P (nebula's decoder).
+TIMES_16P_US = (
     0,
     3.15,
     6.3,
@@ -78,31 +79,31 @@ TIMES_16P = (
     41.42,
     43.91,
 )
-#: degrees; those of a captured unit's DIFOP, in steps of a third of a degree.
-VERTICAL_5515 = (
+#: Elevations of a captured unit's DIFOP, in steps of a third of a degree.
+ELEVATION_5515_DEG = (
     *(15, 13, 11, 9, 7, 5.5, 4, 2.67, 1.33, 0, -1.33, -2.67, -4, -5.33, -6.67, -8),
     *(-10, -16, -13, -19, -22, -28, -25, -31, -34, -37, -40, -43, -46, -49, -52, -55),
 )
 
 HELIOS_16P_ROTOR = Rotor(
-    delay=np.array(TIMES_16P) * 1e-6,
-    period=PERIOD,
+    delay=np.array(TIMES_16P_US) * 1e-6,
+    period=FIRING_PERIOD_S,
     lens=0.03498,
-    vertical=15.0
-    - 2
-    * np.arange(
-        16
-    ),  # assumed: the topmost laser first, 2 degrees apart over the model's 30 degrees
+    # assumed: the topmost laser first, 2 degrees apart over the model's 30 degrees
+    vertical=15.0 - 2 * np.arange(16),
 )
 HELIOS_5515_ROTOR = Rotor(
-    delay=np.arange(LASERS) * 1.73e-6, period=PERIOD, lens=0.03498, vertical=np.array(VERTICAL_5515)
+    delay=np.arange(LASERS) * 1.73e-6,
+    period=FIRING_PERIOD_S,
+    lens=0.03498,
+    vertical=np.array(ELEVATION_5515_DEG),
 )
 # assumed: the topmost laser first, 1 degree apart over the model's 31 degrees
 HELIOS_32_ROTOR = dataclasses.replace(HELIOS_5515_ROTOR, vertical=15.0 - np.arange(LASERS))
 
 
-def packet(rows: Construct) -> Struct:
-    """Return a data packet with these blocks."""
+def make_packet(rows: Construct) -> Struct:
+    """Return the struct of a data packet with these blocks."""
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x5a"),
         "protocol_version" / Int16ub * "0 old, 1 latest",
@@ -122,8 +123,8 @@ def packet(rows: Construct) -> Struct:
     )
 
 
-#: Table 11: what stands from byte 313 on; the 16P has angles of 16 lasers and reserved bytes where
-#: others have those of 17 to 32.
+#: Bytes from 313 on (Table 11). The 16P has angles of 16 lasers, and reserved bytes in place of the
+#: angles of lasers 17 to 32.
 STATUS: tuple[Construct, ...] = (
     "operating_status" / Bytes(12) * "current and voltages: input, 12 V, 5 V, 2.5 V, APD",
     "reserved_325" / Bytes(17),
@@ -137,66 +138,71 @@ STATUS: tuple[Construct, ...] = (
 )
 DIFOP_START = (*DIFOP_HEAD, *DIFOP_VERSIONS, *DIFOP_UNIT, *DIFOP_TIME, *STATUS)
 DIFOP_END = ("reserved_660" / Bytes(586), DIFOP_TAIL)
-OTHERS = Bytes(48) * "values of lasers 17 to 32 in other models"
+OTHER_LASERS = Bytes(48) * "values of lasers 17 to 32 in other models"
 DIFOP_16 = Struct(
     *DIFOP_START,
-    "vertical" / angles(16),
-    "reserved_516" / OTHERS,
-    "horizontal" / angles(16),
-    "reserved_612" / OTHERS,
+    "vertical" / make_angles(16),
+    "reserved_516" / OTHER_LASERS,
+    "horizontal" / make_angles(16),
+    "reserved_612" / OTHER_LASERS,
     *DIFOP_END,
 )
 DIFOP_32 = Struct(
-    *DIFOP_START, "vertical" / angles(LASERS), "horizontal" / angles(LASERS), *DIFOP_END
+    *DIFOP_START, "vertical" / make_angles(LASERS), "horizontal" / make_angles(LASERS), *DIFOP_END
 )
 
 
 def plausible(f: Fields) -> Any:
-    """Azimuths below 360 degrees (manual 6.2.2.2)."""
+    """Return whether azimuths are below 360 degrees (manual 6.2.2.2)."""
     return f.blocks.azimuth < 360
 
 
 def points_16p(f: Fields) -> Polar:
-    """Two firings in a block; lasers are numbered as in it."""
-    polar = halves(f, f.state.difop.return_mode == DUAL, HELIOS_16P_ROTOR, directions(f))
+    """Return the points of blocks with two firings; rings are in the order of a block."""
+    polar = points_of_groups(
+        f, f.state.difop.return_mode == DUAL, HELIOS_16P_ROTOR, laser_angles(f)
+    )
     return dataclasses.replace(polar, range=scale_range(f, polar), ring=np.arange(16))
 
 
 def points_32(f: Fields, model: Rotor) -> Polar:
-    """One firing in a block."""
-    polar = pairs(f, f.state.difop.return_mode == DUAL, model)
+    """Return the points of blocks with one firing."""
+    polar = points_of_firings(f, f.state.difop.return_mode == DUAL, model)
     return dataclasses.replace(polar, range=scale_range(f, polar))
 
 
 def scale_range(f: Fields, polar: Polar) -> Any:
-    """Metres, by the step that the header says."""
+    """Return ranges in metres, by the step in the header."""
     return polar.range * np.where(f.range_resolution == 0, 2, 1)
 
 
 def sweep_data(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
-    """Packet i, of blocks that take so many firings each."""
+    """Return the values of simulated packet i, with `shots` firings per block."""
     counts = {"protocol_version": 1, "bottom_packet_count": i % (1 << 32), "range_resolution": 1}
-    return sweep(i, BLOCKS, shots * PERIOD, lidar_type=lidar_type, **counts)
+    return rotation_values(i, BLOCKS, shots * FIRING_PERIOD_S, lidar_type=lidar_type, **counts)
 
 
-def in_pairs(f: Fields) -> Any:
-    """Return whether blocks have one azimuth: the two returns of 32 lasers."""
+def has_block_pairs(f: Fields) -> Any:
+    """Return whether two blocks have one azimuth: two returns of 32 lasers."""
     return f.blocks[0].azimuth == f.blocks[1].azimuth
 
 
-def two_returns(f: Fields) -> Any:
-    """Whether the halves of most blocks are the same: the two returns of 16 lasers, where most have
-    one echo.
+def has_equal_halves(f: Fields) -> Any:
+    """Return whether the halves of most blocks are equal.
+
+    These are two returns of 16 lasers, which are equal for beams with one echo.
     """
     distance = np.asarray(f.blocks.channels.distance)
-    one = distance[..., :16]
-    other = distance[..., 16:]
-    return (one == other).sum(axis=(1, 2)) > ((one != other) | (one == 0)).sum(axis=(1, 2))
+    first = distance[..., :16]
+    second = distance[..., 16:]
+    return (first == second).sum(axis=(1, 2)) > ((first != second) | (first == 0)).sum(axis=(1, 2))
 
 
 DIFOP_SIMULATION = Simulation(partial(sweep_difop, speed="measured_rpm"), rate=1)
-PACKET_32 = Frame(packet(blocks(BLOCKS, LASERS, 0.0025)), data=True, plausible=plausible)
-INFORMATION_32 = Frame(DIFOP_32, simulation=DIFOP_SIMULATION)
+DATA_FRAME_32 = Frame(
+    make_packet(make_blocks(BLOCKS, LASERS, 0.0025)), data=True, plausible=plausible
+)
+DIFOP_FRAME_32 = Frame(DIFOP_32, simulation=DIFOP_SIMULATION)
 MODEL_5515 = Relative("type 6, Helios-5515", lambda f: f.lidar_type == TYPE_5515)
 NOT_5515 = Relative("type other than 6", lambda f: f.lidar_type != TYPE_5515)
 
@@ -205,17 +211,17 @@ HELIOS_16P = Sensor(
     model="RS-Helios-16P",
     frames={
         "data": Frame(
-            packet(blocks(BLOCKS, 16, 0.0025, firings=2)), data=True, plausible=plausible
+            make_packet(make_blocks(BLOCKS, 16, 0.0025, firings=2)), data=True, plausible=plausible
         ),
         "difop": Frame(DIFOP_16, simulation=DIFOP_SIMULATION),
     },
     points=points_16p,
     sequence=Sequence("bottom_packet_count"),
-    state=HELIOS_16P_ROTOR.state(return_mode=STRONGEST),
+    state=HELIOS_16P_ROTOR.make_default_state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep_data, shots=2, lidar_type=TYPE_1615)),
     range_limits=(0.1, 180.0),  # rs_driver's limits for this model
-    # firmware: the first of three boards in Table 11; the temperature has its sign in a field of
-    # its own
+    # firmware: that of the first of three boards in Table 11; no temperature, because its sign is
+    # in a separate field
     info={
         "serial": "difop.serial_number",
         "firmware": "difop.top_firmware",
@@ -224,28 +230,32 @@ HELIOS_16P = Sensor(
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios32": Relative(
-            "pairs of blocks with one azimuth; or one packet every 0.67 ms", in_pairs
+            "pairs of blocks with one azimuth; or one packet every 0.67 ms", has_block_pairs
         ),
     },
     source=(
         "RS-Helios-16P user manual, 5.4, 6.2, 6.3 and appendix B; rs_driver; capture and"
         " point clouds of nebula"
     ),
-    **{**COMMON, "turn": (TURNS, 20.0), "status": "capture"},  # 600 and 1200 rpm (manual B.1)
+    **{
+        **COMMON,
+        "turn": (FACTORY_SPEED_HZ, 20.0),
+        "status": "capture",
+    },  # 600 and 1200 rpm (manual B.1)
 )
 
 HELIOS_32 = dataclasses.replace(
     HELIOS_16P,
     id="robosense-helios32",
     model="RS-Helios-1615",
-    frames={"data": PACKET_32, "difop": INFORMATION_32},
+    frames={"data": DATA_FRAME_32, "difop": DIFOP_FRAME_32},
     points=partial(points_32, model=HELIOS_32_ROTOR),
-    state=HELIOS_32_ROTOR.state(return_mode=STRONGEST),
+    state=HELIOS_32_ROTOR.make_default_state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_1615)),
     relatives={
         "robosense-helios5515": MODEL_5515,
         "robosense-helios16p": Relative(
-            "equal halves of blocks; or one packet every 1.33 ms", two_returns
+            "equal halves of blocks; or one packet every 1.33 ms", has_equal_halves
         ),
     },
     status="manual",
@@ -260,7 +270,7 @@ HELIOS_5515 = dataclasses.replace(
     id="robosense-helios5515",
     model="RS-Helios-5515",
     points=partial(points_32, model=HELIOS_5515_ROTOR),
-    state=HELIOS_5515_ROTOR.state(return_mode=STRONGEST),
+    state=HELIOS_5515_ROTOR.make_default_state(return_mode=STRONGEST),
     simulation=Simulation(partial(sweep_data, shots=1, lidar_type=TYPE_5515)),
     relatives={"robosense-helios16p": NOT_5515, "robosense-helios32": NOT_5515},
     status="capture",

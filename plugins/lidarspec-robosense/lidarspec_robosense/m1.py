@@ -1,22 +1,22 @@
-"""RoboSense RS-LiDAR-M1 and M1 Plus: solid-state lidars of five channels over UDP; every point
-carries its own angles.
+"""RoboSense RS-LiDAR-M1 and M1 Plus: solid-state lidars of five channels over UDP.
 
-Both send the same packets, and nothing in them tells the two apart.
+Each point contains its own angles. Both models send the same packets, which do not contain the
+model.
 
 Source: RS-LiDAR-M1 user guide, 2.1.2 and Table 5 (the data blocks); RS-LiDAR-M1P user guide, pages
 9 to 14 (header, tail, formulas, worked example), with which the vendor's rs_driver agrees.
 
 Known errors and gaps of the guides: the time of a group of points is printed as "titime_offset",
-and is the packet's timestamp plus time_offset; the offset 32768 of the angles stands on the M1P's
-next page only; z of the worked example is printed as 2.17 and is 2.1647; the formula raw - 80 of
+and is the packet's timestamp plus time_offset; the offset 32768 of the angles is only on the M1P's
+next page; z of the worked example is printed as 2.17 and is 2.1647; the formula raw - 80 of
 mems_tmp gives -46 degC for the guide's own capture, so the raw byte is kept; 750 000 points per
 second do not agree with 630 packets in a frame (787 500).
 
-DIFOP has three layouts from byte 28 on, and no number says which: that of rs_driver since December
-2023 (`difop`), that of the driver before, with the field of view (`difop_fov`), and that of the M1P
-user guide (`difop_guide`). The one in which return mode, kind and state of the synchronisation and
-microseconds are what they can be is taken, in this order; where none is, what stands there is
-`difop_other`.
+DIFOP has three layouts from byte 28 on, without a number that identifies them: that of rs_driver
+since December 2023 (`difop`), that of the driver before, with the field of view (`difop_fov`), and
+that of the M1P user guide (`difop_guide`). A packet is read by the first of these layouts with
+possible values of return mode, synchronisation mode and status, and microseconds. If none fits, it
+is `difop_other`.
 """
 
 from __future__ import annotations
@@ -55,12 +55,13 @@ from lidarspec_robosense.rotor import TIME
 
 BLOCKS = 25
 CHANNELS = 5
-SINGLE = 630
-DUAL = 1260  # packets of a frame (rs_driver; M1P user guide: the counter restarts with each frame)
-FRAME_RATE = 10  # Hz (M1P user guide, page 6)
-FIRING = 10e-6 / 3  # seconds between blocks: 0, 3, 7, 10, 13, 17 us in the M1P guide's capture
-OFFSETS = np.round(np.arange(BLOCKS) * FIRING, 6)  # seconds, as the sensor rounds them
-LINE = 125  # firings of a line in `sweep`, which makes 126 lines 0.2 degrees apart
+# Packets per frame (rs_driver; M1P user guide: the counter restarts with each frame)
+SINGLE_RETURN_PACKETS = 630
+DUAL_RETURN_PACKETS = 1260
+FRAME_RATE_HZ = 10  # M1P user guide, page 6
+BLOCK_PERIOD_S = 10e-6 / 3  # the M1P guide's capture has blocks at 0, 3, 7, 10, 13, 17 us
+BLOCK_OFFSETS_S = np.round(np.arange(BLOCKS) * BLOCK_PERIOD_S, 6)  # rounded as by the sensor
+SIMULATED_LINE_FIRINGS = 125  # per line, which gives 126 lines 0.2 degrees apart
 
 HEADER: tuple[Construct, ...] = (
     "magic" / Const(b"\x55\xaa\x5a\xa5"),
@@ -97,7 +98,7 @@ DATA = Struct(
     "tail" / Bytes(3) * "reserved",
 )
 
-#: the first 28 bytes of every DIFOP.
+#: The first 28 bytes of every DIFOP.
 DIFOP_HEAD: tuple[Construct, ...] = (
     "magic" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
     "reserved_8" / Bytes(1),
@@ -116,7 +117,7 @@ MODES: tuple[Construct, ...] = (
     *TIME,
     "in_range" / Check((this.microseconds < 1_000_000) & (this.seconds < 2**36)),
 )
-VIEW = tuple(
+FOV_FIELDS = tuple(
     f"{way}_{end}" / Scaled(Int16ub, 0.01, "deg")
     for way in ("horizontal", "vertical")
     for end in ("start", "end")
@@ -127,9 +128,11 @@ POWER = (
     "reserved_power" / Bytes(50),
 )
 CALIBRATION = "calibration" / Array(20, Struct("sign" / Int8ub, "value" / Int16ub))
-RECENT = ("serial_number" / Bytes(6), *MODES, *POWER, CALIBRATION)
-DIFOP = Struct(*DIFOP_HEAD, *FIRMWARE, *RECENT, "reserved_end" / Bytes(79))
-DIFOP_FOV = Struct(*DIFOP_HEAD, *VIEW, *FIRMWARE, *RECENT, "reserved_end" / Bytes(71))
+RS_DRIVER_FIELDS = ("serial_number" / Bytes(6), *MODES, *POWER, CALIBRATION)
+DIFOP = Struct(*DIFOP_HEAD, *FIRMWARE, *RS_DRIVER_FIELDS, "reserved_end" / Bytes(79))
+DIFOP_FOV = Struct(
+    *DIFOP_HEAD, *FOV_FIELDS, *FIRMWARE, *RS_DRIVER_FIELDS, "reserved_end" / Bytes(71)
+)
 DIFOP_GUIDE = Struct(
     *DIFOP_HEAD,
     *FIRMWARE,
@@ -144,18 +147,18 @@ DIFOP_OTHER = Struct(*DIFOP_HEAD, "rest" / Bytes(228))
 
 
 def plausible(f: Fields) -> Any:
-    """Return the counter starts at 1 (M1P user guide, header)."""
+    """Return whether the counter is at least 1 (M1P user guide, header)."""
     return f.pkt_psn >= 1
 
 
 def packets_per_frame(f: Fields) -> Any:
     """Return the last number of the counter; only wave mode 0 is dual return."""
-    return np.where(f.wave_mode == 0, DUAL, SINGLE)
+    return np.where(f.wave_mode == 0, DUAL_RETURN_PACKETS, SINGLE_RETURN_PACKETS)
 
 
 def pace(f: Fields) -> Any:
     """Return the seconds from a packet to the next."""
-    return 1 / (FRAME_RATE * packets_per_frame(f))
+    return 1 / (FRAME_RATE_HZ * packets_per_frame(f))
 
 
 def points(f: Fields) -> Polar:
@@ -176,26 +179,27 @@ def points(f: Fields) -> Polar:
 
 
 @functools.cache
-def looking(number: int) -> tuple[Any, Any]:
-    """Elevation and azimuth in degrees, (25, 5), in a packet of this number, counted from 0, of a
-    frame with single return.
+def simulated_angles(number: int) -> tuple[Any, Any]:
+    """Return elevation and azimuth in degrees, (25, 5), of a simulated packet.
 
-    Lines from +12.5 to -12.5 degrees, to and fro over a fifth of 120 degrees.
-    Source: field of view, number of packets and where the channels look are the guide's; the lines
-    are assumed.
+    Each channel scans a fifth of 120 degrees, forth and back, in lines from +12.5 to -12.5 degrees.
+    `number` counts the packets of a frame from 0, with single return.
+
+    Source: field of view, number of packets and directions of the channels are the guide's; the
+    lines are assumed.
     """
-    line, spot = np.divmod(number * BLOCKS + np.arange(BLOCKS), LINE)
-    across = (spot + 0.5) / LINE - 0.5
+    line, firing = np.divmod(number * BLOCKS + np.arange(BLOCKS), SIMULATED_LINE_FIRINGS)
+    across = (firing + 0.5) / SIMULATED_LINE_FIRINGS - 0.5
     azimuth = np.where(line % 2, across, -across)[:, None] * 24 + np.array([48, 24, 0, -24, -48])
-    elevation = 12.5 - 25 * line / (SINGLE * BLOCKS // LINE - 1)
+    elevation = 12.5 - 25 * line / (SINGLE_RETURN_PACKETS * BLOCKS // SIMULATED_LINE_FIRINGS - 1)
     return np.repeat(elevation[:, None], CHANNELS, axis=1), azimuth
 
 
 def sweep(i: int) -> dict[str, Any]:
-    """Packet i of frames with single return."""
-    number = i % SINGLE
-    time = i / (SINGLE * FRAME_RATE)
-    elevation, azimuth = looking(number)
+    """Return the values of simulated packet i with single return."""
+    number = i % SINGLE_RETURN_PACKETS
+    time = i / (SINGLE_RETURN_PACKETS * FRAME_RATE_HZ)
+    elevation, azimuth = simulated_angles(number)
     return {
         "pkt_psn": number + 1,
         "protocol_version": 0,
@@ -205,7 +209,7 @@ def sweep(i: int) -> dict[str, Any]:
         "microseconds": time % 1,
         "lidar_type": 0x10,
         "mems_tmp": 105,
-        "blocks.time_offset": OFFSETS,
+        "blocks.time_offset": BLOCK_OFFSETS_S,
         "blocks.channels.elevation": elevation,
         "blocks.channels.azimuth": azimuth,
     }
@@ -221,7 +225,13 @@ def sweep_difop(i: int) -> dict[str, Any]:
         "seconds": i,
         "microseconds": 0,
     }
-    return {"frame_rate": FRAME_RATE, "msop_port": 6699, "difop_port": 7788, **addresses, **modes}
+    return {
+        "frame_rate": FRAME_RATE_HZ,
+        "msop_port": 6699,
+        "difop_port": 7788,
+        **addresses,
+        **modes,
+    }
 
 
 M1 = Sensor(
@@ -230,7 +240,7 @@ M1 = Sensor(
     model="RS-LiDAR-M1, M1 Plus",
     frames={
         "data": Frame(DATA, data=True, plausible=plausible),
-        # one a second (M1 user guide); an M1P sends 10
+        # 1 packet a second (M1 user guide); an M1P sends 10
         "difop": Frame(DIFOP, simulation=Simulation(sweep_difop, rate=1)),
         "difop_fov": Frame(DIFOP_FOV, simulation=Simulation(sweep_difop)),
         "difop_guide": Frame(DIFOP_GUIDE, simulation=Simulation(sweep_difop)),
@@ -244,7 +254,7 @@ M1 = Sensor(
     simulation=Simulation(sweep),
     range_limits=(0.2, 200.0),  # rs_driver's limits for this model
     vendor_axes=("forward", "left", "up"),
-    turn=(FRAME_RATE, FRAME_RATE),
+    turn=(FRAME_RATE_HZ, FRAME_RATE_HZ),
     info={"serial": "difop.serial_number", "firmware": "difop.pl_firmware"},
     status="vectors",
     source=(

@@ -1,15 +1,14 @@
-"""What the rotating lidars have in common: clocks, temperatures, DIFOP in three layouts, and lasers
-beside the direction of a rotor.
+"""Common parts of the rotating lidars: clocks, temperatures, DIFOP, and points of a rotor.
 
-DIFOP tells the speed as set, the return mode and the angles of each laser of the unit. Its first
-layout is that of RS-LiDAR-16, -32 and RS-Bpearl, the second that of Helios; the Ruby family has the
-head of the second and the tail of the first, for 128 lasers.
+DIFOP contains the set speed, the return mode and the unit's angles of each laser, in three layouts:
+the first is that of RS-LiDAR-16, -32 and RS-Bpearl, the second that of Helios; the Ruby family has
+the beginning of the second and the end of the first, for 128 lasers.
 
 Source: the vendor's rs_driver (decoder.hpp, decoder_mech.hpp, block_iterator.hpp: layouts,
-geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (what its second layout
-holds). That a DIFOP packet comes once a second: Airy manual, Table 8; assumed of the others.
+geometry, time, gaps); RS-Helios-16P user manual, Table 11 and appendix B (fields of the second
+layout); Airy manual, Table 8 (one DIFOP packet a second, assumed for the other models).
 
-Not expressed: with a field of view set, blocks after the gap are later than a packet's times say.
+Not supported: if a field of view is set, blocks after the gap are later than the packet's times.
 """
 
 from __future__ import annotations
@@ -38,12 +37,12 @@ from numpy.typing import NDArray
 
 from lidarspec.spec import Clock, Fields, OnWrap, Polar, Scaled, Udp, between_blocks, following
 
-TURNS = 10  # per second, the factory's setting
-TURN = (5.0, 20.0)  # turns per second, the slowest and the fastest of the family
-FASTEST = TURN[1] * 360  # degrees per second
+FACTORY_SPEED_HZ = 10  # revolutions per second
+SPEED_LIMITS_HZ = (5.0, 20.0)  # lowest and highest of the family
+MAX_SPEED_DEG_S = SPEED_LIMITS_HZ[1] * 360
+BLOCK_FLAG: Construct = Const(b"\xff\xee")  # the first bytes of a block
 
-BLOCK: Construct = Const(b"\xff\xee")  # what a block begins with
-#: of most models: the low byte first, its sign in a bit of its own.
+#: The temperature of most models: low byte first, with a sign bit.
 TEMPERATURE = ByteSwapped(
     BitStruct(
         "negative" / BitsInteger(1),
@@ -51,24 +50,30 @@ TEMPERATURE = ByteSwapped(
         "reserved" / BitsInteger(3),
     )
 )
-#: of the Ruby family: the high byte first.
+#: The temperature of the Ruby family: high byte first.
 TEMPERATURE_BE = BitStruct(
     "negative" / BitsInteger(1),
     "magnitude" / Scaled(BitsInteger(11), 0.0625, "degC"),
     "reserved" / BitsInteger(4),
 )
-#: in packets of both kinds, of the models that count seconds.
+#: The time in data packets and DIFOP, of the models that count seconds.
 TIME: tuple[Construct, ...] = (
     "seconds" / Scaled(BytesInteger(6), 1, "s") * "time since 1970, if synchronized",
     "microseconds" / Scaled(Int32ub, 1e-6, "s"),
 )
 
 
-def blocks(
-    count: int, lasers: int, step: float, *, firings: int = 1, flag: Construct = BLOCK
+def make_blocks(
+    count: int, lasers: int, step: float, *, firings: int = 1, flag: Construct = BLOCK_FLAG
 ) -> Construct:
-    """So many blocks of one azimuth, of one firing or of two groups, with distances in steps of so
-    many metres.
+    """Return the array of blocks; a block has one azimuth.
+
+    Args:
+        count: blocks per packet.
+        lasers: channels of a firing.
+        step: metres of a distance step.
+        firings: 1 for one firing, 2 for two groups of channels.
+        flag: the type of the first bytes of a block.
     """
     channel = Struct("distance" / Scaled(Int16ub, step, "m") * "0: no return", "intensity" / Int8ub)
     channels: Construct = "channels" / Array(lasers, channel)
@@ -85,13 +90,16 @@ def blocks(
     return Array(count, Struct("flag" / flag, "azimuth" / azimuth, channels))
 
 
-def angles(lasers: int, step: float = 0.01) -> Construct:
-    """Sign and size of an angle of each laser, in steps of so many degrees."""
+def make_angles(lasers: int, step: float = 0.01) -> Construct:
+    """Return the array of an angle per laser, as sign and size.
+
+    `step` is the step of the size in degrees.
+    """
     sign = Int8ub * "0 positive, 1 negative, 255 not calibrated"
     return Array(lasers, Struct("sign" / sign, "value" / Scaled(Int16ub, step, "deg")))
 
 
-#: the first 40 bytes of every DIFOP.
+#: The first 50 bytes of every DIFOP.
 DIFOP_HEAD: tuple[Construct, ...] = (
     "header" / Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55"),
     "rpm" / Scaled(Int16ub, 1, "rpm") * "configured speed",
@@ -109,7 +117,7 @@ DIFOP_HEAD: tuple[Construct, ...] = (
     "top_firmware" / Bytes(5),
     "bottom_firmware" / Bytes(5),
 )
-#: bytes 50 to 302 of the second layout.
+#: Bytes 50 to 291 of the second layout.
 DIFOP_VERSIONS: tuple[Construct, ...] = (
     "software" / Bytes(5),
     "motor_firmware" / Bytes(5),
@@ -120,15 +128,15 @@ DIFOP_VERSIONS: tuple[Construct, ...] = (
     "subnet_mask" / Bytes(4),
     "reserved_91" / Bytes(201),
 )
-#: bytes 292 to 301 of every layout.
+#: Bytes 292 to 300 of every layout.
 DIFOP_UNIT: tuple[Construct, ...] = (
     "serial_number" / Bytes(6),
     "zero_angle_offset" / Int16ub,
     "return_mode" / Int8ub,
 )
-#: bytes 301 to 312 of the second layout.
+#: Bytes 301 to 312 of the second layout.
 DIFOP_TIME: tuple[Construct, ...] = ("time_sync_mode" / Int8ub, "time_sync_status" / Int8ub, *TIME)
-#: bytes 313 to 467 of the first layout.
+#: Bytes 313 to 467 of the first layout.
 DIFOP_STATUS: tuple[Construct, ...] = (
     "currents" / Array(2, Int24ub),
     "voltages" / Array(9, Int16ub),
@@ -141,8 +149,8 @@ DIFOP_STATUS: tuple[Construct, ...] = (
 DIFOP_TAIL = "tail" / Const(b"\x0f\xf0")
 
 
-def difop_first(*end: Construct) -> Construct:
-    """Device information of the first layout; what stands from byte 468 on."""
+def make_first_layout(*end: Construct) -> Construct:
+    """Return the device information of the first layout; `end` begins at byte 468."""
     time = ("software" / Int16ub, "time" / Bytes(10))
     return Struct(
         *DIFOP_HEAD, "reserved_50" / Bytes(242), *DIFOP_UNIT, *time, *DIFOP_STATUS, *end, DIFOP_TAIL
@@ -151,15 +159,15 @@ def difop_first(*end: Construct) -> Construct:
 
 @dataclass(frozen=True, eq=False)
 class Rotor:
-    """What tells the models apart.
+    """The firing times, geometry and nominal angles of a model.
 
     Attributes:
-        delay: (slots,) seconds from the block to the firing of each laser; (blocks, slots) where
+        delay: seconds from the block to the firing of each laser, (slots,), or (blocks, slots) if
             blocks hold different lasers.
         period: seconds from one firing of all lasers to the next.
         lens: metres from the axis to the optical centre, in the rotor's direction.
-        height: metres of it above the origin.
-        vertical, horizontal: (lasers,) degrees, nominal, until DIFOP says the unit's own.
+        vertical, horizontal: (lasers,) nominal degrees, until DIFOP contains the unit's angles.
+        height: metres from the origin up to the optical centre.
     """
 
     delay: NDArray[Any]
@@ -171,38 +179,43 @@ class Rotor:
 
     @property
     def ring(self) -> NDArray[np.intp]:
-        """(lasers,) the lasers, counted from the lowest nominal one."""
+        """The number of each laser, counted from the lowest nominal one, (lasers,)."""
         return np.argsort(np.argsort(self.vertical))
 
-    def state(self, **others: Any) -> dict[str, dict[str, Any]]:
-        """What stands in for the first DIFOP packet."""
+    def make_default_state(self, **others: Any) -> dict[str, dict[str, Any]]:
+        """Return the values that are used until the first DIFOP packet."""
         horizontal = np.zeros(len(self.vertical)) if self.horizontal is None else self.horizontal
-        own = {**signs("vertical", self.vertical), **signs("horizontal", horizontal)}
-        return {"difop": {"rpm": TURNS * 60, **own, **others}}
+        nominal_angles = {
+            **split_angles("vertical", self.vertical),
+            **split_angles("horizontal", horizontal),
+        }
+        return {"difop": {"rpm": FACTORY_SPEED_HZ * 60, **nominal_angles, **others}}
 
 
-def signs(name: str, values: NDArray[np.float64]) -> dict[str, Any]:
-    """Angles as DIFOP has them."""
+def split_angles(name: str, values: NDArray[np.float64]) -> dict[str, Any]:
+    """Return the default values of angles as sign and size, as in DIFOP."""
     return {f"{name}.sign": values < 0, f"{name}.value": np.abs(values)}
 
 
 def laser_degrees(entry: Any) -> Any:
-    """Degrees of each laser, on the lasers' axis; nan, so no point, where the sensor is not
-    calibrated.
+    """Return the degrees of each laser, on the lasers' axis.
+
+    The angle is nan if the sensor is not calibrated, so such a laser gives no points.
     """
     sign = entry.sign.on("channels")
     value = entry.value.on("channels")
     return np.where(sign == 0, value, np.where(sign == 1, -value, np.nan))
 
 
-def directions(f: Fields) -> tuple[Any, Any]:
-    """Degrees above the horizon, and clockwise of the rotor's direction, of each laser."""
+def laser_angles(f: Fields) -> tuple[Any, Any]:
+    """Return each laser's elevation and clockwise angle from the rotor, in degrees."""
     return laser_degrees(f.state.difop.vertical), laser_degrees(f.state.difop.horizontal)
 
 
-def pairs(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
-    """Points of blocks of all lasers; with dual return, pairs of blocks are one firing, the first
-    of which began `late` blocks ago.
+def points_of_firings(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
+    """Return the points of blocks with one firing of all lasers.
+
+    With dual return, two blocks are one firing, which began `late` blocks before the packet.
     """
     azimuth = f.blocks.azimuth
     block = f.blocks.index
@@ -210,10 +223,10 @@ def pairs(f: Fields, dual: Any, model: Rotor, *, late: Any = 0) -> Polar:
     shot = np.where(dual, (block + late) // 2, block)
     echo = np.where(dual, (block + late) % 2, 0)
     times = {"elapsed": model.delay, "duration": model.period, "shot": shot}
-    return beams(f, f.blocks.channels, model, directions(f), ahead, echo=echo, **times)
+    return make_points(f, f.blocks.channels, model, laser_angles(f), ahead, echo=echo, **times)
 
 
-def halves(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar:
+def points_of_groups(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar:
     """Return the points of blocks with two groups of all lasers.
 
     The groups are two firings, or with dual return the two returns of one firing.
@@ -226,10 +239,10 @@ def halves(f: Fields, dual: Any, model: Rotor, lasers: tuple[Any, Any]) -> Polar
     channels = f.blocks.groups.channels
     shot = f.blocks.index
     times = {"elapsed": elapsed, "duration": duration, "shot": shot}
-    return beams(f, channels, model, lasers, ahead, echo=echo, **times)
+    return make_points(f, channels, model, lasers, ahead, echo=echo, **times)
 
 
-def beams(
+def make_points(
     f: Fields,
     channels: Any,
     model: Rotor,
@@ -243,13 +256,13 @@ def beams(
     distance: Any = None,
     ring: Any = None,
 ) -> Polar:
-    """Return the points of lasers beside the rotor's direction.
+    """Return the points of lasers whose optical centre is beside the axis.
 
-    The optical centre turns with the rotor (rs_driver, internDecodeMsopPkt). Before the first good
-    step between shots, the speed that DIFOP reports gives the step.
+    The optical centre rotates with the rotor (rs_driver, internDecodeMsopPkt). The step between
+    shots follows from the speed in DIFOP until the first good step.
 
     Args:
-        lasers: degrees above the horizon, and clockwise of the rotor's direction.
+        lasers: elevation, and the clockwise angle from the rotor's direction, in degrees.
         ahead: azimuth of the next shot, degrees.
         elapsed: seconds from the azimuth of a shot to each laser.
         duration: seconds from shot to shot.
@@ -259,23 +272,23 @@ def beams(
         ring: numbers of the lasers; by default in the order of their elevation.
     """
     vertical, horizontal = lasers
-    step = between_blocks(f.blocks.azimuth, ahead, fastest=FASTEST * duration)
+    step = between_blocks(f.blocks.azimuth, ahead, fastest=MAX_SPEED_DEG_S * duration)
     step = np.where(np.isnan(step), f.state.difop.rpm * 6 * duration, step)
-    rotor = np.deg2rad(f.blocks.azimuth + step * elapsed / duration)
+    clockwise = np.deg2rad(f.blocks.azimuth + step * elapsed / duration)
     return Polar(
         range=channels.distance if distance is None else distance,
-        azimuth=-(rotor + np.deg2rad(horizontal)),
+        azimuth=-(clockwise + np.deg2rad(horizontal)),
         elevation=np.deg2rad(vertical),
         intensity=channels.intensity,
         time=shot * duration + elapsed,
         ring=model.ring if ring is None else ring,
         return_index=echo,
-        origin=(model.lens * np.cos(rotor), -model.lens * np.sin(rotor), model.height),
+        origin=(model.lens * np.cos(clockwise), -model.lens * np.sin(clockwise), model.height),
     )
 
 
 def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
-    """Return the seconds from a packet to the next, by the return mode that DIFOP tells.
+    """Return the seconds from a packet to the next, by the return mode in DIFOP.
 
     Args:
         shots: of a packet with single return; with dual return it has half as many.
@@ -285,22 +298,28 @@ def pace(f: Fields, shots: float, period: float, dual: int) -> Any:
     return np.where(f.state.difop.return_mode == dual, shots / 2, shots) * period
 
 
-def sweep(i: int, shots: int, period: float, **others: Any) -> dict[str, Any]:
-    """Packet i of so many shots a packet, in single return mode, with the time in seconds and
-    microseconds.
+def rotation_values(i: int, shots: int, period: float, **others: Any) -> dict[str, Any]:
+    """Return the values of simulated packet i with single return.
+
+    Args:
+        i: the number of the packet.
+        shots: shots per packet.
+        period: seconds from shot to shot.
+        others: values of further fields.
     """
     time = i * shots * period
-    azimuth = np.round((i * shots + np.arange(shots)) * period * TURNS * 360, 2) % 360
+    azimuth = np.round((i * shots + np.arange(shots)) * period * FACTORY_SPEED_HZ * 360, 2) % 360
     return {"seconds": int(time), "microseconds": time % 1, "blocks.azimuth": azimuth, **others}
 
 
 def sweep_difop(i: int, speed: str = "measured_speed", **others: Any) -> Mapping[str, Any]:
-    """The device information of a sensor with the factory's settings; the angles are the default
-    ones.
+    """Return the device information with the factory's settings and default angles.
+
+    `speed` is the field of the measured speed.
     """
     addresses = {"lidar_ip": bytes([192, 168, 1, 200]), "host_ip": bytes([192, 168, 1, 102])}
     return {
-        speed: TURNS * 60,
+        speed: FACTORY_SPEED_HZ * 60,
         "msop_port": 6699,
         "difop_port": 7788,
         "fov_end": 360.0,
@@ -309,13 +328,13 @@ def sweep_difop(i: int, speed: str = "measured_speed", **others: Any) -> Mapping
     }
 
 
-#: what the declarations of all of them have in common.
+#: Arguments of `Sensor` that all rotating models share.
 COMMON: dict[str, Any] = {
     "vendor": "RoboSense",
     "scan": OnWrap("blocks.azimuth"),
     "links": {"data": Udp(6699, 7788)},
     "clock": Clock(("seconds", "microseconds")),
     "vendor_axes": ("forward", "left", "up"),
-    "turn": TURN,
+    "turn": SPEED_LIMITS_HZ,
     "status": "manual",
 }

@@ -1,15 +1,16 @@
-"""RoboSense RS-LiDAR-16, RS-LiDAR-32 and RS-Bpearl: rotating lidars of 16 and 32 lasers over UDP,
-with DIFOP of the first layout.
+"""RoboSense RS-LiDAR-16, RS-LiDAR-32 and RS-Bpearl: rotating lidars of 16 and 32 lasers over UDP.
+
+Their DIFOP has the first layout.
 
 Source: the vendor's rs_driver (decoder_RS16.hpp, decoder_RS32.hpp, decoder_RSBP.hpp and their
 tests: layouts, firing times, optical centre, return modes, time); angles of an example unit of
-each, ros_rslidar. The date of a packet is taken for UTC: rs_driver takes it for the computer's own
-zone. A comment in the test of the RS-LiDAR-16 has its angles in steps of 0.001 degrees, its result
-in steps of 0.0001.
+each, ros_rslidar. The date of a packet is read as UTC, in rs_driver as local time of the computer.
+A comment in the test of the RS-LiDAR-16 has its angles in steps of 0.001 degrees, its result in
+steps of 0.0001.
 
-Assumed: that the type byte 30 is 2 from an RS-LiDAR-32 alone and 1 from an RS-LiDAR-16 alone, as
-rs_driver has it; and that the nominal angles of a Bpearl are those of version 4 too. What tells
-version 4, bytes 31 and 32, is rs_driver's.
+Assumed: the type byte 30 is 2 only in packets of an RS-LiDAR-32 and 1 only in those of an
+RS-LiDAR-16, as in rs_driver; a Bpearl of version 4 has the nominal angles of other Bpearls. Bytes
+31 and 32 identify version 4, as in rs_driver.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from construct import Array, Bytes, Const, Construct, Int8ub, Int16ub, Int24ub, 
 from lidarspec.spec import Clock, Fields, Frame, Polar, Scaled, Sensor, Simulation, unix_time
 from lidarspec_robosense.rotor import (
     COMMON,
+    FACTORY_SPEED_HZ,
     TEMPERATURE,
     TIME,
-    TURNS,
     Rotor,
-    angles,
-    blocks,
-    difop_first,
-    halves,
+    make_angles,
+    make_blocks,
+    make_first_layout,
     pace,
-    pairs,
-    sweep as turning,
+    points_of_firings,
+    points_of_groups,
+    rotation_values,
     sweep_difop,
 )
 
@@ -44,8 +45,8 @@ DUAL = 0
 STRONGEST = 1  # return modes in DIFOP
 RS16_TYPE = 1
 RS32_TYPE = 2
-V4 = (3, 4)  # bytes 31 and 32 of a Bpearl of version 4
-SLOT = np.arange(LASERS)
+V4_BYTES = (3, 4)  # bytes 31 and 32 of a Bpearl of version 4
+SLOT_INDEX = np.arange(LASERS)
 
 # fmt: off
 RS16_VERTICAL = (
@@ -65,9 +66,12 @@ RS16_ROTOR = Rotor(
     delay=np.arange(16) * 2.8e-6, period=55.5e-6, lens=0.03825, vertical=np.array(RS16_VERTICAL)
 )
 RS32_ROTOR = Rotor(
-    # 2.88 us apart in two rows, the second 1.44 us after the first; the last of each later
-    # (rs_driver)
-    delay=(SLOT % 16 * 2.88 + SLOT // 16 * 1.44 + np.where(SLOT % 16 == 15, 1.44, 0)) * 1e-6,
+    # 2.88 us apart in two rows, the second 1.44 us after the first; the last laser of a row fires
+    # 1.44 us later still (rs_driver)
+    delay=(
+        SLOT_INDEX % 16 * 2.88 + SLOT_INDEX // 16 * 1.44 + np.where(SLOT_INDEX % 16 == 15, 1.44, 0)
+    )
+    * 1e-6,
     period=55.52e-6,
     lens=0.03997,
     vertical=np.array(RS32_VERTICAL),
@@ -76,16 +80,19 @@ RS32_ROTOR = Rotor(
 BPEARL_ROTOR = Rotor(
     # 2.56 us apart in two rows, the second 1.28 us after the first, each with a pause in its middle
     # (rs_driver)
-    delay=(SLOT % 16 * 2.56 + SLOT // 16 * 1.28 + np.where(SLOT % 16 >= 8, 5.2, 0)) * 1e-6,
+    delay=(
+        SLOT_INDEX % 16 * 2.56 + SLOT_INDEX // 16 * 1.28 + np.where(SLOT_INDEX % 16 >= 8, 5.2, 0)
+    )
+    * 1e-6,
     period=55.52e-6,
     lens=0.01473,
     height=0.09427,
-    vertical=np.round(89.5 - 2.8125 * SLOT, 2),  # in the steps of its DIFOP
+    vertical=np.round(89.5 - 2.8125 * SLOT_INDEX, 2),  # in the steps of its DIFOP
 )
 BPEARL_V4_ROTOR = dataclasses.replace(
     # in steps of 1.6680 us, rounded to hundredths (rs_driver)
     BPEARL_ROTOR,
-    delay=np.round(SLOT * 1.668, 2) * 1e-6,
+    delay=np.round(SLOT_INDEX * 1.668, 2) * 1e-6,
     period=55.56e-6,
     lens=0.01619,
     height=0.09571,
@@ -103,8 +110,8 @@ DATE: tuple[Construct, ...] = (
 )
 
 
-def packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
-    """Return a data packet with this time and these blocks."""
+def make_packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
+    """Return the struct of a data packet with this time and these blocks."""
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x0a\x5a\xa5\x50\xa0"),
         "reserved_8" / Bytes(12),
@@ -121,16 +128,19 @@ def packet(time: tuple[Construct, ...], rows: Construct) -> Struct:
     )
 
 
-def difop(step: float) -> Construct:
-    """Device information with the angles of 32 lasers, in steps of so many degrees."""
-    return difop_first(
-        "vertical" / angles(LASERS, step),
-        "horizontal" / angles(LASERS, step),
+def make_difop(step: float) -> Construct:
+    """Return the device information with angles of 32 lasers.
+
+    `step` is the step of the angles in degrees.
+    """
+    return make_first_layout(
+        "vertical" / make_angles(LASERS, step),
+        "horizontal" / make_angles(LASERS, step),
         "reserved_660" / Bytes(586),
     )
 
 
-DIFOP_16 = difop_first(
+DIFOP_16 = make_first_layout(
     "reserved_468" / Bytes(697),
     "pitch"
     / Array(16, Scaled(Int24ub, 0.0001, "deg"))
@@ -139,16 +149,21 @@ DIFOP_16 = difop_first(
 )
 
 
-def plausible(f: Fields, lidar_type: int) -> Any:
-    """Azimuths below 360 degrees, and this model's type."""
+def is_plausible(f: Fields, lidar_type: int) -> Any:
+    """Return whether azimuths are below 360 degrees and the type is that of the model."""
     return (f.blocks.azimuth < 360) & (f.lidar_type == lidar_type)
 
 
-def plausible_bpearl(f: Fields, v4: bool) -> Any:
-    """Azimuths below 360 degrees, and the type of no other model with such packets."""
-    newer = (f.series == V4[0]) & (f.version == V4[1])
+def is_plausible_bpearl(f: Fields, v4: bool) -> Any:
+    """Return whether azimuths are below 360 degrees and type and version fit a Bpearl.
+
+    Packets with the type of another model do not fit. `v4` is whether version 4 is required.
+    """
+    is_version_4 = (f.series == V4_BYTES[0]) & (f.version == V4_BYTES[1])
     return (f.blocks.azimuth < 360) & (
-        newer if v4 else (f.lidar_type != RS16_TYPE) & (f.lidar_type != RS32_TYPE) & ~newer
+        is_version_4
+        if v4
+        else (f.lidar_type != RS16_TYPE) & (f.lidar_type != RS32_TYPE) & ~is_version_4
     )
 
 
@@ -158,8 +173,8 @@ def clock(f: Fields) -> tuple[Any, Any, Any]:
     return date, f.milliseconds, f.microseconds
 
 
-def clock_of(source: Any, shots: int, model: Rotor) -> Clock:
-    """Return the clock of packets with so many firings of all lasers."""
+def make_clock(source: Any, shots: int, model: Rotor) -> Clock:
+    """Return the clock of packets with `shots` firings of all lasers."""
     return Clock(source, pace=partial(pace, shots=shots, period=model.period, dual=DUAL))
 
 
@@ -169,20 +184,22 @@ def points_16(f: Fields) -> Polar:
     Only vertical angles are corrected. Their signs are the same in every unit.
     """
     up = np.where(np.arange(16) < 8, -1, 1) * f.state.difop.pitch.on("channels")
-    return halves(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))
+    return points_of_groups(f, f.state.difop.return_mode == DUAL, RS16_ROTOR, (up, 0.0))
 
 
 def points(f: Fields, model: Rotor) -> Polar:
-    """One firing in a block."""
-    return pairs(f, f.state.difop.return_mode == DUAL, model)
+    """Return the points of blocks with one firing."""
+    return points_of_firings(f, f.state.difop.return_mode == DUAL, model)
 
 
-def sweep(i: int, shots: float, lidar_type: int) -> dict[str, Any]:
-    """Packet i of a sensor in single return mode, from the beginning of 2024 on; blocks take so
-    many microseconds.
+def sweep(i: int, block_us: float, lidar_type: int) -> dict[str, Any]:
+    """Return the values of simulated packet i with single return.
+
+    The sensor starts at the beginning of 2024. `block_us` is the duration of a block in
+    microseconds.
     """
-    values = turning(i, BLOCKS, shots * 1e-6, lidar_type=lidar_type)
-    seconds, micros = divmod(round(i * BLOCKS * shots), 1_000_000)
+    values = rotation_values(i, BLOCKS, block_us * 1e-6, lidar_type=lidar_type)
+    seconds, micros = divmod(round(i * BLOCKS * block_us), 1_000_000)
     date = {
         "year": 24,
         "month": 1,
@@ -207,15 +224,15 @@ RS32 = Sensor(
     model="RS-LiDAR-32",
     frames={
         "data": Frame(
-            packet(DATE, blocks(BLOCKS, LASERS, 0.005)),
+            make_packet(DATE, make_blocks(BLOCKS, LASERS, 0.005)),
             data=True,
-            plausible=partial(plausible, lidar_type=RS32_TYPE),
+            plausible=partial(is_plausible, lidar_type=RS32_TYPE),
         ),
-        "difop": Frame(difop(0.001), simulation=INFORMATION),
+        "difop": Frame(make_difop(0.001), simulation=INFORMATION),
     },
     points=partial(points, model=RS32_ROTOR),
-    state=RS32_ROTOR.state(return_mode=STRONGEST),
-    simulation=Simulation(partial(sweep, shots=55.52, lidar_type=RS32_TYPE)),
+    state=RS32_ROTOR.make_default_state(return_mode=STRONGEST),
+    simulation=Simulation(partial(sweep, block_us=55.52, lidar_type=RS32_TYPE)),
     range_limits=(0.4, 230.0),  # rs_driver's limits for this model
     info={
         "serial": "difop.serial_number",
@@ -223,7 +240,7 @@ RS32 = Sensor(
         "model": "data.lidar_type",
     },
     source="rs_driver (decoder_RS32.hpp); angles of an example unit in ros_rslidar",
-    **{**COMMON, "clock": clock_of(clock, BLOCKS, RS32_ROTOR)},
+    **{**COMMON, "clock": make_clock(clock, BLOCKS, RS32_ROTOR)},
 )
 
 RS16 = dataclasses.replace(
@@ -232,18 +249,22 @@ RS16 = dataclasses.replace(
     model="RS-LiDAR-16",
     frames={
         "data": Frame(
-            packet(DATE, blocks(BLOCKS, 16, 0.005, firings=2)),
+            make_packet(DATE, make_blocks(BLOCKS, 16, 0.005, firings=2)),
             data=True,
-            plausible=partial(plausible, lidar_type=RS16_TYPE),
+            plausible=partial(is_plausible, lidar_type=RS16_TYPE),
         ),
         "difop": Frame(DIFOP_16, simulation=INFORMATION),
     },
     points=points_16,
-    clock=clock_of(clock, 2 * BLOCKS, RS16_ROTOR),
+    clock=make_clock(clock, 2 * BLOCKS, RS16_ROTOR),
     state={
-        "difop": {"rpm": TURNS * 60, "return_mode": STRONGEST, "pitch": np.abs(RS16_ROTOR.vertical)}
+        "difop": {
+            "rpm": FACTORY_SPEED_HZ * 60,
+            "return_mode": STRONGEST,
+            "pitch": np.abs(RS16_ROTOR.vertical),
+        }
     },
-    simulation=Simulation(partial(sweep, shots=111.0, lidar_type=RS16_TYPE)),
+    simulation=Simulation(partial(sweep, block_us=111.0, lidar_type=RS16_TYPE)),
     source="rs_driver (decoder_RS16.hpp and its test); angles of an example unit in ros_rslidar",
 )
 
@@ -253,17 +274,17 @@ BPEARL = dataclasses.replace(
     model="RS-Bpearl",
     frames={
         "data": Frame(
-            packet(DATE, blocks(BLOCKS, LASERS, 0.005)),
+            make_packet(DATE, make_blocks(BLOCKS, LASERS, 0.005)),
             data=True,
-            plausible=partial(plausible_bpearl, v4=False),
+            plausible=partial(is_plausible_bpearl, v4=False),
         ),
-        "difop": Frame(difop(0.01), simulation=INFORMATION),
+        "difop": Frame(make_difop(0.01), simulation=INFORMATION),
     },
     points=partial(points, model=BPEARL_ROTOR),
-    clock=clock_of(clock, BLOCKS, BPEARL_ROTOR),
-    state=BPEARL_ROTOR.state(return_mode=STRONGEST),
-    simulation=Simulation(partial(sweep, shots=55.52, lidar_type=0)),
-    range_limits=(0.1, 150.0),  # likewise
+    clock=make_clock(clock, BLOCKS, BPEARL_ROTOR),
+    state=BPEARL_ROTOR.make_default_state(return_mode=STRONGEST),
+    simulation=Simulation(partial(sweep, block_us=55.52, lidar_type=0)),
+    range_limits=(0.1, 150.0),  # rs_driver's limits for this model
     info={"serial": "difop.serial_number", "firmware": "difop.top_firmware"},
     source="rs_driver (decoder_RSBP.hpp and its tests); angles of an example unit in ros_rslidar",
 )
@@ -274,16 +295,18 @@ BPEARL_V4 = dataclasses.replace(
     model="RS-Bpearl, version 4",
     frames={
         "data": Frame(
-            packet(TIME, blocks(BLOCKS, LASERS, 0.0025)),
+            make_packet(TIME, make_blocks(BLOCKS, LASERS, 0.0025)),
             data=True,
-            plausible=partial(plausible_bpearl, v4=True),
+            plausible=partial(is_plausible_bpearl, v4=True),
         ),
         "difop": BPEARL.frames["difop"],
     },
     points=partial(points, model=BPEARL_V4_ROTOR),
-    clock=clock_of(("seconds", "microseconds"), BLOCKS, BPEARL_V4_ROTOR),
-    state=BPEARL_V4_ROTOR.state(return_mode=STRONGEST),
+    clock=make_clock(("seconds", "microseconds"), BLOCKS, BPEARL_V4_ROTOR),
+    state=BPEARL_V4_ROTOR.make_default_state(return_mode=STRONGEST),
     simulation=Simulation(
-        lambda i: turning(i, BLOCKS, BPEARL_V4_ROTOR.period, series=V4[0], version=V4[1])
+        lambda i: rotation_values(
+            i, BLOCKS, BPEARL_V4_ROTOR.period, series=V4_BYTES[0], version=V4_BYTES[1]
+        )
     ),
 )

@@ -1,22 +1,22 @@
-"""RoboSense RS-Ruby (RS-LiDAR-128, -80, -48) and RS-Ruby Plus (128, 80, 80V, 48): rotating lidars
-of 48 to 128 lasers over UDP.
+"""RoboSense RS-Ruby and RS-Ruby Plus: rotating lidars of 48 to 128 lasers over UDP.
 
-Both series send the same packets, of 3, 4 or 8 blocks of all lasers. Three blocks with dual return
-hold one shot and a half: A A B, then B C C.
+RS-Ruby are the RS-LiDAR-128, -80 and -48; RS-Ruby Plus have 128, 80, 80 (80V) or 48 lasers. Both
+series send the same packets, of 3, 4 or 8 blocks of all lasers. With dual return, three blocks hold
+one shot and a half: A A B, then B C C.
 
 Source: RS-Ruby Plus user manual, Table 5-2 to 5-5 (header, return modes, blocks), RS-Ruby user
 manual, Table 4; the vendor's rs_driver (decoder_RS128.hpp, decoder_RS80.hpp, decoder_RS48.hpp and
-their RSP namesakes: firing times, optical centre, DIFOP).
+the RSP variants: firing times, optical centre, DIFOP).
 
-Contradictions: the manual has series and model at bytes 31 and 32, rs_driver at 30 and 31, so both
-are looked at; rs_driver takes the return mode from DIFOP, with codes that differ by model, the
-manuals have it in every packet, which is what stands here. The seconds of a time are followed by
-nanoseconds in early units. In dual return the manual has the last return first, then the strongest.
+Contradictions: series and model are at bytes 31 and 32 in the manual, at 30 and 31 in rs_driver, so
+both are read. The return mode is in every packet in the manuals, which this module follows, and in
+DIFOP with codes of each model in rs_driver. The time is seconds and nanoseconds in early units. In
+dual return the manual has the last return first, then the strongest.
 
-Assumed: nominal angles, even steps over the 40 degrees of the 128 and 80 lasers' data sheets, the
-lowest laser first, for no table was found: before the first DIFOP packet clouds say that they are
-nominal; and that no RS-Ruby has the number of the Ruby Plus, 5, as series. What the ranges of a
-model's own unit are, and where rs_driver has them alike for all, is rs_driver's.
+Assumed, because no table was found: the nominal angles, which are evenly spaced over the 40 degrees
+of the data sheets of 128 and 80 lasers, lowest laser first. Clouds are marked as nominal before the
+first DIFOP packet. Also assumed: no RS-Ruby has the series number of the Ruby Plus, 5. The range
+limits, which are the same for all models, are those of rs_driver.
 """
 
 from __future__ import annotations
@@ -41,24 +41,28 @@ from lidarspec_robosense.rotor import (
     TEMPERATURE_BE,
     TIME,
     Rotor,
-    angles,
-    blocks,
-    pairs,
-    sweep,
+    make_angles,
+    make_blocks,
+    points_of_firings,
+    rotation_values,
     sweep_difop,
 )
 
+# lower bits of the return mode in a packet
 SINGLE = 1
-DUAL = 3  # lower bits of the return mode in a packet
-PLUS = 5  # series
-MODELS = {128: 1, 80: 2, 48: 4}  # of the Ruby Plus, by lasers
+DUAL = 3
+PLUS_SERIES = 5
+#: Lasers -> model number of a Ruby Plus.
+MODELS = {128: 1, 80: 2, 48: 4}
 MODEL_80V = 3
+#: Lasers -> blocks per packet.
 BLOCKS = {128: 3, 80: 4, 48: 8}
-AFTER = {128: 4, 80: 192, 48: 4}  # bytes after the blocks
+#: Lasers -> bytes after the blocks.
+END_BYTES = {128: 4, 80: 192, 48: 4}
 
 
-def packet(lasers: int) -> Struct:
-    """Return a data packet of a model with so many lasers."""
+def make_packet(lasers: int) -> Struct:
+    """Return the struct of a data packet of a model with `lasers` lasers."""
     flag = Struct("mark" / Const(b"\xfe"), "return_id" / Int8ub)
     return Struct(
         "header" / Const(b"\x55\xaa\x05\x5a"),
@@ -77,62 +81,81 @@ def packet(lasers: int) -> Struct:
         / Int8ub
         * "1 RS-Ruby Plus, 2 RS-Ruby Plus 80, 3 RS-Ruby Plus 80V, 4 RS-Ruby Plus 48",
         "reserved_33" / Bytes(47),
-        "blocks" / blocks(BLOCKS[lasers], lasers, 0.005, flag=flag),
-        "reserved_end" / Bytes(AFTER[lasers]),
+        "blocks" / make_blocks(BLOCKS[lasers], lasers, 0.005, flag=flag),
+        "reserved_end" / Bytes(END_BYTES[lasers]),
     )
 
 
-def difop(lasers: int) -> Struct:
-    """Device information: angles of 128 lasers, of which a model with fewer has the first ones."""
-    others = () if lasers == 128 else ("others_vertical" / angles(128 - lasers),)
-    more = () if lasers == 128 else ("others_horizontal" / angles(128 - lasers),)
+def make_difop(lasers: int) -> Struct:
+    """Return the device information: angles of 128 lasers.
+
+    A model with fewer lasers uses the first angles.
+    """
+    other_vertical = () if lasers == 128 else ("others_vertical" / make_angles(128 - lasers),)
+    other_horizontal = () if lasers == 128 else ("others_horizontal" / make_angles(128 - lasers),)
     start = (*DIFOP_HEAD, *DIFOP_VERSIONS, *DIFOP_UNIT, *DIFOP_TIME, *DIFOP_STATUS)
     ends = ("reserved_1236" / Bytes(10), DIFOP_TAIL)
     return Struct(
-        *start, "vertical" / angles(lasers), *others, "horizontal" / angles(lasers), *more, *ends
+        *start,
+        "vertical" / make_angles(lasers),
+        *other_vertical,
+        "horizontal" / make_angles(lasers),
+        *other_horizontal,
+        *ends,
     )
 
 
 def plausible(f: Fields) -> Any:
-    """Azimuths below 360 degrees."""
+    """Return whether azimuths are below 360 degrees."""
     return f.blocks.azimuth < 360
 
 
 def is_plus(f: Fields) -> Any:
-    """Return whether a packet names the Ruby Plus as its series."""
-    return (f.series == PLUS) | (f.type_30 == PLUS)
+    """Return whether a packet contains the series of the Ruby Plus."""
+    return (f.series == PLUS_SERIES) | (f.type_30 == PLUS_SERIES)
 
 
 def points(f: Fields, model: Rotor, variant: NDArray[np.float64] | None = None) -> Polar:
-    """With dual return the first block may hold the second return of a shot; `variant`: the delays
-    of an 80V.
+    """Return the points of a packet.
+
+    With dual return the first block may hold the second return of a shot. `variant` are the delays
+    of an 80V, in seconds.
     """
     late = np.where(f.blocks[0].azimuth == f.blocks[1].azimuth, 0, 1)
     if variant is not None:
-        named = np.where(f.series == PLUS, f.model, f.series) == MODEL_80V
-        model = dataclasses.replace(model, delay=np.where(named, variant, model.delay))
-    return pairs(f, f.wave_mode.returns == DUAL, model, late=late)
+        is_80v = np.where(f.series == PLUS_SERIES, f.model, f.series) == MODEL_80V
+        model = dataclasses.replace(model, delay=np.where(is_80v, variant, model.delay))
+    return points_of_firings(f, f.wave_mode.returns == DUAL, model, late=late)
 
 
 def pace(f: Fields, shots: int, period: float) -> Any:
-    """Return the seconds from a packet to the next; with dual return, two blocks are one shot."""
+    """Return the seconds from a packet to the next.
+
+    With dual return, two blocks are one shot.
+    """
     return np.where(f.wave_mode.returns == DUAL, shots / 2, shots) * period
 
 
 def firing_times(times: Any, counts: Any) -> NDArray[np.float64]:
-    """Seconds of lasers of which so many fire at each of some times in microseconds."""
+    """Return the seconds of each laser.
+
+    Args:
+        times: firing times in microseconds.
+        counts: how many lasers fire at each time.
+    """
     return np.repeat(np.asarray(times, np.float64), counts) * 1e-6
 
 
-def steps(*counts: int) -> NDArray[np.float64]:
-    """Seconds of lasers of which so many fire at each of 16 times, 3.236 us apart, in two rows
-    (rs_driver).
+def even_firing_times(*counts: int) -> NDArray[np.float64]:
+    """Return the seconds of each laser, for two rows of 16 times, 3.236 us apart.
+
+    `counts` are the lasers that fire at each time. Source: rs_driver.
     """
     return firing_times(np.tile(np.arange(16) * 3.236, 2), counts)
 
 
-def rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
-    """Return a model by its firing times, with nominal angles."""
+def make_rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
+    """Return the rotor of a model with these firing times and nominal angles."""
     return Rotor(
         delay=delay,
         period=period,
@@ -142,12 +165,12 @@ def rotor(delay: NDArray[np.float64], period: float, lens: float) -> Rotor:
 
 
 # fmt: off
-#: microseconds at which lasers of a Ruby Plus fire, and how many at each (rs_driver).
-TIMES_128 = (
+#: Firing times of a Ruby Plus in microseconds, and lasers that fire at each (rs_driver).
+TIMES_128_US = (
     0, 1.13, 2.13, 3.26, 4.26, 5.38, 6.38, 7.51, 8.51, 10.01, 11.38, 13.31, 15.11, 17.04, 18.85, 21.14, 23.31, 25.61, 27.78, 30.07, 32.24,
     34.54, 36.7, 38.64, 40.44, 41.94, 43.3, 44.8, 46.17, 47.66, 49.03, 50.53, 53.771,
 )
-TIMES = (
+TIMES_US = (
     0, 1.217, 2.434, 3.652, 4.869, 6.086, 7.304, 8.521, 9.739, 11.323, 12.907, 14.924, 16.941, 18.959, 20.976, 23.127, 25.278, 27.428,
     29.579, 31.963, 34.347, 36.498, 38.648, 40.666, 42.683, 50.603, 52.187, 53.771,
 )
@@ -156,35 +179,47 @@ COUNTS_80 = (4, 4, 2, 3, 2, 2, 2, 2, 2, 2, 2, 2, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 2
 
 FRAMES = {
     lasers: {
-        "data": Frame(packet(lasers), data=True, plausible=plausible),
-        "difop": Frame(difop(lasers), simulation=Simulation(sweep_difop, rate=1)),
+        "data": Frame(make_packet(lasers), data=True, plausible=plausible),
+        "difop": Frame(make_difop(lasers), simulation=Simulation(sweep_difop, rate=1)),
     }
     for lasers in BLOCKS
 }
 
 
-def model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = None) -> Sensor:
-    """Return a Ruby, or where its id says so a Ruby Plus; what the two series have in common."""
+def make_model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = None) -> Sensor:
+    """Return the sensor of a Ruby or Ruby Plus; the id of a Ruby Plus contains "plus".
+
+    Args:
+        id: the id of the sensor.
+        name: the name of the model.
+        rotor: its firing times and geometry.
+        relative: the id of the model of the other series.
+        variant: the firing times of an 80V.
+    """
     lasers = len(rotor.delay)
-    plus = "plus" in id
-    own = {"series": PLUS, "model": MODELS[lasers]} if plus else {}
-    data = partial(
-        sweep, shots=BLOCKS[lasers], period=rotor.period, **own, **{"wave_mode.returns": SINGLE}
+    is_plus_model = "plus" in id
+    model_values = {"series": PLUS_SERIES, "model": MODELS[lasers]} if is_plus_model else {}
+    sweep = partial(
+        rotation_values,
+        shots=BLOCKS[lasers],
+        period=rotor.period,
+        **model_values,
+        **{"wave_mode.returns": SINGLE},
     )
-    named = {"model": "data.model"} if plus else {}
+    model_info = {"model": "data.model"} if is_plus_model else {}
     return Sensor(
         id,
         model=name,
         frames=FRAMES[lasers],
         points=partial(points, model=rotor, variant=variant),
-        state=rotor.state(),
-        simulation=Simulation(data),
+        state=rotor.make_default_state(),
+        simulation=Simulation(sweep),
         range_limits=(0.4, 250.0),  # rs_driver's limits for these models
-        info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", **named},
+        info={"serial": "difop.serial_number", "firmware": "difop.top_firmware", **model_info},
         relatives={
             relative: (
                 Relative("series other than 5", lambda f: ~is_plus(f))
-                if plus
+                if is_plus_model
                 else Relative("series 5", is_plus)
             )
         },
@@ -202,33 +237,33 @@ def model(id: str, name: str, rotor: Rotor, relative: str, variant: Any = None) 
     )
 
 
-RS128_ROTOR = rotor(steps(*[4] * 32), 55.55e-6, 0.03615)
+RS128_ROTOR = make_rotor(even_firing_times(*[4] * 32), 55.55e-6, 0.03615)
 RS80_COUNTS = ((3, 2, 4, 3, 3, 3, 3, *[2] * 8, 3), (3, 3, 3, 2, 4, 2, 3, 3, 2, 2, 2, 3, 2, 1, 2, 3))
-RS80_ROTOR = rotor(steps(*RS80_COUNTS[0], *RS80_COUNTS[1]), 55.552e-6, 0.03615)
-RS48_ROTOR = rotor(steps(*[1, 1, 1, 1, 2, 2, 2, 2] * 4), 55.552e-6, 0.03615)
-PLUS_128_ROTOR = rotor(
-    firing_times(TIMES_128, [4] * 15 + [5] + [4] * 15 + [2, 1]), 55.56e-6, 0.02892
+RS80_ROTOR = make_rotor(even_firing_times(*RS80_COUNTS[0], *RS80_COUNTS[1]), 55.552e-6, 0.03615)
+RS48_ROTOR = make_rotor(even_firing_times(*[1, 1, 1, 1, 2, 2, 2, 2] * 4), 55.552e-6, 0.03615)
+PLUS_128_ROTOR = make_rotor(
+    firing_times(TIMES_128_US, [4] * 15 + [5] + [4] * 15 + [2, 1]), 55.56e-6, 0.02892
 )
-PLUS_80_ROTOR = rotor(firing_times(TIMES, COUNTS_80), 55.56e-6, 0.02892)
-PLUS_48_ROTOR = rotor(firing_times(TIMES[:24], [2] * 24), 55.56e-6, 0.02892)
+PLUS_80_ROTOR = make_rotor(firing_times(TIMES_US, COUNTS_80), 55.56e-6, 0.02892)
+PLUS_48_ROTOR = make_rotor(firing_times(TIMES_US[:24], [2] * 24), 55.56e-6, 0.02892)
 
-RS128 = model("robosense-rs128", "RS-LiDAR-128", RS128_ROTOR, "robosense-ruby-plus-128")
-RS80 = model("robosense-rs80", "RS-LiDAR-80", RS80_ROTOR, "robosense-ruby-plus-80")
-RS48 = model("robosense-rs48", "RS-LiDAR-48", RS48_ROTOR, "robosense-ruby-plus-48")
-RUBY_PLUS_128 = model(
+RS128 = make_model("robosense-rs128", "RS-LiDAR-128", RS128_ROTOR, "robosense-ruby-plus-128")
+RS80 = make_model("robosense-rs80", "RS-LiDAR-80", RS80_ROTOR, "robosense-ruby-plus-80")
+RS48 = make_model("robosense-rs48", "RS-LiDAR-48", RS48_ROTOR, "robosense-ruby-plus-48")
+RUBY_PLUS_128 = make_model(
     "robosense-ruby-plus-128",
     "RS-Ruby Plus",
     PLUS_128_ROTOR,
     "robosense-rs128",
 )
-RUBY_PLUS_80 = model(
+RUBY_PLUS_80 = make_model(
     "robosense-ruby-plus-80",
     "RS-Ruby Plus 80",
     PLUS_80_ROTOR,
     "robosense-rs80",
-    variant=firing_times(TIMES[:20], [4] * 20),
+    variant=firing_times(TIMES_US[:20], [4] * 20),
 )
-RUBY_PLUS_48 = model(
+RUBY_PLUS_48 = make_model(
     "robosense-ruby-plus-48",
     "RS-Ruby Plus 48",
     PLUS_48_ROTOR,

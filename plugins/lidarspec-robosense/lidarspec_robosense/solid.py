@@ -1,15 +1,14 @@
-"""RoboSense M2, MX and E1: solid-state lidars over UDP; every point carries its radius and a
-direction of length 1.
+"""RoboSense M2, MX and E1: solid-state lidars over UDP; each point has a radius and a unit vector.
 
 Source: the vendor's rs_driver (decoder_RSM2.hpp, decoder_RSMX.hpp, decoder_RSE1.hpp: packets, their
 number in a frame, limits); E1 user manual, Tables 4 to 9 (packets, tail, DIFOP).
 
 Contradictions: the E1's manual counts packets from 0, and has dual return as modes 9 to 11,
-rs_driver as 0. Not checked: the CRCs at the end of packets, of which nobody says in public what
-they are over; that of the E1 is called AUTOSAR E2E profile 4. Assumed: that the other models count
-from 1, as the M1 does; frames with dual return of twice as many packets, but for the MX, whose
-points have two radii; and g and rad/s of the E1's IMU, since rs_driver hands its numbers on beside
-those of the Airy in these units, from bytes that the manual leaves reserved.
+rs_driver as 0. Not verified: the CRCs at the end of packets, because the bytes that they cover are
+not public; that of the E1 is called AUTOSAR E2E profile 4. Assumed: the other models count from 1,
+as the M1 does; frames with dual return have twice as many packets, except for the MX, whose points
+have two radii. Also assumed: g and rad/s of the E1's IMU, because rs_driver returns its numbers
+like those of the Airy, which have these units, from bytes that are reserved in the manual.
 """
 
 from __future__ import annotations
@@ -44,25 +43,26 @@ from lidarspec.spec import (
     Simulation,
     stack,
 )
-from lidarspec_robosense.m1 import FRAME_RATE, HEADER, M1
+from lidarspec_robosense.m1 import FRAME_RATE_HZ, HEADER, M1
 from lidarspec_robosense.rotor import TIME
 
+# return modes
 DUAL = 0
-STRONGEST = 4  # return modes
+STRONGEST = 4
 GRAVITY = 9.80665
 MAGIC = Const(b"\xa5\xff\x00\x5a\x11\x11\x55\x55")
-UNIT = tuple(axis / Scaled(Int16sb, 1 / 32768, "") for axis in "xyz")
+UNIT_VECTOR = tuple(axis / Scaled(Int16sb, 1 / 32768, "") for axis in "xyz")
 
 
 @dataclass(frozen=True)
 class Scanner:
-    """What tells the models apart.
+    """The packets and the field of view of a model.
 
     Attributes:
-        blocks, channels: of a packet, and of a block.
-        packets: of a frame with single return.
-        first: the number of the first of them.
-        wide, high: degrees of the field of view, for simulation.
+        blocks, channels: blocks per packet, channels per block.
+        packets: packets per frame with single return.
+        first: the number of the first packet of a frame.
+        wide, high: degrees of the simulated field of view.
     """
 
     blocks: int
@@ -73,14 +73,22 @@ class Scanner:
     high: float
 
 
-def packet(
+def make_packet(
     model: Scanner,
     offset: Construct,
     parts: tuple[Construct, ...],
     channel: tuple[Construct, ...],
     *tail: Construct,
 ) -> Struct:
-    """A packet whose blocks have an offset of time, these parts, and channels of these fields."""
+    """Return the struct of a packet.
+
+    Args:
+        model: the model.
+        offset: the type of a block's time offset.
+        parts: the fields of a block between time offset and channels.
+        channel: the fields of a channel.
+        tail: the fields after the blocks.
+    """
     time = "time_offset" / Scaled(offset, 1e-6, "s") * "added to the time of the packet"
     return Struct(
         *HEADER,
@@ -94,32 +102,36 @@ def packet(
 
 RADIUS = "radius" / Scaled(Int16ub, 0.005, "m") * "0: no return"
 ATTRIBUTE = "attribute" / Int8ub * "E1: 1 normal, 2 noise"
-ONE = (RADIUS, *UNIT, "intensity" / Int8ub, ATTRIBUTE)
-TWO = (
+ONE_RETURN = (RADIUS, *UNIT_VECTOR, "intensity" / Int8ub, ATTRIBUTE)
+TWO_RETURNS = (
     RADIUS,
     "second_radius" / Scaled(Int16ub, 0.005, "m") * "second distance with dual return",
-    *UNIT,
+    *UNIT_VECTOR,
     "intensity" / Int8ub,
     "second_intensity" / Int8ub,
     ATTRIBUTE,
 )
-RETURN = "return_seq" / Int8ub * "0 single return, 1 first, 2 second"
-UNCHECKED = "not checked: the covered bytes are not documented"
-SEALED = ("crc" / Int32ub * UNCHECKED, "rolling_counter" / Int16ub)
+RETURN_NUMBER = "return_seq" / Int8ub * "0 single return, 1 first, 2 second"
+UNCHECKED_NOTE = "not checked: the covered bytes are not documented"
+CRC_AND_COUNTER = ("crc" / Int32ub * UNCHECKED_NOTE, "rolling_counter" / Int16ub)
 
 M2_SCANNER = Scanner(25, 5, 1260, 1, wide=120, high=25)
 MX_SCANNER = Scanner(50, 2, 630, 1, wide=120, high=25)
 E1_SCANNER = Scanner(96, 1, 288, 0, wide=120, high=90)
 
-M2_DATA = packet(M2_SCANNER, Int8ub, (RETURN,), ONE, "reserved_end" / Bytes(4), *SEALED)
-MX_DATA = packet(MX_SCANNER, Int8ub, (), TWO, "reserved_end" / Bytes(16), *SEALED)
+M2_DATA = make_packet(
+    M2_SCANNER, Int8ub, (RETURN_NUMBER,), ONE_RETURN, "reserved_end" / Bytes(4), *CRC_AND_COUNTER
+)
+MX_DATA = make_packet(
+    MX_SCANNER, Int8ub, (), TWO_RETURNS, "reserved_end" / Bytes(16), *CRC_AND_COUNTER
+)
 E1_TAIL = (
     "data_length" / Const(1200, Int16ub),
     "counter" / Int16ub,
     "data_id" / Const(0xE5C, Int32ub),
-    "crc" / Int32ub * UNCHECKED,
+    "crc" / Int32ub * UNCHECKED_NOTE,
 )
-E1_DATA = packet(E1_SCANNER, Int16ub, (), ONE, "reserved_end" / Bytes(4), *E1_TAIL)
+E1_DATA = make_packet(E1_SCANNER, Int16ub, (), ONE_RETURN, "reserved_end" / Bytes(4), *E1_TAIL)
 E1_DIFOP = Struct(
     "magic" / MAGIC,
     "reserved_8" / Bytes(8),
@@ -153,19 +165,19 @@ E1_DIFOP = Struct(
 
 
 def plausible(f: Fields, model: Scanner) -> Any:
-    """Numbers of a frame with dual return at most."""
+    """Return whether the packet number is in the range of a frame with dual return."""
     return (f.pkt_psn >= model.first) & (f.pkt_psn < model.first + 2 * model.packets)
 
 
-def packets(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
-    """Return the last number of a frame, by the return mode."""
-    twice = np.logical_or.reduce([f.wave_mode == mode for mode in dual]) if dual else False
-    return np.where(twice, 2 * model.packets, model.packets) + model.first - 1
+def last_packet_number(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
+    """Return the last packet number of a frame, by the return mode."""
+    is_dual = np.logical_or.reduce([f.wave_mode == mode for mode in dual]) if dual else False
+    return np.where(is_dual, 2 * model.packets, model.packets) + model.first - 1
 
 
 def pace(f: Fields, model: Scanner, dual: tuple[int, ...]) -> Any:
     """Return the seconds from a packet to the next."""
-    return 1 / (FRAME_RATE * (packets(f, model, dual) - model.first + 1))
+    return 1 / (FRAME_RATE_HZ * (last_packet_number(f, model, dual) - model.first + 1))
 
 
 def make_counter(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
@@ -176,15 +188,16 @@ def make_counter(model: Scanner, dual: tuple[int, ...] = ()) -> dict[str, Any]:
     """
     return {
         "sequence": Sequence(
-            "pkt_psn", first=model.first, last=partial(packets, model=model, dual=dual)
+            "pkt_psn", first=model.first, last=partial(last_packet_number, model=model, dual=dual)
         ),
         "clock": Clock(("seconds", "microseconds"), pace=partial(pace, model=model, dual=dual)),
     }
 
 
-def direction(f: Fields) -> dict[str, Any]:
-    """Azimuth, elevation, and what points of every model have besides; REP-103 axes, as on the
-    wire.
+def common_columns(f: Fields) -> dict[str, Any]:
+    """Return azimuth, elevation, time and ring, which points of every model have.
+
+    The unit vectors have REP-103 axes.
     """
     channels = f.blocks.channels
     across = np.hypot(channels.x, channels.y)
@@ -197,22 +210,24 @@ def direction(f: Fields) -> dict[str, Any]:
 
 
 def points(f: Fields, returns: bool = False) -> Polar:
-    """A point of each channel; the length of a direction, 1 but for its steps, is part of the
-    range, as in rs_driver.
+    """Return a point of each channel.
+
+    The length of the vector, 1 except for its rounding, is part of the range, as in rs_driver.
+    `returns` is whether blocks have the number of the return.
     """
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
     echo = np.maximum(f.blocks.return_seq - 1, 0) if returns else None
-    own = {
+    other_columns = {
         "intensity": channels.intensity,
         "return_index": echo,
         "extra": {"attribute": channels.attribute},
     }
-    return Polar(range=channels.radius * length, **direction(f), **own)
+    return Polar(range=channels.radius * length, **common_columns(f), **other_columns)
 
 
 def points_mx(f: Fields) -> Polar:
-    """Two points of each channel with dual return."""
+    """Return two points of each channel, the second with dual return only."""
     channels = f.blocks.channels
     length = np.sqrt(channels.x**2 + channels.y**2 + channels.z**2)
     second = np.where(f.wave_mode == DUAL, channels.second_radius, 0)
@@ -220,12 +235,12 @@ def points_mx(f: Fields) -> Polar:
         range=stack(channels.radius * length, second * length),
         intensity=stack(channels.intensity, channels.second_intensity),
         return_index=stack(second * 0, second * 0 + 1),
-        **direction(f),
+        **common_columns(f),
     )
 
 
 def imu(f: Fields) -> Imu:
-    """As rs_driver hands it on."""
+    """Return the IMU sample with the axes of rs_driver."""
     return Imu(
         (f.rotation_x, f.rotation_y, f.rotation_z),
         (f.acceleration_x, f.acceleration_y, f.acceleration_z),
@@ -233,20 +248,21 @@ def imu(f: Fields) -> Imu:
 
 
 def sweep(i: int, model: Scanner, mode: int = STRONGEST) -> dict[str, Any]:
-    """Packet i of frames of so many packets: lines to and fro, downwards; each channel an equal
-    part of a line.
+    """Return the values of simulated packet i.
+
+    Lines run forth and back, downwards; each channel scans an equal part of a line.
     """
     number = i % model.packets
-    time = i / (model.packets * FRAME_RATE)
-    spot = (number * model.blocks + np.arange(model.blocks))[:, None] / (
+    time = i / (model.packets * FRAME_RATE_HZ)
+    progress = (number * model.blocks + np.arange(model.blocks))[:, None] / (
         model.packets * model.blocks
     )
     lines = 100
-    line, along = np.divmod(spot * lines, 1)
+    line, along = np.divmod(progress * lines, 1)
     along = np.where(line % 2, 1 - along, along)
     azimuth = np.deg2rad((0.5 - (along + np.arange(model.channels)) / model.channels) * model.wide)
     elevation = np.deg2rad(np.broadcast_to((0.5 - line / (lines - 1)) * model.high, azimuth.shape))
-    offsets = np.arange(model.blocks) / (model.packets * FRAME_RATE * model.blocks)
+    offsets = np.arange(model.blocks) / (model.packets * FRAME_RATE_HZ * model.blocks)
     return {
         "pkt_psn": number + model.first,
         "wave_mode": mode,
@@ -263,7 +279,7 @@ def sweep_e1(i: int) -> dict[str, Any]:
     """Return the device information of a sensor at rest with the factory's settings."""
     ports = {"msop_port": 6699, "difop_port": 7788, "lidar_ip": bytes([192, 168, 1, 200])}
     return {
-        "frame_rate": FRAME_RATE,
+        "frame_rate": FRAME_RATE_HZ,
         "return_mode": STRONGEST,
         "seconds": i,
         "microseconds": 0,
@@ -312,9 +328,8 @@ MX = dataclasses.replace(
     },
     points=points_mx,
     **make_counter(MX_SCANNER),
-    simulation=Simulation(
-        partial(sweep, model=MX_SCANNER, mode=DUAL)
-    ),  # whose packets have a second radius that is used
+    # with dual return, so that the second radius is simulated too
+    simulation=Simulation(partial(sweep, model=MX_SCANNER, mode=DUAL)),
     range_limits=(0.2, 200.0),
     info={"serial": "difop.serial_number"},
     source="rs_driver (decoder_RSMX.hpp); not tested with packets of this model",
