@@ -1,18 +1,17 @@
-"""ROS 2 driver for all lidars of lidarspec: the verb `lidarspec ros2`, and the
-executable `lidarspec_node`.
+"""ROS 2 driver for all lidars: the verb `lidarspec ros2`, and the executable `lidarspec_node`.
 
-A lifecycle node over a `Device`, as every verb has one. ROS is imported when the node starts, and
-not before. Modules in reading order:
+The driver is a lifecycle node that reads a `Device`, as every verb does. ROS is imported when the
+node starts, not earlier. Modules in reading order:
 
-* `command`: the verb and the executable; which ROS there is.
-* `parameters`: the one table of parameters, and the values of one configuration.
-* `ros_arguments`: the parameters on the command line, before there is a node.
+* `command`: the verb and the executable; the search for ROS.
+* `parameters`: the table of parameters, and the values of one configuration.
+* `ros_arguments`: the parameters on the command line, before the node exists.
 * `shared_memory`: the shared memory of Fast DDS, large enough for the clouds of the sensor.
 * `node`: the lifecycle, services, and the thread that reads.
-* `topics`: what is published.
+* `topics`: the published messages.
 * `packets`: packets as a topic, and as a source.
-* `diagnostics`: how the sensor is doing, as /diagnostics says it.
-* `clock`: stamps in ROS's time, and the sensor's clock by the host's.
+* `diagnostics`: the state of the sensor for /diagnostics.
+* `clock`: stamps in ROS's time, and the sensor's clock converted to the host's.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 @hookimpl
 def lidarspec_verbs() -> list[click.Command]:
-    """The verb `ros2`."""
+    """Return the verb `ros2`."""
     from lidarspec_ros2.command import ros2
 
     return [ros2]
@@ -37,7 +36,7 @@ def lidarspec_verbs() -> list[click.Command]:
 
 @hookimpl
 def lidarspec_source(url: str, sensor: Sensor | None) -> Transport | None:
-    """The packets of a topic, ``ros2:/TOPIC``."""
+    """Return the transport of a topic's packets, ``ros2:/TOPIC``."""
     scheme, _, topic = url.partition(":")
     if scheme != "ros2":
         return None

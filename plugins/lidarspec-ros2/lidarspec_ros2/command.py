@@ -1,8 +1,7 @@
-"""The verb `lidarspec ros2` and the executable `lidarspec_node`: the node in a process of its own,
-from its start to its end.
+"""The verb `lidarspec ros2` and the executable `lidarspec_node`: the node in a separate process.
 
-Of several ROS installations that one is used that Python imports: a sourced one stands in
-PYTHONPATH, before the wheels of the extra `ros2`.
+If there are several ROS installations, the node uses the one that Python imports: a sourced
+installation is in PYTHONPATH, before the wheels of the extra `ros2`.
 """
 
 from __future__ import annotations
@@ -29,17 +28,17 @@ if TYPE_CHECKING:
     from lidarspec_ros2.shared_memory import SharedMemory
 
 
-#: seconds between two looks at whether a signal has come.
-LOOK = 0.1
+#: Seconds between two checks for a signal.
+SIGNAL_CHECK_S = 0.1
 
 
 class _RosCommand(click.Command):
-    """A verb that leaves what begins with --ros-args to ROS."""
+    """A verb that leaves --ros-args and all following words to ROS."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        place = args.index("--ros-args") if "--ros-args" in args else len(args)
-        ctx.meta["ros_args"] = args[place:]
-        return super().parse_args(ctx, args[:place])
+        index = args.index("--ros-args") if "--ros-args" in args else len(args)
+        ctx.meta["ros_args"] = args[index:]
+        return super().parse_args(ctx, args[:index])
 
     def collect_usage_pieces(self, ctx: click.Context) -> list[str]:
         return [*super().collect_usage_pieces(ctx), "[--ros-args ...]"]
@@ -73,7 +72,7 @@ def ros2(
 
 
 def main() -> None:
-    """The executable: as the verb, with everything told by ROS's own words."""
+    """Run the executable: the node with all settings from ROS's arguments."""
     try:
         run({}, sys.argv[1:])
     except Exception as error:
@@ -81,10 +80,10 @@ def main() -> None:
 
 
 def import_ros() -> None:
-    """Find the ROS that there is.
+    """Import ROS, to check that it is installed.
 
     Raises:
-        UsageError: where there is none, with the ways to have one.
+        UsageError: if it is not, with the ways to install it.
     """
     try:
         importlib.import_module("rclpy")
@@ -97,39 +96,41 @@ def import_ros() -> None:
 
 
 def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
-    """Run the node until it is interrupted, or has come to its end.
+    """Run the node until it is interrupted or its input ends.
 
     Args:
         given: parameters, by name.
-        ros_args: the words of the command line that are ROS's.
+        ros_args: the words of the command line for ROS.
 
     Raises:
-        LidarSpecError: where there is no ROS, a parameter cannot be, or the sensor cannot be read.
+        LidarSpecError: if ROS is missing, a parameter is invalid, or the sensor cannot be read.
     """
     import_ros()
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
     from lidarspec_ros2.node import LidarNode
-    from lidarspec_ros2.shared_memory import profile_in_use
+    from lidarspec_ros2.shared_memory import use_profile
 
     signals, nodes = list[int](), list[LidarNode]()
 
-    def told(number: int, frame: object) -> None:
-        """End in good order; only what waits for a sensor is broken off."""
+    def handle_signal(number: int, frame: object) -> None:
+        """Note the signal, and interrupt only a node that waits for a sensor."""
         signals.append(number)
         if any(node.opening for node in nodes):
             raise KeyboardInterrupt
 
-    previous = {number: signal.signal(number, told) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {
+        number: signal.signal(number, handle_signal) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     rclpy.init(
         args=["lidarspec_node", *ros_args], signal_handler_options=rclpy.SignalHandlerOptions.NO
     )
     try:
-        memory = _shared_memory(given, ros_args)
-        with profile_in_use(memory):
+        memory = _find_shared_memory(given, ros_args)
+        with use_profile(memory):
             nodes.append(LidarNode(given, max_cloud_bytes=memory.max_cloud_bytes))
-        _log(nodes[0], memory)
+        _log_shared_memory(nodes[0], memory)
         executor = SingleThreadedExecutor()
         executor.add_node(nodes[0])
         _serve(nodes[0], executor, signals)
@@ -139,8 +140,8 @@ def run(given: Mapping[str, Any], ros_args: Sequence[str]) -> None:
             signal.signal(number, handler)
 
 
-def _shared_memory(given: Mapping[str, Any], ros_args: Sequence[str]) -> SharedMemory:
-    """Return the shared memory for the sensor that the parameters name, before there is a node."""
+def _find_shared_memory(given: Mapping[str, Any], ros_args: Sequence[str]) -> SharedMemory:
+    """Return the shared memory for the parameters' sensor, before the node exists."""
     from rclpy.utilities import get_rmw_implementation_identifier
 
     from lidarspec.transports.open_url import live_address
@@ -156,14 +157,14 @@ def _shared_memory(given: Mapping[str, Any], ros_args: Sequence[str]) -> SharedM
     is_serial = address is not None and address.scheme == "serial"
 
     def find_sensor() -> Sensor | None:
-        return Settings(values).known_sensor()
+        return Settings(values).find_known_sensor()
 
     rmw = get_rmw_implementation_identifier()
     return choose_shared_memory(rmw, find_sensor, is_serial=is_serial)
 
 
-def _log(node: LidarNode, memory: SharedMemory) -> None:
-    """Say in the log how the node uses shared memory."""
+def _log_shared_memory(node: LidarNode, memory: SharedMemory) -> None:
+    """Log how the node uses shared memory."""
     if memory.notice:
         node.get_logger().info(memory.notice)
     if memory.warning:
@@ -171,7 +172,11 @@ def _log(node: LidarNode, memory: SharedMemory) -> None:
 
 
 def _serve(node: LidarNode, executor: Executor, signals: Sequence[int]) -> None:
-    """Serve until the node has come to its end, or is told to end by a signal."""
+    """Serve until the node ends or a signal arrives, then close the node.
+
+    Raises:
+        Exception: the node's failure, if it starts automatically.
+    """
     serving = threading.Thread(target=executor.spin, name="executor")
     try:
         with contextlib.suppress(KeyboardInterrupt):
@@ -179,7 +184,7 @@ def _serve(node: LidarNode, executor: Executor, signals: Sequence[int]) -> None:
                 node.start()
             serving.start()
             while not signals and not node.ended.wait(
-                LOOK
+                SIGNAL_CHECK_S
             ):  # a signal that comes just before it waits does not end the wait
                 pass
     finally:

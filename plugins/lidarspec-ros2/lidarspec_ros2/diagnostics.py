@@ -1,4 +1,4 @@
-"""How the sensor is doing, as /diagnostics says it once a second."""
+"""The state of the sensor, as /diagnostics reports it once a second."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from lidarspec.cli.read import FIGURES
 from lidarspec.device.device import Device
 from lidarspec.view.rate_meter import MeterReading
 
-#: states of a device in which nothing comes.
-LOST = ("disconnected", "silent")
+#: States of a device that sends nothing.
+LOST_STATES = ("disconnected", "silent")
 
 
 def make_status(
@@ -21,12 +21,12 @@ def make_status(
     device_warnings: Sequence[str],
     more: Mapping[str, str],
 ) -> DiagnosticStatus:
-    """How a device is doing.
+    """Return the state of a device for /diagnostics.
 
     Args:
-        name: of the node.
+        name: the name of the node.
         reading: the figures of the last second.
-        device_warnings: what is to be said of it besides the device's own warnings.
+        device_warnings: warnings in addition to those of the device.
         more: further values.
     """
     warnings = [*device.warnings, *device_warnings]
@@ -40,7 +40,7 @@ def make_status(
     }
     level = (
         DiagnosticStatus.ERROR
-        if device.state in LOST
+        if device.state in LOST_STATES
         else DiagnosticStatus.WARN
         if warnings
         else DiagnosticStatus.OK

@@ -1,9 +1,8 @@
-"""The lifecycle node: a sensor opened on configuring, published while active, closed on cleaning
-up.
+"""The lifecycle node: it opens the sensor on configure, publishes while active, closes on cleanup.
 
-One thread reads the device and publishes what comes. The executor's thread serves transitions,
-parameters and commands, and does what the reading thread asks for: to say once a second how the
-sensor is doing, and to be inactive while it is gone.
+One thread reads the device and publishes messages. The executor's thread serves transitions,
+parameters and commands. On request of the reading thread it also publishes diagnostics once a
+second, and deactivates the node while the sensor is gone.
 """
 
 from __future__ import annotations
@@ -34,33 +33,32 @@ from lidarspec.explaining.assignments import parse_arguments
 from lidarspec.explaining.explanation import reply_text
 from lidarspec.view.live_scans import LOOK_S, LiveScans
 from lidarspec.view.rate_meter import MeterReading
-from lidarspec_ros2.diagnostics import LOST, make_status
+from lidarspec_ros2.diagnostics import LOST_STATES, make_status
 from lidarspec_ros2.packets import PacketLog
 from lidarspec_ros2.parameters import NAMED, NODE_NAME, PARAMETERS, Parameter, Settings
 from lidarspec_ros2.topics import Topics
 
-#: seconds between two diagnostics.
-SECOND = 1.0
-#: seconds by which the end of a scan is looked for too early, and for which it is looked for; which
-#: what an IMU felt may wait.
-EARLY, LATE, SOON = 0.003, 0.02, 0.01
+DIAGNOSTICS_PERIOD_S = 1.0
+EARLY_WAKE_S = 0.003  # before the expected end of a scan
+MAX_SCAN_LATENESS_S = 0.02  # after it, the node waits at its normal pace
+MAX_IMU_DELAY_S = 0.01
 
 
 class LidarNode(LifecycleNode):
     """A sensor as a node.
 
     Args:
-        given: parameters that come before those of the command line and of files.
+        given: parameters that precede those of the command line and of files.
         max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
 
     Attributes:
-        failure: why the node could not be configured, or the sensor cannot be read any more; None
-            where it can.
-        ended: set when nothing more will come of it by itself.
-        opening: whether it waits for a sensor to be found, and to answer.
+        failure: why the node could not be configured, or the sensor can no longer be read; None
+            without failure.
+        ended: set when the node will do nothing more by itself.
+        opening: whether it waits for a sensor to be found, and to reply.
 
     Raises:
-        UsageError: for a parameter that cannot be.
+        UsageError: if a parameter is invalid.
     """
 
     def __init__(self, given: Mapping[str, Any], *, max_cloud_bytes: int | None = None) -> None:
@@ -79,25 +77,27 @@ class LidarNode(LifecycleNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         try:
             values = {
-                one.name: self.declare_parameter(one.name, one.default, _descriptor(one)).value
-                for one in PARAMETERS
+                parameter.name: self.declare_parameter(
+                    parameter.name, parameter.default, _make_descriptor(parameter)
+                ).value
+                for parameter in PARAMETERS
             }
             self._settings = Settings(values)
         except (ParameterException, LidarSpecError) as error:
             self.destroy_node()
             raise error if isinstance(error, LidarSpecError) else UsageError(str(error)) from None
-        self.add_on_set_parameters_callback(self._set)
+        self.add_on_set_parameters_callback(self._apply_parameters)
 
     @property
     def autostarts(self) -> bool:
-        """Whether it is to be started at once."""
+        """Whether the node configures and activates itself."""
         return bool(self._settings["autostart"])
 
     def start(self) -> None:
-        """Configure and activate.
+        """Configure and activate the node.
 
         Raises:
-            LidarSpecError: where it cannot be configured.
+            LidarSpecError: if it cannot be configured.
         """
         self.trigger_configure()
         if self.failure is not None:
@@ -105,11 +105,11 @@ class LidarNode(LifecycleNode):
         self.trigger_activate()
 
     def close(self) -> None:
-        """Stop reading and give the sensor back; a second call does nothing."""
+        """Stop reading and close the sensor; a second call has no effect."""
         self._stopping.set()
         device, self._device = self._device, None
         if device is not None:
-            if device.is_live:  # which ends what waits for data
+            if device.is_live:  # this ends the reading thread's wait for data
                 device.close()
             if self._thread is not None:
                 self._thread.join()
@@ -122,42 +122,42 @@ class LidarNode(LifecycleNode):
         self._services_of_sensor.clear()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Open the sensor, and read it."""
+        """Open the sensor and start to read it."""
         self.failure = None
         try:
             self._open()
-        except Exception as error:  # of which rclpy would say nothing
+        except Exception as error:  # rclpy would not report it
             self._fail(error)
             self.close()
             return TransitionCallbackReturn.FAILURE
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let through what is published."""
+        """Start to publish."""
         self._was_lost = False
         if self._topics is not None:
             self._topics.activate(active=True)
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Go on reading, for commands and diagnostics, and publish nothing."""
+        """Stop publishing, but continue to read, for commands and diagnostics."""
         if self._topics is not None:
             self._topics.activate(active=False)
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop the sensor, and give it back."""
+        """Stop and close the sensor."""
         self.close()
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Return the same, and come to the end."""
+        """Stop and close the sensor, and end."""
         self.close()
         self.ended.set()
         return super().on_shutdown(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Give the sensor back, so that it can be configured again."""
+        """Close the sensor, so that it can be configured again."""
         self.close()
         return super().on_error(state)
 
@@ -166,7 +166,7 @@ class LidarNode(LifecycleNode):
         packets = PacketLog()
         self.opening = True
         try:
-            device = self._device = settings.device(lambda opened: packets)
+            device = self._device = settings.open_device(lambda opened: packets)
         finally:
             self.opening = False
         topics = self._topics = Topics(
@@ -177,7 +177,7 @@ class LidarNode(LifecycleNode):
             max_cloud_bytes=self._max_cloud_bytes,
         )
         packets.publish = topics.publish_packet
-        self._serve_commands(device)
+        self._create_command_services(device)
         self._warn_of_unknown_parameters()
         self._stopping.clear()
         self._was_lost = False
@@ -187,31 +187,35 @@ class LidarNode(LifecycleNode):
         self._thread.start()
 
     def _read(self, device: Device, topics: Topics) -> None:
-        """Publish what comes, until the node is stopped or the input ends."""
+        """Publish scans, packets and IMU samples until the node stops or the input ends."""
         speed = self._settings["replay_speed"]
         feed = LiveScans(
             device, played=speed > 0, speed=speed, ahead=None
-        )  # what is read tells of the sensor's clock before it is shown
-        due, expected = time.monotonic(), 0.0
+        )  # all read data updates the clock's conversion before a scan is published
+        next_diagnostics, scan_end = time.monotonic(), 0.0
         try:
             while not self._stopping.is_set() and not feed.ended:
                 feed.read(0.0 if device.is_live else time.monotonic() + LOOK_S)
                 self._publish(feed, topics)
-                expected = _predict_scan_end(expected, feed)
+                scan_end = _predict_scan_end(scan_end, feed)
                 device.delay_decoding(
-                    min(expected, time.monotonic() + SOON) if device.sensor.imu_frames else expected
+                    min(scan_end, time.monotonic() + MAX_IMU_DELAY_S)
+                    if device.sensor.imu_frames
+                    else scan_end
                 )
-                self._watch(device)
-                if (now := time.monotonic()) >= due:
-                    due = now + SECOND
-                    reading = feed.meter.reading(device.stats, SECOND if device.is_live else None)
-                    self._call_in_executor(
+                self._check_connection(device)
+                if (now := time.monotonic()) >= next_diagnostics:
+                    next_diagnostics = now + DIAGNOSTICS_PERIOD_S
+                    reading = feed.meter.reading(
+                        device.stats, DIAGNOSTICS_PERIOD_S if device.is_live else None
+                    )
+                    self._run_in_executor(
                         partial(self._publish_diagnostics, device, topics, reading)
                     )
         except Exception as error:
             self._fail(error)
         if not self._stopping.is_set():
-            self._call_in_executor(self._end)
+            self._run_in_executor(self._end_input)
 
     def _publish(self, feed: LiveScans, topics: Topics) -> None:
         if feed.packets is not None and len(feed.packets):
@@ -221,28 +225,28 @@ class LidarNode(LifecycleNode):
             if scan.whole:
                 topics.publish(scan)
 
-    def _watch(self, device: Device) -> None:
-        """Have the node be inactive while the sensor is gone, which has been there."""
-        is_lost = device.state in LOST and bool(device.stats.frames)
+    def _check_connection(self, device: Device) -> None:
+        """Deactivate the node while a sensor that has sent data is gone."""
+        is_lost = device.state in LOST_STATES and bool(device.stats.frames)
         if is_lost != self._was_lost and (self._was_lost or self._is_active):
-            self._call_in_executor(self._lose if is_lost else self._regain)
+            self._run_in_executor(self._handle_loss if is_lost else self._handle_return)
 
     @property
     def _is_active(self) -> bool:
         return self._topics is not None and self._topics.active
 
-    def _lose(self) -> None:
+    def _handle_loss(self) -> None:
         if self._is_active:
             self.trigger_deactivate()
             self._was_lost = True
 
-    def _regain(self) -> None:
+    def _handle_return(self) -> None:
         if self._was_lost:
             self.trigger_activate()
 
     def _publish_diagnostics(self, device: Device, topics: Topics, reading: MeterReading) -> None:
-        """Say how the sensor is doing."""
-        if device is not self._device:  # which is closed
+        """Publish the state of the sensor on /diagnostics."""
+        if device is not self._device:  # the device was closed
             return
         more = {
             "lifecycle": "active" if topics.active else "inactive",
@@ -261,13 +265,13 @@ class LidarNode(LifecycleNode):
             DiagnosticArray(header=Header(stamp=self.get_clock().now().to_msg()), status=[status])
         )
 
-    def _call_in_executor(self, callback: Callable[[], Any]) -> None:
-        """Have something done in the thread of the executor."""
+    def _run_in_executor(self, callback: Callable[[], Any]) -> None:
+        """Schedule a callback in the thread of the executor."""
         if self.executor is not None:
             self.executor.create_task(callback)
 
-    def _end(self) -> None:
-        """The input has come to its end, or cannot be read any more."""
+    def _end_input(self) -> None:
+        """Deactivate the node after its input has ended or failed."""
         if self._is_active:
             self.trigger_deactivate()
         if self.failure is not None:
@@ -277,13 +281,15 @@ class LidarNode(LifecycleNode):
 
     def _fail(self, error: Exception) -> None:
         self.failure = error
-        if not self.autostarts:  # else it ends the process, which says so
+        if not self.autostarts:  # with autostart the process ends and prints the error
             following = suggestion(error)
             self.get_logger().error(f"{error}{f'; next: {following}' if following else ''}")
 
-    def _set(self, parameters: Sequence[RosParameter]) -> SetParametersResult:
-        """Take parameters that are set at run time, or say why not."""
-        ours = {one.name: one.value for one in parameters if one.name in NAMED}
+    def _apply_parameters(self, parameters: Sequence[RosParameter]) -> SetParametersResult:
+        """Apply parameters that are set at run time, or return why not."""
+        ours = {
+            parameter.name: parameter.value for parameter in parameters if parameter.name in NAMED
+        }
         try:
             for name, value in ours.items():
                 if (
@@ -303,17 +309,16 @@ class LidarNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _warn_of_unknown_parameters(self) -> None:
-        """Say which parameters are given that no node of this sensor has, of which ROS itself says
-        nothing.
-        """
-        for name in self._parameter_overrides:  # which rclpy tells in no other way
+        """Log the given parameters that this node does not have, which ROS ignores."""
+        for name in self._parameter_overrides:  # rclpy has no public way to list them
             if not self.has_parameter(name) and not name.startswith("qos_overrides."):
-                close = did_you_mean(name, [one.name for one in PARAMETERS])
+                close = did_you_mean(name, [parameter.name for parameter in PARAMETERS])
                 self.get_logger().warning(f"unknown parameter {name!r} is ignored{close}")
 
-    def _serve_commands(self, device: Device) -> None:
-        """A service for each command of the sensor, beside the node's own, such as get_state, and a
-        parameter for each of its arguments.
+    def _create_command_services(self, device: Device) -> None:
+        """Create a service per command, and a parameter per argument of a command.
+
+        The node's own services, for example get_state, keep their names.
         """
         for name, command in device.sensor.commands.items():
             for argument in command.args:
@@ -327,13 +332,15 @@ class LidarNode(LifecycleNode):
                         ParameterDescriptor(description=text, dynamic_typing=True),
                     )
             self._services_of_sensor.append(
-                self.create_service(Trigger, f"~/send/{name}", partial(self._send, device, name))
+                self.create_service(
+                    Trigger, f"~/send/{name}", partial(self._send_command, device, name)
+                )
             )
 
-    def _send(
+    def _send_command(
         self, device: Device, name: str, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        """Send a command, and answer with its reply, or why there is none."""
+        """Send a command, and return its reply or the error in the response."""
         given = {
             argument: self.get_parameter(f"{name}.{argument}").value
             for argument in device.sensor.commands[name].args
@@ -350,27 +357,28 @@ class LidarNode(LifecycleNode):
         return response
 
 
-def _predict_scan_end(before: float, feed: LiveScans) -> float:
-    """When the next scan may end, a time of `time.monotonic`, a little too early; one that is late
-    is waited for less eagerly.
+def _predict_scan_end(expected: float, feed: LiveScans) -> float:
+    """Return when to wake for the end of the next scan, by `time.monotonic`.
+
+    The time is a little too early. If a scan is late, the result is the normal polling time.
     """
     now = time.monotonic()
     for scan in feed.scans:
         if scan.whole and math.isfinite(scan.rate_hz):
-            return now + 1 / scan.rate_hz - EARLY
-    return before if now - before < LATE else now + LOOK_S
+            return now + 1 / scan.rate_hz - EARLY_WAKE_S
+    return expected if now - expected < MAX_SCAN_LATENESS_S else now + LOOK_S
 
 
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    described = ParameterDescriptor(description=parameter.text)
+def _make_descriptor(parameter: Parameter) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(description=parameter.text)
     if parameter.low is None or parameter.high is None:
-        return described
+        return descriptor
     if isinstance(parameter.default, float):
-        described.floating_point_range = [
+        descriptor.floating_point_range = [
             FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
         ]
     else:
-        described.integer_range = [
+        descriptor.integer_range = [
             IntegerRange(from_value=int(parameter.low), to_value=int(parameter.high), step=1)
         ]
-    return described
+    return descriptor

@@ -1,8 +1,7 @@
-"""Packets over a topic: what arrives from a sensor is published, and what is published is a source,
-`ros2:/TOPIC`.
+"""Packets over a topic: a node publishes received packets, and `ros2:/TOPIC` reads them.
 
-So a node decodes again what another one published, or `ros2 bag play` plays, with the times at
-which it arrived then.
+So a node can decode packets that another node or `ros2 bag play` publishes, with their original
+arrival times.
 """
 
 from __future__ import annotations
@@ -21,16 +20,15 @@ from lidarspec.errors import SourceError
 from lidarspec.transports.protocol import Chunk, LiveTransport
 from lidarspec.transports.robotics_logs import raw_chunk
 
-#: packets that wait for a reader: some seconds of the fastest sensors.
-WAITING = 5000
-_NUMBER = itertools.count()
+MAX_WAITING_PACKETS = 5000  # some seconds of the fastest sensors
+_NODE_NUMBERS = itertools.count()
 
 
 class PacketLog:
-    """Hands what arrives on to a topic, in the place of a recording.
+    """A traffic log that publishes received packets instead of recording them.
 
     Attributes:
-        publish: what takes each chunk.
+        publish: the function that publishes a chunk.
     """
 
     error = None
@@ -39,24 +37,24 @@ class PacketLog:
         self.publish: Callable[[Chunk], None] | None = None
 
     def write(self, chunk: Chunk, direction: Literal["in", "out"] = "in") -> None:
-        """Hand it on."""
+        """Publish a received chunk; sent data is ignored."""
         if direction == "in" and self.publish is not None:
             self.publish(chunk)
 
     def event(self, name: str, at: int | None = None, **details: Any) -> None:
-        """The diagnostics say it."""
+        """Ignore an event, which the diagnostics report."""
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing, because no file is open."""
 
 
 class PacketTransport(LiveTransport):
-    """The packets of a topic, in a context of ROS of its own.
+    """The packets of a topic, in a separate ROS context.
 
     Args:
-        label: how the user called it.
-        topic: its name.
-        datagrams: whether each packet is one.
+        label: the source as the user wrote it.
+        topic: the name of the topic.
+        datagrams: whether each packet is a datagram.
     """
 
     def __init__(self, label: str, topic: str, *, datagrams: bool) -> None:
@@ -64,26 +62,26 @@ class PacketTransport(LiveTransport):
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node(
-            f"lidarspec_source_{os.getpid()}_{next(_NUMBER)}", context=self._context
+            f"lidarspec_source_{os.getpid()}_{next(_NODE_NUMBERS)}", context=self._context
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        qos = QoSProfile(depth=WAITING, reliability=ReliabilityPolicy.BEST_EFFORT)
+        qos = QoSProfile(depth=MAX_WAITING_PACKETS, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._node.create_subscription(
             UInt8MultiArray, topic, lambda message: self._chunks.append(raw_chunk(message)), qos
         )
 
     def read(self, timeout: float) -> list[Chunk]:
-        """Return the packets that have come."""
-        number = -1
-        while number < len(self._chunks) < WAITING:
-            number = len(self._chunks)
-            self._executor.spin_once(timeout_sec=0.0 if number else timeout)
+        """Return the received packets, after at most `timeout` seconds."""
+        count = -1
+        while count < len(self._chunks) < MAX_WAITING_PACKETS:
+            count = len(self._chunks)
+            self._executor.spin_once(timeout_sec=0.0 if count else timeout)
         chunks, self._chunks = self._chunks, []
         return chunks
 
     def reopen(self) -> None:
-        """A topic does not go away."""
+        """Do nothing, because a topic does not disappear."""
 
     def write(self, data: bytes) -> None:
         raise SourceError(f"cannot send to {self.label}: it is a topic of packets")

@@ -1,8 +1,7 @@
-"""The parameters of the node: one table, of which their declaration, their checks and their
-documentation are made.
+"""The parameters of the node: the table for their declaration, checks and documentation.
 
-`Settings` are the values of one configuration, checked by what checks the words of the command
-line, and refused in its words.
+`Settings` are the values of one configuration. They are checked by the code of the command line,
+with the same messages.
 """
 
 from __future__ import annotations
@@ -11,6 +10,8 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
+
+from lidarspec.scans.selection import Selection
 
 from lidarspec.cli.options import configure_sensor
 from lidarspec.detect.identification import detect, find_declared_sensor
@@ -22,7 +23,6 @@ from lidarspec.points.mount import Mount
 from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.scans.beams import PlanarScans
 from lidarspec.scans.laserscan import LaserScan
-from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.protocol import Transport
 
@@ -32,12 +32,12 @@ class Parameter:
     """One parameter.
 
     Attributes:
-        name: as ROS knows it.
-        default: its value where nobody gives one, which says its type too.
-        text: what it is.
-        low, high: the span of a number.
-        live: whether it is changed while the node is configured; the others are read on
-            configuring.
+        name: its name in ROS.
+        default: the default value, which also defines the type.
+        text: its description.
+        low, high: the limits of a number.
+        live: whether it can be changed while the node is configured; the others are read during
+            configuration.
     """
 
     name: str
@@ -49,13 +49,13 @@ class Parameter:
 
     @property
     def kind(self) -> str:
-        """Its type, in ROS's words."""
+        """The type, as ROS names it."""
         kinds = {bool: "bool", int: "integer", float: "double", str: "string", list: "string_array"}
         return kinds[type(self.default)]
 
 
-#: what the fields of `Mount` are.
-_MOUNT = {
+#: Descriptions of the fields of `Mount`.
+_MOUNT_TEXTS = {
     **{
         axis: f"Position of the sensor, metres {way} the carrier."
         for axis, way in (("x", "in front of"), ("y", "left of"), ("z", "above"))
@@ -66,7 +66,8 @@ _MOUNT = {
     },
     "inverted": "The sensor is mounted upside down.",
 }
-_SIDE, _FAR, _TURN = 1e4, 1e6, 360.0
+_MAX_OFFSET = 1e4  # metres, or seconds
+_MAX_RANGE_M = 1e6
 PARAMETERS = (
     Parameter(
         "source",
@@ -90,7 +91,7 @@ PARAMETERS = (
         Parameter(
             f"mount.{field.name}",
             getattr(Mount(), field.name),
-            _MOUNT[field.name],
+            _MOUNT_TEXTS[field.name],
         )
         for field in fields(Mount)
     ),
@@ -126,13 +127,13 @@ PARAMETERS = (
         10,
         live=True,
     ),
-    Parameter("range_min", 0.0, "Drop nearer returns, metres.", 0, _FAR, live=True),
+    Parameter("range_min", 0.0, "Drop nearer returns, metres.", 0, _MAX_RANGE_M, live=True),
     Parameter(
         "range_max",
         0.0,
         "Drop farther returns, metres. 0: the limit of the sensor.",
         0,
-        _FAR,
+        _MAX_RANGE_M,
         live=True,
     ),
     Parameter(
@@ -147,16 +148,16 @@ PARAMETERS = (
         "scan_z_min",
         0.0,
         "Lowest z of points in scan, metres, for a sensor with several rings.",
-        -_SIDE,
-        _SIDE,
+        -_MAX_OFFSET,
+        _MAX_OFFSET,
         live=True,
     ),
     Parameter(
         "scan_z_max",
         0.0,
         "Highest z of points in scan, metres. If equal to scan_z_min: not used.",
-        -_SIDE,
-        _SIDE,
+        -_MAX_OFFSET,
+        _MAX_OFFSET,
         live=True,
     ),
     Parameter(
@@ -181,8 +182,8 @@ PARAMETERS = (
         "time_offset",
         0.0,
         "Seconds added to every stamp; negative for a constant delay.",
-        -_SIDE,
-        _SIDE,
+        -_MAX_OFFSET,
+        _MAX_OFFSET,
         live=True,
     ),
     Parameter(
@@ -202,11 +203,10 @@ PARAMETERS = (
     ),
 )
 NAMED = {parameter.name: parameter for parameter in PARAMETERS}
-#: seconds from decoding to decoding when a scan is expected to end.
-PERIOD = 0.002
-#: the name of the node, unless it is renamed.
+DECODING_PERIOD_S = 0.002  # near the expected end of a scan
+#: The name of the node, unless it is renamed.
 NODE_NAME = "lidar"
-QUALITIES = ("best_effort", "reliable")
+QOS_NAMES = ("best_effort", "reliable")
 
 
 @dataclass(frozen=True)
@@ -214,15 +214,15 @@ class Settings:
     """The values of the parameters, by name.
 
     Raises:
-        UsageError: for what cannot be, as far as it is known before a sensor is.
+        UsageError: if a value is invalid for all sensors.
     """
 
     values: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if self["qos"] not in QUALITIES:
-            raise UsageError(f"qos: expected {' or '.join(QUALITIES)}, got {self['qos']!r}")
-        self.selection()
+        if self["qos"] not in QOS_NAMES:
+            raise UsageError(f"qos: expected {' or '.join(QOS_NAMES)}, got {self['qos']!r}")
+        self.make_selection()
         if self["scan_z_min"] > self["scan_z_max"]:
             raise UsageError(
                 f"scan_z_min {self['scan_z_min']} is above scan_z_max {self['scan_z_max']}"
@@ -231,15 +231,15 @@ class Settings:
     def __getitem__(self, name: str) -> Any:
         return self.values[name]
 
-    def selection(self) -> Selection:
-        """What is wanted of each scan."""
+    def make_selection(self) -> Selection:
+        """Return the selection of points in each scan."""
         far = self["range_max"] or math.inf
         return Selection(
             ranges=(self["range_min"], far), beams=self["beams"] or None, frame_id=self["frame_id"]
         )
 
     def make_planar_scans(self) -> PlanarScans:
-        """What makes planar scans."""
+        """Return the object that projects scans to planar scans."""
         first, width = self["angle_min"], (self["angle_max"] - self["angle_min"]) % (2 * math.pi)
         low, high = self["scan_z_min"], self["scan_z_max"]
         return PlanarScans(
@@ -249,54 +249,58 @@ class Settings:
         )
 
     def limit_ranges(self, planar: LaserScan) -> LaserScan:
-        """A planar scan that says of its ranges what is wanted of them, where that is less than the
-        sensor has.
-        """
+        """Return a planar scan with the parameters' range limits, if they are narrower."""
         far = min(planar.range_max, self["range_max"] or math.inf)
         return replace(planar, range_min=max(planar.range_min, self["range_min"]), range_max=far)
 
-    def sensor(self) -> Sensor:
-        """Return the sensor, configured; detected where none is named.
+    def find_sensor(self) -> Sensor:
+        """Return the configured sensor, detected if the parameters do not name one.
 
         Raises:
-            UsageError, WireError, SourceError: as the command line.
+            UsageError, WireError, SourceError: as on the command line.
         """
         sensor = self._configured_sensor()
         return detect(self["source"]) if sensor is None else sensor
 
-    def known_sensor(self) -> Sensor | None:
-        """Return the sensor that the parameters or the source name; None if it must be detected.
+    def find_known_sensor(self) -> Sensor | None:
+        """Return the sensor of the parameters or the source; None if it must be detected.
 
         Raises:
-            UsageError: for a sensor that is not installed, or an option that it does not take.
-            SourceError: for a file that cannot be opened.
+            UsageError: if a sensor is not installed, or does not accept an option.
+            SourceError: if a file cannot be opened.
         """
         sensor = self._configured_sensor()
         return find_declared_sensor(self["source"]) if sensor is None else sensor
 
     def _configured_sensor(self) -> Sensor | None:
-        """Return the sensor that the parameters name, with its options; None if they name none."""
+        """Return the sensor of the parameters with its options; None if they name none."""
         options = [option for option in self["options"] if option]
         sensor = configure_sensor(self["sensor"] or None, options, self["calibration"] or None)
         return None if sensor is None else named_sensor(sensor)
 
-    def mount(self) -> Mount | None:
-        """How the sensor is mounted: by the parameters, or else as `lidarspec.toml` says."""
+    def find_mount(self) -> Mount | None:
+        """Return the mount of the parameters or of `lidarspec.toml`; None if neither."""
         given = Mount(**{field.name: self[f"mount.{field.name}"] for field in fields(Mount)})
         device = find_device(self["source"])
         return given if given != Mount() else None if device is None else device.mount
 
-    def device(self, record: Callable[[Transport], TrafficLog]) -> Device:
+    def open_device(self, record: Callable[[Transport], TrafficLog]) -> Device:
         """Return the open device.
 
         Args:
-            record: makes what takes the packets, where they are published.
+            record: makes the log that publishes packets, if the parameters request it.
 
         Raises:
-            LidarSpecError: as the command line.
+            LidarSpecError: as on the command line.
         """
         if not self["source"]:
             raise UsageError("source is missing, such as /dev/ttyUSB0, udp:// or sim:ID")
-        mount = None if self["publish_tf"] else self.mount()
+        mount = None if self["publish_tf"] else self.find_mount()
         record_to = record if self["publish_packets"] else None
-        return Device(self["source"], self.sensor(), record=record_to, period=PERIOD, mount=mount)
+        return Device(
+            self["source"],
+            self.find_sensor(),
+            record=record_to,
+            period=DECODING_PERIOD_S,
+            mount=mount,
+        )

@@ -1,8 +1,8 @@
-"""The parameters on ROS's part of the command line, read before there is a node.
+"""The parameters in ROS's part of the command line, read before the node exists.
 
-rclpy hands parameters to a node that exists. Some decisions come before: the transports of the
+rclpy passes parameters to an existing node. Some decisions come earlier: the transports of the
 middleware are set when the first node is created. This module reads the same words and files. It
-ignores everything that it cannot read, because rclpy reads it again and reports what is invalid.
+ignores everything that it cannot read, because rclpy reads it again and reports invalid values.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ _REMAP_OPTIONS = ("-r", "--remap")
 def read_parameters(arguments: Sequence[str], node_name: str) -> dict[str, Any]:
     """Return the parameters that the command line and its files give to a node.
 
-    As in ROS, values of one pattern of node names replace earlier ones; patterns apply in the order
-    in which they appear first.
+    As in ROS, values of one pattern of node names replace earlier values; patterns apply in the
+    order in which they appear first.
 
     Args:
-        arguments: the words of the command line; only those after ``--ros-args`` count.
+        arguments: the words of the command line; only words after ``--ros-args`` count.
         node_name: the name of the node, unless the words rename it.
     """
     options = list(itertools.pairwise(_ros_words(arguments)))
@@ -63,7 +63,7 @@ def _ros_words(arguments: Sequence[str]) -> list[str]:
 
 
 def _full_name(options: Sequence[tuple[str, str]], node_name: str) -> str:
-    """Return the name of the node with its namespace, after the remapping that is asked for."""
+    """Return the name of the node with its namespace, after remapping."""
     namespace = ""
     for option, value in options:
         rule, _, name = value.partition(":=")
@@ -107,6 +107,9 @@ def _iter_nodes(tree: Any, name: str) -> Iterator[tuple[str, Mapping[str, Any]]]
 
 
 def _is_name_of(pattern: str, full_name: str) -> bool:
-    """Return whether a pattern, ``*`` for one part and ``**`` for any, is the name of a node."""
+    """Return whether a pattern is the name of a node.
+
+    ``*`` matches one part of a name, ``**`` any number of parts.
+    """
     expression = re.escape(pattern).replace(r"/\*\*", r"(/[^/]+)*").replace(r"\*", r"[^/]+")
     return re.fullmatch(expression, full_name) is not None

@@ -1,16 +1,16 @@
 """The shared memory of Fast DDS, large enough for the clouds of the sensor.
 
-Fast DDS hands messages to other processes of the same computer in a segment of shared memory that
-the publisher owns: 512 KiB, unless a profile says otherwise. A cloud of megabytes is sent in
+Fast DDS passes messages to other processes of the same computer in a segment of shared memory of
+the publisher. It has 512 KiB, unless a profile sets another size. A cloud of megabytes is sent in
 fragments that overwrite each other there, and with best effort most clouds are lost. The node
 brings a profile with a larger segment. Subscribers need no profile.
 
-Fast DDS reads the profile from a file that an environment variable names, once, when the first
-participant of a process is created. `profile_in_use` sets the variable for that moment only.
+Fast DDS reads the profile from a file in an environment variable, once, when the first participant
+of a process is created. `profile_in_use` sets the variable for that moment only.
 
 The profile lists the transports that Fast DDS would use anyway, shared memory and UDP. If discovery
-is limited to this computer, ROS adds its own UDP transport to those of the profile, which then
-brings shared memory alone. Of two transports of one kind Fast DDS sends with the first.
+is limited to this computer, ROS adds its own UDP transport to the profile, which then contains only
+shared memory. If there are two transports of one kind, Fast DDS sends with the first.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ USER_FILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 DEFAULT_SEGMENT_BYTES = 512 * 1024
 MIN_SEGMENT_BYTES = 4_000_000
 SEGMENT_STEP_BYTES = 1_000_000
-#: A segment needs room for at least so many clouds: one is read while the next is written.
+#: Minimum clouds that fit into a segment: one is read while the next is written.
 MIN_CLOUDS = 2
 #: Clouds that a new segment has room for, and the number if memory is short. With dual return it is
 #: half as many.
@@ -68,10 +68,10 @@ class SharedMemory:
     """How the node uses the shared memory of Fast DDS.
 
     Attributes:
-        segment_bytes: size of the segment that a profile asks for; 0 if the node brings no profile.
+        segment_bytes: size of the segment in the node's profile; 0 if the node brings no profile.
         max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
-        notice: text for the log that says what the node does; "" if it changes nothing.
-        warning: text for the log that says why clouds will be lost; "" if they will not.
+        notice: text for the log about the node's profile; "" if there is none.
+        warning: text for the log about the loss of clouds; "" if they are not lost.
     """
 
     segment_bytes: int = 0
@@ -86,7 +86,7 @@ def choose_shared_memory(
     """Return the shared memory for the clouds of a sensor.
 
     Args:
-        rmw: identifier of the middleware, such as rmw_fastrtps_cpp.
+        rmw: identifier of the middleware, for example rmw_fastrtps_cpp.
         find_sensor: returns the sensor, or None if it is not known yet. It is called only if the
             node may bring a profile.
         is_serial: whether the sensor is on a serial line, which is too slow for large clouds.
@@ -101,17 +101,17 @@ def choose_shared_memory(
         cloud_bytes = None
     if cloud_bytes is None and is_serial:
         cloud_bytes = 0
-    return _fit(cloud_bytes, free)
+    return _fit_segment(cloud_bytes, free)
 
 
-def _fit(cloud_bytes: int | None, free: int) -> SharedMemory:
-    """Return the shared memory for clouds of a size, None if it is unknown."""
+def _fit_segment(cloud_bytes: int | None, free: int) -> SharedMemory:
+    """Return the shared memory for clouds of this size, None if the size is unknown."""
     assumed = ASSUMED_CLOUD_BYTES if cloud_bytes is None else cloud_bytes
     if MIN_CLOUDS * assumed <= DEFAULT_SEGMENT_BYTES:
         return SharedMemory(max_cloud_bytes=DEFAULT_SEGMENT_BYTES // MIN_CLOUDS)
     size = format_megabytes(assumed)
     for clouds in (CLOUDS, FEWER_CLOUDS):
-        segment_bytes = _segment_for(clouds * assumed)
+        segment_bytes = _round_segment_bytes(clouds * assumed)
         if free >= FREE_SEGMENTS * segment_bytes:
             reason = "" if cloud_bytes is not None else " (the size for this sensor is unknown)"
             notice = (
@@ -128,7 +128,7 @@ def _fit(cloud_bytes: int | None, free: int) -> SharedMemory:
     return SharedMemory(warning=warning)
 
 
-def _segment_for(size: int) -> int:
+def _round_segment_bytes(size: int) -> int:
     """Return a round size of a segment, bytes."""
     return max(MIN_SEGMENT_BYTES, math.ceil(size / SEGMENT_STEP_BYTES) * SEGMENT_STEP_BYTES)
 
@@ -154,7 +154,7 @@ def has_user_profile() -> bool:
 
 
 def profile_variable() -> str:
-    """Return the variable that names the file of profiles, for the Fast DDS that is loaded.
+    """Return the environment variable for the profile of the loaded Fast DDS.
 
     Later versions of ROS read the variable of Fast DDS 2 too, but warn that it is deprecated.
     """
@@ -163,9 +163,10 @@ def profile_variable() -> str:
 
 
 def largest_cloud_bytes(sensor: Sensor) -> int | None:
-    """Return the size of the largest cloud of a sensor with single return, from simulated packets.
+    """Return the size of a sensor's largest cloud, from simulated packets.
 
-    That is the cloud of the slowest scan. None if the specification does not say enough.
+    It is the cloud of the slowest scan, with single return. None if the specification is
+    incomplete.
 
     Raises:
         LidarSpecError: if the sensor cannot be simulated.
@@ -203,7 +204,7 @@ def make_profile(segment_bytes: int, environment: Mapping[str, str]) -> str:
 
     Args:
         segment_bytes: size of the segment of shared memory.
-        environment: variables that say whether discovery is limited to this computer.
+        environment: variables, which may limit discovery to this computer.
     """
     udp = "" if _is_local(environment) else "<transport_id>udp</transport_id>"
     return f"""<?xml version="1.0" encoding="UTF-8"?>
@@ -238,10 +239,11 @@ def _is_local(environment: Mapping[str, str]) -> bool:
 
 
 @contextlib.contextmanager
-def profile_in_use(memory: SharedMemory) -> Iterator[None]:
-    """Have Fast DDS read the profile if it creates its first participant within the context.
+def use_profile(memory: SharedMemory) -> Iterator[None]:
+    """Make Fast DDS read the profile when it creates its first participant.
 
-    Neither the file nor the environment variable remains afterwards.
+    That has to happen within the context. Neither the file nor the environment variable remains
+    afterwards.
     """
     if not memory.segment_bytes:
         yield

@@ -1,4 +1,4 @@
-"""The topics of a sensor: messages for any subscriber.
+"""The topics of a sensor.
 
 Messages are published as bytes, in the encoding of log files.
 """
@@ -37,39 +37,37 @@ from lidarspec_ros2.clock import MessageStamps
 from lidarspec_ros2.parameters import Settings
 from lidarspec_ros2.shared_memory import format_megabytes
 
-#: of each kind of message its topic, its class, and how many are kept for those who are slow: of
-#: scans those of five seconds, as Fast DDS asks only every three for what was lost on the way, and
-#: a busy computer loses some of clouds of megabytes.
-KINDS = {
+#: Kind of message -> topic, class, and number of messages kept for slow subscribers. Scans are kept
+#: for five seconds, because Fast DDS requests lost messages only every three seconds, and a busy
+#: computer loses parts of large clouds.
+TOPICS = {
     CLOUD: ("points", PointCloud2, 50),
     SCAN: ("scan", LaserScan, 50),
     IMU: ("imu", Imu, 200),
     RAW: ("packets", UInt8MultiArray, 2000),
 }
-#: what ROS's own parameters, such as `qos_overrides./scan.publisher.depth`, change of that.
-_OVERRIDING = QoSOverridingOptions.with_default_policies()
+#: Settings that users can change with ROS's `qos_overrides./scan.publisher.depth` and similar.
+_QOS_OVERRIDES = QoSOverridingOptions.with_default_policies()
 
 
 class Topics:
     """The topics of one sensor.
 
     Args:
-        node: whose they are.
-        sensor: as it was opened.
-        played: whether it is a file that is played: then /clock says its time, where `use_sim_time`
-            is set.
+        node: the node that publishes them.
+        sensor: the opened sensor.
+        played: whether a file is played; its time is published on /clock if `use_sim_time` is set.
         max_cloud_bytes: size of the largest cloud that arrives with best effort; None if unknown.
 
     Attributes:
         stamps: the times of messages.
         sent: how many messages were published, by topic.
-        active: whether what is published is let through.
-        fault: why there is no planar scan that was asked for, "" where there is.
-        latency_s: seconds from the arrival of the packets that ended the last scan to its being
-            published.
+        active: whether messages are published.
+        fault: why the requested planar scan cannot be made, "" if it can.
+        latency_s: seconds from the arrival of the last packets of a scan to its publication.
 
     Raises:
-        UsageError: for a transform that cannot be published here.
+        UsageError: if the transform cannot be published because a package is missing.
     """
 
     def __init__(
@@ -95,9 +93,9 @@ class Topics:
         )
         self._publishers: dict[str, Any] = {}
         self.sent, self._publishing = Counter[str](), threading.Lock()
-        self._others = list[Any]()
+        self._plain_publishers = list[Any]()
         self.active, self.latency_s, self.fault = False, 0.0, ""
-        self._arrived = 0
+        self._arrival_ns = 0
         self.use_settings(settings)
         self._publisher(CLOUD)
         if settings["publish_packets"]:
@@ -107,90 +105,90 @@ class Topics:
             self._publisher(IMU)
         if settings["publish_tf"]:
             self._publish_transform(settings)
-        self._time = (
+        self._clock_publisher = (
             self._make_plain_publisher(Clock, "/clock", 10)
             if played and node.get_parameter("use_sim_time").value
             else None
         )
 
     def use_settings(self, settings: Settings) -> None:
-        """Publish by other parameters from now on."""
-        self._settings, self._planes, self._sieve = (
+        """Apply the parameters to all later messages."""
+        self._settings, self._planar_scans, self._selector = (
             settings,
             settings.make_planar_scans(),
-            ScanSelector(settings.selection()),
+            ScanSelector(settings.make_selection()),
         )
 
     def learn(self, packets: Packets) -> None:
-        """Learn the sensor's clock from packets."""
-        self._arrived = int(packets.host_ns[0]) or self._arrived
+        """Update the conversion of the sensor's clock with packets."""
+        self._arrival_ns = int(packets.host_ns[0]) or self._arrival_ns
         self.stamps.learn(packets.time_ns, packets.host_ns)
 
     def publish(self, scan: Scan) -> None:
-        """Publish a scan, as far as anybody listens."""
-        wanted = self._sieve.select(scan)
-        assert wanted is not None  # nothing is selected by number or time
-        at, settings = self._stamp(scan), self._settings
+        """Publish a scan on the topics with subscribers."""
+        selected = self._selector.select(scan)
+        assert selected is not None  # nothing is selected by number or time
+        stamp, settings = self._stamp(scan), self._settings
         if self._has_subscribers(CLOUD):
-            organised = settings["organized"] and wanted.points.shape is not None
-            self._send(self._messages.cloud(wanted, at, every_point=organised))
+            organised = settings["organized"] and selected.points.shape is not None
+            self._send(self._messages.cloud(selected, stamp, every_point=organised))
         try:
-            planar, self.fault = self._planes.project(wanted), ""
+            planar, self.fault = self._planar_scans.project(selected), ""
         except UsageError as error:  # a ring that the sensor lacks: it is set at run time
             planar, self.fault = None, str(error)
         if planar is not None and self._has_subscribers(SCAN):
             self._send(
                 self._messages.laserscan(
-                    wanted, settings.limit_ranges(planar), at + planar.stamp_ns - scan.stamp_ns
+                    selected, settings.limit_ranges(planar), stamp + planar.stamp_ns - scan.stamp_ns
                 )
             )
-        self.latency_s = (time.time_ns() - self._arrived) / 1e9
-        if self._time is not None and self.active:
-            self._time.publish(Clock(clock=Time(nanoseconds=at).to_msg()))
+        self.latency_s = (time.time_ns() - self._arrival_ns) / 1e9
+        if self._clock_publisher is not None and self.active:
+            self._clock_publisher.publish(Clock(clock=Time(nanoseconds=stamp).to_msg()))
 
     def publish_imu(self, samples: ImuSamples) -> None:
-        """Publish what the IMU felt."""
+        """Publish samples of the IMU."""
         for index in range(len(samples)) if len(samples) and self._has_subscribers(IMU) else ():
-            at = self.stamps.at(
+            stamp = self.stamps.stamp_sample(
                 int(samples.time_ns[index]), self._settings, by_clock=self._is_imu_by_clock
             )
-            self._send(self._messages.imu(samples, index, at, self._settings["frame_id"]))
+            self._send(self._messages.imu(samples, index, stamp, self._settings["frame_id"]))
 
     def publish_packet(self, chunk: Chunk) -> None:
-        """Publish what the sensor sent."""
+        """Publish a received packet."""
         if self._has_subscribers(RAW):
             self._send(self._messages.raw(chunk, datagram=self._sensor.datagrams))
 
     def activate(self, *, active: bool) -> None:
-        """Let through what is published, or not."""
+        """Start or stop publishing."""
         with self._publishing:
             self.active = active
             for publisher in self._publishers.values():
                 (publisher.on_activate if active else publisher.on_deactivate)(None)
 
     def close(self) -> None:
-        """Give the topics back."""
+        """Destroy the publishers."""
         for publisher in self._publishers.values():
             self._node.destroy_lifecycle_publisher(publisher)
-        for publisher in self._others:
+        for publisher in self._plain_publishers:
             self._node.destroy_publisher(publisher)
 
     def _stamp(self, scan: Scan) -> int:
-        """Return the time of the first point, ns, in ROS's time."""
-        if not scan.host_ns:  # of a file that does not say when its bytes arrived
+        """Return the time of the first point in ROS's time, ns."""
+        if not scan.host_ns:  # a file without arrival times
             return int(self._node.get_clock().now().nanoseconds)
-        return self.stamps.of(scan.stamp_ns, scan.host_ns, self._settings)
+        return self.stamps.stamp_scan(scan.stamp_ns, scan.host_ns, self._settings)
 
     def _publisher(self, kind: str) -> Any:
-        """Return the publisher of a kind of messages.
+        """Return the publisher of a kind of messages, created on first use.
 
-        The publisher of `scan` is made when the first planar scan arrives.
+        So `scan` has a publisher only after the first planar scan.
         """
         if kind not in self._publishers:
-            topic, message, depth = KINDS[kind]
+            topic, message, depth = TOPICS[kind]
             qos = QoSProfile(depth=depth, reliability=self._reliability)
             publisher = self._node.create_lifecycle_publisher(
-                message, topic, qos, qos_overriding_options=_OVERRIDING
+                message, topic, qos, qos_overriding_options=_QOS_OVERRIDES
             )
             with self._publishing:
                 self._publishers[kind] = publisher
@@ -199,9 +197,9 @@ class Topics:
         return self._publishers[kind]
 
     def _make_plain_publisher(self, message: Any, topic: str, qos: Any) -> Any:
-        """Return a publisher that is not the lifecycle's."""
-        self._others.append(self._node.create_publisher(message, topic, qos))
-        return self._others[-1]
+        """Return a new publisher that is independent of the lifecycle."""
+        self._plain_publishers.append(self._node.create_publisher(message, topic, qos))
+        return self._plain_publishers[-1]
 
     def _publish_transform(self, settings: Settings) -> None:
         try:
@@ -229,10 +227,10 @@ class Topics:
         ):  # packets come from a thread of their own, transitions from another one
             if self.active:
                 publisher.publish(data)
-                self.sent[KINDS[message.kind][0]] += 1
+                self.sent[TOPICS[message.kind][0]] += 1
 
     def _warn_of_large_cloud(self, size: int) -> None:
-        """Warn once if a cloud is too large for the shared memory that was chosen at the start."""
+        """Warn once if a cloud is too large for the chosen shared memory."""
         limit = self._max_cloud_bytes
         is_reliable = self._reliability == ReliabilityPolicy.RELIABLE
         if limit is None or size <= limit or is_reliable:
@@ -246,14 +244,14 @@ class Topics:
 
 
 def make_transform(settings: Settings, stamp: Any) -> TransformStamped:
-    """Return the mount, from the frame of the carrier to that of the points."""
-    mount = settings.mount() or Mount()
+    """Return the transform from the frame of the carrier to that of the points."""
+    mount = settings.find_mount() or Mount()
     roll, pitch, yaw = (
         math.radians(angle) / 2
         for angle in (mount.roll_deg + 180.0 * mount.inverted, mount.pitch_deg, mount.yaw_deg)
     )
     (sr, cr), (sp, cp), (sy, cy) = ((math.sin(half), math.cos(half)) for half in (roll, pitch, yaw))
-    turned = Quaternion(
+    rotation = Quaternion(
         x=sr * cp * cy - cr * sp * sy,
         y=cr * sp * cy + sr * cp * sy,
         z=cr * cp * sy - sr * sp * cy,
@@ -262,6 +260,6 @@ def make_transform(settings: Settings, stamp: Any) -> TransformStamped:
     stamped = TransformStamped(child_frame_id=settings["frame_id"])
     stamped.header.stamp, stamped.header.frame_id = stamp, settings["parent_frame"]
     stamped.transform = Transform(
-        translation=Vector3(x=mount.x, y=mount.y, z=mount.z), rotation=turned
+        translation=Vector3(x=mount.x, y=mount.y, z=mount.z), rotation=rotation
     )
     return stamped

@@ -345,7 +345,7 @@ def test_a_transform_turns_as_the_mount_does(
         [2 * (q.x * q.y + q.z * q.w), 1 - 2 * (q.x**2 + q.z**2), 2 * (q.y * q.z - q.x * q.w)],
         [2 * (q.x * q.z - q.y * q.w), 2 * (q.y * q.z + q.x * q.w), 1 - 2 * (q.x**2 + q.y**2)],
     ]
-    mount = settings.mount()
+    mount = settings.find_mount()
     assert mount is not None
     np.testing.assert_allclose(turned, mount.rotation, atol=1e-12)
     assert (found.header.frame_id, found.child_frame_id, found.transform.translation.x) == (

@@ -27,7 +27,7 @@ from lidarspec_ros2.shared_memory import (
     choose_shared_memory,
     largest_cloud_bytes,
     make_profile,
-    profile_in_use,
+    use_profile,
 )
 
 #: Clouds that are counted, and the share of them that has to arrive.
@@ -169,7 +169,7 @@ def test_file_and_variable_exist_only_while_the_participant_is_created() -> None
     files: list[Path] = []
 
     def create_and_interrupt() -> None:
-        with profile_in_use(SharedMemory(segment_bytes=5_000_000)):
+        with use_profile(SharedMemory(segment_bytes=5_000_000)):
             files.append(Path(os.environ[PROFILE_VARIABLE]))
             assert files[0].stat().st_size > 0
             assert files[0].parent.stat().st_mode & 0o77 == 0
@@ -179,7 +179,7 @@ def test_file_and_variable_exist_only_while_the_participant_is_created() -> None
         create_and_interrupt()
     assert PROFILE_VARIABLE not in os.environ
     assert not files[0].parent.exists()
-    with profile_in_use(SharedMemory()):
+    with use_profile(SharedMemory()):
         assert PROFILE_VARIABLE not in os.environ
 
 
