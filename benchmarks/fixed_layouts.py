@@ -70,7 +70,12 @@ def compact_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
     (module,) = sensor.parse(frame).modules
     layers, beams, echoes = module.layer_count, module.beam_count, module.echo_count
     echo = Struct("distance" / Scaled(Int16ul, 0.001, "m"), "strength" / Int16ul)
-    azimuth = "azimuth" / Scaled(Int16ul, compact.STEP, "rad", -compact.ZERO * compact.STEP)
+    azimuth = "azimuth" / Scaled(
+        Int16ul,
+        compact.AZIMUTH_STEP_RAD,
+        "rad",
+        -compact.ZERO_AZIMUTH_STEPS * compact.AZIMUTH_STEP_RAD,
+    )
     beam = Struct("echoes" / Array(echoes, echo), "property" / Int8ul, azimuth)
     struct = Struct(
         compact.MAGIC,
@@ -155,9 +160,11 @@ def cola_telegram(sensor: ls.Sensor, frame: bytes) -> Sensor:
         first, second = f.dist1, f.rssi1
         return Polar(
             range=first.samples * first.scale + first.offset * 0.001,
-            azimuth=np.deg2rad(first.start - telegrams.AHEAD + first.step * first.samples.index),
+            azimuth=np.deg2rad(
+                first.start - telegrams.AHEAD_DEG + first.step * first.samples.index
+            ),
             intensity=(second.samples * second.scale + second.offset).on("dist1.samples"),
-            invalid=first.samples < telegrams.LEAST,
+            invalid=first.samples < telegrams.MIN_DISTANCE_M,
         )
 
     return make_sensor(

@@ -11,8 +11,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from lidarspec.scans.selection import Selection
-
 from lidarspec.cli.options import configure_sensor
 from lidarspec.detect.identification import detect, find_declared_sensor
 from lidarspec.device.device import Device
@@ -23,6 +21,7 @@ from lidarspec.points.mount import Mount
 from lidarspec.recording.background_writer import TrafficLog
 from lidarspec.scans.beams import PlanarScans
 from lidarspec.scans.laserscan import LaserScan
+from lidarspec.scans.selection import Selection
 from lidarspec.sensor_operations import Sensor
 from lidarspec.transports.protocol import Transport
 

@@ -14,5 +14,5 @@ MULTISCAN136, PICOSCAN150 = COMPACT
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The SICK scanners."""
+    """Return the SICK scanners."""
     return [*SCANNERS, *COMPACT]

@@ -1,8 +1,8 @@
-"""What can be asked of a scanner, and what it answers, in CoLa B or CoLa A.
+"""Commands of a scanner and its replies, in CoLa B or CoLa A.
 
 Source: the telegram listing 8014631; 8023202 (LMS4000), tables 14 to 16, prints how a stream is
-started. `login` is needed before anything is changed, and `run` afterwards; what is set is lost
-with the power unless it is saved.
+started. A change of settings needs `login` before and `run` afterwards. Settings are lost at
+power-off unless they are saved.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any
 from construct import Bytes, Const, Construct, Enum, Int8ub, Int16ub, Int32sb, Int32ub, this
 
 from lidarspec.spec import Command, Frame, Scaled
-from lidarspec_sick.telegrams import binary, text
+from lidarspec_sick.telegrams import make_binary_frame, make_text_frame
 
-CLIENT = 3
-PASSWORD = 0xF472_4744  # the user level "authorised client", and the hash of its password
-MOST_TEXT = 200  # bytes of an answer with texts in it
+CLIENT_LEVEL = 3  # the user level "authorised client"
+CLIENT_PASSWORD_HASH = 0xF472_4744
+MAX_TEXT_REPLY_BYTES = 200
 STRING = ("size" / Int16ub, "text" / Bytes(this.size))
 RANGE = (
     "sectors" / Int16ub,
@@ -36,7 +36,7 @@ CONTENT = (
     *(name / Int8ub for name in ("position", "name", "comment", "time")),
     "interval" / Int16ub * "1: each scan, 2: every second scan",
 )
-#: what a scanner may refuse a command for, from 1 on (8014631, error codes).
+#: Reasons for a refused command, numbered from 1 (8014631, error codes).
 ERRORS = (
     "access_denied",
     "method_unknown",
@@ -65,7 +65,7 @@ ERRORS = (
     "asynchronous_methods_off",
     "complex_arrays_unsupported",
 )
-#: frame -> kind, method, content. What is asked is called ask_ or set_.
+#: Frame -> kind, method, content. The names of most requests begin with ask_ or set_.
 MESSAGES: dict[str, tuple[str, str, tuple[Construct, ...]]] = {
     "login": ("sMN", "SetAccessMode", ("level" / Int8ub, "password" / Int32ub)),
     "logged_in": ("sAN", "SetAccessMode", ("done" / Int8ub,)),
@@ -106,44 +106,53 @@ MESSAGES: dict[str, tuple[str, str, tuple[Construct, ...]]] = {
         ("error" / Enum(Int16ub, **{name: number for number, name in enumerate(ERRORS, 1)}),),
     ),
 }
-ASKED = ("sMN", "sRN", "sWN", "sEN")
+REQUEST_KINDS = ("sMN", "sRN", "sWN", "sEN")
 
 
-def message(cola: str, kind: str, method: str, content: tuple[Construct, ...]) -> Frame:
-    """One message; in CoLa B what the scanner answers has a space behind the method even where
-    nothing follows.
+def make_message(cola: str, kind: str, method: str, content: tuple[Construct, ...]) -> Frame:
+    """Return the frame of a message.
+
+    Messages of a scanner in CoLa B have a space after the method, even without content.
+
+    Args:
+        cola: "A" or "B".
+        kind: the three letters of the message kind.
+        method: the name of the method; "" if there is none.
+        content: the fields after the method.
     """
-    out = kind in ASKED
+    out = kind in REQUEST_KINDS
     direction = "out" if out else "in"
-    most = MOST_TEXT if set(STRING) & set(content) else 0
+    max_length = MAX_TEXT_REPLY_BYTES if set(STRING) & set(content) else 0
     if cola == "A":
         names = [
             "kind" / Const(kind.encode()),
             *(["method" / Const(method.encode())] if method else []),
         ]
-        return text(*names, *content, direction=direction)
-    head = f"{kind} {method} " if method else f"{kind} "
-    return binary(
-        "method" / Const(head.rstrip(" " if out and not content else "").encode()),
+        return make_text_frame(*names, *content, direction=direction)
+    prefix = f"{kind} {method} " if method else f"{kind} "
+    return make_binary_frame(
+        "method" / Const(prefix.rstrip(" " if out and not content else "").encode()),
         *content,
         direction=direction,
-        max_length=most,
+        max_length=max_length,
     )
 
 
 @cache
-def messages(cola: str) -> Mapping[str, Frame]:
-    """Return all messages in CoLa "A" or "B"."""
-    return {name: message(cola, *row) for name, row in MESSAGES.items()}
+def make_messages(cola: str) -> Mapping[str, Frame]:
+    """Return the frames of all messages in CoLa "A" or "B"."""
+    return {name: make_message(cola, *row) for name, row in MESSAGES.items()}
 
 
-def asking(frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any) -> Command:
-    """What may be asked twice, and what answers it."""
+def make_request(
+    frame: str, reply: str, values: Mapping[str, Any] | None = None, **more: Any
+) -> Command:
+    """Return the command for a request, which is repeated if no reply arrives."""
     return Command(frame, values or {}, reply=reply, refusal="refused", retries=1, **more)
 
 
-def commands(scan: str) -> dict[str, Command]:
-    """Return all commands of a scanner whose scans are such frames."""
+def make_commands(scan: str) -> dict[str, Command]:
+    """Return all commands of a scanner; `scan` is the frame type of its scans."""
     content = {
         "reserved": 0,
         "wide": 1,
@@ -155,20 +164,25 @@ def commands(scan: str) -> dict[str, Command]:
         "time": 1,
     }
     return {
-        "start": asking("set_stream", "stream", {"active": 1}, echoes=("active",), starts=True),
-        "stop": asking("set_stream", "stream", {"active": 0}, echoes=("active",), stops=True),
-        "get_scan": asking("ask_scan", scan),
-        "login": asking(
-            "login", "logged_in", {"level": CLIENT, "password": PASSWORD}, matches={"done": 1}
+        "start": make_request(
+            "set_stream", "stream", {"active": 1}, echoes=("active",), starts=True
         ),
-        "run": asking("run", "running", matches={"done": 1}),
-        "start_measuring": asking("measure", "measuring", matches={"error": 0}),
-        "stop_measuring": asking("halt", "halted", matches={"error": 0}),
-        "get_state": asking("ask_state", "state"),
-        "get_identity": asking("ask_identity", "identity"),
-        "get_firmware": asking("ask_firmware", "firmware"),
-        "get_range": asking("ask_range", "range"),
-        "set_range": asking(
+        "stop": make_request("set_stream", "stream", {"active": 0}, echoes=("active",), stops=True),
+        "get_scan": make_request("ask_scan", scan),
+        "login": make_request(
+            "login",
+            "logged_in",
+            {"level": CLIENT_LEVEL, "password": CLIENT_PASSWORD_HASH},
+            matches={"done": 1},
+        ),
+        "run": make_request("run", "running", matches={"done": 1}),
+        "start_measuring": make_request("measure", "measuring", matches={"error": 0}),
+        "stop_measuring": make_request("halt", "halted", matches={"error": 0}),
+        "get_state": make_request("ask_state", "state"),
+        "get_identity": make_request("ask_identity", "identity"),
+        "get_firmware": make_request("ask_firmware", "firmware"),
+        "get_range": make_request("ask_range", "range"),
+        "set_range": make_request(
             "set_range",
             "range_set",
             {"sectors": 1},
@@ -178,7 +192,7 @@ def commands(scan: str) -> dict[str, Command]:
                 "stop": ("stop", -47.5, 227.5),
             },
         ),
-        "set_content": asking(
+        "set_content": make_request(
             "set_content",
             "content_set",
             content,
@@ -188,12 +202,12 @@ def commands(scan: str) -> dict[str, Command]:
                 "interval": ("interval", 1, 50_000),
             },
         ),
-        "save": asking("save", "saved", matches={"done": 1}),
+        "save": make_request("save", "saved", matches={"done": 1}),
     }
 
 
-#: what a simulated scanner answers, where that is more than the reply as it stands.
-ANSWERS: dict[str, Any] = {
+#: Simulated replies that are not derived from the request.
+SIMULATED_ANSWERS: dict[str, Any] = {
     "get_state": (("state", {"readiness": 1}),),
     "get_firmware": (("firmware", {"text": b"V1.0"}),),
 }

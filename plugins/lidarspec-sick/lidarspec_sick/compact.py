@@ -1,10 +1,10 @@
-"""multiScan100 and picoScan100: telegrams in the compact format over UDP, of scans and of the IMU.
+"""multiScan100 and picoScan100: compact telegrams over UDP, of scans and of the IMU.
 
 Source: sick_scan_xd (compact_parser.cpp and its unit tests) for the layout, of versions 3 and 4;
 multiScan136 operating instructions 8027119 for segments and layers. A telegram is a chain of
-modules under one CRC; each has its own layers, beams and echoes, and its azimuths on the wire, or
-evenly between those of its first and last beam. Elevation counts downwards. The property of a beam
-says by bit 0 that a reflector was seen.
+modules under one CRC. Each module has its own layers, beams and echoes. Its azimuths are on the
+wire, or evenly spaced between the azimuths of its first and last beam. Elevation counts downwards.
+Bit 0 of a beam's property means a reflector.
 """
 
 from __future__ import annotations
@@ -51,16 +51,21 @@ CRC = Crc(
     32, 0x04C11DB7, init=0xFFFFFFFF, refin=True, refout=True, xorout=0xFFFFFFFF, order="little"
 )
 MAGIC = "magic" / Const(b"\x02\x02\x02\x02")
-LONGEST = 16_384  # bytes: three echoes of the 900 beams of a segment of a multiScan136 take 14 160
-STEP = 1 / 5215
-ZERO = 16_384  # radians for each step of an azimuth, and the step straight ahead
-TURNS = 20.0  # turns a second of a simulated one
+#: Three echoes of the 900 beams of a segment of a multiScan136 need 14 160.
+MAX_TELEGRAM_BYTES = 16_384
+AZIMUTH_STEP_RAD = 1 / 5215
+ZERO_AZIMUTH_STEPS = 16_384  # the azimuth straight ahead on the wire
+SIMULATED_SPEED_HZ = 20.0  # revolutions per second
 
 
-def module(version: int) -> Struct:
-    """Return a module of a telegram of version 3 or 4: beams of all its layers."""
+def make_module(version: int) -> Struct:
+    """Return the struct of a module in telegrams of version 3 or 4.
+
+    A module holds the beams of all its layers.
+    """
     azimuth = "azimuth" / If(
-        this._.beam_content.has_azimuth == 1, Scaled(Int16ul, STEP, "rad", -ZERO * STEP)
+        this._.beam_content.has_azimuth == 1,
+        Scaled(Int16ul, AZIMUTH_STEP_RAD, "rad", -ZERO_AZIMUTH_STEPS * AZIMUTH_STEP_RAD),
     )
     properties = "property" / If(this._.beam_content.has_property == 1, Int8ul) * "bit 0: reflector"
     echo = Struct(
@@ -103,8 +108,8 @@ def module(version: int) -> Struct:
     )
 
 
-def telegram(version: int) -> Construct:
-    """Return a telegram of scans, of version 3 or 4."""
+def make_telegram(version: int) -> Construct:
+    """Return the struct of a scan telegram of version 3 or 4."""
     struct = Struct(
         MAGIC,
         "command" / Const(1, Int32ul),
@@ -112,7 +117,7 @@ def telegram(version: int) -> Construct:
         "sent" / Scaled(Int64ul, 1, "us"),
         "version" / Const(version, Int32ul),
         "size" / Int32ul * "bytes of the first module",
-        "modules" / Parts(module(version), size=this.size, following=this.next_size),
+        "modules" / Parts(make_module(version), size=this.size, following=this.next_size),
         "crc" / Int32ul,
     )
     return Checksummed(struct, field="crc", algorithm=CRC)
@@ -135,24 +140,24 @@ IMU = Checksummed(
 
 
 def points(f: Fields, version: int) -> Polar:
-    """Points of one module: all echoes of a beam, the beams of all layers one after another."""
+    """Return the points of one module, beam by beam, with all layers and echoes."""
     beam = f.beams
-    number = beam.index / np.maximum(f.beam_count - 1, 1)
+    position = beam.index / np.maximum(f.beam_count - 1, 1)
     first = f.first_azimuth.on("beams[]")
     start = f.start_time.on("beams[]")
-    even = first + (f.last_azimuth.on("beams[]") - first) * number
+    even_azimuth = first + (f.last_azimuth.on("beams[]") - first) * position
     return Polar(
         range=beam.echoes.distance * (f.scale if version == 4 else 1.0),
-        azimuth=np.where(f.beam_content.has_azimuth == 1, beam.azimuth, even),
+        azimuth=np.where(f.beam_content.has_azimuth == 1, beam.azimuth, even_azimuth),
         elevation=-f.elevation.on("beams[]"),
         intensity=beam.echoes.strength,
-        time=(start - f.start_time[0] + (f.stop_time.on("beams[]") - start) * number) * 1e-6,
+        time=(start - f.start_time[0] + (f.stop_time.on("beams[]") - start) * position) * 1e-6,
         extra={"reflector": beam.property % 2 == 1},
     )
 
 
 def imu(f: Fields) -> Imu:
-    """What is felt, gravity included."""
+    """Return angular rates and accelerations, including gravity."""
     return Imu(
         (f.turning_x, f.turning_y, f.turning_z),
         (f.acceleration_x, f.acceleration_y, f.acceleration_z),
@@ -162,9 +167,17 @@ def imu(f: Fields) -> Imu:
 def sweep(
     i: int, version: int, elevations: tuple[float, ...], beams: int, segments: int
 ) -> dict[str, Any]:
-    """Telegram i: one segment of a turn, in one module, with one echo."""
+    """Return the values of simulated telegram i: one segment, one module, one echo.
+
+    Args:
+        i: the number of the telegram.
+        version: 3 or 4.
+        elevations: elevations of the layers in degrees.
+        beams: beams per segment.
+        segments: segments per revolution.
+    """
     layers = len(elevations)
-    begin = i / segments / TURNS * 1e6
+    begin = i / segments / SIMULATED_SPEED_HZ * 1e6
     width = 360 / segments
     azimuths = np.deg2rad(i % segments * width - 180 + np.arange(beams) * width / beams)
     module = {
@@ -174,7 +187,9 @@ def sweep(
         "beam_count": beams,
         "echo_count": 1,
         "start_time": np.full(layers, begin),
-        "stop_time": np.full(layers, begin + (beams - 1) / beams / segments / TURNS * 1e6),
+        "stop_time": np.full(
+            layers, begin + (beams - 1) / beams / segments / SIMULATED_SPEED_HZ * 1e6
+        ),
         "elevation": -np.deg2rad(elevations),
         "first_azimuth": np.full(layers, azimuths[0]),
         "last_azimuth": np.full(layers, azimuths[-1]),
@@ -188,13 +203,13 @@ def sweep(
     return {"counter": i, "sent": begin, "modules": [module]}
 
 
-def scans(version: int, sweep: Callable[..., Mapping[str, Any]]) -> Frame:
-    """Return the telegram of scans of this version, and what is simulated in it."""
+def make_scan_frame(version: int, sweep: Callable[..., Mapping[str, Any]]) -> Frame:
+    """Return the frame of scan telegrams; `sweep` gives the simulated values."""
     read = {"modules": partial(points, version=version)}
     return Frame(
-        telegram(version),
+        make_telegram(version),
         data=True,
-        max_length=LONGEST,
+        max_length=MAX_TELEGRAM_BYTES,
         points=read,
         simulation=Simulation(partial(sweep, version=version)),
     )
@@ -206,8 +221,8 @@ IMU_FRAME = Frame(
     clock=Clock("time"),
     simulation=Simulation(lambda i: {"time": i * 10_000}, rate=100),
 )
-#: id -> model, elevations of the layers in degrees, beams of a segment, segments of a turn, limits
-#: of range, status.
+#: Id -> model, elevations of the layers in degrees, beams per segment, segments per revolution,
+#: range limits in m, status.
 MODELS: dict[str, tuple[str, tuple[float, ...], int, int, tuple[float, float], str]] = {
     "sick-multiscan136": (
         "multiScan136",
@@ -221,15 +236,19 @@ MODELS: dict[str, tuple[str, tuple[float, ...], int, int, tuple[float, float], s
 }
 
 
-def scanner(name: str) -> Sensor:
-    """One row of the table as a sensor."""
+def make_scanner(name: str) -> Sensor:
+    """Return the sensor of one row of `MODELS`."""
     model, elevations, beams, segments, limits, status = MODELS[name]
-    shown = partial(sweep, elevations=elevations, beams=beams, segments=segments)
+    simulated_sweep = partial(sweep, elevations=elevations, beams=beams, segments=segments)
     return Sensor(
         name,
         vendor="SICK",
         model=model,
-        frames={"scan": scans(4, shown), "scan_v3": scans(3, shown), "imu": IMU_FRAME},
+        frames={
+            "scan": make_scan_frame(4, simulated_sweep),
+            "scan_v3": make_scan_frame(3, simulated_sweep),
+            "imu": IMU_FRAME,
+        },
         points=None,
         scan=OnChange("modules.turn"),
         clock=Clock("modules.start_time[0]"),
@@ -247,4 +266,4 @@ def scanner(name: str) -> Sensor:
     )
 
 
-COMPACT = [scanner(name) for name in MODELS]
+COMPACT = [make_scanner(name) for name in MODELS]

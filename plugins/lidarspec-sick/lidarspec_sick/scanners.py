@@ -1,11 +1,13 @@
-"""TiM5xx, TiM7xx, TiM871S, LMS1xx, LMS5xx and MRS1000: scanners that send LMDscandata over TCP, in
-CoLa B or CoLa A.
+"""TiM5xx, TiM7xx, TiM871S, LMS1xx, LMS5xx and MRS1000: scanners with LMDscandata over TCP.
+
+They use CoLa B or CoLa A.
 
 Source: the telegram listing 8014631; TiM55x, TiM56x and TiM57x operating instructions 8015883
 (steps, rate and angles, 5.3), LMS5xx 8013796 (steps, 3.5), MRS1000 8020494 (layers, 3.5.10).
-Assumed, since no sheet was at hand: the steps, rates and angles of TiM7xx and LMS1xx, the rates of
-an LMS5xx, and the ranges of all. What can be set stands in the telegrams, so that models are told
-apart by what others cannot be set to; what cannot be told, they answer to `get_identity`.
+Assumed, because no data sheet was available: the steps, rates and angles of TiM7xx and LMS1xx, the
+rates of an LMS5xx, and the ranges of all. Telegrams contain the settings, so models are
+distinguished by settings that other models do not support. If that is not enough, the reply to
+`get_identity` contains the model.
 """
 
 from __future__ import annotations
@@ -30,23 +32,28 @@ from lidarspec.spec import (
     Simulation,
     Tcp,
 )
-from lidarspec_sick.commands import ANSWERS, commands, messages
-from lidarspec_sick.telegrams import scans
+from lidarspec_sick.commands import SIMULATED_ANSWERS, make_commands, make_messages
+from lidarspec_sick.telegrams import make_scan_frame
 
-WRAP = 2**32 * 1e-6  # seconds after which the clock starts again
-SENT = np.frombuffer(b"sSN", np.uint8)
-ANSWERED = np.frombuffer(b"sRA", np.uint8)
-EMPTY = ("channels8", "has_position", "has_name", "has_comment", "has_date", "has_event")
-NEAR = 1e-4  # degrees that an angle on the wire may be off
+CLOCK_WRAP_S = 2**32 * 1e-6
+STREAM_KIND = np.frombuffer(b"sSN", np.uint8)
+REPLY_KIND = np.frombuffer(b"sRA", np.uint8)
+#: Optional parts that a simulated telegram does not have.
+ABSENT_PARTS = ("channels8", "has_position", "has_name", "has_comment", "has_date", "has_event")
+ANGLE_TOLERANCE_DEG = 1e-4
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What the models of a family can be set to: scans a second, steps in degrees, the first angle;
-    what a simulated one does is first.
+    """The possible settings of a family of models; a simulated scanner has the first.
 
     Attributes:
-        layers: in the order in which they come, degrees downwards.
+        rates: scans per second.
+        steps: in degrees.
+        start: the first angle in degrees.
+        beams: beams of a simulated scan.
+        echoes: maximum number of echoes.
+        layers: elevations in the order on the wire, degrees downwards.
     """
 
     rates: tuple[float, ...]
@@ -57,23 +64,23 @@ class Kind:
     layers: tuple[float, ...] = (0.0,)
 
     def fits(self, f: Fields) -> Any:
-        """Return whether a scan can be one of these."""
-        steps = [np.abs(f.dist1.step - step) < NEAR for step in self.steps]
+        """Return whether a scan has possible settings."""
+        steps = [np.abs(f.dist1.step - step) < ANGLE_TOLERANCE_DEG for step in self.steps]
         rates = [f.scan_rate == rate for rate in self.rates]
         return (
             any_of(steps)
             & any_of(rates)
-            & (f.dist1.start > self.start - NEAR)
+            & (f.dist1.start > self.start - ANGLE_TOLERANCE_DEG)
             & any_of([f.layer == layer for layer in self.layers])
         )
 
 
 def any_of(conditions: list[Any]) -> Any:
-    """Return whether one of them holds."""
-    found = conditions[0]
+    """Return whether one of the conditions is true."""
+    result = conditions[0]
     for condition in conditions[1:]:
-        found = found | condition
-    return found
+        result = result | condition
+    return result
 
 
 COARSE = Kind((15,), (1,), -45, 271)
@@ -83,7 +90,7 @@ LMS1 = Kind((50, 25), (0.5, 0.25), -45, 541, echoes=2)
 LMS5 = Kind((50, 25, 35, 75, 100), (0.5, 0.1667, 0.25, 0.3333, 0.6667, 1), -5, 381, echoes=5)
 MRS1 = Kind((50,), (0.25,), -47.5, 1101, echoes=3, layers=(0, -2.5, 2.5, -5))  # 8020494, 3.5.10
 
-#: id -> model, kind, limits of range, status.
+#: Id -> model, kind, range limits in m, status.
 MODELS: dict[str, tuple[str, Kind, tuple[float, float], str]] = {
     "sick-tim551": ("TiM551", COARSE, (0.05, 10), "vectors"),
     "sick-tim561": ("TiM561", TIM5, (0.05, 10), "manual"),
@@ -99,15 +106,15 @@ MODELS: dict[str, tuple[str, Kind, tuple[float, float], str]] = {
 
 
 def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
-    """Telegram i of a scanner of this kind, with so many echoes and their strengths."""
+    """Return the values of simulated telegram i with this number of echoes."""
     rate = kind.rates[0]
     step = kind.steps[0]
     channels = [f"{name}{number}" for number in range(1, echoes + 1) for name in ("dist", "rssi")]
-    each = {"start": kind.start, "step": step, "count": kind.beams, "scale": 1.0, "offset": 0.0}
+    values = {"start": kind.start, "step": step, "count": kind.beams, "scale": 1.0, "offset": 0.0}
     return {
-        **{f"{channel}.{name}": value for channel in channels for name, value in each.items()},
-        **dict.fromkeys((*EMPTY, "encoder_count", "inputs", "outputs", "status"), 0),
-        "kind": SENT,
+        **{f"{channel}.{name}": value for channel in channels for name, value in values.items()},
+        **dict.fromkeys((*ABSENT_PARTS, "encoder_count", "inputs", "outputs", "status"), 0),
+        "kind": STREAM_KIND,
         "version": 1,
         "telegram_counter": i % 65_536,
         "scan_counter": i % 65_536,
@@ -120,18 +127,23 @@ def sweep(i: int, kind: Kind, echoes: int = 1) -> dict[str, Any]:
     }
 
 
-def frames(kind: Kind, cola: str) -> dict[str, Frame]:
-    """Scans with one echo and with all, first those in this form; messages in this form alone."""
+def make_frames(kind: Kind, cola: str) -> dict[str, Frame]:
+    """Return the frames of scans, with one echo and with all, and of messages.
+
+    Scans come in both forms, first in the form `cola`; messages only in that form.
+    """
     forms = sorted("AB", key=lambda form: form != cola)
-    own = {{"A": "text", "B": "scan"}[form]: scans(form, 1) for form in forms}
+    frames = {{"A": "text", "B": "scan"}[form]: make_scan_frame(form, 1) for form in forms}
     if kind.echoes > 1:
         names = {"A": "echoes_text", "B": "echoes"}
         simulation = Simulation(partial(sweep, kind=kind, echoes=kind.echoes))
-        own |= {
-            names[form]: dataclasses.replace(scans(form, kind.echoes), simulation=simulation)
+        frames |= {
+            names[form]: dataclasses.replace(
+                make_scan_frame(form, kind.echoes), simulation=simulation
+            )
             for form in forms
         }
-    return own | dict(messages(cola))
+    return frames | dict(make_messages(cola))
 
 
 def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0) -> Sensor:
@@ -140,21 +152,21 @@ def configure(sensor: Sensor, *, cola: Literal["A", "B"] = "B", echoes: int = 0)
     Scans are read in both forms, with one echo and with `echoes`, by default all.
 
     Raises:
-        UsageError: for more echoes than the scanner has.
+        UsageError: if the scanner has fewer echoes.
     """
     kind = MODELS[sensor.id][1]
     if echoes not in range(kind.echoes + 1):
         raise UsageError(
             f"{sensor.id}: echoes must be a number from 1 to {kind.echoes}, not {echoes!r}"
         )
-    own = frames(dataclasses.replace(kind, echoes=echoes or kind.echoes), cola)
+    frames = make_frames(dataclasses.replace(kind, echoes=echoes or kind.echoes), cola)
     return dataclasses.replace(
-        sensor, frames=own, commands=commands("text" if cola == "A" else "scan")
+        sensor, frames=frames, commands=make_commands("text" if cola == "A" else "scan")
     )
 
 
-def relative(own: Kind, other: Kind) -> str | Relative:
-    """What tells a scanner of another kind."""
+def describe_difference(own: Kind, other: Kind) -> str | Relative:
+    """Return how to recognize a scanner of another kind."""
     if own == other:
         return "identical scans; see its reply to get_identity, or the label on the housing"
     return Relative(
@@ -162,35 +174,42 @@ def relative(own: Kind, other: Kind) -> str | Relative:
     )
 
 
-def scanner(name: str) -> Sensor:
-    """One row of the table as a sensor."""
+def make_scanner(name: str) -> Sensor:
+    """Return the sensor of one row of `MODELS`."""
     model, kind, limits, status = MODELS[name]
     return Sensor(
         name,
         vendor="SICK",
         model=model,
-        frames=frames(kind, "B"),
+        frames=make_frames(kind, "B"),
         points=None,
         scan=OnChange("telegram_counter")
         if len(kind.layers) == 1
         else OnFlag("layer", kind.layers[0]),
-        clock=Clock("time", wraps_at=WRAP),
+        clock=Clock("time", wraps_at=CLOCK_WRAP_S),
         sequence=Sequence("telegram_counter"),
         links={"data": Tcp(2112)},
-        commands=commands("scan"),
+        commands=make_commands("scan"),
         on_open=("start",),
         on_close=("stop",),
         simulation=Simulation(
             partial(sweep, kind=kind),
-            answers={**ANSWERS, "get_scan": (("scan", {**sweep(0, kind), "kind": ANSWERED}),)},
+            answers={
+                **SIMULATED_ANSWERS,
+                "get_scan": (("scan", {**sweep(0, kind), "kind": REPLY_KIND}),),
+            },
         ),
         configure=configure,
         range_limits=limits,
-        relatives={other: relative(kind, row[1]) for other, row in MODELS.items() if other != name},
+        relatives={
+            other: describe_difference(kind, row[1])
+            for other, row in MODELS.items()
+            if other != name
+        },
         info={"serial": "scan.serial", "firmware": "firmware.text"},
         status=status,
         source="SICK Telegram Listing 8014631, 8023198 table 17",
     )
 
 
-SCANNERS = [scanner(name) for name in MODELS]
+SCANNERS = [make_scanner(name) for name in MODELS]

@@ -1,12 +1,11 @@
-"""The telegram of a scan, LMDscandata, in CoLa B, which is binary, and in CoLa A, the same fields
-as hexadecimal text.
+"""LMDscandata, the telegram of a scan, in CoLa B (binary) and CoLa A (hexadecimal text).
 
 Source: SICK Telegram Listing LiDAR sensors 8014631 and the tables of LMDscandata in the operating
-instructions 8023198 (LMS4000), with the values below 16 that are no distances; 8020494 (MRS1000)
-for the layers; sick_scan_xd for where angles count from. A telegram has one layer. Its channels of
-16 bits are DIST1 to DISTn; RSSI1 to RSSIn follow if they are asked for, in 16 bits or in 8. Where
-both are there, the intensity is that of 8 bits. Telegrams with channels of other kinds (ANGL, VANG,
-QLTY) are not read. A third of a degree is 0.3333 on the wire, and is left so.
+instructions 8023198 (LMS4000), with the values below 16 that are not distances; 8020494 (MRS1000)
+for the layers; sick_scan_xd for the zero direction. A telegram has one layer. Its 16-bit channels
+are DIST1 to DISTn, followed by RSSI1 to RSSIn if requested, in 16 or in 8 bits. If both are
+present, the intensity is from the 8-bit channels. Telegrams with channels of other kinds (ANGL,
+VANG, QLTY) are not supported. A third of a degree is 0.3333 on the wire, and is not rounded.
 """
 
 from __future__ import annotations
@@ -34,16 +33,17 @@ from construct import (
 
 from lidarspec.spec import Checksummed, Fields, Frame, Polar, Scaled, SizeOf, Tokens, Xor, stack
 
-# metres before scaling: the smallest value that is a distance is 16 (8023198, reserved values)
-LEAST = 0.016
-AHEAD = 90.0  # degrees on the wire that lie straight ahead (sick_scan_xd)
+#: The smallest distance before scaling: raw values below 16 are reserved (8023198).
+MIN_DISTANCE_M = 0.016
+AHEAD_DEG = 90.0  # the direction straight ahead on the wire (sick_scan_xd)
 DISTANCE = Scaled(Int16ub, 0.001, "m") * "before scaling; below 16: no distance"
-HIGHEST = 1e6  # Hz; rates above are in Hz, not in 100 Hz, as sick_scan_xd says of some firmware
-MOST_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
+#: Higher rates are in Hz instead of 100 Hz, because of an error in some firmware (sick_scan_xd).
+MAX_BEAM_RATE_HZ = 1e6
+MAX_BEAMS = 1141  # of an LMS5xx with steps of a sixth of a degree
 
 
-def binary(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
-    """Return a telegram of CoLa B: four times 02, a length, the content, and the XOR of it."""
+def make_binary_frame(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
+    """Return the frame of CoLa B: four times 02, a length, the content, and its XOR."""
     struct = Struct(
         "magic" / Const(b"\x02\x02\x02\x02"),
         "length" / SizeOf(Int32ub, plus=-9) * "bytes of the content",
@@ -56,8 +56,8 @@ def binary(*parts: Construct, max_length: int = 0, **more: Any) -> Frame:
     return Frame(sealed, max_length=max_length, **more)
 
 
-def text(*parts: Construct, max_length: int = 200, **more: Any) -> Frame:
-    """Return a telegram of CoLa A: 02, tokens, 03."""
+def make_text_frame(*parts: Construct, max_length: int = 200, **more: Any) -> Frame:
+    """Return the frame of a telegram in CoLa A: 02, tokens, 03."""
     return Frame(
         Struct(*parts),
         wire=Tokens(start=b"\x02", sep=b" ", end=b"\x03", base=16),
@@ -66,10 +66,16 @@ def text(*parts: Construct, max_length: int = 200, **more: Any) -> Frame:
     )
 
 
-def channel(content: str, values: Construct, *, first: bool = False, name: str = "") -> Construct:
-    """Return a channel of this content, a field called `name`, by default after the content.
+def make_channel(
+    content: str, values: Construct, *, first: bool = False, name: str = ""
+) -> Construct:
+    """Return the field of a channel with this content.
 
-    All channels have as many values as the first one.
+    Args:
+        content: the content on the wire.
+        values: the type of a sample.
+        first: whether it is the first channel; all others have its number of values.
+        name: the name of the field, by default the content in lower case.
     """
     count = this.count if first else this._.dist1.count
     struct = Struct(
@@ -84,17 +90,17 @@ def channel(content: str, values: Construct, *, first: bool = False, name: str =
     return (name or content.lower()) / struct
 
 
-def optional(name: str, *parts: Construct) -> tuple[Construct, Construct]:
-    """What is there if a flag before it says so."""
+def make_optional(name: str, *parts: Construct) -> tuple[Construct, Construct]:
+    """Return a flag and the fields that are present if it is 1."""
     return f"has_{name}" / Int16ub, name / If(this[f"has_{name}"] == 1, Struct(*parts))
 
 
-def scan(echoes: int) -> list[Construct]:
-    """What stands behind the name of a telegram with so many echoes of each beam."""
-    others = [channel(f"DIST{number}", DISTANCE) for number in range(2, echoes + 1)]
-    strengths = [channel(f"RSSI{number}", Int16ub) for number in range(1, echoes + 1)]
+def make_scan_fields(echoes: int) -> list[Construct]:
+    """Return the fields after the telegram's name, with `echoes` echoes per beam."""
+    others = [make_channel(f"DIST{number}", DISTANCE) for number in range(2, echoes + 1)]
+    strengths = [make_channel(f"RSSI{number}", Int16ub) for number in range(1, echoes + 1)]
     strengths8 = [
-        channel(f"RSSI{number}", Int8ub, name=f"rssi{number}_8bit")
+        make_channel(f"RSSI{number}", Int8ub, name=f"rssi{number}_8bit")
         for number in range(1, echoes + 1)
     ]
     named = ("length" / Int8ub, "text" / Bytes(this.length))
@@ -119,7 +125,7 @@ def scan(echoes: int) -> list[Construct]:
         "encoder_count" / Int16ub,
         "encoders" / Array(this.encoder_count, Struct("position" / Int32sb, "speed" / Int16sb)),
         "channels" / Int16ub * "of 16 bits",
-        channel("DIST1", DISTANCE, first=True),
+        make_channel("DIST1", DISTANCE, first=True),
         *others,
         *(part.name / If(this.channels == 2 * echoes, part.subcon) for part in strengths),
         "channels8" / Int16ub * "of 8 bits",
@@ -127,21 +133,21 @@ def scan(echoes: int) -> list[Construct]:
             part.name / If(this.channels8 >= number, part.subcon)
             for number, part in enumerate(strengths8, 1)
         ),
-        *optional(
+        *make_optional(
             "position",
             *(axis / Float32b for axis in ("x", "y", "z", "rx", "ry", "rz")),
             "rotation" / Int8ub,
             "named" / Int8ub,
         ),
-        *optional("name", *named),
-        *optional("comment", *named),
-        *optional(
+        *make_optional("name", *named),
+        *make_optional("comment", *named),
+        *make_optional(
             "date",
             "year" / Int16ub,
             *(name / Int8ub for name in ("month", "day", "hour", "minute", "second")),
             "us" / Int32ub,
         ),
-        *optional(
+        *make_optional(
             "event",
             "type" / Bytes(4),
             "encoder" / Int32ub,
@@ -152,37 +158,42 @@ def scan(echoes: int) -> list[Construct]:
 
 
 def plausible(f: Fields, echoes: int) -> Any:
-    """There are beams, and all channels are as long as the first one."""
+    """Return whether there are beams, and all channels have the same length."""
     count = f.dist1.count
-    held = (f.dist1.step > 0) & (count > 0)
+    is_plausible = (f.dist1.step > 0) & (count > 0)
     for number in range(1, echoes + 1):
-        held = held & (getattr(f, f"dist{number}").count == count)
-        held = held & ((f.channels != 2 * echoes) | (getattr(f, f"rssi{number}").count == count))
-        held = held & ((f.channels8 < number) | (getattr(f, f"rssi{number}_8bit").count == count))
-    return held
+        is_plausible = is_plausible & (getattr(f, f"dist{number}").count == count)
+        is_plausible = is_plausible & (
+            (f.channels != 2 * echoes) | (getattr(f, f"rssi{number}").count == count)
+        )
+        is_plausible = is_plausible & (
+            (f.channels8 < number) | (getattr(f, f"rssi{number}_8bit").count == count)
+        )
+    return is_plausible
 
 
 def points(f: Fields, echoes: int) -> Polar:
-    """Points from the start angle on, each as many times as there are echoes."""
+    """Return points from the start angle on, each with `echoes` returns."""
     first = f.dist1
-    distances = [getattr(f, f"dist{number}") for number in range(1, echoes + 1)]
-    strengths = [getattr(f, f"rssi{number}") for number in range(1, echoes + 1)]
-    strengths8 = [getattr(f, f"rssi{number}_8bit") for number in range(1, echoes + 1)]
+    distances = [getattr(f, f"dist{index}") for index in range(1, echoes + 1)]
+    strengths = [getattr(f, f"rssi{index}") for index in range(1, echoes + 1)]
+    strengths8 = [getattr(f, f"rssi{index}_8bit") for index in range(1, echoes + 1)]
     ranges = [
-        (one.samples * one.scale + one.offset * 0.001).on("dist1.samples") for one in distances
+        (channel.samples * channel.scale + channel.offset * 0.001).on("dist1.samples")
+        for channel in distances
     ]
-    missing = [(one.samples < LEAST).on("dist1.samples") for one in distances]
+    missing = [(channel.samples < MIN_DISTANCE_M).on("dist1.samples") for channel in distances]
     intensity = [
         np.where(f.channels8 == echoes, scaled_intensity(narrow), scaled_intensity(wide))
         for narrow, wide in zip(strengths8, strengths, strict=True)
     ]
-    number = first.samples.index
+    index = first.samples.index
     return Polar(
         range=ranges[0] if echoes == 1 else stack(*ranges),
-        azimuth=np.deg2rad(first.start - AHEAD + first.step * number),
+        azimuth=np.deg2rad(first.start - AHEAD_DEG + first.step * index),
         elevation=np.deg2rad(-f.layer),
         intensity=intensity[0] if echoes == 1 else stack(*intensity),
-        time=number / np.where(f.beam_rate > HIGHEST, f.beam_rate / 100, f.beam_rate),
+        time=index / np.where(f.beam_rate > MAX_BEAM_RATE_HZ, f.beam_rate / 100, f.beam_rate),
         invalid=missing[0] if echoes == 1 else stack(*missing),
         return_index=None if echoes == 1 else np.arange(echoes),
     )
@@ -194,9 +205,9 @@ def scaled_intensity(channel: Fields) -> Any:
 
 
 @cache
-def scans(cola: str, echoes: int) -> Frame:
-    """Return the telegram of a scan with so many echoes, in CoLa "A" or "B"."""
-    longest = 200 + echoes * 2 * (40 + 2 * MOST_BEAMS)
+def make_scan_frame(cola: str, echoes: int) -> Frame:
+    """Return the frame of a scan with `echoes` echoes, in CoLa "A" or "B"."""
+    max_length = 200 + echoes * 2 * (40 + 2 * MAX_BEAMS)
     kind = "kind" / Bytes(3) * "sSN sent automatically, sRA sent on request"
     more = {
         "data": True,
@@ -204,9 +215,17 @@ def scans(cola: str, echoes: int) -> Frame:
         "points": partial(points, echoes=echoes),
     }
     if cola == "A":
-        return text(
-            kind, "method" / Const(b"LMDscandata"), *scan(echoes), max_length=3 * longest, **more
+        return make_text_frame(
+            kind,
+            "method" / Const(b"LMDscandata"),
+            *make_scan_fields(echoes),
+            max_length=3 * max_length,
+            **more,
         )
-    return binary(
-        kind, "method" / Const(b" LMDscandata "), *scan(echoes), max_length=longest, **more
+    return make_binary_frame(
+        kind,
+        "method" / Const(b" LMDscandata "),
+        *make_scan_fields(echoes),
+        max_length=max_length,
+        **more,
     )
