@@ -1,30 +1,28 @@
-"""Slamtec RPLIDAR A1 to A3, S1 to S3, T1 and C1: 360 degree lidars of one family, which answer in
-six kinds of data frames.
+"""Slamtec RPLIDAR A1 to A3, S1 to S3, T1 and C1: 360 degree lidars with six kinds of data frames.
 
 Source: RPLIDAR interface protocol and the vendor's SDK (sl_lidar_cmd.h, handler_capsules.cpp,
-sl_lidar_driver.cpp); bauds and ports from the SDK (_getNativeBaudRate) and the launch files of
-sllidar_ros2, ranges from the models' data sheets where `source` names them.
+sl_lidar_driver.cpp); baud rates and ports from the SDK (_getNativeBaudRate) and the launch files of
+sllidar_ros2, ranges from the models' data sheets if `source` names them.
 
-A response descriptor says which kind follows, and each kind is looked for after its descriptor
-alone. The kind that comes first in an input is its data. ``configure(answer="express")`` chooses
-another one, and starts as if its descriptor had been seen, for recordings that begin in the middle.
-The kinds: `node`, `express`, `ultra`, `dense`, `ultra_dense` and `hq`.
+A response descriptor announces the kind of the following frames, and a kind is searched for only
+after its descriptor. The first kind in an input is its data. ``configure(answer="express")``
+selects another kind, and starts as if its descriptor had been received, for recordings that begin
+after it. The kinds are `node`, `express`, `ultra`, `dense`, `ultra_dense` and `hq`.
 
-One rule cuts scans for all of them: where the azimuth of the points passes zero. Nodes and HQ
-capsules mark the first node past zero by a bit, which is the same place; a turn of capsules ends
-where the start angle drops, which lies up to a capsule beside it. So scans begin at the same angle
-whatever the answer.
+One rule ends scans for all kinds: the azimuth of the points passes zero. Nodes and HQ capsules mark
+the first node past zero with a bit, at the same point. The start angle of capsules passes zero up
+to a capsule earlier or later. So scans begin at the same angle for all kinds.
 
-Nodes have no checksum, and are believed in unbroken runs of ten: the module `nodes` has the
-measured rates of false ones. No frame says when its points were taken: all points of one bear its
-time.
+Nodes have no checksum, and are accepted in unbroken runs of ten: the module `nodes` has the
+measured rates of false nodes. No frame contains the times of its points: all points of a frame have
+its time.
 
-How far it is proven: requests, descriptors, information and configuration answers against a live
-A1's exchange; nodes, express and ultra capsules against bytes built after the SDK; dense,
-ultra-dense and HQ capsules against the SDK's arithmetic by hand. Whether a C1 obeys the speed
-command is not known: the SDK's rule by model number would take PWM for it. That an S2L has the
-numbers of an S2 is assumed: nothing in the bytes tells these two apart. A T1 is asked over UDP, and
-sends its stream there.
+Verification: requests, descriptors, information and configuration replies against the recorded
+communication of a live A1; nodes, express and ultra capsules against bytes built after the SDK;
+dense, ultra-dense and HQ capsules against the SDK's arithmetic by hand. It is not known whether a
+C1 supports the speed command: by the SDK's rule for model numbers it would use PWM. An S2L is
+assumed to have the model numbers of an S2: no bytes distinguish them. A T1 receives requests over
+UDP, and sends its stream over UDP.
 """
 
 from __future__ import annotations
@@ -38,11 +36,11 @@ from lidarspec import UsageError
 from lidarspec.spec import Command, Frame, Link, OnWrap, Sensor, Serial, Simulation, Udp, hookimpl
 from lidarspec_slamtec import capsules, nodes, units
 from lidarspec_slamtec.answers import ANSWERS, DESCRIPTORS
-from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, express
+from lidarspec_slamtec.commands import BY_DTR, BY_PWM, BY_SPEED, COMMANDS, make_express_request
 from lidarspec_slamtec.requests import REQUESTS
 
 MODELS = ("A1", "A2", "A3", "S1", "S2", "S2L", "S3", "T1", "C1")
-TWINS = ("S2", "S2L")
+SAME_MODEL_NUMBER = ("S2", "S2L")
 
 FRAMES = {
     **DESCRIPTORS,
@@ -51,7 +49,7 @@ FRAMES = {
         nodes.NODE,
         data=True,
         points=nodes.node_points,
-        simulation=Simulation(nodes.node_sweep, rate=nodes.RATE),
+        simulation=Simulation(nodes.node_sweep, rate=nodes.NODE_RATE_HZ),
         plausible=nodes.plausible,
         after="scan_descriptor",
         confirm=nodes.CONFIRM,
@@ -72,7 +70,7 @@ FRAMES = {
         points=capsules.ultra_points,
         simulation=Simulation(
             partial(capsules.sweep, degrees=capsules.ULTRA_STEP),
-            capsules.ultra_codes,
+            capsules.encode_ultra,
             capsules.ULTRA_RATE,
         ),
         plausible=capsules.plausible,
@@ -94,7 +92,7 @@ FRAMES = {
         points=capsules.ultra_dense_points,
         simulation=Simulation(
             partial(capsules.sweep, degrees=capsules.ULTRA_DENSE_STEP),
-            capsules.ultra_dense_codes,
+            capsules.encode_ultra_dense,
             capsules.ULTRA_DENSE_RATE,
         ),
         plausible=capsules.plausible,
@@ -104,7 +102,7 @@ FRAMES = {
         nodes.HQ,
         data=True,
         points=nodes.hq_points,
-        simulation=Simulation(nodes.hq_sweep, rate=nodes.HQ_RATE),
+        simulation=Simulation(nodes.hq_sweep, rate=nodes.HQ_CAPSULE_RATE_HZ),
         after="hq_descriptor",
     ),
     **REQUESTS,
@@ -140,14 +138,14 @@ def configure(
         }
         sensor = dataclasses.replace(
             sensor,
-            commands={**sensor.commands, "mode_scan": express(mode)},
+            commands={**sensor.commands, "mode_scan": make_express_request(mode)},
             simulation=Simulation(answers=answers),
             on_open=("stop", "start_motor", "mode_scan"),
         )
     return sensor
 
 
-def rplidar(
+def make_rplidar(
     name: str,
     *,
     link: Link,
@@ -158,7 +156,7 @@ def rplidar(
     status: str,
     source: str,
 ) -> Sensor:
-    """One model of the family; simulated, it is this unit."""
+    """Return one model of the family, simulated with the values of `unit`."""
     commands = {**COMMANDS, **motor}
     return Sensor(
         f"slamtec-rplidar-{name.lower()}",
@@ -183,21 +181,21 @@ def rplidar(
         turn=turn,
         relatives={
             f"slamtec-rplidar-{other.lower()}": (
-                "no public difference; see the label" if {name, other} == {*TWINS} else "info.model"
+                "no public difference; see the label"
+                if {name, other} == {*SAME_MODEL_NUMBER}
+                else "info.model"
             )
             for other in MODELS
             if other != name
         },
-        info={
-            "serial": "info.serial",
-            "model": "info.model",
-        },  # the firmware stands in two fields, major and minor
+        # the firmware version is omitted: it has two fields, major and minor
+        info={"serial": "info.serial", "model": "info.model"},
         status=status,
         source=f"RPLIDAR interface protocol and SDK; {source}",
     )
 
 
-A1 = rplidar(
+A1 = make_rplidar(
     "A1",
     link=Serial(115_200),
     motor=BY_DTR,
@@ -207,17 +205,17 @@ A1 = rplidar(
     status="vectors",
     source="A1M8 data sheet; captured exchange with an A1",
 )
-A2 = rplidar(
+A2 = make_rplidar(
     "A2",
     link=Serial(115_200, 256_000),  # A2M8 and older; A2M7, A2M12
     motor=BY_PWM,
     unit=units.A2,
-    range_limits=(0.15, 16.0),  # an A2M8 sees from 0.15 to 12 m; the rest is assumed for the A2M7
+    range_limits=(0.15, 16.0),  # an A2M8 measures 0.15 to 12 m; the rest is assumed for the A2M7
     turn=(5.0, 15.0),
     status="manual",
     source="A2M8 data sheet rev. 2.5 (12 m, speed); the range of an A2M7 is assumed",
 )
-A3 = rplidar(
+A3 = make_rplidar(
     "A3",
     link=Serial(256_000),
     motor=BY_PWM,
@@ -227,7 +225,7 @@ A3 = rplidar(
     status="vectors",
     source="A3M1 data sheet; ultra capsules built from the SDK",
 )
-S1 = rplidar(
+S1 = make_rplidar(
     "S1",
     link=Serial(256_000),
     motor=BY_SPEED,
@@ -237,7 +235,7 @@ S1 = rplidar(
     status="manual",
     source="ArduPilot's page of the S1 (40 m, speed); its shortest distance is assumed",
 )
-S2 = rplidar(
+S2 = make_rplidar(
     "S2",
     link=Serial(1_000_000),
     motor=BY_SPEED,
@@ -246,7 +244,7 @@ S2 = rplidar(
     status="manual",
     source="S2 data sheet",
 )
-S2L = rplidar(
+S2L = make_rplidar(
     "S2L",
     link=Serial(1_000_000),
     motor=BY_SPEED,
@@ -255,25 +253,25 @@ S2L = rplidar(
     status="manual",
     source="its range is assumed",
 )
-S3 = rplidar(
+S3 = make_rplidar(
     "S3",
-    link=Serial(1_000_000, 460_800),  # the second where the model is 82 (SDK)
+    link=Serial(1_000_000, 460_800),  # the second for the model number 82 (SDK)
     motor=BY_SPEED,
     unit=units.S3,
     range_limits=(0.05, 40.0),
     status="manual",
     source="its range is assumed",
 )
-T1 = rplidar(
+T1 = make_rplidar(
     "T1",
-    link=Udp(8089, stream=True),  # asked at 192.168.11.2 (sllidar_ros2)
+    link=Udp(8089, stream=True),  # the sensor's address is 192.168.11.2 (sllidar_ros2)
     motor=BY_SPEED,
     unit=units.T1,
     range_limits=(0.05, 40.0),  # assumed: an S3's
     status="manual",
     source="port from sllidar_ros2; its range is assumed",
 )
-C1 = rplidar(
+C1 = make_rplidar(
     "C1",
     link=Serial(460_800),
     motor=BY_SPEED,
@@ -286,5 +284,5 @@ C1 = rplidar(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The RPLIDAR models."""
+    """Return the RPLIDAR models."""
     return [A1, A2, A3, S1, S2, S2L, S3, T1, C1]

@@ -1,10 +1,8 @@
-"""What comes back: single answers behind their descriptors, and the descriptors that announce a
-stream of data frames.
+"""Single replies with their descriptors, and the descriptors before a stream of data frames.
 
-Every descriptor is ``A5 5A``, 30 bits of length, 2 bits of mode (0: one answer, 1: an endless
-stream) and a type. A single answer is one frame together with its descriptor. A descriptor of a
-stream is a frame of its own: the data frames of its kind are looked for from there on, until
-another one comes.
+Every descriptor is ``A5 5A``, 30 bits of length, 2 bits of mode (0: one reply, 1: an endless
+stream) and a type. A single reply and its descriptor are one frame. The descriptor of a stream is a
+separate frame: its kind of data frames is searched for until another descriptor follows.
 
 Source: RPLIDAR interface protocol, "response descriptors" and "requests with single response";
 configuration keys and the widths of their values from the vendor's SDK (sl_lidar_cmd.h).
@@ -32,20 +30,19 @@ from construct import (
 
 from lidarspec.spec import Fields, Frame, Scaled, take
 
+# modes of a descriptor
 SINGLE = 0
-STREAM = 1  # the modes of a descriptor
-LONGEST_NAME = 64  # bytes of the name of a scan mode (SDK, LidarScanMode)
-
-#: series by the high nibble of the model (SDK, GetModelNameStringByModelID), and the models in
-#: them: an A2M8 is 28.
+STREAM = 1
+MAX_MODE_NAME_BYTES = 64  # SDK, LidarScanMode
+#: High nibble of the model number -> series, low nibbles of its models; an A2M8 is 28 (SDK,
+#: GetModelNameStringByModelID).
 SERIES = {0x1: ("A1", (8,)), 0x2: ("A2", (4, 6, 7, 8, 12)), 0x3: ("A3", (1,)), 0x4: ("C1", (1,))}
 SERIES |= {0x6: ("S1", (1,)), 0x7: ("S2", (1, 2)), 0x8: ("S3", (1, 2)), 0x9: ("T1", (1,))}
 MODEL_NUMBERS = ", ".join(
     f"0x{high:x}{low:x} RPLIDAR {name}" for high, (name, models) in SERIES.items() for low in models
 )
 
-#: keys of configuration values; the first two are of the sensor, the others of one of its scan
-#: modes.
+#: Keys of configuration values: the first two of the sensor, the others of one of its scan modes.
 MODE_COUNT = 0x70
 TYPICAL_MODE = 0x7C
 US_PER_SAMPLE = 0x71
@@ -53,7 +50,7 @@ MAX_DISTANCE = 0x74
 ANSWER_TYPE = 0x75
 MODE_NAME = 0x7F
 
-#: the values of fixed width.
+#: Configuration values of fixed width, by key.
 VALUES: dict[int, Construct] = {
     MODE_COUNT: "mode_count" / Int16ul,
     TYPICAL_MODE: "typical_mode" / Int16ul,
@@ -63,11 +60,11 @@ VALUES: dict[int, Construct] = {
     / Int8ul
     * "type in the descriptor that precedes the data frames of the mode",
 }
-_SIZES = np.full(MODE_NAME + 1, np.nan)
-_SIZES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
+_VALUE_BYTES = np.full(MODE_NAME + 1, np.nan)
+_VALUE_BYTES[list(VALUES)] = [value.sizeof() for value in VALUES.values()]
 
 
-def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]:
+def make_descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]:
     """Return the fields of a descriptor of this type and mode."""
     block = BitStruct(
         "mode" / Const(mode, BitsInteger(2)) * "0: one reply, 1: endless stream",
@@ -80,33 +77,34 @@ def descriptor(kind: int, mode: int, length: Construct) -> tuple[Construct, ...]
     )
 
 
-def single(kind: int, size: int, *fields: Construct) -> Frame:
-    """Return a single answer of `size` bytes behind its descriptor."""
-    return Frame(Struct(*descriptor(kind, SINGLE, Const(size, BitsInteger(30))), *fields))
+def make_reply(kind: int, size: int, *fields: Construct) -> Frame:
+    """Return the frame of a single reply of `size` bytes after its descriptor."""
+    return Frame(Struct(*make_descriptor(kind, SINGLE, Const(size, BitsInteger(30))), *fields))
 
 
-def announcing(kind: int, size: int) -> Frame:
-    """Return the descriptor of an endless stream of data frames of `size` bytes."""
-    return Frame(Struct(*descriptor(kind, STREAM, Const(size, BitsInteger(30)))))
+def make_stream_descriptor(kind: int, size: int) -> Frame:
+    """Return the descriptor frame of an endless stream of frames of `size` bytes."""
+    return Frame(Struct(*make_descriptor(kind, STREAM, Const(size, BitsInteger(30)))))
 
 
-def config_plausible(f: Fields) -> Any:
-    """Return the length fits the value, where the width of the value is known."""
-    size = take(_SIZES, f.key)
+def is_config_plausible(f: Fields) -> Any:
+    """Return whether the length fits the value, if the key has a known width."""
+    size = take(_VALUE_BYTES, f.key)
     return np.isnan(size) | (f.descriptor.length == 4 + size)
 
 
-def config(key: int, value: Any) -> tuple[str, dict[str, Any]]:
-    """The answer that holds a configuration value in its unit, or its bytes where its width is not
-    fixed: the frame and its values.
+def make_config(key: int, value: Any) -> tuple[str, dict[str, Any]]:
+    """Return frame name and values of a simulated reply with a configuration value.
+
+    `value` is in its unit, or bytes if the key has no fixed width.
     """
-    known = VALUES.get(key)
-    name, size = (known.name, known.sizeof()) if known else ("data", len(value))
+    field = VALUES.get(key)
+    name, size = (field.name, field.sizeof()) if field else ("data", len(value))
     return "config", {"descriptor.length": 4 + size, "key": key, f"value.{name}": value}
 
 
 CONFIG = Struct(
-    *descriptor(0x20, SINGLE, BitsInteger(30)),
+    *make_descriptor(0x20, SINGLE, BitsInteger(30)),
     "key" / Int32ul,
     "value"
     / Switch(
@@ -118,13 +116,13 @@ CONFIG = Struct(
     ),
 )
 CONFIG_SET = Struct(
-    *descriptor(0x21, SINGLE, BitsInteger(30)),
+    *make_descriptor(0x21, SINGLE, BitsInteger(30)),
     "key" / Int32ul,
     "data" / Bytes(this.descriptor.length - 4),
 )
 
 ANSWERS = {
-    "info": single(
+    "info": make_reply(
         0x04,
         20,
         "model" / Int8ul * f"high nibble: series, low nibble: model; {MODEL_NUMBERS}",
@@ -133,22 +131,24 @@ ANSWERS = {
         "hardware" / Int8ul,
         "serial" / Bytes(16),
     ),
-    "health": single(0x06, 3, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul),
-    "sample_rate": single(
+    "health": make_reply(
+        0x06, 3, "status" / Int8ul * "0 good, 1 warning, 2 error", "error" / Int16ul
+    ),
+    "sample_rate": make_reply(
         0x15, 4, "standard" / Scaled(Int16ul, 1, "us"), "express" / Scaled(Int16ul, 1, "us")
     ),
-    "config": Frame(CONFIG, max_length=7 + 4 + LONGEST_NAME, plausible=config_plausible),
-    "config_set": Frame(CONFIG_SET, max_length=7 + 4 + LONGEST_NAME),
-    "accessory": single(
+    "config": Frame(CONFIG, max_length=7 + 4 + MAX_MODE_NAME_BYTES, plausible=is_config_plausible),
+    "config_set": Frame(CONFIG_SET, max_length=7 + 4 + MAX_MODE_NAME_BYTES),
+    "accessory": make_reply(
         0xFF, 4, "flags" / Int32ul * "bit 0: the accessory board drives the motor by PWM"
     ),
 }
 
 DESCRIPTORS = {
-    "scan_descriptor": announcing(0x81, 5),
-    "express_descriptor": announcing(0x82, 84),
-    "hq_descriptor": announcing(0x83, 781),
-    "ultra_descriptor": announcing(0x84, 132),
-    "dense_descriptor": announcing(0x85, 84),
-    "ultra_dense_descriptor": announcing(0x86, 170),
+    "scan_descriptor": make_stream_descriptor(0x81, 5),
+    "express_descriptor": make_stream_descriptor(0x82, 84),
+    "hq_descriptor": make_stream_descriptor(0x83, 781),
+    "ultra_descriptor": make_stream_descriptor(0x84, 132),
+    "dense_descriptor": make_stream_descriptor(0x85, 84),
+    "ultra_dense_descriptor": make_stream_descriptor(0x86, 170),
 }

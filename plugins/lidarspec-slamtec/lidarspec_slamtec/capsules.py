@@ -1,16 +1,15 @@
-"""Capsules: many distances behind the angle of the first one. The other angles need the start of
-the next capsule.
+"""Capsules: many distances after the angle of the first one.
 
-Point k of N stands at ``start + (next start - start) * k / N``, less a compensation of its own.
-Where bytes were lost, at the end of the input, and before a capsule with the S bit (the first after
-a start) there is no next capsule, and the points of the last one have no direction. All four kinds
-begin alike: their checksum, the XOR of the bytes from the third on, stands in two nibbles beside
-the sync nibbles A and 5.
+The angles of the other points need the start angle of the next capsule: point k of N is at ``start
++ (next start - start) * k / N``, minus a compensation. Before lost bytes, at the end of the input,
+and before a capsule with the S bit (the first after a start) there is no next capsule, and the
+points of the last capsule have no direction. All four kinds begin with the sync nibbles A and 5,
+each next to one nibble of the checksum, the XOR of the bytes from the third on.
 
-Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; what it does not say (dense and ultra-dense
+Source: RPLIDAR interface protocol, "EXPRESS_SCAN"; facts missing there (dense and ultra-dense
 capsules, the ultra capsule's angles, that dtheta is unsigned) from the vendor's SDK
-(sl_lidar_cmd.h, handler_capsules.cpp). The SDK averages neighbours of an ultra-dense capsule that
-differ by up to 2 mm; that is a filter, and is left out.
+(sl_lidar_cmd.h, handler_capsules.cpp). The SDK averages adjacent points of an ultra-dense capsule
+that differ by up to 2 mm; that is a filter, and is left out.
 """
 
 from __future__ import annotations
@@ -37,70 +36,70 @@ EXPRESS_CABINS = 16
 ULTRA_CABINS = 32
 DENSE_CABINS = 40
 ULTRA_DENSE_CABINS = 32
-SIGNED = 32  # dtheta has six bits; read as signed, this one and those above are negative
-#: degrees of a simulated capsule: 720, 1440, 800 and 800 points a turn.
+DTHETA_SIGN_BIT = 32  # of six bits
+#: Degrees of a simulated capsule: 720, 1440, 800 and 800 points a revolution.
 EXPRESS_STEP = 16.0
 ULTRA_STEP = 24.0
 DENSE_STEP = 18.0
 ULTRA_DENSE_STEP = 28.8
-#: simulated capsules a second: 254 and 127 us a point, a live A1's, for 5.5 turns; 125 us, assumed,
-#: for 10 turns.
+#: Simulated capsules per second: 254 and 127 us per point, as of a live A1, give 5.5 revolutions a
+#: second; 125 us, assumed, give 10.
 EXPRESS_RATE, ULTRA_RATE, DENSE_RATE, ULTRA_DENSE_RATE = (
     1e6 / us / points for us, points in ((254, 32), (127, 96), (125, 40), (125, 64))
 )
 
-#: the ultra capsule's scale: values from STARTS on begin at BASES millimetres and go on in steps of
-#: 1, 2, 4, 8 and 16.
+#: The five levels of the ultra capsule's codes: a level begins at the code _STARTS, which means
+#: _BASES millimetres, and its steps are 1, 2, 4, 8 or 16 mm.
 _STARTS = np.array([0, 512, 1280, 1792, 3328])
 _BASES = np.array([0, 512, 2048, 4096, 16384])
 _CODES = np.arange(1 << 12)
-LEVELS = np.searchsorted(_STARTS, _CODES, side="right") - 1
-MILLIMETRES = _BASES[LEVELS] + ((_CODES - _STARTS[LEVELS]) << LEVELS)
+CODE_LEVELS = np.searchsorted(_STARTS, _CODES, side="right") - 1
+CODE_MILLIMETRES = _BASES[CODE_LEVELS] + ((_CODES - _STARTS[CODE_LEVELS]) << CODE_LEVELS)
 
-#: the ultra-dense capsule's four scales begin at these millimetres.
-SCALES = np.array([0, 2046, 8187, 24567])
-QUALITY = 47  # of simulated points
+#: First distance in mm of each of the ultra-dense capsule's four scales.
+SCALE_STARTS_MM = np.array([0, 2046, 8187, 24567])
+SIMULATED_QUALITY = 47
 
 
-def nibble(sync: int) -> Construct:
-    """One of the first two bytes: a sync nibble above a nibble of the checksum."""
+def make_nibbles(sync: int) -> Construct:
+    """Return the struct of a sync nibble above a nibble of the checksum."""
     return BitStruct("sync" / Const(sync, BitsInteger(4)), "checksum" / BitsInteger(4))
 
 
-def capsule(*fields: Construct) -> Checksummed:
-    """Return a capsule of these fields behind its sync and checksum."""
-    struct = Struct("low" / nibble(0xA), "high" / nibble(0x5), *fields)
+def make_capsule(*fields: Construct) -> Checksummed:
+    """Return the struct of a capsule with these fields after sync and checksum."""
+    struct = Struct("low" / make_nibbles(0xA), "high" / make_nibbles(0x5), *fields)
     return Checksummed(struct, field=("low.checksum", "high.checksum"), algorithm=Xor())
 
 
-def start() -> Construct:
-    """Return the angle of the first point, and whether this is the first capsule after a start."""
+def make_start() -> Construct:
+    """Return the field of the first angle, and the flag of the first capsule."""
     flag = "sync" / BitsInteger(1) * "S, 1: first capsule after a start"
     return "start" / ByteSwapped(BitStruct(flag, "angle" / Scaled(BitsInteger(15), 1 / 64, "deg")))
 
 
-def sample() -> Construct:
-    """14 bits of distance above the two high bits of its angle's compensation."""
+def make_sample() -> Construct:
+    """Return the struct of a distance and the high bits of its compensation."""
     distance = "distance" / Scaled(BitsInteger(14), 0.001, "m") * "0: no return"
     return ByteSwapped(BitStruct(distance, "dtheta_high" / BitsInteger(2)))
 
 
-EXPRESS = capsule(
-    start(),
+EXPRESS = make_capsule(
+    make_start(),
     "cabins"
     / Array(
         EXPRESS_CABINS,
         Struct(
-            "first" / sample(),
-            "second" / sample(),
+            "first" / make_sample(),
+            "second" / make_sample(),
             "dtheta_low"
             / BitStruct("second" / BitsInteger(4), "first" / BitsInteger(4))
             * "1/8 degree",
         ),
     ),
 )
-ULTRA = capsule(
-    start(),
+ULTRA = make_capsule(
+    make_start(),
     "cabins"
     / Array(
         ULTRA_CABINS,
@@ -120,13 +119,13 @@ ULTRA = capsule(
         ),
     ),
 )
-DENSE = capsule(
-    start(), "distances" / Array(DENSE_CABINS, Scaled(Int16ul, 0.001, "m")) * "0: no return"
+DENSE = make_capsule(
+    make_start(), "distances" / Array(DENSE_CABINS, Scaled(Int16ul, 0.001, "m")) * "0: no return"
 )
-ULTRA_DENSE = capsule(
+ULTRA_DENSE = make_capsule(
     "time_stamp" / Int32ul * "unit not documented",
     "status" / Int16ul,
-    start(),
+    make_start(),
     "cabins"
     / Array(
         ULTRA_DENSE_CABINS,
@@ -145,12 +144,12 @@ ULTRA_DENSE = capsule(
 
 
 def plausible(f: Fields) -> Any:
-    """Return the first angle is below 360 degrees."""
+    """Return whether the first angle is below 360 degrees."""
     return f.start.angle < 360
 
 
-def step(f: Fields, count: int) -> Any:
-    """Return the degrees from one of `count` points to the next, (n, 1).
+def point_step(f: Fields, count: int) -> Any:
+    """Return the degrees from a point to the next, (n, 1), for `count` points.
 
     The step is nan if there is no next capsule.
     """
@@ -158,36 +157,40 @@ def step(f: Fields, count: int) -> Any:
     return wrap(after - f.start.angle, 360.0) / count
 
 
-def headings(f: Fields, cabins: int, points: int) -> Any:
-    """Degrees clockwise of each point, not compensated, (n, cabins, points)."""
+def uncompensated_angles(f: Fields, cabins: int, points: int) -> Any:
+    """Return the clockwise degrees of the points, (n, cabins, points)."""
     count = cabins * points
-    between = step(f, cabins * points)
+    step = point_step(f, cabins * points)
     return stack(
-        *(f.start.angle + between * np.arange(place, count, points) for place in range(points))
+        *(f.start.angle + step * np.arange(index, count, points) for index in range(points))
     )
 
 
 def express_points(f: Fields, *, signed: bool = False) -> Polar:
-    """32 points a capsule, with dtheta read as unsigned (SDK) or signed (protocol)."""
+    """Return 32 points per capsule, with dtheta unsigned (SDK) or signed (protocol)."""
     first = f.cabins.first
     second = f.cabins.second
     low = f.cabins.dtheta_low
     eighths = stack(first.dtheta_high * 16 + low.first, second.dtheta_high * 16 + low.second)
     if signed:
-        eighths = np.where(eighths >= SIGNED, eighths - 2 * SIGNED, eighths)
-    clockwise = headings(f, EXPRESS_CABINS, 2) - eighths / 8
+        eighths = np.where(eighths >= DTHETA_SIGN_BIT, eighths - 2 * DTHETA_SIGN_BIT, eighths)
+    clockwise = uncompensated_angles(f, EXPRESS_CABINS, 2) - eighths / 8
     return Polar(range=stack(first.distance, second.distance), azimuth=-np.deg2rad(clockwise))
 
 
 def dense_points(f: Fields) -> Polar:
-    """40 points a capsule, without compensation."""
-    clockwise = f.start.angle + step(f, DENSE_CABINS) * np.arange(DENSE_CABINS)
+    """Return 40 points per capsule, without compensation."""
+    clockwise = f.start.angle + point_step(f, DENSE_CABINS) * np.arange(DENSE_CABINS)
     return Polar(range=f.distances, azimuth=-np.deg2rad(clockwise))
 
 
-def predict(base: Any, level: Any, prediction: Any) -> Any:
-    """Millimetres of a predicted distance, in steps of its base's scale; 0 for the two values that
-    mean no return.
+def predicted_distance(base: Any, level: Any, prediction: Any) -> Any:
+    """Return a predicted distance in mm, 0 for the two codes of no return.
+
+    Args:
+        base: the reference distance in mm.
+        level: the level of the reference's code.
+        prediction: the difference in steps of that level.
     """
     return np.where(
         (prediction == 511) | (prediction == -512), 0, base + prediction * np.exp2(level)
@@ -195,38 +198,44 @@ def predict(base: Any, level: Any, prediction: Any) -> Any:
 
 
 def compensation(mm: Any) -> Any:
-    """Degrees that an ultra capsule's point lies before its heading, by its distance.
+    """Return the degrees to subtract from the angle of an ultra capsule's point.
 
-    Source: handler_capsules.cpp: 7.5 degrees below 50 mm, else 8 degrees less two terms in 1/65536
-    rad of 98361 by the distance in quarters of a millimetre, a whole number.
+    Source: handler_capsules.cpp: 7.5 degrees below 50 mm, otherwise 8 degrees minus two terms in
+    1/65536 rad. The terms depend on 98361 divided by the distance in quarters of a millimetre,
+    rounded down.
     """
     ratio = np.floor(98361 / np.maximum(mm * 4, 200))
     return np.where(mm >= 50, 8 - np.rad2deg((ratio * 64 + ratio**3 / 98304) / 65536), 7.5)
 
 
 def ultra_points(f: Fields) -> Polar:
-    """96 points a capsule: a major distance in each cabin, and two that are predicted from it and
-    from the next one's.
+    """Return 96 points per capsule.
+
+    A cabin has a major distance, a distance predicted from it, and a distance predicted from the
+    major distance of the next cabin.
     """
     code = f.cabins.major
-    code_after = following(f.cabins.major)
-    major = take(MILLIMETRES, code)
-    after = take(MILLIMETRES, code_after)
-    after_level = take(LEVELS, code_after)
-    lacking = (major == 0) & (after > 0)
-    base = np.where(lacking, after, major)
-    level = np.where(lacking, after_level, take(LEVELS, code))
-    first = predict(base, level, f.cabins.predict1)
-    second = predict(after, after_level, f.cabins.predict2)
+    next_code = following(f.cabins.major)
+    major = take(CODE_MILLIMETRES, code)
+    next_major = take(CODE_MILLIMETRES, next_code)
+    next_level = take(CODE_LEVELS, next_code)
+    is_major_missing = (major == 0) & (next_major > 0)
+    base = np.where(is_major_missing, next_major, major)
+    level = np.where(is_major_missing, next_level, take(CODE_LEVELS, code))
+    first = predicted_distance(base, level, f.cabins.predict1)
+    second = predicted_distance(next_major, next_level, f.cabins.predict2)
     mm = stack(major, first, second)
     return Polar(
-        range=mm / 1000, azimuth=-np.deg2rad(headings(f, ULTRA_CABINS, 3) - compensation(mm))
+        range=mm / 1000,
+        azimuth=-np.deg2rad(uncompensated_angles(f, ULTRA_CABINS, 3) - compensation(mm)),
     )
 
 
 def ultra_dense_points(f: Fields) -> Polar:
-    """64 points a capsule: by its scale, 10 to 13 bits of distance in steps of 2 to 5 mm, and above
-    them 8 to 5 bits of quality.
+    """Return 64 points per capsule.
+
+    By its scale, a point has 10 to 13 bits of distance in steps of 2 to 5 mm, and above them 8 to 5
+    bits of quality.
     """
     cabins = f.cabins
     scale = stack(cabins.first_scale, cabins.second_scale)
@@ -237,63 +246,69 @@ def ultra_dense_points(f: Fields) -> Polar:
     size = np.exp2(10 + scale)
     quality = np.floor(code / size)
     return Polar(
-        range=(take(SCALES, scale) + (2 + scale) * (code - quality * size)) / 1000,
-        azimuth=-np.deg2rad(headings(f, ULTRA_DENSE_CABINS, 2)),
+        range=(take(SCALE_STARTS_MM, scale) + (2 + scale) * (code - quality * size)) / 1000,
+        azimuth=-np.deg2rad(uncompensated_angles(f, ULTRA_DENSE_CABINS, 2)),
         intensity=quality * np.exp2(scale),
     )
 
 
-def ultra_codes(polar: Polar) -> Mapping[str, Any]:
-    """The fields of ultra capsules that hold these ranges; a prediction that cannot reach its point
-    says that there is no return.
+def encode_ultra(polar: Polar) -> Mapping[str, Any]:
+    """Return the fields of ultra capsules with these ranges.
+
+    A prediction that does not reach its point becomes the code of no return.
     """
     mm = np.asarray(polar.range) * 1000
-    code = nearest(mm[..., 0])
-    after = np.append(code.reshape(-1)[1:], 0).reshape(code.shape)
-    base = np.where(code > 0, code, after)
+    code = nearest_codes(mm[..., 0])
+    next_code = np.append(code.reshape(-1)[1:], 0).reshape(code.shape)
+    base = np.where(code > 0, code, next_code)
     first, second = (
-        prediction(mm[..., place], reference) for place, reference in ((1, base), (2, after))
+        encode_prediction(mm[..., index], reference)
+        for index, reference in ((1, base), (2, next_code))
     )
     return {"cabins.major": code, "cabins.predict1": first, "cabins.predict2": second}
 
 
-def nearest(mm: Any) -> Any:
-    """Return the codes of the scale's values next to these distances."""
-    above = np.clip(np.searchsorted(MILLIMETRES, mm), 1, len(MILLIMETRES) - 1)
-    return np.where(mm - MILLIMETRES[above - 1] < MILLIMETRES[above] - mm, above - 1, above) * (
-        mm > 0
-    )
+def nearest_codes(mm: Any) -> Any:
+    """Return the codes with the distances nearest to `mm`, 0 for no return."""
+    above = np.clip(np.searchsorted(CODE_MILLIMETRES, mm), 1, len(CODE_MILLIMETRES) - 1)
+    return np.where(
+        mm - CODE_MILLIMETRES[above - 1] < CODE_MILLIMETRES[above] - mm, above - 1, above
+    ) * (mm > 0)
 
 
-def prediction(mm: Any, code: Any) -> Any:
-    """Steps from the distance that a code stands for to another one; 511 for no return."""
-    base = MILLIMETRES[code]
-    scale = np.exp2(LEVELS[code])
+def encode_prediction(mm: Any, code: Any) -> Any:
+    """Return the steps from the distance of a code to another one, 511 if impossible.
+
+    A distance of 0, no return, is 511 too.
+    """
+    base = CODE_MILLIMETRES[code]
+    scale = np.exp2(CODE_LEVELS[code])
     steps = np.rint((mm - base) / scale)
     return np.where(
         (mm > 0) & (base + steps * scale > 0) & (np.abs(steps) < 511), steps, 511
     ).astype(np.int64)
 
 
-def ultra_dense_codes(polar: Polar) -> Mapping[str, Any]:
-    """The fields of ultra-dense capsules that hold these ranges, each in the finest scale that
-    reaches it, of one quality.
+def encode_ultra_dense(polar: Polar) -> Mapping[str, Any]:
+    """Return the fields of ultra-dense capsules with these ranges.
+
+    Each range has the finest scale that contains it, and all have the same quality.
     """
     mm = np.asarray(polar.range) * 1000
-    scale = np.searchsorted(SCALES, mm, side="right") - 1
-    steps = np.rint((mm - SCALES[scale]) / (2 + scale)).astype(np.int64)
-    code = np.where(mm > 0, steps + ((QUALITY >> scale) << (10 + scale)), 0)
+    scale = np.searchsorted(SCALE_STARTS_MM, mm, side="right") - 1
+    steps = np.rint((mm - SCALE_STARTS_MM[scale]) / (2 + scale)).astype(np.int64)
+    code = np.where(mm > 0, steps + ((SIMULATED_QUALITY >> scale) << (10 + scale)), 0)
     fields: dict[str, Any] = {}
-    for place, name in enumerate(("first", "second")):
-        own = code[..., place]
+    for index, name in enumerate(("first", "second")):
+        point_code = code[..., index]
         fields |= {
-            f"cabins.{name}_low": own & 0x3FFF,
-            f"cabins.{name}_high": own >> 14,
-            f"cabins.{name}_scale": scale[..., place],
+            f"cabins.{name}_low": point_code & 0x3FFF,
+            f"cabins.{name}_high": point_code >> 14,
+            f"cabins.{name}_scale": scale[..., index],
         }
     return fields
 
 
 def sweep(i: int, degrees: float) -> Mapping[str, Any]:
-    """Capsule i of capsules that are so many degrees apart."""
+    """Return the values of simulated capsule i; capsules are `degrees` apart."""
     return {"start.angle": i * degrees % 360, "start.sync": int(i == 0)}

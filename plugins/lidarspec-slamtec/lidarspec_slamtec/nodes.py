@@ -1,11 +1,9 @@
-"""Points that carry their own angle: the five-byte nodes of a scan, and the HQ capsules of 96 nodes
-with a CRC-32.
+"""Points with their own angle: the five-byte nodes of a scan, and HQ capsules of 96 nodes.
 
-A node has no checksum. What holds it together is that S and its inverse differ, that the check bit
-is 1 and that the angle is below 360 degrees: 17.6 % of all random five bytes pass. So nodes are
-weak frames, believed in unbroken runs of
-`CONFIRM` alone. Measured, nodes accepted where none was sent, with a run of one, of 6, of 8, and of
-ten as chosen:
+An HQ capsule has a CRC-32, a node has no checksum. A node is valid if S and its inverse differ, the
+check bit is 1 and the angle is below 360 degrees: 17.6 % of all random five bytes pass. So nodes
+are weak frames, accepted only in unbroken runs of `CONFIRM`. The table counts nodes that were
+accepted but not sent, for runs of 1, 6, 8, and the selected 10:
 
     random bytes, 8 MiB                          865 530    1 192      32       0
     express capsules, 2 MiB                      227 743    3 767     551     159
@@ -15,12 +13,12 @@ ten as chosen:
     joining nodes in the middle of one, 300 x        135        9       0       0
     nodes with 1 % of the bytes damaged, 2 MiB     7 430    1 811   1 760   1 732
 
-Distances that hardly change put the same bits in every cabin of a capsule, hence rows two and
-three; but nodes are looked for after the descriptor 81 alone, so that they are met only where a
-later descriptor was lost. The last row counts what goes on at a shifted place in a run that was
-believed already, which no confirmation prevents: of 419 430 nodes sent, a run of one brings 411 423
-back, a run of ten 395 728. The streams have noise of a few millimetres; a test repeats this on
-less.
+Distances that hardly change put the same bits in every cabin of a capsule, which explains rows two
+and three. Nodes are searched for only after the descriptor 81, so capsules are searched for nodes
+only if a later descriptor was lost. The last row counts nodes that continue an accepted run at a
+shifted offset, which no run length prevents: of 419 430 sent nodes, 411 423 are recovered with runs
+of 1 and 395 728 with runs of 10. The streams have noise of a few millimetres; a test repeats this
+with less data.
 
 Source: RPLIDAR interface protocol, "SCAN"; HQ capsules: the vendor's SDK (sl_lidar_cmd.h,
 handler_hqnode.cpp).
@@ -48,11 +46,11 @@ from construct import (
 from lidarspec.spec import Checksummed, Crc, Fields, Polar, Scaled, ZeroPadded
 
 CONFIRM = 10  # nodes in an unbroken run; see the measurement above
-HQ_NODES = 96
-TURN = 360  # nodes of a simulated turn
-RATE = 1e6 / 508  # nodes a second: a live A1's standard time between two, which makes 5.5 turns
-HQ_TURN = 960  # nodes of a simulated turn of HQ capsules
-HQ_RATE = 80.0  # capsules a second, which makes 8 turns; assumed
+HQ_NODES = 96  # per capsule
+NODES_PER_TURN = 360  # simulated
+NODE_RATE_HZ = 1e6 / 508  # 508 us from node to node, as of a live A1: 5.5 revolutions a second
+HQ_NODES_PER_TURN = 960  # simulated
+HQ_CAPSULE_RATE_HZ = 80.0  # 8 revolutions a second; assumed
 
 NODE = Struct(
     "head"
@@ -94,12 +92,12 @@ HQ = Checksummed(
 
 
 def plausible(f: Fields) -> Any:
-    """S and its inverse differ, and the angle is below 360 degrees."""
+    """Return whether S and its inverse differ and the angle is below 360 degrees."""
     return (f.head.start != f.head.inverse) & (f.beam.angle < 360)
 
 
 def node_points(f: Fields) -> Polar:
-    """One point: the node's own; clockwise seen from above."""
+    """Return the point of a node; angles are clockwise seen from above."""
     return Polar(range=f.distance, azimuth=-np.deg2rad(f.beam.angle), intensity=f.head.quality)
 
 
@@ -111,12 +109,16 @@ def hq_points(f: Fields) -> Polar:
 
 
 def node_sweep(i: int) -> Mapping[str, Any]:
-    """Node i of turns of 360."""
-    start = int(i % TURN == 0)
-    return {"head.start": start, "head.inverse": 1 - start, "beam.angle": i % TURN * 360 / TURN}
+    """Return the values of simulated node i, 360 per revolution."""
+    start = int(i % NODES_PER_TURN == 0)
+    return {
+        "head.start": start,
+        "head.inverse": 1 - start,
+        "beam.angle": i % NODES_PER_TURN * 360 / NODES_PER_TURN,
+    }
 
 
 def hq_sweep(i: int) -> Mapping[str, Any]:
-    """Capsule i of turns of ten."""
-    places = (i * HQ_NODES + np.arange(HQ_NODES)) % HQ_TURN
-    return {"nodes.angle": places * 360 / HQ_TURN, "nodes.flag": places == 0}
+    """Return the values of simulated capsule i, ten per revolution."""
+    indices = (i * HQ_NODES + np.arange(HQ_NODES)) % HQ_NODES_PER_TURN
+    return {"nodes.angle": indices * 360 / HQ_NODES_PER_TURN, "nodes.flag": indices == 0}

@@ -1,5 +1,4 @@
-"""What the host sends: ``A5 cmd``, or, where bit 7 of the command is set, ``A5 cmd size payload
-xor8``.
+"""Requests of the host: ``A5 cmd``, with ``size payload xor8`` if bit 7 of the command is set.
 
 Source: RPLIDAR interface protocol, "request packets"; A8, F0 and FF from the vendor's SDK
 (sl_lidar_cmd.h).
@@ -26,14 +25,14 @@ START = Const(b"\xa5")
 
 
 def make_request(*fields: Construct) -> Checksummed:
-    """A request of these fields, between its start byte and the XOR of all bytes before that."""
+    """Return the struct of a request: start byte, fields, XOR of all bytes before."""
     return Checksummed(
         Struct("start" / START, *fields, "checksum" / Int8ul), field="checksum", algorithm=Xor()
     )
 
 
-def asking(cmd: int, size: int, *payload: Construct) -> Frame:
-    """Return the request of one command with a payload of `size` bytes."""
+def make_payload_request(cmd: int, size: int, *payload: Construct) -> Frame:
+    """Return the frame of a command with a payload of `size` bytes."""
     return Frame(
         make_request("cmd" / Const(cmd, Int8ul), "size" / Const(size, Int8ul), *payload),
         direction="out",
@@ -55,20 +54,20 @@ PAYLOAD = make_request(
 
 REQUESTS = {
     "request": Frame(PLAIN, direction="out"),
-    "express_request": asking(
+    "express_request": make_payload_request(
         0x82,
         5,
         "mode" / Int8ul * "0: express scan; else a scan mode, see get_mode_count",
         "flags" / Int16ul,
         "param" / Int16ul,
     ),
-    "config_request": asking(0x84, 4, "key" / Int32ul),
-    "mode_config_request": asking(
+    "config_request": make_payload_request(0x84, 4, "key" / Int32ul),
+    "mode_config_request": make_payload_request(
         0x84, 6, "key" / Int32ul, "mode" / Int16ul * "requested scan mode"
     ),
-    "rpm_request": asking(0xA8, 2, "speed" / Scaled(Int16ul, 1, "rpm") * "0: stop"),
-    "pwm_request": asking(0xF0, 2, "duty" / Int16ul * "0: stop, 1023: full speed"),
-    "accessory_request": asking(0xFF, 4, "reserved" / Int32ul),
+    "rpm_request": make_payload_request(0xA8, 2, "speed" / Scaled(Int16ul, 1, "rpm") * "0: stop"),
+    "pwm_request": make_payload_request(0xF0, 2, "duty" / Int16ul * "0: stop, 1023: full speed"),
+    "accessory_request": make_payload_request(0xFF, 4, "reserved" / Int32ul),
     "payload_request": Frame(
         PAYLOAD, direction="out", max_length=4 + 255, plausible=lambda f: f.cmd >= 0x80
     ),

@@ -1,9 +1,8 @@
-"""What a simulated unit of each model says of itself: information, scan modes, and the descriptor
-that announces each mode.
+"""Simulated replies of each model: information, scan modes, and the descriptor of each mode.
 
-Source: the information and the mode Sensitivity of the A1 are a live A1's answers. The rest is
-assumed: the times and reaches of the other modes are those that the vendor's SDK prints for such
-models, and only the kinds of capsules of a model are told apart.
+Source: the information and the mode Sensitivity of the A1 are replies of a live A1. The rest is
+assumed: the times and ranges of the other modes are those that the vendor's SDK prints for similar
+models, and models differ only in the kinds of their capsules.
 """
 
 from __future__ import annotations
@@ -18,15 +17,15 @@ NODE = 0x81
 EXPRESS = 0x82
 ULTRA = 0x84
 DENSE = 0x85
-DESCRIPTOR = {
+DESCRIPTORS = {
     NODE: "scan_descriptor",
     EXPRESS: "express_descriptor",
     ULTRA: "ultra_descriptor",
     DENSE: "dense_descriptor",
 }
-#: what asks for configuration values, of the sensor and of one of its scan modes.
-OF_SENSOR = ("get_config", "get_mode_count", "get_typical_mode")
-OF_MODE = (
+#: Commands that request configuration values of the sensor, and of a scan mode.
+SENSOR_REQUESTS = ("get_config", "get_mode_count", "get_typical_mode")
+MODE_REQUESTS = (
     "get_mode_config",
     "get_us_per_sample",
     "get_max_distance",
@@ -37,25 +36,35 @@ OF_MODE = (
 
 @dataclass(frozen=True)
 class Mode:
-    """A scan mode: its name, microseconds from point to point, reach in metres, and the type of its
-    descriptor.
+    """A scan mode.
+
+    Attributes:
+        name: its name.
+        us_per_sample: microseconds from point to point.
+        max_range: in metres.
+        kind: the type of its descriptor.
     """
 
     name: str
     us_per_sample: float
-    reach: float
+    max_range: float
     kind: int
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What a unit says of itself; `model` as in its information, the typical mode is the last."""
+    """Values of a simulated unit.
+
+    Attributes:
+        model: the model number in its information.
+        modes: its scan modes; the typical mode is the last.
+    """
 
     model: int
     modes: tuple[Mode, ...]
 
     def answers(self) -> dict[str, Any]:
-        """What this unit answers, by command, where that is more than the reply as it stands."""
+        """Return the replies by command that are not derived from the request."""
         information = {
             "model": self.model,
             "firmware_minor": 29,
@@ -71,14 +80,12 @@ class Unit:
             "get_info": (("info", information),),
             "get_samplerate": (("sample_rate", times),),
             "get_accessory": (("accessory", {"flags": 1}),),
-            "express_scan": self.descriptor,
-            **dict.fromkeys((*OF_SENSOR, *OF_MODE), self.config),
+            "express_scan": self.reply_descriptor,
+            **dict.fromkeys((*SENSOR_REQUESTS, *MODE_REQUESTS), self.reply_config),
         }
 
-    def config(self, request: Mapping[str, Any]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The answer to a request for a configuration value; none for a key or mode that it does
-        not have.
-        """
+    def reply_config(self, request: Mapping[str, Any]) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+        """Return the reply with a configuration value, empty for unknown keys and modes."""
         key = request["key"]
         number = request.get("mode", 0)
         if number >= len(self.modes):
@@ -88,20 +95,21 @@ class Unit:
             answers.MODE_COUNT: len(self.modes),
             answers.TYPICAL_MODE: len(self.modes) - 1,
             answers.US_PER_SAMPLE: mode.us_per_sample,
-            answers.MAX_DISTANCE: mode.reach,
+            answers.MAX_DISTANCE: mode.max_range,
             answers.ANSWER_TYPE: mode.kind,
             answers.MODE_NAME: mode.name.encode() + b"\0",
         }
-        return (answers.config(key, values[key]),) if key in values else ()
+        return (answers.make_config(key, values[key]),) if key in values else ()
 
-    def descriptor(self, request: Mapping[str, Any]) -> tuple[str, ...]:
-        """The descriptor of the scan mode that is asked for; mode 0 of an express request is the
-        plain express scan.
+    def reply_descriptor(self, request: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the descriptor of the requested scan mode, empty for an unknown mode.
+
+        Mode 0 of an express request is the plain express scan.
         """
         number = request["mode"]
         if number >= len(self.modes):
             return ()
-        return (DESCRIPTOR[self.modes[number].kind if number else EXPRESS],)
+        return (DESCRIPTORS[self.modes[number].kind if number else EXPRESS],)
 
 
 A1 = Unit(

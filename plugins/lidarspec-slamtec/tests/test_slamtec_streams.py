@@ -11,7 +11,7 @@ import pytest
 
 from lidarspec import simulate
 from lidarspec.spec import Polar
-from lidarspec_slamtec.capsules import ultra_codes
+from lidarspec_slamtec.capsules import encode_ultra
 from tests.engine.oracle import Oracle
 from tests.engine.streams import damage
 from tests.evidence import clockwise, decode
@@ -136,7 +136,7 @@ def test_the_start_bit_marks_scan_starts() -> None:
 def test_simulated_predictions_that_cannot_reach_their_point_are_no_returns() -> None:
     near, far = 0.3, 20.0
     polar = Polar(np.array([[[near, far, near], [far, far, near], [0.0, near, 0.0]]]), 0)
-    codes = ultra_codes(polar)
+    codes = encode_ultra(polar)
     assert codes["cabins.predict1"][0].tolist()[0] == 511
     assert codes["cabins.major"][0, 2] == 0
     assert codes["cabins.predict2"][0, 2] == 511
