@@ -1,5 +1,6 @@
-"""Velodyne VLP-16 (Puck, Puck LITE), Puck Hi-Res, HDL-32E, VLP-32C and VLS-128: spinning lidars of
-16 to 128 lasers over UDP.
+"""Velodyne VLP-16 (Puck, Puck LITE), Puck Hi-Res, HDL-32E, VLP-32C and VLS-128.
+
+Spinning lidars with 16 to 128 lasers over UDP.
 
 Source: velodyne_decoder (calibration files, calib_db.cpp, packet_decoder.cpp) and
 ros-drivers/velodyne (rawdata), which cite the vendor's user manuals: laser angles, firing times,
@@ -7,9 +8,9 @@ focal distances. The vertical offsets that follow from the focal distance are do
 VLP-16 (11.2 mm at -15 degrees); ros-drivers and nebula leave them out, so their z differs by up to
 11 mm (VLP-16), 17 mm (HDL-32E), 20 mm (VLP-32C) and 27 mm (VLS-128).
 
-The times of a VLS-128's lasers differ by sources: ros-drivers has one idle slot after eight groups
-and 8.7 us before the packet's time, velodyne_decoder two and 7 us, which is what stands here;
-directions differ by 0.01 degrees.
+Sources contradict each other on the firing times of a VLS-128: ros-drivers has one idle slot after
+eight groups and 8.7 us before the packet's time, velodyne_decoder two and 7 us, which this module
+follows; directions differ by 0.01 degrees.
 """
 
 from __future__ import annotations
@@ -27,35 +28,35 @@ from lidarspec_velodyne.firings import Firings, configure, pace, points, sweep
 from lidarspec_velodyne.frames import (
     BANK,
     BANKS,
+    CLOCK_WRAP_S,
     DUAL,
-    HOUR,
     POSITION_FRAME,
     PUCK_FRAMES,
     SLOTS,
-    TURN,
+    SPEED_LIMITS_HZ,
     VLP32C_FRAMES,
     VLP32C_PRODUCT,
     VLS128_PRODUCT,
+    is_plausible_dual,
+    is_plausible_single,
+    make_packet,
     nmea_seconds,
-    packet,
-    plausible_dual,
-    plausible_single,
 )
 from lidarspec_velodyne.hdl64e import HDL64E_S2, HDL64E_S3
 
-SLOT = np.arange(SLOTS)
+SLOT_INDEX = np.arange(SLOTS)
 
 VLP16_FIRINGS = Firings(
-    # 16 lasers, two firings of each in a block: 2.304 us apart, the second round 55.296 us after
-    # the first
+    # 16 lasers, each firing twice in a block: 2.304 us from laser to laser, the second round
+    # 55.296 us after the first
     elevation=np.tile([-15.0, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15], 2),
-    delay=(SLOT // 16 * 55.296 + SLOT % 16 * 2.304) * 1e-6,
+    delay=(SLOT_INDEX // 16 * 55.296 + SLOT_INDEX % 16 * 2.304) * 1e-6,
     period=2 * 55.296e-6,
     focal_distance=0.04191,
     product=0x22,
 )
 
-LOWER = [
+LOWER_LASERS = [
     -30.67,
     -29.33,
     -28.00,
@@ -73,7 +74,7 @@ LOWER = [
     -12.00,
     -10.67,
 ]
-UPPER = [
+UPPER_LASERS = [
     -9.33,
     -8.00,
     -6.67,
@@ -93,9 +94,9 @@ UPPER = [
 ]
 
 HDL32E_FIRINGS = Firings(
-    # 32 lasers 1.152 us apart, by turns of the lower and of the upper half
-    elevation=np.array([LOWER, UPPER]).T.ravel(),
-    delay=1.152e-6 * SLOT.astype(np.float64),
+    # 32 lasers 1.152 us apart, alternating between the lower and the upper half
+    elevation=np.array([LOWER_LASERS, UPPER_LASERS]).T.ravel(),
+    delay=1.152e-6 * SLOT_INDEX.astype(np.float64),
     period=46.080e-6,
     focal_distance=0.02883,
     product=0x21,
@@ -119,7 +120,7 @@ VLS128_ELEVATION = (
     3.51, -6.06, -0.67, 4.72, -3.97, 2.3, -6.39, -1, 4.39, -5.18, 0.21, 6.98, -3.09, 4.98, -3.75, 1.64, -8.352, -2.54, 2.85, -5.84,
     -0.45, 8.43, -2.87, 2.52, -6.17, -1.66, 3.73, -4.96, 0.43,
 )
-# of each eight lasers, which fire together
+# of each group of eight lasers, which fire together
 VLS128_OFFSET = (-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354)
 # fmt: on
 
@@ -153,57 +154,58 @@ VLP32C_FIRINGS = Firings(
     # 32 lasers, two at a time, 2.304 us apart
     elevation=np.array(VLP32C_ELEVATION),
     offset=np.array(VLP32C_OFFSET),
-    delay=(SLOT // 2).astype(np.float64) * 2.304e-6,
+    delay=(SLOT_INDEX // 2).astype(np.float64) * 2.304e-6,
     period=55.296e-6,
     focal_distance=0.0424,
     product=VLP32C_PRODUCT,
 )
 
-GROUP = (
-    8 / 3 * 1e-6
-)  # seconds from eight lasers of a VLS-128 to the next eight; 2.89 us from firmware 5.2.3 on
+#: Seconds from eight lasers of a VLS-128 to the next eight; 2.89 us from firmware 5.2.3 on.
+GROUP_PERIOD_S = 8 / 3 * 1e-6
 VLS128_LASERS = np.arange(4 * SLOTS).reshape(4, SLOTS)
 
 
-def vls128_firings(returns: int) -> Firings:
-    """128 lasers in four blocks, or in four pairs with dual return; eight fire at once, and after
-    eight of these there is a pause.
+def make_vls128_firings(returns: int) -> Firings:
+    """Return the firing pattern for 1 or 2 returns.
+
+    The 128 lasers are in four blocks, or in four pairs of blocks with dual return. Eight lasers
+    fire at once, and a pause follows eight such groups.
     """
 
-    def blocks(values: Any) -> Any:
+    def fill_blocks(values: Any) -> Any:
         table = np.reshape(values, (4, SLOTS))
         return np.repeat(table, 2, axis=0) if returns == 2 else np.tile(table, (3, 1))
 
     return Firings(
-        elevation=blocks(VLS128_ELEVATION),
-        offset=blocks(np.tile(VLS128_OFFSET, 16)),
-        delay=blocks((VLS128_LASERS // 8 + 2 * (VLS128_LASERS // 64)) * GROUP),
-        period=20 * GROUP,
+        elevation=fill_blocks(VLS128_ELEVATION),
+        offset=fill_blocks(np.tile(VLS128_OFFSET, 16)),
+        delay=fill_blocks((VLS128_LASERS // 8 + 2 * (VLS128_LASERS // 64)) * GROUP_PERIOD_S),
+        period=20 * GROUP_PERIOD_S,
         focal_distance=0.05863,
         product=VLS128_PRODUCT,
         sharing=4,
         returns=returns,
-        start=-7e-6,  # the packet's time is that of the fourth group, about
+        start=-7e-6,  # the packet's time is about that of the fourth group
     )
 
 
-VLS128_SINGLE = vls128_firings(1)
-VLS128_DUAL = vls128_firings(2)
+VLS128_SINGLE = make_vls128_firings(1)
+VLS128_DUAL = make_vls128_firings(2)
 VLS128_FRAMES = {
     "data": Frame(
-        packet(
+        make_packet(
             BANK,
             0.004,
             Int8ul * "0x37 strongest, 0x38 last",
             Const(VLS128_PRODUCT, Int8ul) * "0xA1 VLS-128",
         ),
         data=True,
-        plausible=plausible_single,
+        plausible=is_plausible_single,
         points=partial(points, model=VLS128_SINGLE),
         simulation=Simulation(partial(sweep, model=VLS128_SINGLE, flags=np.tile(BANKS, (3, 1)))),
     ),
     "data_dual": Frame(
-        packet(
+        make_packet(
             BANK,
             0.004,
             Const(DUAL, Int8ul),
@@ -211,19 +213,19 @@ VLS128_FRAMES = {
             blocks=8,
         ),
         data=True,
-        plausible=plausible_dual,
+        plausible=is_plausible_dual,
         points=partial(points, model=VLS128_DUAL),
         simulation=Simulation(partial(sweep, model=VLS128_DUAL, flags=np.repeat(BANKS, 2, axis=0))),
     ),
     "position": POSITION_FRAME,
 }
 
-# the same packets by other products (velodyne_decoder, types.h); 0x21 tells nothing: a VLP-16 with
-# old firmware sends it too
-OTHERS = {
+# Other products with the same packets (velodyne_decoder, types.h). 0x21 does not identify a
+# product: a VLP-16 with old firmware sends it too.
+VLP32A_RELATIVE = {
     "velodyne-vlp32a": Relative("product 0x23, VLP-32A or VLP-32B", lambda f: f.product == 0x23)
 }
-HI_RES = {"velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24)}
+HI_RES_RELATIVE = {"velodyne-puck-hi-res": Relative("product 0x24", lambda f: f.product == 0x24)}
 
 
 UNPUBLISHED = {"LS710": "the packet is not redistributed; the project's tests read the original"}
@@ -238,7 +240,7 @@ VLP16 = Sensor(
     links={"data": Udp(2368, 8308)},
     clock=Clock(
         "timestamp",
-        wraps_at=HOUR,
+        wraps_at=CLOCK_WRAP_S,
         pace=partial(pace, model=VLP16_FIRINGS),
         reference=("position", nmea_seconds),
     ),
@@ -246,16 +248,17 @@ VLP16 = Sensor(
     configure=configure,
     range_limits=(0.4, 130.0),  # the default of ros-drivers/velodyne for this model
     vendor_axes=("right", "forward", "up"),
-    turn=TURN,
-    # 12 blocks, or 6 shots: periods of 110.592 and 46.080 us
+    turn=SPEED_LIMITS_HZ,
+    # 12 shots, or 6 with dual return, with periods of 110.592 and 46.080 us
     relatives={
         "velodyne-hdl32e": (
             "one packet every 1327 us, with dual return 664 us; an HDL-32E: 553 and 276 us"
         ),
-        **HI_RES,
-        **OTHERS,
+        **HI_RES_RELATIVE,
+        **VLP32A_RELATIVE,
     },
-    info={"temperature": "position.top_board_temperature"},  # the product byte is not to be trusted
+    # without the model, because the product byte is unreliable
+    info={"temperature": "position.top_board_temperature"},
     status="capture",
     source=(
         "velodyne_decoder and ros-drivers/velodyne, citing the VLP-16 user manual; three captures"
@@ -263,8 +266,15 @@ VLP16 = Sensor(
 )
 
 
-def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
-    """Another model of the family: a VLP-16 but for these facts."""
+def make_related_model(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
+    """Return another model of the family: a VLP-16 with other facts.
+
+    Args:
+        id: the id of the model.
+        model: the name of the model.
+        firings: its firing pattern.
+        facts: further arguments of `Sensor`.
+    """
     return dataclasses.replace(
         VLP16,
         id=id,
@@ -272,7 +282,7 @@ def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
         points=partial(points, model=firings),
         clock=Clock(
             "timestamp",
-            wraps_at=HOUR,
+            wraps_at=CLOCK_WRAP_S,
             pace=partial(pace, model=firings),
             reference=("position", nmea_seconds),
         ),
@@ -281,22 +291,22 @@ def relative(id: str, model: str, firings: Firings, **facts: Any) -> Sensor:
     )
 
 
-HDL32E = relative(
+HDL32E = make_related_model(
     "velodyne-hdl32e",
     "HDL-32E",
     HDL32E_FIRINGS,
-    range_limits=(0.9, 130.0),  # likewise
+    range_limits=(0.9, 130.0),  # the default of ros-drivers/velodyne for this model
     relatives={
         "velodyne-vlp16": Relative(
             "product 0x22; or one packet every 1327 us", lambda f: f.product == 0x22
         ),
-        **HI_RES,
-        **OTHERS,
+        **HI_RES_RELATIVE,
+        **VLP32A_RELATIVE,
     },
     source="velodyne_decoder and ros-drivers/velodyne, citing the HDL-32E user manual; one capture",
 )
 
-PUCK_HI_RES = relative(
+PUCK_HI_RES = make_related_model(
     "velodyne-puck-hi-res",
     "Puck Hi-Res",
     HI_RES_FIRINGS,
@@ -306,7 +316,7 @@ PUCK_HI_RES = relative(
             lambda f: (f.product == 0x22) | (f.product == 0x21),
         ),
         "velodyne-hdl32e": Relative("product 0x21", lambda f: f.product == 0x21),
-        **OTHERS,
+        **VLP32A_RELATIVE,
     },
     status="manual",
     source=(
@@ -315,7 +325,7 @@ PUCK_HI_RES = relative(
     ),
 )
 
-VLP32C = relative(
+VLP32C = make_related_model(
     "velodyne-vlp32c",
     "VLP-32C",
     VLP32C_FIRINGS,
@@ -331,7 +341,7 @@ VLP32C = relative(
     ),
 )
 
-VLS128 = relative(
+VLS128 = make_related_model(
     "velodyne-vls128",
     "VLS-128",
     VLS128_SINGLE,
@@ -350,5 +360,5 @@ VLS128 = relative(
 
 @hookimpl
 def lidarspec_sensors() -> Iterable[Sensor]:
-    """The Velodyne sensors."""
+    """Return the Velodyne sensors."""
     return [VLP16, HDL32E, PUCK_HI_RES, VLP32C, VLS128, HDL64E_S2, HDL64E_S3]

@@ -1,17 +1,15 @@
-"""Where and when the lasers of a spinning sensor fire: from blocks that share an azimuth to a
-direction for each firing.
+"""Direction and time of each firing of a spinning sensor, from blocks that share an azimuth.
 
 The azimuth of a block is that of its first firing; the others lie on the way to the next block, in
-proportion to their time. With dual return two blocks in a row hold the two returns of the same
-firings and share an azimuth, so that the next one is two blocks on.
+proportion to their time. With dual return two consecutive blocks hold the two returns of the same
+firings and share an azimuth, so the next azimuth is two blocks ahead.
 
-Where nothing follows, or what follows is further than the sensor can have turned (packets carry no
-sequence, so this is
-how a loss shows; a sector masked in the sensor's settings looks the same), the rule for the last
-block decides:
+The rule for the last block applies if there is no next block, or if it is further than the sensor
+can have rotated. Packets have no counter, so such a step is the sign of a loss; a sector masked in
+the sensor's settings looks the same. The rules are:
 
 * "previous", the default: the last good step is used again, as ros-drivers and nebula do for the
-  last block of every packet; velodyne_decoder takes the mean of the packet. On real packets these
+  last block of every packet; velodyne_decoder uses the mean of the packet. On real packets these
   differ by up to 0.04 degrees.
 * "invalid": these firings have no direction, and their points are not valid.
 
@@ -30,10 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarspec.spec import Fields, Polar, Sensor, between_blocks, following
-from lidarspec_velodyne.frames import BLOCKS, DUAL, HOUR, STRONGEST, TURN
+from lidarspec_velodyne.frames import BLOCKS, CLOCK_WRAP_S, DUAL, SPEED_LIMITS_HZ, STRONGEST
 
 LastBlock = Literal["previous", "invalid"]
-FASTEST = TURN[1] * 360  # degrees per second
+MAX_SPEED_DEG_S = SPEED_LIMITS_HZ[1] * 360
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,18 +39,17 @@ class Firings:
     """The firing pattern of a model.
 
     Attributes:
-        elevation: (32,) degrees, of the laser of each slot of a block; (blocks, 32) where these
-            hold different lasers.
-        delay: likewise, seconds from the beginning of the firings that share an azimuth to the
-            firing of each slot.
+        elevation: degrees, (32,), of the laser of each slot of a block; (blocks, 32) if blocks hold
+            different lasers.
+        delay: seconds from the first firing with the same azimuth to that of each slot, shaped as
+            `elevation`.
         period: seconds from one azimuth to the next.
         focal_distance: metres; lasers leave the lens at different heights and cross at this
             distance.
         product: the product byte that the model should send.
-        offset: as `elevation`, degrees by which the laser of each slot looks to the left of the
-            azimuth.
-        sharing: how many blocks of single return share an azimuth: banks of lasers.
-        returns: of each firing, in packets that always have so many; 0 where these say it.
+        offset: degrees to the left of the azimuth for each slot, shaped as `elevation`.
+        sharing: the number of blocks of single return that share an azimuth.
+        returns: returns of each firing; 0 if the packets contain this number.
         start: seconds from the time of the packet to its first firing.
     """
 
@@ -68,30 +65,30 @@ class Firings:
 
     @property
     def blocks(self) -> int:
-        """How many blocks of a packet hold points."""
+        """The number of blocks of a packet with points."""
         return BLOCKS if self.elevation.ndim == 1 else len(self.elevation)
 
     @property
     def ring(self) -> NDArray[np.intp]:
-        """The laser of each slot, counted from the lowest one, the shape of `elevation`."""
+        """The laser of each slot, counted from the lowest, shaped as `elevation`."""
         return np.searchsorted(np.unique(self.elevation), self.elevation)
 
     @property
     def height(self) -> NDArray[np.float64]:
-        """Height above the origin at which the beam of each slot leaves, metres.
-
-        The shape is that of `elevation`.
-        """
+        """The height in metres at which each slot's beam leaves, shaped as `elevation`."""
         return -self.focal_distance * np.tan(np.deg2rad(self.elevation))
 
 
 def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Polar:
-    """The sensor turns clockwise from its forward axis; heights are along the axis of rotation."""
+    """Return the points of a packet.
+
+    The sensor rotates clockwise from its forward axis; heights are along the axis of rotation.
+    """
     dual = model.returns == 2 if model.returns else f.return_mode == DUAL
     block = np.arange(model.blocks)[:, None]
     clockwise = (
         f.blocks.azimuth
-        + _step(f, dual, model, last_block) * (model.delay / model.period)
+        + block_step(f, dual, model, last_block) * (model.delay / model.period)
         - model.offset
     )
     return Polar(
@@ -107,36 +104,40 @@ def points(f: Fields, model: Firings, last_block: LastBlock = "previous") -> Pol
     )
 
 
-def _step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> Any:
+def block_step(f: Fields, dual: Any, model: Firings, last_block: LastBlock) -> Any:
     """Return the degrees from each block's azimuth to the next, (n, blocks, 1)."""
     azimuth = f.blocks.azimuth
     ahead = np.where(dual, following(azimuth, 2 * model.sharing), following(azimuth, model.sharing))
     repeat = last_block == "previous"
-    return between_blocks(azimuth, ahead, fastest=FASTEST * model.period, repeat=repeat)
+    return between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * model.period, repeat=repeat)
 
 
 def configure(sensor: Sensor, /, *, last_block: LastBlock) -> Sensor:
-    """Return the sensor with another rule for the last block (see the docstring of the module)."""
+    """Return the sensor with another rule for the last block (see the module)."""
 
-    def ruled(function: Any) -> Any:
+    def set_rule(function: Any) -> Any:
         return function and partial(function, last_block=last_block)
 
     frames = {
-        name: dataclasses.replace(frame, points=ruled(frame.points)) if frame.points else frame
+        name: dataclasses.replace(frame, points=set_rule(frame.points)) if frame.points else frame
         for name, frame in sensor.frames.items()
     }
-    return dataclasses.replace(sensor, points=ruled(sensor.points), frames=frames)
+    return dataclasses.replace(sensor, points=set_rule(sensor.points), frames=frames)
 
 
 def pace(f: Fields, model: Firings) -> Any:
-    """Seconds from a packet to the next: 12 blocks, or the 6 shots of dual return."""
+    """Return the seconds from a packet to the next.
+
+    A packet has 12 blocks, or 6 shots with dual return.
+    """
     shots = BLOCKS // model.sharing
     return np.where(f.return_mode == DUAL, shots // 2, shots) * model.period
 
 
 def sweep(i: int, model: Firings, flags: Any = None) -> dict[str, Any]:
-    """Packet i of packets with so many returns, one where these say it themselves, at 10 turns a
-    second; with the flags of its blocks.
+    """Return the values of simulated packet i, at 10 revolutions a second.
+
+    `flags` are the flags of the blocks, if the model has them.
     """
     dual = model.returns == 2
     sharing = model.sharing * (2 if dual else 1)
@@ -147,7 +148,7 @@ def sweep(i: int, model: Firings, flags: Any = None) -> dict[str, Any]:
     )
     values = {
         "blocks.azimuth": azimuth,
-        "timestamp": i * shots * model.period % HOUR,
+        "timestamp": i * shots * model.period % CLOCK_WRAP_S,
         "return_mode": DUAL if dual else STRONGEST,
     }
     return {

@@ -1,5 +1,6 @@
-"""The packets of the family: data on UDP port 2368, in three forms, and position on port 8308, the
-same from all models.
+"""The packets of the family: data on UDP port 2368, in three forms, and position on port 8308.
+
+Position packets are the same for all models.
 
 Source: velodyne_decoder (types.h, telemetry_packet.h) and ros-drivers/velodyne, which cite the
 vendor's user manuals; the leading zeros and inertial readings of position packets: VeloView's
@@ -32,18 +33,19 @@ BLOCKS = 12
 SLOTS = 32
 STRONGEST = 0x37
 DUAL = 0x39
+# product bytes
 VLP32C_PRODUCT = 0x28
-VLS128_PRODUCT = 0xA1  # product bytes
-HOUR = 3600.0  # seconds after which the clock starts again
-TURN = (5.0, 20.0)  # turns a second, slowest and fastest (data sheets)
-POSITIONS = 144  # position packets a second, about
-NMEA = 128  # bytes that a sentence may have (velodyne_decoder)
+VLS128_PRODUCT = 0xA1
+CLOCK_WRAP_S = 3600.0
+SPEED_LIMITS_HZ = (5.0, 20.0)  # lowest and highest revolutions per second (data sheets)
+POSITION_RATE_HZ = 144  # position packets per second, approximately
+NMEA_BYTES = 128  # maximum of a sentence (velodyne_decoder)
 
-#: flags of the blocks of a VLS-128, by the bank of 32 lasers (velodyne_decoder, LaserBankId).
+#: Flags of the blocks of a VLS-128, by the bank of 32 lasers (velodyne_decoder, LaserBankId).
 BANKS = np.array([0xFFEE, 0xFFDD, 0xFFCC, 0xFFBB])[:, None]
 
 
-def packet(
+def make_packet(
     flag: Construct, unit: float, mode: Construct, product: Construct, *, blocks: int = BLOCKS
 ) -> Struct:
     """Return the struct of a data packet with `blocks` blocks of points.
@@ -107,26 +109,27 @@ POSITION = Struct(
     "shutdown_temperature" / Scaled(Int8ul, 1, "degC") * "at the last thermal shutdown",
     "power_up_temperature" / Scaled(Int8ul, 1, "degC"),
     "nmea"
-    / Bytes(NMEA)
+    / Bytes(NMEA_BYTES)
     * "GPRMC or GPGGA sentence, padded with zeros; all 0 without a GPS receiver",
     "unused" / Bytes(178),
 )
 
 
 def plausible(f: Fields) -> Any:
-    """Azimuths of at most a whole turn (documented to 359.99 degrees; old firmware sends 360.00),
-    and none of a VLP-32C's packets.
+    """Return whether azimuths are at most 360 degrees and the model is not a VLP-32C.
+
+    Azimuths are documented up to 359.99 degrees; old firmware sends 360.00.
     """
     return (f.blocks.azimuth <= 360) & (f.product != VLP32C_PRODUCT)
 
 
-def plausible_turn(f: Fields) -> Any:
-    """Azimuths of at most a whole turn."""
+def is_plausible_vlp32c(f: Fields) -> Any:
+    """Return whether azimuths are at most 360 degrees."""
     return f.blocks.azimuth <= 360
 
 
-def plausible_single(f: Fields) -> Any:
-    """Four banks in a row, three times, and no dual return."""
+def is_plausible_single(f: Fields) -> Any:
+    """Return whether the four banks follow each other three times, in single return."""
     return (
         (f.blocks.azimuth <= 360)
         & (f.blocks.flag == np.tile(BANKS, (3, 1)))
@@ -134,39 +137,40 @@ def plausible_single(f: Fields) -> Any:
     )
 
 
-def plausible_dual(f: Fields) -> Any:
-    """Return each of the four banks twice."""
+def is_plausible_dual(f: Fields) -> Any:
+    """Return whether each of the four banks comes twice."""
     return (f.blocks.azimuth <= 360) & (f.blocks.flag == np.repeat(BANKS, 2, axis=0))
 
 
-def plausible_position(f: Fields) -> Any:
-    """Known states of the PPS, and text where the NMEA sentence stands: a stretch of a data packet
-    has flags there.
+def is_plausible_position(f: Fields) -> Any:
+    """Return whether the PPS state is known and the NMEA sentence is text.
+
+    Bytes of a data packet are not text there, because they contain flags.
     """
     return (f.pps <= 3) & ((f.nmea == 0) | ((f.nmea >= 9) & (f.nmea < 127)))
 
 
-#: time, that it is valid, and date of a sentence; what stands in between is the position and the
-#: movement.
+#: Time, validity and date of a sentence, with position and movement in between.
 _RMC = re.compile(rb"\$G[A-Z]RMC,(\d{6})(?:\.\d*)?,A,(?:[^,]*,){6}(\d{6})[,*]")
-LOCKED = 2  # state of the PPS
+PPS_LOCKED = 2
 
 
 def nmea_seconds(f: Fields) -> Any:
-    """Seconds since 1970 of each NMEA sentence; nan of one that is not valid, or while no PPS holds
-    the clock to it.
+    """Return the seconds since 1970 of the first valid sentence, nan for all others.
+
+    A sentence counts only if the PPS has locked the clock to it.
     """
-    locked = np.asarray(f.pps).reshape(-1) == LOCKED
-    found = np.full(len(locked), np.nan)
+    is_locked = np.asarray(f.pps).reshape(-1) == PPS_LOCKED
+    seconds = np.full(len(is_locked), np.nan)
     sentences = np.asarray(f.nmea).astype(np.uint8)
-    for row in np.flatnonzero(locked).tolist():
-        found[row] = _seconds(sentences[row].tobytes())
-        if found[row] > 0:
+    for row in np.flatnonzero(is_locked).tolist():
+        seconds[row] = _parse_nmea(sentences[row].tobytes())
+        if seconds[row] > 0:
             break  # the first one is enough
-    return found
+    return seconds
 
 
-def _seconds(nmea: bytes) -> float:
+def _parse_nmea(nmea: bytes) -> float:
     sentence = _RMC.match(nmea)
     try:
         if sentence:
@@ -181,36 +185,37 @@ def _seconds(nmea: bytes) -> float:
 
 
 def sweep_position(i: int) -> dict[str, Any]:
-    """Position packet i of a sensor that was switched on at the beginning of 2024, with a GPS
-    receiver that knows the time alone.
+    """Return the values of simulated position packet i.
+
+    The sensor was switched on at the beginning of 2024; its GPS receiver sends only the time.
     """
     moment = datetime.datetime(2024, 1, 1, tzinfo=datetime.UTC) + datetime.timedelta(
-        seconds=i // POSITIONS
+        seconds=i // POSITION_RATE_HZ
     )
     text = moment.strftime("GPRMC,%H%M%S,A,,,,,,,%d%m%y,,,A").encode()
     sentence = b"$%s*%02X\r\n" % (text, np.bitwise_xor.reduce(np.frombuffer(text, np.uint8)))
     return {
-        "timestamp": i / POSITIONS % HOUR,
-        "pps": LOCKED,
-        "nmea": np.frombuffer(sentence.ljust(NMEA, b"\0"), np.uint8),
+        "timestamp": i / POSITION_RATE_HZ % CLOCK_WRAP_S,
+        "pps": PPS_LOCKED,
+        "nmea": np.frombuffer(sentence.ljust(NMEA_BYTES, b"\0"), np.uint8),
     }
 
 
 POSITION_FRAME = Frame(
     POSITION,
-    plausible=plausible_position,
-    simulation=Simulation(sweep_position, rate=POSITIONS),
+    plausible=is_plausible_position,
+    simulation=Simulation(sweep_position, rate=POSITION_RATE_HZ),
 )
 FLAG = Const(b"\xff\xee")
 PUCK_FRAMES = {
-    "data": Frame(packet(FLAG, 0.002, MODE, PRODUCT), data=True, plausible=plausible),
+    "data": Frame(make_packet(FLAG, 0.002, MODE, PRODUCT), data=True, plausible=plausible),
     "position": POSITION_FRAME,
 }
 VLP32C_FRAMES = {
     "data": Frame(
-        packet(FLAG, 0.004, MODE, Const(VLP32C_PRODUCT, Int8ul) * "0x28 VLP-32C"),
+        make_packet(FLAG, 0.004, MODE, Const(VLP32C_PRODUCT, Int8ul) * "0x28 VLP-32C"),
         data=True,
-        plausible=plausible_turn,
+        plausible=is_plausible_vlp32c,
     ),
     "position": POSITION_FRAME,
 }

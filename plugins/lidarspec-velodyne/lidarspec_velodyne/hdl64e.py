@@ -1,18 +1,18 @@
-"""Velodyne HDL-64E, series S2 and S3: 64 lasers in two banks, blocks of which take turns, each
-laser with corrections of its own.
+"""Velodyne HDL-64E, series S2 and S3: 64 lasers in two banks with alternating blocks.
 
 Source: velodyne_decoder (calibration files of an example unit of each series, packet_decoder.cpp:
 firing times) and ros-drivers/velodyne (rawdata.cc: corrections; gen_calibration.py: names and units
 in db.xml), which cite the vendor's manuals. Blocks with 0xFFEE hold lasers 1 to 32, those with
-0xFFDD lasers 33 to 64 of the same firing; with dual return, four blocks in a row share an azimuth
-(velodyne_decoder), the two of the strongest return first.
+0xFFDD lasers 33 to 64 of the same firing; with dual return, four consecutive blocks share an
+azimuth (velodyne_decoder), first the two of the strongest return.
 
-Every unit has corrections of its own, in the file that comes with it (db.xml), and a byte at a time
-in `status_value`: those of an example unit stand here, and clouds say that they are nominal, until
-`configure(calibration=...)` names the file. Not expressed: the second correction of near distances
-(below 25 m), intensity by focal distance, and the calibration in the status bytes. No packet of
-this model was seen; points of simulated ones lie within 8 cm of those of velodyne_decoder, which
-makes that second correction. Nothing completes its clock: the date is in the status bytes.
+Each laser of each unit has its own corrections, in the unit's file (db.xml), and a byte at a time
+in `status_value`. The corrections here are those of an example unit; clouds are marked as nominal
+until `configure(calibration=...)` reads the file. Not supported: the second correction of near
+distances (below 25 m), intensity by focal distance, and the calibration in the status bytes. No
+captured packet was available; points of simulated packets lie within 8 cm of those of
+velodyne_decoder, which applies that second correction. The clock has no date, which is only in the
+status bytes.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ from lidarspec.spec import (
     between_blocks,
     following,
 )
-from lidarspec_velodyne.firings import FASTEST
-from lidarspec_velodyne.frames import BLOCKS, HOUR, SLOTS, TURN
+from lidarspec_velodyne.firings import MAX_SPEED_DEG_S
+from lidarspec_velodyne.frames import BLOCKS, CLOCK_WRAP_S, SLOTS, SPEED_LIMITS_HZ
 
-UPPER = 0xFFEE
-LOWER = 0xFFDD
-LARGEST = 1 << 20  # bytes of a calibration file at most
-NAMES = (
+UPPER_BANK = 0xFFEE
+LOWER_BANK = 0xFFDD
+MAX_CALIBRATION_BYTES = 1 << 20
+CORRECTION_NAMES = (
     "rotCorrection_",
     "vertCorrection_",
     "distCorrection_",
     "vertOffsetCorrection_",
     "horizOffsetCorrection_",
 )
-FLAGS = np.tile([[UPPER], [LOWER]], (BLOCKS // 2, 1))
-TURNS = 10
+FLAGS = np.tile([[UPPER_BANK], [LOWER_BANK]], (BLOCKS // 2, 1))
+SIMULATED_SPEED_HZ = 10
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,13 @@ class Unit:
     Attributes:
         period: seconds from shot to shot.
         firing: microseconds from four lasers to the next four.
-        within: microseconds of the four.
-        vertical: degrees above the horizon, of the 64 lasers.
-        offset: degrees by which they look to the left of the azimuth.
-        height: metres above the origin from which they look, across their beams.
-        distance: metres that are added to what is measured.
-        aside: metres to the left of the axis from which they look, across their beams.
-        nominal: whether these are the example's.
+        within: microseconds of the four lasers after the first.
+        vertical: elevation of the 64 lasers in degrees.
+        offset: degrees to the left of the azimuth.
+        height: metres above the origin, perpendicular to the beam.
+        distance: metres to add to the measured distance.
+        aside: metres to the left of the axis, perpendicular to the beam.
+        nominal: whether these are the values of the example unit.
     """
 
     period: float
@@ -84,8 +84,8 @@ class Unit:
     aside: tuple[float, ...] = (0.026, -0.026) * SLOTS
     nominal: bool = True
 
-    def of_blocks(self, values: Any) -> Any:
-        """Numbers of the lasers as those of the slots of each block, (blocks, slots)."""
+    def by_block(self, values: Any) -> Any:
+        """Return values of the 64 lasers for the slots of each block, (blocks, slots)."""
         return np.tile(np.reshape(values, (2, SLOTS)), (BLOCKS // 2, 1))
 
     @property
@@ -174,38 +174,38 @@ DATA = Struct(
 
 
 def plausible(f: Fields) -> Any:
-    """Banks by turns, and azimuths of at most a whole turn."""
+    """Return whether the banks alternate and azimuths are at most 360 degrees."""
     return (f.blocks.flag == FLAGS) & (f.blocks.azimuth <= 360)
 
 
-def dual(f: Fields) -> Any:
+def is_dual(f: Fields) -> Any:
     """Return whether four blocks share an azimuth."""
     return f.blocks[0].azimuth == f.blocks[2].azimuth
 
 
 def points(f: Fields, unit: Unit) -> Polar:
-    """Lasers beside the axis of rotation, each from a place of its own."""
+    """Return the points of a packet, with an origin of their own for each laser."""
     azimuth = f.blocks.azimuth
     block = f.blocks.index
-    twice = dual(f)
-    ahead = np.where(twice, following(azimuth, 4), following(azimuth, 2))
-    step = between_blocks(azimuth, ahead, fastest=FASTEST * unit.period)
-    turned = np.deg2rad(azimuth + step * (unit.delay / unit.period) - unit.of_blocks(unit.offset))
-    elevation = np.deg2rad(unit.of_blocks(unit.vertical))
-    height = unit.of_blocks(unit.height)
-    aside = unit.of_blocks(unit.aside)
+    is_dual_return = is_dual(f)
+    ahead = np.where(is_dual_return, following(azimuth, 4), following(azimuth, 2))
+    step = between_blocks(azimuth, ahead, fastest=MAX_SPEED_DEG_S * unit.period)
+    clockwise = np.deg2rad(azimuth + step * (unit.delay / unit.period) - unit.by_block(unit.offset))
+    elevation = np.deg2rad(unit.by_block(unit.vertical))
+    height = unit.by_block(unit.height)
+    aside = unit.by_block(unit.aside)
     back = -height * np.sin(elevation)
-    cos = np.cos(turned)
-    sin = np.sin(turned)
+    cos = np.cos(clockwise)
+    sin = np.sin(clockwise)
     distance = f.blocks.channels.distance
     return Polar(
-        range=np.where(distance == 0, 0, distance + unit.of_blocks(unit.distance)),
-        azimuth=-turned,
+        range=np.where(distance == 0, 0, distance + unit.by_block(unit.distance)),
+        azimuth=-clockwise,
         elevation=elevation,
         intensity=f.blocks.channels.intensity,
-        time=np.where(twice, block // 4, block // 2) * unit.period + unit.delay,
-        ring=unit.of_blocks(np.argsort(np.argsort(unit.vertical))),
-        return_index=np.where(twice, block // 2 % 2, 0),
+        time=np.where(is_dual_return, block // 4, block // 2) * unit.period + unit.delay,
+        ring=unit.by_block(np.argsort(np.argsort(unit.vertical))),
+        return_index=np.where(is_dual_return, block // 2 % 2, 0),
         origin=(back * cos + aside * sin, aside * cos - back * sin, height * np.cos(elevation)),
         nominal=unit.nominal,
     )
@@ -215,16 +215,21 @@ def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sens
     """Return the sensor with the corrections of one unit.
 
     Args:
-        calibration: its db.xml; degrees and centimetres.
+        calibration: the unit's db.xml, with degrees and centimetres.
 
     Raises:
-        UsageError: for a file that cannot be read, or does not have all of the 64 lasers once.
+        UsageError: if the file cannot be read, or does not have all 64 lasers once.
     """
     try:
         with open(calibration, "rb") as file:
-            lasers = ElementTree.fromstring(file.read(LARGEST)).findall("DB/points_/item/px")
+            lasers = ElementTree.fromstring(file.read(MAX_CALIBRATION_BYTES)).findall(
+                "DB/points_/item/px"
+            )
         table = {
-            int(_number(laser, "id_")): [_number(laser, name) for name in NAMES] for laser in lasers
+            int(_parse_number(laser, "id_")): [
+                _parse_number(laser, name) for name in CORRECTION_NAMES
+            ]
+            for laser in lasers
         }
     except (OSError, ElementTree.ParseError, ValueError) as error:
         raise UsageError(
@@ -239,7 +244,7 @@ def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sens
         tuple(column) for column in np.array([table[laser] for laser in sorted(table)]).T
     )
     distance, height, aside = (tuple(value / 100 for value in column) for column in metres)
-    own = replace(
+    corrected = replace(
         unit,
         vertical=vertical,
         offset=offset,
@@ -248,10 +253,10 @@ def configure(unit: Unit, sensor: Sensor, /, *, calibration: str | Path) -> Sens
         aside=aside,
         nominal=False,
     )
-    return replace(sensor, points=partial(points, unit=own))
+    return replace(sensor, points=partial(points, unit=corrected))
 
 
-def _number(laser: ElementTree.Element, name: str) -> float:
+def _parse_number(laser: ElementTree.Element, name: str) -> float:
     text = laser.findtext(name)
     value = float(text) if text is not None else math.nan
     if not math.isfinite(value):
@@ -260,18 +265,21 @@ def _number(laser: ElementTree.Element, name: str) -> float:
 
 
 def pace(f: Fields, unit: Unit) -> Any:
-    """Seconds from a packet to the next: six shots, or three of dual return."""
-    return np.where(dual(f), 3, 6) * unit.period
+    """Return the seconds from a packet to the next.
+
+    A packet has six shots, or three with dual return.
+    """
+    return np.where(is_dual(f), 3, 6) * unit.period
 
 
 def sweep(i: int, unit: Unit) -> dict[str, Any]:
-    """Packet i of single return."""
+    """Return the values of simulated packet i, with single return."""
     shot = i * (BLOCKS // 2) + np.arange(BLOCKS) // 2
-    azimuth = np.round(shot * unit.period * TURNS * 360, 2) % 360
+    azimuth = np.round(shot * unit.period * SIMULATED_SPEED_HZ * 360, 2) % 360
     return {
         "blocks.azimuth": azimuth,
         "blocks.flag": FLAGS[:, 0],
-        "timestamp": i * 6 * unit.period % HOUR,
+        "timestamp": i * 6 * unit.period % CLOCK_WRAP_S,
         "status_type": ord("V"),
     }
 
@@ -279,8 +287,11 @@ def sweep(i: int, unit: Unit) -> dict[str, Any]:
 FRAMES = {"data": Frame(DATA, data=True, plausible=plausible)}
 
 
-def model(series: str, unit: Unit, other: str) -> Sensor:
-    """Return a series by its unit."""
+def make_sensor(series: str, unit: Unit, other: str) -> Sensor:
+    """Return the sensor of a series.
+
+    `other` is the other series, "s2" or "s3".
+    """
     return Sensor(
         f"velodyne-hdl64e-{series}",
         vendor="Velodyne",
@@ -289,12 +300,12 @@ def model(series: str, unit: Unit, other: str) -> Sensor:
         points=partial(points, unit=unit),
         scan=OnWrap("blocks.azimuth"),
         links={"data": Udp(2368)},
-        clock=Clock("timestamp", wraps_at=HOUR, pace=partial(pace, unit=unit)),
+        clock=Clock("timestamp", wraps_at=CLOCK_WRAP_S, pace=partial(pace, unit=unit)),
         simulation=Simulation(partial(sweep, unit=unit)),
         configure=partial(configure, unit),
         range_limits=(0.9, 120.0),  # data sheet
         vendor_axes=("right", "forward", "up"),
-        turn=TURN,
+        turn=SPEED_LIMITS_HZ,
         relatives={
             f"velodyne-hdl64e-{other}": (
                 "one packet every 288 us (S2) or 346 us (S3); half of this with dual return"
@@ -308,5 +319,5 @@ def model(series: str, unit: Unit, other: str) -> Sensor:
     )
 
 
-HDL64E_S2 = model("s2", S2, "s3")
-HDL64E_S3 = model("s3", S3, "s2")
+HDL64E_S2 = make_sensor("s2", S2, "s3")
+HDL64E_S3 = make_sensor("s3", S3, "s2")
