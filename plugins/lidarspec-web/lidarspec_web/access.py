@@ -3,8 +3,8 @@
 Each server makes a token, and each request needs it in its query: pages, scripts, downloads,
 socket. Other users of this computer can connect to the server, but do not know the token. It is not
 kept in a cookie: browsers send the cookies of one port to all ports of this computer, so a server
-of another user would receive it. Host and Origin stop other pages in the same browser, also those
-with a name that was made to point to this computer.
+of another user would receive it. Host and Origin stop other pages in the same browser, including
+pages with a name that was made to point to this computer.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 TOKEN_BYTES = 24
 #: Names of this computer in its own browser.
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-#: Addresses that stand for all interfaces.
+#: Addresses that mean all interfaces.
 ANY_ADDRESS = ("0.0.0.0", "::")
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -93,7 +93,7 @@ class Guard:
         """Serve a request, or refuse it."""
         if scope["type"] not in ("http", "websocket"):
             return
-        refusal = self._refusal(scope)
+        refusal = self._check_request(scope)
         if refusal is not None and scope["type"] == "websocket":
             await send({"type": "websocket.close"})
             return
@@ -110,8 +110,8 @@ class Guard:
         # The application does not see the token, so that it is in no log and no message.
         await self._app({**scope, "query_string": b""}, receive, send_with_headers)
 
-    def _refusal(self, scope: Scope) -> Response | None:
-        """Return the response to a request that is refused, else None."""
+    def _check_request(self, scope: Scope) -> Response | None:
+        """Return the response that refuses a request, None if the request is allowed."""
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         origin = headers.get("origin")

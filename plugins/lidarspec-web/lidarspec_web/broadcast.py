@@ -52,23 +52,27 @@ class ShownScan:
         self.position = position
         self.sent = sent
         self._message = b""
-        self._message_most = -1
+        self._message_max_points = -1
 
-    def message(self, most: int) -> bytes:
-        """Return the scan as a message of at most `most` points.
+    def message(self, max_points: int) -> bytes:
+        """Return the scan as a message of at most `max_points` points.
 
-        The message is cached until `most` changes.
+        The message is cached until `max_points` changes.
         """
-        if most != self._message_most:
+        if max_points != self._message_max_points:
             self._message = make_scan_message(
-                self.scan, self.number, position=self.position, sent=self.sent, most=most
+                self.scan,
+                self.number,
+                position=self.position,
+                sent=self.sent,
+                max_points=max_points,
             )
-            self._message_most = most
+            self._message_max_points = max_points
         return self._message
 
 
 class Broadcast:
-    """Reads a device for viewers. A context manager that closes the device.
+    """Reads a device for viewers. It is a context manager that closes the device.
 
     Args:
         source: the source as typed by the user.
@@ -83,7 +87,7 @@ class Broadcast:
         paused: whether a file is paused.
         speed: speed of a file, relative to real time.
         warnings: warnings of the device.
-        info: facts about the device, such as its serial number, by name.
+        info: facts about the device, for example its serial number, by name.
         history: the figures of the last minute, one dict for each second.
         failure: the error that ended the reading, None while it continues.
         news: called in the reading thread if there is anything new.
@@ -124,7 +128,7 @@ class Broadcast:
         self._has_request = threading.Event()
         self._measured_at = time.monotonic()
         self._feed = self._make_feed(self._select)
-        self._seen_count = 0  # number of scans of the feed that were taken over
+        self._seen_count = 0  # number of scans of the feed that were stored
 
     def __enter__(self) -> Broadcast:
         return self
@@ -316,7 +320,7 @@ class Broadcast:
         return LiveScans(self.device, played=True, select=select)
 
     def _update(self) -> None:
-        """Take over a new scan, the figures, and the end of a file; announce what is new."""
+        """Store a new scan, new figures, and the end of a file, and announce changes."""
         has_news = self._update_scan()
         if self._update_figures():
             has_news = True
@@ -390,8 +394,8 @@ class Broadcast:
     def _position(self, scan: Scan) -> float:
         """Return the seconds from the first scan.
 
-        They come from the arrival for a live source, else from the times that select scans, or from
-        the number of the scan if there are no times.
+        They come from the arrival if the source is live, or from the times of a file's scans.
+        Without times they come from the number of the scan.
         """
         first = self._first_scan
         assert first is not None

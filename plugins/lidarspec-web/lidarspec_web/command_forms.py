@@ -38,9 +38,9 @@ def find_restart(sensor: Sensor) -> dict[str, str] | None:
 
 
 def _group(sensor: Sensor, name: str) -> str:
-    """Return the group of a command.
+    """Return the group of a command: "switch", "ask" or "set".
 
-    It is "switch" if the command starts or stops the data, "ask" if it changes nothing, else "set".
+    "switch" commands start or stop the data, "ask" commands change nothing.
     """
     command = sensor.commands[name]
     if command.starts or command.stops:

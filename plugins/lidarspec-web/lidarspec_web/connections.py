@@ -18,8 +18,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 #: Maximum number of connections, with and without the token.
 MAX_CONNECTIONS = 128
-#: Number of connections that the system accepts before the server does; each needs a descriptor,
-#: too.
+#: Number of connections that the system accepts before the server does. Each needs a descriptor.
 BACKLOG = 64
 #: Timeout for the token of a connection.
 TOKEN_TIMEOUT_S = 10.0
@@ -66,7 +65,7 @@ class Connections:
         return LimitedProtocol
 
     def admit(self, client: Client | None) -> None:
-        """Mark a connection as having the token; None is one that is closed again."""
+        """Mark a connection as having the token; None means that it is already closed."""
         if client in self._waiting:
             self._admitted[client] = self._waiting.pop(client).transport
 
@@ -76,7 +75,7 @@ class Connections:
             self._admitted.pop(client).abort()
 
     async def close(self) -> None:
-        """Close all connections, also those of clients that do not read."""
+        """Close all connections, including those of clients that do not read."""
         waiting = [one.transport for one in self._waiting.values()]
         for transport in [*waiting, *self._admitted.values()]:
             transport.abort()

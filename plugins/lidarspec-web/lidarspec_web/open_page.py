@@ -50,7 +50,7 @@ GREETING_CHECK_S = 0.05
 CLOSE_CODES = (1000, 1001, 1012)
 #: Maximum number of points that a page may request.
 MAX_POINTS = 1 << 24
-#: Number of scans that a page may ask about: the drawn one, and the one that is being sent.
+#: Number of scans that a page may ask about: the drawn scan, and the scan that is being sent.
 HELD_SCANS = 2
 #: The largest number in a request.
 MAX_NUMBER = 1e12
@@ -154,7 +154,7 @@ class OpenPage:
             await self._socket.send_text(json.dumps(message, allow_nan=False))
 
     async def _next_message(self) -> bytes | dict[str, Any] | None:
-        """Return the message to send now, None if there is none."""
+        """Return the message to send now, or None."""
         if self._replies:
             return self._replies.popleft()
         return (
@@ -165,14 +165,14 @@ class OpenPage:
         )
 
     def _next_scan_message(self) -> bytes | None:
-        most = self._wanted_points
+        max_points = self._wanted_points
         shown = self._unseen_scan()
-        if most is None or shown is None:
+        if max_points is None or shown is None:
             return None
         self._wanted_points = None
         self._held.append(shown)
         # Made in this thread: glibc would keep large blocks of memory for each further thread.
-        return shown.message(most)
+        return shown.message(max_points)
 
     def _end_message(self) -> dict[str, Any] | None:
         has_ended = self._broadcast.has_ended
@@ -190,7 +190,7 @@ class OpenPage:
         if now < self._frame_due:
             return None
         self._frame_due = now + FRAME_PERIOD_S
-        number = self._backlog.newest
+        number = self._backlog.newest_number
         taken = self._backlog.frame(number)
         if taken is None or number == self._sent_frame:
             return None
@@ -417,7 +417,7 @@ def _number(request: Mapping[str, Any], name: str, low: float, high: float) -> f
 
 
 def _command(request: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """Return the name of a command, and its arguments as text, without empty ones.
+    """Return the name of a command, and its non-empty arguments as text.
 
     Raises:
         UsageError: if they are of another type.

@@ -103,24 +103,24 @@ class PageMessages:
         }
 
     def frame(
-        self, taken: StoredFrame, why: str, place: PointOrigin | None = None
+        self, stored: StoredFrame, why: str, point_origin: PointOrigin | None = None
     ) -> dict[str, Any]:
         """Return a frame with every byte explained.
 
         Args:
-            taken: the frame.
+            stored: the frame.
             why: the reason why it is shown: "last", "number" or "point".
-            place: origin of the point that the page asked for.
+            point_origin: origin of the point that the page asked for.
         """
-        explanation = self._explain(taken.frame, taken.data)
+        explanation = self._explain(stored.frame, stored.data)
         value = None
-        if place is not None:
-            value = explanation.path_of(place.number, place.part)
+        if point_origin is not None:
+            value = explanation.path_of(point_origin.number, point_origin.part)
         return {
             "is": "frame",
-            "number": taken.number,
-            "position": self._position(taken.at),
-            "hex": taken.data.hex(),
+            "number": stored.number,
+            "position": self._position(stored.at),
+            "hex": stored.data.hex(),
             "why": why,
             "value": value,
             "explanation": explanation.to_dict(),

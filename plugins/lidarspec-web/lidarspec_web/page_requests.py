@@ -1,8 +1,8 @@
-"""The requests of one page: their rate limit, and the threads for slow ones.
+"""The requests of one page: their rate limit, and the threads for slow requests.
 
-A page that sends requests without end delays itself: the server reads its next message later.
-The slow requests of a page run in threads one after another, so that no page has more than its
-share of the threads.
+A page that sends requests without end delays itself: the server reads its next message later. The
+slow requests of a page run in threads one after another, so that no page has more than its share of
+the threads.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class RequestQueue:
         return self._requests.qsize() >= MAX_WAITING
 
     def add(self, request: PageRequest) -> None:
-        """Add a request after the waiting ones."""
+        """Add a request to the end of the queue."""
         self._requests.put_nowait(request)
 
     async def run(self) -> NoReturn:

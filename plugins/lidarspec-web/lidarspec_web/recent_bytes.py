@@ -165,7 +165,7 @@ class RecentBytes:
             self._drop_old()
 
     def observe_frames(self, frames: Frames) -> None:
-        """Store frames of the input, in its order."""
+        """Store frames in their order in the input."""
         if not len(frames):
             return
         with self._lock:
@@ -176,7 +176,7 @@ class RecentBytes:
             self._end = int(frames.places[-1]) + int(frames.sizes[-1])
 
     def forget(self) -> None:
-        """Discard the bytes, because the input begins anew; frame numbers continue."""
+        """Discard the bytes, because the input restarts; frame numbers continue."""
         with self._lock:
             self._inputs.clear()
             self._results.clear()
@@ -194,8 +194,8 @@ class RecentBytes:
         return copy
 
     @property
-    def newest(self) -> int:
-        """The number of the newest frame; -1 if there is none yet."""
+    def newest_number(self) -> int:
+        """The number of the newest frame; -1 before the first."""
         return self._frame_count - 1
 
     def frame(self, number: int) -> StoredFrame | None:
@@ -207,22 +207,22 @@ class RecentBytes:
             return None
         return result.take(number - result.first_number)
 
-    def find_point_frame(self, place: PointOrigin) -> StoredFrame | None:
+    def find_point_frame(self, point_origin: PointOrigin) -> StoredFrame | None:
         """Return the frame that a point came from.
 
         Returns None if it is no longer stored and the scan does not have its original bytes.
         """
         with self._lock:
-            following = bisect_right(self._results, place.offset, key=lambda one: one.offset)
+            following = bisect_right(self._results, point_origin.offset, key=lambda one: one.offset)
             result = self._results[following - 1] if following else None
         if result is not None:
             offsets = result.frames.offsets
-            index = int(offsets.searchsorted(place.offset))
-            if index < len(offsets) and offsets[index] == place.offset:
+            index = int(offsets.searchsorted(point_origin.offset))
+            if index < len(offsets) and offsets[index] == point_origin.offset:
                 return result.take(index)
-        if self.sensor.frames[place.frame].wire is not None:
+        if self.sensor.frames[point_origin.frame].wire is not None:
             return None
-        return StoredFrame(None, place.frame, place.host_ns or -1, place.data)
+        return StoredFrame(None, point_origin.frame, point_origin.host_ns or -1, point_origin.data)
 
     def find_damaged(self, number: int) -> DamagedBytes | None:
         """Return a damaged piece by its number, None if it is no longer stored."""

@@ -32,7 +32,9 @@ _HEADER_LENGTH = struct.Struct("<I")
 _GOLDEN_SECTION = (math.sqrt(5) - 1) / 2
 
 
-def make_scan_message(scan: Scan, number: int, *, position: float, sent: float, most: int) -> bytes:
+def make_scan_message(
+    scan: Scan, number: int, *, position: float, sent: float, max_points: int
+) -> bytes:
     """Return a scan as a message, without points that have no return.
 
     Args:
@@ -40,15 +42,15 @@ def make_scan_message(scan: Scan, number: int, *, position: float, sent: float, 
         number: number of the scan, by which the page asks for the frame of a point.
         position: position of its first point, seconds since the first packet of the source.
         sent: arrival of its last packet, seconds since 1970 by this computer's clock.
-        most: maximum number of points; if there are more, an even selection is sent, always the
-            same.
+        max_points: maximum number of points; if there are more, an even selection is sent, always
+            the same.
     """
     points = scan.points
     points.load(*COLUMNS, "valid")
     returns = np.flatnonzero(points.valid)
     indices = returns
-    if len(returns) > most:
-        indices = thin_out(returns, most)
+    if len(returns) > max_points:
+        indices = thin_out(returns, max_points)
     columns = _take_columns(points, indices)
     header = {
         "scan": number,
@@ -72,10 +74,10 @@ def make_scan_message(scan: Scan, number: int, *, position: float, sent: float, 
     return b"".join(parts)
 
 
-def thin_out(indices: NDArray[np.intp], most: int) -> NDArray[np.intp]:
-    """Return an even selection of indices, (m,) with m <= `most`, in their order."""
+def thin_out(indices: NDArray[np.intp], max_points: int) -> NDArray[np.intp]:
+    """Return an even selection of at most `max_points` indices, in their order."""
     fractions = np.arange(len(indices)) * _GOLDEN_SECTION % 1
-    return indices[fractions < most / len(indices)][:most]
+    return indices[fractions < max_points / len(indices)][:max_points]
 
 
 def _padding(size: int) -> int:

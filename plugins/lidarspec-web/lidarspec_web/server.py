@@ -1,7 +1,7 @@
 """The HTTP server of the page: its files, a WebSocket for each open page, and saved scans.
 
-One event loop in a thread of its own serves all pages of a source. `access` decides which requests
-are served, `open_page` serves the sockets, and `saving` writes and sends scans.
+One event loop in a separate thread serves all pages of a source. `access` decides which requests
+are served, `open_page` serves the sockets, and `scan_files` writes and sends scans.
 """
 
 from __future__ import annotations

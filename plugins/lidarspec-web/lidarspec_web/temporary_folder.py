@@ -1,7 +1,7 @@
-"""The temporary folder of a server; if it is killed, the next one removes it.
+"""The temporary folder of a server; after a crash, the next server removes it.
 
 Each server locks its folder. The system releases the lock when the process ends for any reason, so
-a folder that can be locked no longer belongs to a server. On systems without such locks (Windows) a
+a folder that can be locked no longer belongs to a server. On systems without file locks (Windows) a
 folder is removed by its own server only.
 """
 
@@ -31,7 +31,7 @@ class TemporaryFolder:
 
     @property
     def path(self) -> Path:
-        """The folder.
+        """The folder; it is made on first use.
 
         Raises:
             OSError: if it cannot be made.

@@ -1,7 +1,7 @@
 """A source in a cell of a notebook, drawn by the code of the page.
 
 A thread reads the source. The cell asks for each scan after it has drawn the previous one (`next`),
-as a page does, and sends `hello` when it is shown. The messages are those of the page (`answers`).
+as a page does, and sends `hello` when it is shown. Its messages are those of `page_messages`.
 """
 
 from __future__ import annotations
@@ -155,10 +155,10 @@ class Viewer:
             self._state_due = now + STATE_PERIOD_S
             self._send(answers.state(frozen=False, since=broadcast.backlog.damaged))
         if self._wanted_points and shown.number != self._sent_scan:
-            most = self._wanted_points
+            max_points = self._wanted_points
             self._wanted_points = 0
             self._sent_scan = shown.number
-            self._send({"is": "scan"}, shown.message(most))
+            self._send({"is": "scan"}, shown.message(max_points))
 
     def _send(self, message: Mapping[str, Any], *buffers: bytes) -> None:
         self._widget.send(message, list(buffers))
