@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from lidarspec.errors import SpecError
+from lidarspec.errors import SpecError, UsageError
 from lidarspec.frames.parse import parse
 from lidarspec.framing.decoder import Decoder
 from lidarspec.framing.frame_engine import get_codec
@@ -196,6 +196,7 @@ class _FrameStream:
     """The data frames of one type from a time on, in ns since power-on.
 
     Attributes:
+        clock_offset: seconds that are added to the sensor's clock from the next batch on.
         due: the time of the next frame.
     """
 
@@ -211,6 +212,7 @@ class _FrameStream:
         self._scene = scene
         self.frame = frame
         self._shake = shake
+        self.clock_offset = 0.0
         self._next = 0
         self._end = began
         self._frames: list[bytes] = []
@@ -240,7 +242,9 @@ class _FrameStream:
     def _more(self) -> None:
         """Make the next batch."""
         count = max(min(int(AHEAD / max(self._made.interval, 1)), MOST), 1)
-        block = self._made.block(self._next, count, self._scene, self._end / SECOND, self._shake)
+        block = self._made.block(
+            self._next, count, self._scene, self._end / SECOND, self._shake, self.clock_offset
+        )
         times = (self._end + block.times).tolist()
         self._frames = block.frames
         self._times = times[:-1]
@@ -338,6 +342,20 @@ class SimulatedDevice:
         self.present = False
         self._plug = None
 
+    def jump_clock(self, seconds: float) -> None:
+        """Let the sensor's clock jump, from a packet within the next quarter of a second on.
+
+        Args:
+            seconds: how far, forward or back; added to earlier jumps until the next `start`.
+
+        Raises:
+            UsageError: if the clock is not a single field of the data frame, or no data is sent.
+        """
+        if self._stream is None:
+            raise UsageError(f"{self.sensor.id} sends no data, so that its clock cannot jump")
+        self._simulation(self._stream.frame).check_clock()
+        self._stream.clock_offset += seconds
+
     def receive(self, data: bytes, now: int, link: str = "data") -> None:
         """Receive bytes or a datagram."""
         self._switch_plug(now)
@@ -383,6 +401,17 @@ class SimulatedDevice:
             due += [self._stream.due] if self._stream else []
             times += [self._powered + math.ceil(at / self.rate) for at in due]
         return min(times, default=None)
+
+    @property
+    def replied_at(self) -> int | None:
+        """The time of the last planned reply to a command, None if there is none."""
+        times = [due.at for due in self._plan if not self._is_periodic(due)]
+        if not times or math.isinf(self.rate):
+            return None
+        return self._powered + math.ceil(max(times) / self.rate)
+
+    def _is_periodic(self, due: _PlannedData) -> bool:
+        return bool(due.frame and self.sensor.frames[due.frame].simulation.rate)
 
     def _clock(self, now: int) -> float:
         """Return the device's time in ns since power-on.

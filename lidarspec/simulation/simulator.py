@@ -850,13 +850,20 @@ class FrameSimulation:
         self.interval = self._pace.interval
 
     def block(
-        self, start: int, count: int, scene: Scene, since: float = 0.0, shake: float = 0.0
+        self,
+        start: int,
+        count: int,
+        scene: Scene,
+        since: float = 0.0,
+        shake: float = 0.0,
+        clock_offset: float = 0.0,
     ) -> PacketBlock:
         """Return the packets from number `start` on.
 
         Args:
             since: seconds since the scene began at the first of them.
             shake: standard deviation of the noise on IMU readings, m/s2 and rad/s.
+            clock_offset: seconds that are added to the sensor's clock.
         """
         numbers = range(start, start + count + AHEAD)
         table = self._maker.table(self._sweep_values(numbers))
@@ -875,7 +882,38 @@ class FrameSimulation:
             self._measurement.fill(table, numbers, scene, seconds)
         if self._rest is not None:
             self._rest.fill(table, shake, [start])
+        if clock_offset:
+            self._shift_clock(table, clock_offset)
         return PacketBlock(self._maker.seal(table)[:count], times[: count + 1])
+
+    def check_clock(self) -> str:
+        """Return the field of the sensor's clock.
+
+        Raises:
+            UsageError: if the clock is not a single field of the frame.
+        """
+        clock = self._sensor.clock
+        path = clock.source if clock is not None else None
+        if not isinstance(path, str) or path not in self._maker.schema.fields:
+            raise UsageError(
+                f"the clock of {self._sensor.id} cannot jump: it is not a single field of"
+                f" {self._frame!r} frames"
+            )
+        return path
+
+    def _shift_clock(self, table: CompiledTable, seconds: float) -> None:
+        """Add seconds to the clock of each packet; it wraps as the sensor's clock does."""
+        path = self.check_clock()
+        assert self._sensor.clock is not None
+        info = table.schema.fields[path]
+        unit_s = float(factor(info.unit, "s") or 1)
+        times = info.physical(table.raw(path).astype(np.float64)) * unit_s + seconds
+        if self._sensor.clock.wraps_at is not None:
+            times %= float(self._sensor.clock.wraps_at)
+        raw = info.raw(times / unit_s)
+        if info.kind == "int":
+            raw = np.clip(raw, *info.limits)
+        write_raw(table, path, raw)
 
     def _with_points(self, table: CompiledTable) -> CompiledTable:
         """Return the rows that have points: frames, or the parts in them."""

@@ -13,7 +13,7 @@ from lidarspec.simulation.device import SimulatedDevice
 from lidarspec.simulation.faults import Faults
 from lidarspec.simulation.scenes import Scene
 from lidarspec.transports.destinations import make_simulated_outlet
-from lidarspec.transports.serving import Served
+from lidarspec.transports.serving import Served, VirtualClock
 
 
 @contextlib.contextmanager
@@ -26,6 +26,7 @@ def virtual_port(
     seed: int = 0,
     rate: float = 1.0,
     faults: Faults | None = None,
+    virtual_time: bool = False,
 ) -> Iterator[Served]:
     """Put a simulated sensor on a pseudo-terminal or a socket; a context manager.
 
@@ -38,11 +39,12 @@ def virtual_port(
         seed: seed of the scene, the faults and the fillers.
         rate: speed relative to real time; inf: as fast as it is read.
         faults: the faults on its links.
+        virtual_time: whether the sensor's time only passes in `advance`.
 
     Yields:
-        An object with a `path` to open, the `device` with the names of the commands that it
-            `heard`,
-        `unplug` and `plug`.
+        An object with a `path` to open, the simulated `device`, whose `heard` has the names of the
+        commands that it received, and the methods `unplug`, `plug`, `jump_clock(seconds)` and, with
+        virtual time, `advance(seconds)`.
 
     Raises:
         SourceError: if the port cannot be opened.
@@ -60,4 +62,6 @@ def virtual_port(
                 Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarspec-port-")))
                 / "port"
             )
-        yield stack.enter_context(Served(device, make_simulated_outlet(resolved, to, link)))
+        outlet = make_simulated_outlet(resolved, to, link)
+        clock = VirtualClock() if virtual_time else None
+        yield stack.enter_context(Served(device, outlet, clock=clock))

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from lidarspec.errors import SourceError, UsageError
 from lidarspec.sensor_operations import Sensor
 from lidarspec.simulation.device import SECOND, SimulatedDevice
 from lidarspec.spec.links import Udp
@@ -23,6 +24,44 @@ from lidarspec.transports.protocol import POLL_S, Chunk, ClosingContext, Sender
 #: Shortest time between two passes, in which the frames of a fast sensor accumulate.
 _MIN_PAUSE_S = 0.001
 _PASS_TIMEOUT_S = 0.1
+#: How long a virtual clock waits for a program to open the port.
+_LISTENER_TIMEOUT_S = 10.0
+
+
+#: The steps of a virtual clock. The simulated device requires less than a second.
+_VIRTUAL_STEP_NS = 20_000_000
+
+
+class VirtualClock:
+    """A clock that only moves when it is advanced, for tests that do not wait.
+
+    The serving thread moves it in steps, and sends at each step what is due.
+    """
+
+    def __init__(self) -> None:
+        self._now_ns = 0
+        self._end_ns = 0
+
+    def __call__(self) -> int:
+        """Return the time in ns."""
+        return self._now_ns
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether steps are left."""
+        return self._now_ns < self._end_ns
+
+    def advance(self, seconds: float) -> None:
+        """Let the steps of some seconds follow."""
+        self.advance_to(self._end_ns + int(seconds * SECOND))
+
+    def advance_to(self, end_ns: int) -> None:
+        """Let steps follow until a time."""
+        self._end_ns = max(self._end_ns, end_ns)
+
+    def step(self) -> None:
+        """Move by one step, but not beyond the end."""
+        self._now_ns = min(self._now_ns + _VIRTUAL_STEP_NS, self._end_ns)
 
 
 class FairLock:
@@ -79,6 +118,7 @@ def serve(
     stop: threading.Event | None = None,
     on_pass: Callable[[], None] | None = None,
     patient: bool = False,
+    clock: VirtualClock | None = None,
 ) -> None:
     """Run a device at an outlet.
 
@@ -89,15 +129,17 @@ def serve(
         stop: ends the loop when it is set.
         on_pass: called in every pass of the loop, at least every 50 ms.
         patient: whether the device is switched on only when there is a listener.
+        clock: the device's time; None for real time.
 
     Raises:
         SourceError: if nothing can be sent any more.
     """
     stop = stop or threading.Event()
+    get_now = clock or time.monotonic_ns
     early_commands = []
     while patient and not outlet.has_listener and not stop.is_set():
         early_commands += outlet.receive(POLL_S)
-    start_ns = time.monotonic_ns()
+    start_ns = get_now()
     device.start(start_ns)
     for link, data in early_commands:
         device.receive(data, start_ns, link)
@@ -109,29 +151,48 @@ def serve(
     while not stop.is_set():
         if on_pass is not None:
             on_pass()
-        now = time.monotonic_ns()
+        # In virtual time nothing is sent before a program can receive it.
+        is_waiting = clock is not None and device.present and not outlet.has_listener
+        if clock is not None and not is_waiting:
+            clock.step()
+        now = get_now()
         if now >= end_ns:
             break
-        _send_due(device, outlet, now, stop)
+        if not is_waiting:
+            _send_due(device, outlet, now, stop, patient=clock is not None)
         if device.present != is_plugged_in:
             is_plugged_in = device.present
             if is_plugged_in:
                 outlet.plug()
             else:
                 outlet.unplug()
-        for link, data in outlet.receive(_find_wait(device, outlet)):
-            device.receive(data, time.monotonic_ns(), link)
+        wait = _find_wait(device, outlet) if clock is None else _MIN_PAUSE_S
+        for link, data in outlet.receive(wait):
+            device.receive(data, get_now(), link)
+            if clock is not None and device.replied_at is not None:
+                clock.advance_to(device.replied_at)
 
 
-def _send_due(device: SimulatedDevice, outlet: Outlet, now: int, stop: threading.Event) -> None:
-    """Send the frames that are due; if `rate` is inf, send as fast as they are read."""
+def _send_due(
+    device: SimulatedDevice,
+    outlet: Outlet,
+    now: int,
+    stop: threading.Event,
+    *,
+    patient: bool = False,
+) -> None:
+    """Send the frames that are due; if `rate` is inf, send as fast as they are read.
+
+    Args:
+        patient: whether to wait until the data is read.
+    """
     is_unlimited = math.isinf(device.rate)
     if is_unlimited and not outlet.has_listener:
         return
     with _SIMULATION_LOCK.hold(stop) as is_held:
         chunks = due_chunks(device, now) if is_held else {}
     for link, sent in chunks.items():
-        outlet.send(link, sent, patient=is_unlimited and link == "data")
+        outlet.send(link, sent, patient=(is_unlimited or patient) and link == "data")
 
 
 def _find_wait(device: SimulatedDevice, outlet: Outlet) -> float:
@@ -190,9 +251,17 @@ class Served(ClosingContext):
         outlet: the outlet.
     """
 
-    def __init__(self, device: SimulatedDevice, outlet: Outlet, *, patient: bool = False) -> None:
+    def __init__(
+        self,
+        device: SimulatedDevice,
+        outlet: Outlet,
+        *,
+        patient: bool = False,
+        clock: VirtualClock | None = None,
+    ) -> None:
         self.device = device
         self.outlet = outlet
+        self._clock = clock
         self._patient = patient
         self._stop = threading.Event()
         self._failure: BaseException | None = None
@@ -215,7 +284,50 @@ class Served(ClosingContext):
 
     def plug(self) -> None:
         """Plug the sensor in again: its port reappears, and it starts as after power-up."""
-        self._call_in_thread(lambda: self.device.start(time.monotonic_ns()))
+        get_now = self._clock or time.monotonic_ns
+        self._call_in_thread(lambda: self.device.start(get_now()))
+
+    def jump_clock(self, seconds: float) -> None:
+        """Let the sensor's clock jump, from a packet within the next quarter of a second on.
+
+        Args:
+            seconds: how far, forward or back.
+
+        Raises:
+            UsageError: if the clock is not a single field of the data frame, or no data is sent.
+        """
+        failures = list[UsageError]()
+
+        def jump() -> None:
+            try:
+                self.device.jump_clock(seconds)
+            except UsageError as error:
+                failures.append(error)
+
+        self._call_in_thread(jump)
+        if failures:
+            raise failures[0]
+
+    def advance(self, seconds: float) -> None:
+        """Let virtual time pass: return when everything that is due has been sent.
+
+        It waits until a program has the port open.
+
+        Raises:
+            UsageError: if the port runs in real time.
+            SourceError: if no program opens the port.
+        """
+        if self._clock is None:
+            raise UsageError("the port runs in real time: open it with virtual_time=True")
+        self._clock.advance(seconds)
+        limit = time.monotonic() + _LISTENER_TIMEOUT_S
+        while self._clock.is_behind:
+            self._call_in_thread(lambda: None)
+            if self.outlet.has_listener:
+                limit = time.monotonic() + _LISTENER_TIMEOUT_S
+            elif time.monotonic() > limit:
+                raise SourceError(f"{self.path}: no program has opened the port")
+        self._call_in_thread(lambda: None)
 
     def stop_sending(self) -> None:
         """Send no further bytes; bytes that were already sent can still be read."""
@@ -257,6 +369,7 @@ class Served(ClosingContext):
                 stop=self._stop,
                 on_pass=self._make_calls,
                 patient=self._patient,
+                clock=self._clock,
             )
         except BaseException as error:
             self._failure = error

@@ -1,4 +1,6 @@
-"""The property test on the page about tests finds its bug, and prints the failure of the page."""
+"""The tests on the page about tests: the property test finds its bug and prints the failure of the
+page, and the test with a simulated port passes.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from tests.docs import pages
 
@@ -37,3 +41,14 @@ def test_the_property_test_of_the_page_prints_its_smallest_failure(tmp_path: Pat
     # Hypothesis writes the kind of failure, whose wording varies, before the first line.
     start = next(index for index, line in enumerate(lines) if line.endswith(expected[0]))
     assert lines[start + 1 : start + len(expected)] == expected[1:]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
+def test_the_test_with_a_port_passes(tmp_path: Path) -> None:
+    (text,) = [block.text for block in pages.blocks(PAGE) if block.title == "test_my_program.py"]
+    (tmp_path / "test_my_program.py").write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."]
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert "1 passed" in done.stdout, done.stdout

@@ -1,0 +1,118 @@
+"""The simulated sensor on a real port: virtual time, faults and jumps of the clock."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+import lidarspec as ls
+from lidarspec.errors import SourceError, UsageError
+from lidarspec.simulation.faults import Faults
+from lidarspec.testing.fixtures import virtual_port
+from lidarspec.transports import serving
+from tests.lines import free_port, read_until
+from tests.shapes import SHAPES
+
+posix = pytest.mark.skipif(os.name != "posix", reason="pseudo terminals are POSIX")
+STL = "ldrobot-stl27l"
+#: Data frames of the STL-27L a second: 21600 points, 12 in each.
+STL_RATE = 1800
+
+
+PLACES = [
+    pytest.param(STL, "pty", STL_RATE, marks=posix),
+    (STL, "tcp://127.0.0.1:0", STL_RATE),
+    ("velodyne-vlp16", "udp", 754),
+]
+
+
+@pytest.mark.parametrize(("name", "to", "rate"), PLACES)
+def test_in_virtual_time_a_second_of_data_comes_at_once(name: str, to: str, rate: int) -> None:
+    sensor = ls.sensor(name)
+    place = f"udp://127.0.0.1:{free_port()}" if to == "udp" else to
+    with (
+        virtual_port(sensor, to=place, virtual_time=True) as port,
+        ls.open(port.path, sensor) as device,
+    ):
+        port.advance(1.0)
+        sent = port.device.sent[sensor.data_frame]
+        assert abs(sent - rate) <= 2
+        read_until(device, lambda: device.stats.frames[sensor.data_frame] == sent)
+        assert device.stats.bytes_skipped == 0
+
+
+@posix
+def test_time_stands_still_without_advance() -> None:
+    with virtual_port(STL, virtual_time=True) as port, ls.open(port.path, STL) as device:
+        port.advance(0.1)
+        sent = port.device.sent["data"]
+        assert next(iter(device.packets(wait=0.3))) is not None
+        assert port.device.sent["data"] == sent
+
+
+@posix
+def test_replies_with_pauses_come_in_virtual_time() -> None:
+    with (
+        virtual_port("slamtec-rplidar-a1", virtual_time=True) as port,
+        ls.open(port.path, "slamtec-rplidar-a1", start=False) as device,
+    ):
+        assert device.send("get_info").confirmed
+        assert device.send("scan").confirmed
+        port.advance(0.5)
+        read_until(device, lambda: device.stats.frames["node"] > 500)
+
+
+@posix
+def test_faults_and_an_unplugged_port_in_virtual_time() -> None:
+    faults = Faults(errors=0.001, loss=0.01, unplug=1.0, absent=1.0)
+    with (
+        virtual_port(STL, faults=faults, virtual_time=True) as port,
+        ls.open(port.path, STL) as device,
+    ):
+        port.advance(2.9)
+        read_until(device, lambda: device.stats.disconnects == 1)
+        read_until(device, lambda: device.stats.frames["data"] > STL_RATE * 1.2)
+        assert device.stats.bad_checksum > 0
+
+
+@posix
+@pytest.mark.parametrize("seconds", [5.0, -5.0])
+def test_the_clock_of_the_sensor_jumps(seconds: float) -> None:
+    with virtual_port(STL, virtual_time=True) as port, ls.open(port.path, STL) as device:
+        port.advance(0.2)
+        port.jump_clock(seconds)
+        port.advance(0.6)
+        times = list[float]()
+        for packets in device.packets(wait=0.1):
+            times += packets["timestamp"].tolist()
+            if len(times) >= port.device.sent["data"]:
+                break
+    steps = np.diff(times)
+    (jump,) = np.flatnonzero(abs(steps) > 1)
+    # The clock of this sensor wraps at 30 s.
+    assert (steps[jump] + 15) % 30 - 15 == pytest.approx(seconds, abs=0.01)
+    assert 0.2 * STL_RATE - 2 <= jump <= 0.46 * STL_RATE
+
+
+def test_a_clock_of_several_fields_cannot_jump() -> None:
+    sensor = SHAPES["shape-paced"]
+    to = f"udp://127.0.0.1:{free_port()}"
+    with (
+        virtual_port(sensor, to=to, virtual_time=True) as port,
+        pytest.raises(UsageError, match="not a single field"),
+    ):
+        port.jump_clock(1.0)
+
+
+@posix
+def test_advance_needs_virtual_time_and_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    with virtual_port(STL) as port, pytest.raises(UsageError, match="virtual_time=True"):
+        port.advance(1.0)
+    monkeypatch.setattr(serving, "_LISTENER_TIMEOUT_S", 0.05)
+    with (
+        virtual_port(STL, virtual_time=True) as port,
+        pytest.raises(SourceError, match="no program has opened"),
+    ):
+        port.advance(1.0)
