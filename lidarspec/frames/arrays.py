@@ -1,6 +1,6 @@
-"""Arrays that cost next to nothing, and the memory of arrays.
+"""Arrays that cost almost nothing, and settings of the memory allocator.
 
-They hold one repeated value, consecutive numbers, or some rows of another array.
+The arrays hold one repeated value, consecutive numbers, or selected rows of another array.
 """
 
 from __future__ import annotations
@@ -13,16 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: numbers that `count_up` keeps.
-COUNTED = 1 << 17
-#: bytes; what is freed at the end of the heap is kept up to twice as much.
-KEPT = 1 << 24
+#: the length of the shared array that `count_up` returns slices of.
+MAX_SHARED_COUNT = 1 << 17
+#: bytes of the block that `keep_freed_memory` allocates. glibc then keeps up to twice this size of
+#: free memory at the end of the heap.
+LARGE_BLOCK_BYTES = 1 << 24
 
 
 def repeat(value: int, *shape: int) -> NDArray[np.int64]:
-    """Return an array of this shape that holds one value everywhere, read-only.
+    """Return a read-only array of this shape with one value everywhere.
 
-    It equals the result of `np.broadcast_to`, at a tenth of its cost.
+    It equals the result of `np.broadcast_to`, at a tenth of the cost.
     """
     memory = value.to_bytes(8, sys.byteorder, signed=True)
     return np.ndarray(shape, np.int64, memory, 0, (0,) * len(shape))
@@ -31,7 +32,10 @@ def repeat(value: int, *shape: int) -> NDArray[np.int64]:
 def select_values(
     values: NDArray[np.int64], which: NDArray[np.bool_] | NDArray[np.intp] | slice
 ) -> NDArray[np.int64]:
-    """Return the values, (k,), that a mask, indices or a slice pick; equal ones stay `repeat`."""
+    """Return the values that a mask, indices or a slice select, (k,).
+
+    A zero-stride array, as from `repeat`, stays one.
+    """
     value = broadcast_value(values)
     if value is None or isinstance(which, slice):
         return values[which]
@@ -41,39 +45,39 @@ def select_values(
 def count_up(count: int) -> NDArray[np.int64]:
     """Return the numbers from 0 to `count` - 1, (count,), read-only.
 
-    Small counts share the same memory.
+    Small results share the same memory.
     """
-    if count <= COUNTED:
-        return _numbers()[:count]
+    if count <= MAX_SHARED_COUNT:
+        return _shared_numbers()[:count]
     return np.arange(count)
 
 
 def is_counted(numbers: NDArray[np.int64]) -> bool:
-    """Return whether numbers are known to ascend, because they are from `count_up`."""
-    return numbers.base is _numbers() and numbers.strides[0] > 0
+    """Return whether an array is from `count_up`, and so is known to ascend."""
+    return numbers.base is _shared_numbers() and numbers.strides[0] > 0
 
 
 @lru_cache(maxsize=1)
-def _numbers() -> NDArray[np.int64]:
-    numbers = np.arange(COUNTED)
+def _shared_numbers() -> NDArray[np.int64]:
+    numbers = np.arange(MAX_SHARED_COUNT)
     numbers.setflags(write=False)
     return numbers
 
 
 def broadcast_value(values: NDArray[np.int64]) -> int | None:
-    """Return the value of a zero-stride array, as from `repeat`, else None."""
+    """Return the value of a zero-stride array, as from `repeat`; None for others."""
     if values.strides == (0,) and len(values):
         return values.item(0)
     return None
 
 
 def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np.intp]]]:
-    """Return each different value, ascending, with the indices of its occurrences.
+    """Return each distinct value, ascending, with the indices of its occurrences.
 
     The indices are ascending, (k,).
 
     Args:
-        few: so many different ones are found one by one sooner than sorted.
+        few: up to this number of distinct values, one search for each is faster than sorting.
     """
     values_found = list[int]()
     left = values
@@ -91,7 +95,10 @@ def group_by_value(values: NDArray[Any], few: int) -> list[tuple[int, NDArray[np
 def take_rows(
     rows: NDArray[np.uint8], which: NDArray[np.intp] | NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """Return the rows of bytes that indices or a mask pick, (k, size), each copied as one piece."""
+    """Return copies of the rows of bytes that indices or a mask select, (k, size).
+
+    Each row is copied as one item, not byte by byte.
+    """
     whole = rows.view(f"V{rows.shape[1]}")[:, 0]
     if which.dtype != np.bool_ and rows.flags.c_contiguous:
         some = whole.take(which)
@@ -102,24 +109,22 @@ def take_rows(
 
 @lru_cache(maxsize=1)
 def keep_freed_memory() -> None:
-    """Let the allocator keep freed blocks, up to 32 MiB.
+    """Make the allocator keep freed blocks of up to 32 MiB.
 
-    This applies from the first work on large batches on.
+    It is called at the first work on a large batch.
 
-    The columns of a batch are blocks of some hundred kilobytes that live for milliseconds. glibc
-    takes such blocks from the system and gives them back, page by page, and fetching the pages anew
-    costs several times what computing the columns costs. It stops doing so for blocks smaller than
-    the largest one that was ever freed, so one is: it is never touched, and takes no memory.
+    The columns of a batch are blocks of several hundred kilobytes that live for milliseconds. glibc
+    requests such blocks from the system and returns them, and the page faults of each new block
+    cost several times as much as computing the columns. glibc keeps blocks that are smaller than
+    the largest block that was ever freed. So this function allocates one large block and frees it.
+    The block is never written, and takes no memory.
 
     Source: mallopt(3), M_MMAP_THRESHOLD: the threshold is adjusted dynamically, and
     M_TRIM_THRESHOLD to twice its value.
     """
-    np.empty(KEPT, np.uint8)
+    np.empty(LARGE_BLOCK_BYTES, np.uint8)
 
 
 def add_axes(array: NDArray[Any], depth: int) -> NDArray[Any]:
-    """Return values of packets, (n, ...), with `depth` axes behind the first.
-
-    Additional axes have length 1.
-    """
+    """Return values of packets with `depth` axes of length 1 after the first."""
     return array.reshape(*array.shape, *(1,) * (depth + 1 - array.ndim))

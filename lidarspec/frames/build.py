@@ -35,12 +35,12 @@ def build(
     *,
     units: bool = False,
 ) -> bytes:
-    """Return the bytes of one frame; constants, counts and the checksum are filled in.
+    """Return the bytes of one frame. Constants, counts and the checksum are computed.
 
     Args:
-        value: a mapping of all fields, such as what `parse` returned, or None; `values` override
-            it.
-        units: take physical values, and round them to the wire's steps.
+        value: a mapping of all fields, for example a result of `parse`, or None.
+        values: single fields by name; they replace entries of `value`.
+        units: True takes physical values and rounds them to the resolution of the fields.
 
     Raises:
         UsageError: for a missing or unknown field, or a value that its field cannot hold.
@@ -53,7 +53,9 @@ def build(
         )
     declared = sensor.frames[frame]
     place = f"{sensor.id} {frame}"
-    checker = _Values(make_schema(declared.tree), list_paths(declared.tree), place, units=units)
+    checker = _ValueChecker(
+        make_schema(declared.tree), list_paths(declared.tree), place, units=units
+    )
     checked = checker.check({**(value or {}), **values}, "")
     layouts = frame_layouts(declared)
     if isinstance(layouts, NotCompilableError):
@@ -76,24 +78,24 @@ def build(
     return data
 
 
-class _Values:
-    """The caller's values, checked against the fields.
+class _ValueChecker:
+    """The caller's values, checked against the fields of the frame.
 
-    Names and ranges are checked, and units if the values are physical.
+    Names and ranges are checked, and also units if the values are physical.
     """
 
     def __init__(self, table: Schema, paths: frozenset[str], place: str, *, units: bool) -> None:
         self._table = table
-        self._known = paths
+        self._paths = paths
         self._place = place
         self._units = units
 
     def check(self, value: Any, path: str, shown: str = "") -> Any:
         info = self._table.all_fields.get(path)
         if info is not None and info.kind == "other" and not (self._units and info.scaled):
-            return value  # construct alone knows what it takes
+            return value  # construct checks it when the frame is built
         if info is not None and info.adapter is not None:
-            return value  # encoded by the functions of the field
+            return value  # the adapter of the field encodes it
         if isinstance(value, Mapping):
             return self._mapping(value, path, shown)
         if info is not None and info.kind == "bytes" and isinstance(value, bytes | bytearray):
@@ -117,18 +119,15 @@ class _Values:
             if name.startswith("_"):
                 continue
             below = f"{path}.{name}" if path else name
-            if below not in self._known:
+            if below not in self._paths:
                 raise UnknownField(
-                    below, [known for known in self._known if known], place=self._place
+                    below, [known for known in self._paths if known], place=self._place
                 )
             checked[name] = self.check(element, below, f"{shown}.{name}" if shown else name)
         return checked
 
     def _bytes(self, numbers: list[Any], shown: str) -> bytes | list[Any]:
-        """Return a byte string of numbers.
-
-        Arrays of other values, such as byte strings, are returned unchanged.
-        """
+        """Return numbers as a byte string; arrays of other values are returned unchanged."""
         if not any(isinstance(part, int | str) for part in numbers):
             return numbers
         try:

@@ -26,16 +26,17 @@ from lidarspec.spec.tree import FieldInfo
 
 
 def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, Any]) -> bytes:
-    """Return the bytes of a command, none for one that only moves lines.
+    """Return the bytes of a command; b"" for a command that only sets control lines.
 
     Args:
-        arguments: by name, in the units of their fields; a value that is found out when it is sent
-            by its path.
+        arguments: by name, in the units of their fields. A value that is known only when the
+            command is sent is given by the path of its field.
 
     Raises:
-        UnknownCommand: for a command that the sensor does not have.
-        UnknownField, MissingField: for an argument that it does not take, or that is left out.
-        OutOfRange: for one beyond its limits.
+        UnknownCommand: if the sensor has no such command.
+        UnknownField: for an argument that the command does not have.
+        MissingField: for an argument that is missing.
+        OutOfRange: for a value beyond the limits of the argument.
     """
     if name not in sensor.commands:
         raise UnknownCommand(name, sensor.commands, place=sensor.id)
@@ -49,7 +50,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
     values: Any = {}
     for path, value in command.values.items():
         if path in command.filled:
-            filled = _find_out_value(sensor, name, path, value, arguments.get(path))
+            filled = _resolve_filled(sensor, name, path, value, arguments.get(path))
         else:
             filled = copy.deepcopy(value)
         values = put_value(values, split_path(path), filled)
@@ -67,7 +68,7 @@ def build_command(sensor: SensorDescription, name: str, arguments: Mapping[str, 
 
 @dataclass(frozen=True)
 class ArgumentSlot:
-    """The destination of an argument.
+    """The field of a command frame that an argument is written to.
 
     `room` is the number of bytes, or of numbers in an array. It is None if it varies.
     """
@@ -78,10 +79,10 @@ class ArgumentSlot:
 
 
 def argument_slot(sensor: SensorDescription, name: str, argument: str) -> ArgumentSlot:
-    """Return the place of a command argument in its frame.
+    """Return the field of its frame that a command argument is written to.
 
     Raises:
-        SpecError: where its kind of value cannot stand there.
+        SpecError: if the field cannot hold this kind of argument.
     """
     declared = sensor.commands[name].arguments[argument]
     place = f"commands.{name}.args.{argument}"
@@ -153,10 +154,10 @@ def _slot(sensor: SensorDescription, name: str, path: str, place: str) -> Argume
 
 
 def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, place: str) -> Any:
-    """Return the raw value of a field that an argument stands for.
+    """Return the raw value of a field for the value of an argument.
 
     Raises:
-        UsageError: for what it does not take.
+        UsageError: for a value that the argument does not accept.
     """
     info = slot.info
     if isinstance(kind, Range):
@@ -183,7 +184,7 @@ def raw_argument(slot: ArgumentSlot, kind: Taken, value: Any, argument: str, pla
 def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
     """Return bytes as the raw value of a field.
 
-    The field is plain bytes, an array of numbers, or one number in network order.
+    The field is plain bytes, an array of numbers, or one number in network byte order.
     """
     if slot.info.kind == "bytes":
         return data
@@ -192,12 +193,12 @@ def _to_raw_value(slot: ArgumentSlot, data: bytes) -> Any:
     return int.from_bytes(data, "big")
 
 
-def _find_out_value(
+def _resolve_filled(
     sensor: SensorDescription, name: str, path: str, value: Filled, given: Any
 ) -> Any:
     """Return a value that is known only when a command is sent.
 
-    If it is not given, the first number is used, or an address of zeros.
+    If the caller gives none, it is the first value of a `Count`, else zero bytes.
     """
     if isinstance(value, Count):
         if given is None:

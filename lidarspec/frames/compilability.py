@@ -1,7 +1,6 @@
 """Check which structs can be compiled.
 
-A part that has no computable place, whatever the header, is found before any bytes arrive. The
-frame is then interpreted by construct.
+A part is found here if no header determines its offset. construct then parses the whole frame.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from lidarspec.spec import tree
 
 
 class NotCompilableError(Exception):
-    """A part of a struct that has no computable place; attributes `path` and `reason`."""
+    """A part of a struct has no computable offset; attributes `path` and `reason`."""
 
     def __init__(self, path: str, reason: str) -> None:
         self.path = path
@@ -20,7 +19,7 @@ class NotCompilableError(Exception):
 
 
 def check_compilable(root: tree.Node) -> None:
-    """Raise `NotCompilableError` if a tree has a part without a computable place.
+    """Raise `NotCompilableError` if a tree has a part without a computable offset.
 
     It is also raised for values that no column can hold.
     """
@@ -68,7 +67,7 @@ def _check_traced(formula: object) -> None:
 
 
 def _check_part(kind: tree.Kind, path: str) -> None:
-    """Hold a part, as a frame in itself, to what holds for frames."""
+    """Check a kind of parts like a frame type."""
     try:
         for ref in () if kind.following is None else tree.refs(kind.following):
             check_control(ref.info)
@@ -78,7 +77,7 @@ def _check_part(kind: tree.Kind, path: str) -> None:
 
 
 def _check_columns(root: tree.Node) -> None:
-    """Raise `NotCompilableError` if a field of a tree has values that no column holds."""
+    """Raise `NotCompilableError` if no column can hold the values of a field."""
     for info in make_schema(root).fields.values():
         if info.dtype is None:
             wide = f"its {info.bits} bits do not fit in a column"
@@ -89,7 +88,7 @@ def _check_columns(root: tree.Node) -> None:
 
 
 def check_control(info: tree.FieldInfo) -> None:
-    """Raise `NotCompilableError` if a layout cannot be made to depend on a field."""
+    """Raise `NotCompilableError` if a layout cannot depend on a field."""
     if info.kind == "int" and info.axes and info.axes[-1].strip("[]") != info.path:
         raise NotCompilableError(
             info.path,

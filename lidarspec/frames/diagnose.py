@@ -1,7 +1,7 @@
-"""Find what is wrong with the bytes of one frame: the first fault in the order of the wire.
+"""Find the first fault in the bytes of one frame.
 
-A wrong constant or value counts at its place, a wrong length or checksum at the end of the struct
-that it belongs to. Bytes that are missing or left over come last.
+Faults are in the order of the wire. A wrong constant or value counts at its own offset, a wrong
+length or checksum at the end of its struct. Missing or additional bytes come last.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lidarspec.frames.layout_tree import (
 from lidarspec.frames.wire_fields import ExaminedFrame, WireField
 from lidarspec.spec.tree import format_hex, format_values
 
-#: kinds of faults.
+#: Kinds of faults.
 CONSTANT = "constant"
 VALUE = "value"
 LENGTH = "length"
@@ -36,16 +36,16 @@ TRAILING = "trailing bytes"
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong with a frame.
+    """A fault of a frame.
 
     Attributes:
         kind: one of the constants of this module.
-        path: of the field, with indices.
-        offset: its first byte in the frame.
+        path: the path of the field, with indices.
+        offset: the first byte of the field in the frame.
         expected, got: texts or numbers.
-        end: the byte up to which the frame was right; faults are ordered by it.
-        needed: of a field that is cut off, its bytes.
-        is_bounded: whether it is cut off by the end of the parts, not by that of the frame.
+        end: the offset up to which the frame is correct; faults are ordered by it.
+        needed: the bytes of a field that is cut off; 0 for others.
+        is_bounded: whether the end of the parts cuts it off, not the end of the frame.
     """
 
     kind: str
@@ -58,9 +58,13 @@ class Fault:
     is_bounded: bool = False
 
     def reason(self, offset: int) -> str:
-        """Return the fault in a sentence; `offset` is the place of the field that is shown."""
+        """Return the fault as a sentence.
+
+        Args:
+            offset: the offset to print, which differs from `self.offset` in a wire form.
+        """
         if self.kind == CUT_OFF:
-            return self._shortage()
+            return self._describe_shortage()
         if self.kind == TRAILING:
             return (
                 f"{self.got - self.expected} bytes after the end of the frame at byte"
@@ -74,7 +78,7 @@ class Fault:
             return f"{self.path}: invalid count or length {self.got}"
         return f"{self.path} at byte {offset}: {self.kind} {self.got}, expected {self.expected}"
 
-    def _shortage(self) -> str:
+    def _describe_shortage(self) -> str:
         if self.expected is None:
             total = ""
         else:
@@ -90,12 +94,12 @@ class Fault:
 
 
 def find_fault(examined: ExaminedFrame) -> Fault | None:
-    """Return the first fault of a frame; None if it is sound.
+    """Return the first fault of a frame; None if it is valid.
 
     Raises:
-        Exception: whatever an expression or a checksum of the plugin raises.
+        Exception: any error of an expression or a checksum of the plugin.
     """
-    faults = [*_faults(examined)]
+    faults = [*_iter_faults(examined)]
     layout = examined.layout
     if layout is not None and layout.size < len(examined.data):
         size = len(examined.data)
@@ -104,41 +108,41 @@ def find_fault(examined: ExaminedFrame) -> Fault | None:
 
 
 def find_shortage(examined: ExaminedFrame) -> Fault | None:
-    """Return why the values of a frame cannot be read at all; None if they can.
+    """Return why the values of a frame cannot be read; None if they can.
 
     Raises:
-        Exception: whatever an expression of the struct raised.
+        Exception: any error of an expression of the struct.
     """
     cut_off = next((each for each in examined.fields() if each.raw is None), None)
     if examined.layout is None or cut_off is not None:
-        return _ending(examined, cut_off)
+        return _find_end_fault(examined, cut_off)
     return None
 
 
-def _faults(examined: ExaminedFrame) -> Iterator[Fault]:
+def _iter_faults(examined: ExaminedFrame) -> Iterator[Fault]:
     cut_off: WireField | None = None
     for each in examined.fields():
         if each.raw is None:
             cut_off = cut_off or each
             continue
-        fault = _fault_of_field(each)
+        fault = _find_value_fault(each)
         if fault is not None:
             yield fault
-    yield from _faults_of_layout(examined)
+    yield from _iter_layout_faults(examined)
     for seal in examined.seals():
         if not seal.is_right:
             digits = (sum(leaf.info.bits for leaf in seal.seal.leaves) + 3) // 4
             expected = f"0x{seal.computed:0{digits}x}"
             got = f"0x{seal.stored:0{digits}x}"
             yield Fault(CHECKSUM, seal.path, seal.offset, expected, got, seal.end)
-    part = _open_part(examined)
+    part = _find_open_part(examined)
     if part is not None:
-        yield from _faults(part)
+        yield from _iter_faults(part)
     if cut_off is not None or examined.layout is None:
-        yield _ending(examined, cut_off)
+        yield _find_end_fault(examined, cut_off)
 
 
-def _fault_of_field(each: WireField) -> Fault | None:
+def _find_value_fault(each: WireField) -> Fault | None:
     info = each.info
     if info.const is not None and each.raw != info.const:
         expected = format_hex(info.const)
@@ -150,24 +154,24 @@ def _fault_of_field(each: WireField) -> Fault | None:
     return None
 
 
-def _faults_of_layout(examined: ExaminedFrame) -> Iterator[Fault]:
-    """Return wrong lengths and broken conditions of a frame that is all there, and of its parts."""
+def _iter_layout_faults(examined: ExaminedFrame) -> Iterator[Fault]:
+    """Yield wrong lengths and false conditions of a complete frame and of its parts."""
     layout = examined.layout
     if layout is None or layout.size > len(examined.data):
         return
     row = np.frombuffer(examined.data[: layout.size], np.uint8).reshape(1, -1)
-    yield from _wrong_lengths(examined, layout, row)
-    yield from _broken_conditions(examined, layout, row)
+    yield from _iter_length_faults(examined, layout, row)
+    yield from _iter_condition_faults(examined, layout, row)
     for axis in layout.regions:
         for part in examined.parts_of(axis):
-            yield from _faults_of_layout(part)
+            yield from _iter_layout_faults(part)
         broken = examined.broken_part(axis)
         if broken is not None:
             yield _describe_misfit(broken)
 
 
 def _describe_misfit(part: ExaminedFrame) -> Fault:
-    """Return why a part does not fit the bytes that there are for parts."""
+    """Return why a part does not fit into the bytes for parts."""
     shortage = find_shortage(part)
     if shortage is not None:
         return shortage
@@ -175,10 +179,10 @@ def _describe_misfit(part: ExaminedFrame) -> Fault:
     return Fault(LENGTH, part.prefix, part.start, "that is filled by its parts", None, end)
 
 
-def _wrong_lengths(
+def _iter_length_faults(
     examined: ExaminedFrame, layout: Layout, row: NDArray[np.uint8]
 ) -> Iterator[Fault]:
-    """Return the fields that say how long a part is, and are wrong."""
+    """Yield the faults of fields that declare a wrong length of a part."""
     if not layout.held:
         return
     right = row.copy()
@@ -191,8 +195,8 @@ def _wrong_lengths(
             continue
         indices = np.argwhere(is_wrong)[0].tolist()
         index = (0, *indices)
-        path = f"{examined.prefix}.{_with_indices(leaf.info.path, leaf.info.axes, indices)}"
-        # Usually the part is measured in the struct around that of its length.
+        path = f"{examined.prefix}.{_insert_indices(leaf.info.path, leaf.info.axes, indices)}"
+        # A length field is usually in a header struct, and measures the struct around the header.
         around = ".".join(leaf.info.path.split(".")[:-2])
         end = examined.start + layout.places.get(around, (0, layout.size))[1]
         offset = examined.start + leaf.byte_span[0]
@@ -202,31 +206,31 @@ def _wrong_lengths(
         yield Fault(LENGTH, path.strip("."), offset, expected, got, end)
 
 
-def _broken_conditions(
+def _iter_condition_faults(
     examined: ExaminedFrame, layout: Layout, row: NDArray[np.uint8]
 ) -> Iterator[Fault]:
     for condition in layout.conditions:
         if condition.formula is None:
-            continue  # the values of a field are judged with the field
+            continue  # `_find_value_fault` checks the allowed values of a field
         if layout.meets_condition(condition, row)[0]:
             continue
         leaves = [layout.leaves[info.path] for info in condition.fields]
         end = examined.start + max((leaf.byte_span[1] for leaf in leaves), default=0)
-        path = f"{examined.prefix}.{_first_failure(condition, layout, row)}".strip(".")
+        path = f"{examined.prefix}.{_find_false_condition(condition, layout, row)}".strip(".")
         yield Fault(CONDITION, path, end, "a condition that is true", "false", end)
 
 
-def _first_failure(condition: Condition, layout: Layout, row: NDArray[np.uint8]) -> str:
-    """Return the path of a condition that does not hold, with the indices of the first element."""
+def _find_false_condition(condition: Condition, layout: Layout, row: NDArray[np.uint8]) -> str:
+    """Return the path of a false condition, with the indices of the first element."""
     raw = {info.path: layout.leaves[info.path].load(row) for info in condition.fields}
     holds = condition.values(raw)
     if holds.ndim == 1:
         return condition.path
     axes = max((info.axes for info in condition.fields), key=len)
-    return _with_indices(condition.path, axes, np.argwhere(~holds[0])[0].tolist())
+    return _insert_indices(condition.path, axes, np.argwhere(~holds[0])[0].tolist())
 
 
-def _with_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> str:
+def _insert_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> str:
     """Return a path with the indices of an element of its arrays."""
     for axis, index in reversed(list(zip(axes, indices, strict=False))):
         if path.startswith(f"{axis}.") or path == axis:
@@ -234,25 +238,27 @@ def _with_indices(path: str, axes: Sequence[str], indices: Sequence[int]) -> str
     return path
 
 
-def _ending(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
-    """Return why a frame has no end: its bytes end, or its header leads to none.
+def _find_end_fault(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
+    """Return why a frame has no end.
+
+    Either its bytes end early, or its header leads to no layout.
 
     Raises:
-        Exception: whatever an expression of the struct raised.
+        Exception: any error of an expression of the struct.
     """
-    part = _open_part(examined)
+    part = _find_open_part(examined)
     if part is not None and part.failure is not None:
-        return _ending(part, cut_off)
+        return _find_end_fault(part, cut_off)
     failure = examined.failure
     if failure is None or isinstance(failure, UnknownSelectorError):
-        return _shortage(examined, cut_off)
+        return _describe_shortage(examined, cut_off)
     if isinstance(failure, TooLongError | UnknownPartError):
-        return _refusal(examined, failure)
+        return _describe_refusal(examined, failure)
     raise failure
 
 
-def _open_part(examined: ExaminedFrame) -> ExaminedFrame | None:
-    """Return the last of the parts that have no end; None if there are none."""
+def _find_open_part(examined: ExaminedFrame) -> ExaminedFrame | None:
+    """Return the last part without an end; None if all parts are complete."""
     if isinstance(examined.known, HeaderWalk):
         for axis, region in examined.known.open_regions.items():
             if axis not in examined.known.regions and region.start <= len(examined.data):
@@ -260,7 +266,7 @@ def _open_part(examined: ExaminedFrame) -> ExaminedFrame | None:
     return None
 
 
-def _shortage(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
+def _describe_shortage(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
     end = examined.start + len(examined.data)
     size = None
     if examined.layout is not None and not examined.prefix:
@@ -272,8 +278,8 @@ def _shortage(examined: ExaminedFrame, cut_off: WireField | None) -> Fault:
     return Fault(CUT_OFF, cut_off.block, cut_off.start, size, end, end, needed, is_bounded)
 
 
-def _refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPartError) -> Fault:
-    """Return why a header leads to no frame."""
+def _describe_refusal(examined: ExaminedFrame, failure: TooLongError | UnknownPartError) -> Fault:
+    """Return why a header leads to no layout."""
     end = examined.start + len(examined.data)
     path = f"{examined.prefix}.{failure}".strip(".") or "frame"
     if isinstance(failure, UnknownPartError):

@@ -1,9 +1,9 @@
 """Encode one frame from the values of its fields, by its layout.
 
-The values are completed first: fields that count elements or bytes follow from what is counted.
-Then the values of the header fields select the layout, every value is stored at its place, and
-lengths, constants and checksums are written last. A part of a frame (`PartSequence`) is encoded
-like a frame, and copied into the frame around it.
+The values are completed first: each count field is set from its array or parts. Then the values of
+the header fields select the layout, each value is stored at its offset, and lengths, constants and
+checksums are written last. A part of a frame (`PartSequence`) is encoded like a frame, and copied
+into the outer frame.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from lidarspec.spec.tree import (
     nodes,
 )
 
-#: The largest value that is tried for a field that counts.
+#: The largest value that is tried for a count field.
 MAX_COUNT_TRIED = 65535
 
 
@@ -67,7 +67,7 @@ def encode(layouts: LayoutLookup, given: Container, place: str) -> bytes:
 
 
 class _Encoder:
-    """The values of one frame, or of one part of it, on their way to bytes."""
+    """Encoder of one frame, or of one part of it."""
 
     def __init__(
         self,
@@ -166,7 +166,7 @@ class _Encoder:
         return to_raw(info, value)
 
     def _find_implied(self, info: FieldInfo) -> Any:
-        """Return the value that a field has if none is given; None if it has to be given."""
+        """Return the value of a field that is not given; None if it is required."""
         if info.const is not None:
             return info.const
         if info.rebuilt is not None and not info.held:
@@ -174,7 +174,7 @@ class _Encoder:
         return evaluate(info.default, self.read)
 
     def _encode_parts(self, node: PartSequence) -> list[bytes]:
-        """Return the bytes of parts, and fill in the fields that count or measure them."""
+        """Return the bytes of parts, and set the fields that count or measure them."""
         parts = get_member(self._given, node.axis, None)
         if parts is None:
             raise self._missing(node.axis)
@@ -192,7 +192,7 @@ class _Encoder:
         }
         encoded: list[bytes] = []
         following = 0
-        # From the last to the first: a part of a chain says how long the next one is.
+        # From the last to the first: in a chain, a part declares the size of the next part.
         for index in reversed(range(len(parts))):
             kind = kinds[index]
             part = parts[index]
@@ -212,8 +212,8 @@ class _Encoder:
         """Add the values of a node to the columns.
 
         Args:
-            value: the value that is given, None if there is none.
-            path, shown: of the node, without and with indices.
+            value: the given value; None if it is missing.
+            path, shown: the path of the node, without and with indices.
         """
         match node:
             case Sealed():
@@ -295,7 +295,7 @@ class _Encoder:
         """Add one value to the column of its field.
 
         Args:
-            size: of a byte string, in bytes.
+            size: the size of a byte string, in bytes.
         """
         column = self._columns.setdefault(path, [])
         if info.held and info.rebuilt is not None:
@@ -304,7 +304,7 @@ class _Encoder:
         if value is None or info.rebuilt is not None:
             value = self._find_implied(info)
             if info.kind == "bytes" and isinstance(value, bytes) and len(value) == 1:
-                value *= size  # a pattern that fills the field
+                value *= size  # a pattern byte fills the field
         if value is None:
             if path not in self._checksums:
                 raise MissingField(shown, place=self._place)
@@ -371,7 +371,7 @@ class _Encoder:
             self._store_payloads(row, leaf, column)
 
     def _check_floats(self, leaf: Leaf, column: list[Any], values: NDArray[Any]) -> None:
-        """Raise OutOfRange for a finite number that became infinite."""
+        """Raise `OutOfRange` if a finite number became infinite."""
         wide = np.array(column, np.float64).reshape(values.shape)
         lost = np.isinf(values) & np.isfinite(wide)
         if lost.any():
@@ -380,7 +380,7 @@ class _Encoder:
             raise OutOfRange(leaf.info.path, number, -largest, largest, place=self._place)
 
     def _store_payloads(self, row: NDArray[np.uint8], leaf: Leaf, column: list[Any]) -> None:
-        """Write the NaNs that keep their bits."""
+        """Write each NaN that has to keep its bits."""
         for value, offset in zip(column, leaf.offsets(), strict=True):
             if isinstance(value, WireNaN) and len(value.raw) == leaf.size:
                 row[0, offset : offset + leaf.size] = np.frombuffer(value.raw, np.uint8)
@@ -396,7 +396,7 @@ class _Encoder:
     def _check(
         self, layout: Layout, row: NDArray[np.uint8], parts: Mapping[str, list[bytes]]
     ) -> None:
-        """Raise UsageError if the frame announces other parts, or breaks a condition."""
+        """Raise `UsageError` if the header declares other parts, or a condition is false."""
         for axis, region in layout.regions.items():
             count = region.rule.count
             if count is not None and count != len(parts[axis]):
@@ -419,7 +419,7 @@ class _Encoder:
         return f"{self._prefix}.{path}".strip(".")
 
     def _missing_count_error(self, path: str) -> UsageError:
-        """Return why a field that decides the layout has no value."""
+        """Return the error for a missing field that decides the layout."""
         for axis, counting in self._schema.counting_fields.items():
             array = get_member(self._given, axis, None)
             if array is not None and counting == path:
@@ -436,7 +436,10 @@ class _Encoder:
 
 
 def to_raw(info: FieldInfo, value: Any) -> Any:
-    """Return the raw value of a field: the number behind a name of an Enum, else the value."""
+    """Return the raw value of a field.
+
+    The name of an Enum becomes its number, and a single byte of an integer field its value.
+    """
     if info.adapter is not None and info.kind == "int" and value is not None:
         return info.adapter.encode(value, 0)
     if isinstance(value, str) and info.labels:
@@ -447,9 +450,9 @@ def to_raw(info: FieldInfo, value: Any) -> Any:
 
 
 def fill_counts(given: Container, table: Schema) -> None:
-    """Set the header fields that arrays take their length from.
+    """Set the header fields that give the lengths of arrays.
 
-    A field that is given stays as it is, unless it always follows from the array.
+    A given field keeps its value, unless it is always computed from the array.
     """
     counted = set[str]()
     for axis, count in table.arrays.items():
@@ -457,15 +460,15 @@ def fill_counts(given: Container, table: Schema) -> None:
         path = table.counting_fields[axis]
         adapter = table.fields[axis].adapter if axis in table.fields else None
         if adapter is not None and array is not None:
-            with contextlib.suppress(Exception):  # refused where it is encoded
+            with contextlib.suppress(Exception):  # `_encode_adapted` raises the error
                 array = adapter.encode(array, 0)
         if not isinstance(array, list | bytes) or path is None or path in counted:
             continue
         counted.add(path)
         if axis in table.branched and get_member(given, path, None) is not None:
-            continue  # which of its lengths applies is not known yet
+            continue  # the branch, and so the formula of the length, is not known yet
         if table.fields[path].held:
-            holder, name = _holder(given, path)
+            holder, name = _find_holder(given, path)
             holder.pop(name, None)
         fill_in(count, given, len(array), table.fields, axis)
 
@@ -477,20 +480,30 @@ def fill_in(
     fields: Mapping[str, FieldInfo],
     axis: str,
 ) -> None:
-    """Set the field that a formula depends on, if it is not given, so that it gives a value."""
+    """Set the field that a formula depends on, so that the formula has a value.
+
+    A field that is already given keeps its value.
+
+    Args:
+        value: the value of the formula.
+        axis: the path of the array or of the parts, for messages.
+    """
     if formula is None:
         return
     path = counting_field(formula, fields)
     if path is None:
         return
-    holder, name = _holder(given, path)
+    holder, name = _find_holder(given, path)
     if isinstance(holder, dict) and holder.get(name) is None:
         read = functools.partial(read_given, given, fields)
         holder[name] = _find_count(formula, read, holder, name, value, fields[path], axis)
 
 
-def _holder(values: Any, path: str) -> tuple[Any, str]:
-    """Return the mapping that holds a field, and its name there; missing mappings are made."""
+def _find_holder(values: Any, path: str) -> tuple[Any, str]:
+    """Return the mapping that contains a field, and the name of the field in it.
+
+    Missing mappings are added.
+    """
     *parents, last = path.split(".")
     for parent in parents:
         values = values.setdefault(parent, Container())
@@ -506,7 +519,7 @@ def _find_count(
     info: FieldInfo,
     axis: str,
 ) -> int:
-    """Return the value of the count field that gives this length, and leave it in its holder."""
+    """Set a count field to the value that gives this length, and return the value."""
     if info.kind == "int":
         top = int(info.limits[1])
     else:
@@ -516,11 +529,11 @@ def _find_count(
         holder[field] = value
         try:
             return evaluate(count, read)
-        except Exception:  # an expression of the struct, that may divide by what is tried
+        except Exception:  # an expression of the struct may divide by the value
             return -1
 
     tried = range(min(top, MAX_COUNT_TRIED) + 1)
-    # Mostly the length itself, or a number that the length grows with.
+    # Usually it is the length itself, or the length increases with it.
     if length <= top and length_for(length) == length:
         return length
     guess = bisect.bisect_left(tried, length, key=length_for)
@@ -533,7 +546,8 @@ def _find_count(
 def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
     """Return the kind of a part that is given by its values.
 
-    It is the first that has all fields of these, and no other constant; else the first.
+    It is the first kind that has all given fields and no contradicting constant. If no kind has, it
+    is the first kind.
     """
     for kind in node.kinds:
         fields = make_schema(kind.root)
@@ -550,7 +564,7 @@ def find_kind(node: PartSequence, part: Mapping[str, Any]) -> Kind:
 
 @functools.lru_cache(maxsize=1024)
 def list_paths(root: Node) -> frozenset[str]:
-    """Return the paths of all fields of a frame type, and of the structs and arrays around them."""
+    """Return the paths of all fields of a frame type, and of their structs and arrays."""
     table = make_schema(root)
     paths = {*table.all_fields, *table.arrays, *table.derived}
     for node in nodes(root):
@@ -561,10 +575,10 @@ def list_paths(root: Node) -> frozenset[str]:
 
 
 def read_given(given: Mapping[str, Any], fields: Mapping[str, FieldInfo], path: str) -> Any:
-    """Return a value that is given for a frame, as formulas read it (`lidarspec.spec.tree.Read`).
+    """Return a given value of a frame, for formulas (`lidarspec.spec.tree.Read`).
 
     Raises:
-        LookupError: if there is none.
+        LookupError: if the value is missing.
     """
     value: Any = given
     for step in split_path(path):

@@ -1,4 +1,4 @@
-"""Paths of fields, such as "points[3].distance", as names and indices."""
+"""Convert paths of fields, for example "points[3].distance", to names and indices."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ Steps = list[int | str]
 
 
 def split_path(path: str) -> Steps:
-    """Return the names and indices of a path: ["points", 3, "distance"] of "points[3].distance"."""
+    """Return the names and indices of a path.
+
+    For "points[3].distance" the result is ["points", 3, "distance"].
+    """
     return [int(step) if step.isdigit() else step for step in re.findall(r"\w+|\*", path)]
 
 
@@ -27,11 +30,14 @@ def put_value(
     length: Callable[[str], int] = lambda array: 0,
     place: str = "",
 ) -> Any:
-    """Return a struct or array, or a new one for None, with a value set in it.
+    """Return a struct or array in which the field at a path has this value.
+
+    Dicts of `target` are changed in place, and lists are copied.
 
     Args:
-        length: returns the number of elements of the array at a path, 0 if it is not known; "*"
-            stands for each of them.
+        target: the struct or array; None makes a new one.
+        length: returns the number of elements of the array at a path, 0 if it is not known. The
+            index "*" sets the field in all elements.
     """
     if not path:
         return value

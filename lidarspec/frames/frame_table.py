@@ -94,7 +94,7 @@ class LayoutRows:
 
 
 class CompiledTable:
-    """A `Table` of frames whose layout is compiled."""
+    """A `Table` of frames with compiled layouts."""
 
     def __init__(self, schema: Schema, groups: Sequence[LayoutRows]) -> None:
         self.schema = schema
@@ -107,7 +107,7 @@ class CompiledTable:
 
     def raw(self, path: str) -> NDArray[Any]:
         info = self.schema.columns[path]
-        dtype = info.dtype or np.dtype(object)  # of a computed constant that is no number
+        dtype = info.dtype or np.dtype(object)  # a computed constant may be any object
         if len(self.groups) == 1:
             group = self.groups[0]
             leaf = group.layout.column(path)
@@ -129,7 +129,7 @@ class CompiledTable:
     def _load(self, leaf: Leaf | Derivation, path: str, group: LayoutRows) -> NDArray[Any]:
         """Return the values of a field in the frames of a group.
 
-        An index in the path removes the axis of which it selects one element.
+        An index in the path selects one element, and removes the axis of the array.
         """
         values = group.layout.load(path, group.rows)
         if "[" in path:
@@ -288,7 +288,7 @@ class _PartRows:
 def _group_by_layout(
     pieces: Sequence[_PartRows], ranks: Sequence[NDArray[np.intp]]
 ) -> list[LayoutRows]:
-    """Return the parts of all pieces as groups of one layout each.
+    """Return the parts grouped by layout.
 
     Args:
         ranks: for each piece, the indices of its parts in the table of parts.
@@ -305,12 +305,12 @@ def _group_by_layout(
 
 
 def _gather_parts(parts: Sequence[tuple[_PartRows, NDArray[np.intp]]]) -> LayoutRows:
-    """Return pieces of one layout in one buffer as a group, in stream order."""
+    """Return parts of one layout in one buffer as a group, in stream order."""
     where = np.concatenate([own for _, own in parts])
     offsets = np.concatenate([piece.offsets for piece, _ in parts])
     first, _ = parts[0]
     if len(where) and where.max() == len(where) - 1:
-        # The group has all parts of the table, so that `where` is a permutation: no need to sort.
+        # The group has all parts of the table, so `where` is a permutation and needs no sorting.
         order = np.empty(len(where), np.intp)
         order[where] = np.arange(len(where))
     else:
@@ -537,7 +537,9 @@ class ParsedTable:
 
 
 def _collect_values(parsed: Any, names: list[str], axes: int) -> Any:
-    """Return the value at a path, or nested lists of values; None if a branch omits it.
+    """Return the value at a path; None if a branch omits it.
+
+    A value in arrays is returned as nested lists.
 
     Args:
         names: the names that lead to the value.
@@ -566,7 +568,10 @@ def _collect_elements(parsed: list[Any], names: list[str], axes: int) -> list[An
 
 
 def _find_present(value: Any) -> Any:
-    """Return whether there is a value; nested lists of booleans if some elements lack it."""
+    """Return whether the value exists.
+
+    For nested lists in which some elements are missing, it is nested lists of booleans.
+    """
     if not isinstance(value, list):
         return value is not None
     present = [_find_present(part) for part in value]
@@ -578,7 +583,7 @@ def _find_present(value: Any) -> Any:
 def _copy_value(column: NDArray[Any], index: int, value: Any) -> None:
     """Copy a value or nested lists to an index of a padded array.
 
-    Lists shorter than the array leave the padding as it is.
+    If a list is shorter than the array, the padding after it is not changed.
     """
     if isinstance(value, list) and column.ndim > 2:
         for place, part in enumerate(value):
@@ -626,7 +631,10 @@ def _iter_numbers(value: Any) -> Iterator[Any]:
 
 
 def _are_numbers(found: list[Any]) -> bool:
-    """Return whether values are numbers that fit into 64 bits, or equally nested lists of them."""
+    """Return whether all values are numbers that fit into 64 bits.
+
+    Nested lists of numbers are accepted as well.
+    """
     values = list(_iter_numbers(found))
     if not all(isinstance(value, int | float) for value in values):
         return False
@@ -639,7 +647,10 @@ def _are_numbers(found: list[Any]) -> bool:
 
 
 def _outer_shape(leaf: Leaf | Derivation) -> tuple[int, ...]:
-    """Return the lengths of the arrays around a field; a text without a character is a value."""
+    """Return the lengths of the arrays around a field.
+
+    A bytes field with an adapter is one value, and its axis of bytes is left out.
+    """
     if leaf.info.adapter is not None and leaf.info.kind == "bytes":
         return leaf.shape[:-1]
     return leaf.shape

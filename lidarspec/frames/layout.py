@@ -106,13 +106,13 @@ class Leaf:
 
     Attributes:
         info: the field.
-        offset: of its first element, in bytes from the start of the frame.
+        offset: the offset of its first element, in bytes from the start of the frame.
         shape: the number of elements along each of its arrays.
-        strides: bytes from one element to the next along each array; an array inside a bit block
+        strides: bytes from one element to the next along each array. An array inside a bit block
             has no stride.
-        wire: its dtype with byte order if it can be read directly, else None.
-        elements: without `wire`, the bits of each element of the innermost array. One entry if
-            that array is not inside the bit block.
+        wire: its dtype with byte order if NumPy can read it directly, else None.
+        elements: if `wire` is None, the bits of each element of the innermost array. It has one
+            entry if that array is not inside the bit block.
         size: bytes of one element, or of the bit block that the field is in.
     """
 
@@ -174,7 +174,7 @@ class Leaf:
         return which, self._is_scalar.load(gather_rows(buffer, starts, self.size))
 
     def read_first(self, frame: bytes | memoryview) -> int | None:
-        """Return its value in the first bytes of a frame, None if they are too few."""
+        """Return its value in the first bytes of a frame; None if they end before it."""
         if self.offset + self.size <= len(frame):
             return self.scalar(frame)
         return None
@@ -233,7 +233,7 @@ class Leaf:
 
     @property
     def _packed(self) -> bool:
-        """Return whether the innermost array is inside the bit block, and so has no stride."""
+        """Whether the innermost array is inside the bit block, and so has no stride."""
         return len(self.shape) > len(self.strides)
 
     def _view(self, rows: Bytes2D, dtype: np.dtype[Any], offset: int) -> NDArray[Any]:
@@ -271,10 +271,10 @@ class Leaf:
         return total
 
     def _whole(self, rows: Bytes2D, element: BitField, wide: np.dtype[Any]) -> NDArray[Any] | None:
-        """Return values of contiguous bits, read from words that end with the last of these bytes.
+        """Return values of contiguous bits; None if they cannot be read as one word.
 
-        Returns None if the bits are not contiguous, if they do not fit into a word, or if the word
-        would begin before the frame.
+        Each word ends with the last byte of the value. The result is None if the bits are not
+        contiguous, if they do not fit into a word, or if the word would begin before the frame.
         """
         if element.run is None:
             return None
@@ -304,10 +304,10 @@ class Leaf:
         return min(byte_offsets), max(byte_offsets) + 1
 
     def element(self, path: str, indices: Mapping[str, int]) -> Leaf | None:
-        """Return one element of its arrays, None if it does not exist.
+        """Return one element of its arrays; None if it does not exist.
 
-        A negative index counts from the last element. An array with an index that contains an
-        array without one keeps its axis, with length 1.
+        A negative index counts from the last element. An array with an index keeps its axis, with
+        length 1, if it contains an array without an index.
         """
         info = get_element(self.info, path, indices)
         if info is None:
@@ -347,15 +347,15 @@ class Leaf:
 
 @dataclass(frozen=True, eq=False)
 class Derivation:
-    """A value that frames of one layout have without bytes of its own.
+    """A value without bytes of its own in frames of one layout.
 
     Attributes:
         info: the value as a field.
         shape: the number of elements along each of its arrays.
-        strides: what is added to `start` from one element to the next along each array.
-        formula: of fields of the frame; None if the value is `start`.
+        strides: the difference from one element to the next along each array, starting at `start`.
+        formula: a formula of fields of the frame; None if the value is computed from `start`.
         start: the value of the first element.
-        picked: the index in each array that is taken; None for all elements.
+        picked: the index of the element to return in each array; None for all elements.
     """
 
     info: FieldInfo
@@ -392,7 +392,7 @@ class Derivation:
         return values
 
     def element(self, path: str, indices: Mapping[str, int]) -> Derivation | None:
-        """Return one element of its arrays, None if it does not exist."""
+        """Return one element of its arrays; None if it does not exist."""
         info = get_element(self.info, path, indices)
         picked = tuple(indices.get(axis) for axis in self.info.axes)
         exists = all(
@@ -425,7 +425,7 @@ class Seal:
     end: int = 0
 
     def covers(self, other: Seal) -> bool:
-        """Return whether it covers a field that holds the other checksum."""
+        """Return whether it covers a field that holds the checksum of another seal."""
         return any(
             start < leaf.byte_span[1] and leaf.byte_span[0] < end
             for start, end in self.spans
@@ -447,7 +447,7 @@ class Seal:
         return total
 
     def _byte_shifts(self, leaf: Leaf) -> NDArray[np.uint64]:
-        """Return by how many bits to shift each byte of a bytes field, (k,)."""
+        """Return the left shift of each byte of a bytes field, in bits, (k,)."""
         powers = np.arange(0, leaf.info.bits, 8, dtype=np.uint64)
         if self.algorithm.order == "little":
             return powers
@@ -457,7 +457,8 @@ class Seal:
         """Compute the checksums of the frames, (n,).
 
         Args:
-            sums: computes the checksums; if it returns None, the algorithm does.
+            sums: a function that computes the checksums. If it is None or returns None, the
+                algorithm of the seal computes them.
         """
         values = None if sums is None else sums(self, rows)
         if values is None:
@@ -476,7 +477,10 @@ class Seal:
             shift += leaf.info.bits
 
     def sound(self, frame: bytes) -> bool:
-        """Return whether one frame has a correct checksum, or a value that means "not filled"."""
+        """Return whether the checksum of one frame is correct.
+
+        A value that means "not filled" counts as correct.
+        """
         stored = shift = 0
         for leaf in self.leaves:
             if leaf.info.kind == "bytes":
@@ -504,7 +508,7 @@ class Seal:
         A value that means "not filled" counts as correct.
 
         Args:
-            sums: computes the checksums, as for `compute`.
+            sums: a function that computes the checksums, as for `compute`.
         """
         stored = self.load_stored(rows)
         if self.absent:
@@ -547,9 +551,9 @@ class Condition:
         return cls(fields, what.condition, what.path)
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
-        """Return whether the condition holds, element by element.
+        """Return whether the condition is true, element by element.
 
-        It does not hold if one of its fields is missing in `raw`.
+        It is false if one of its fields is missing in `raw`.
         """
         if len(raw) < len(self.fields):
             return np.zeros(1, np.bool_)
@@ -586,15 +590,18 @@ class FrameTest(Protocol):
         """The fields that the test reads."""
 
     def values(self, raw: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-        """Return whether the test holds, element by element.
+        """Return whether the test is true, element by element.
 
         Args:
-            raw: the raw values of its fields, by path, without the fields that a layout lacks.
+            raw: the raw values of its fields, by path, without fields that a layout does not have.
         """
 
 
 def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> NDArray[np.bool_]:
-    """Return which frames, given as rows of bytes, pass a test with all elements, (n,)."""
+    """Return which frames, given as rows of bytes, pass a test, (n,).
+
+    A frame passes if the test is true for all its elements.
+    """
     raw = {
         info.path: leaf.load(rows)
         for info in test.fields
@@ -607,13 +614,14 @@ def find_passing(test: FrameTest, leaves: Mapping[str, Leaf], rows: Bytes2D) -> 
 
 @dataclass(frozen=True, eq=False)
 class LayoutRefusal:
-    """The result for a header that leads to no layout.
+    """The reason why a header leads to no layout.
 
     Attributes:
         error: the error of a plugin expression that failed.
-        by_constant: True if a constant is wrong. Without it and `error`, the frame is too long.
-        constants: if the frame is too long, its constants before that point. A candidate without
-            them is refused because of a constant instead.
+        by_constant: True if a constant is wrong. If it is False and `error` is None, the frame is
+            too long.
+        constants: if the frame is too long, its constants before that point. A candidate in which
+            one of them is wrong is refused because of this constant instead.
     """
 
     error: PluginError | None = None
@@ -630,16 +638,16 @@ class Layout:
         leaves: the position of each field, by path.
         constants: offset -> (mask, value).
         seals: its checksums, inner ones first.
-        places: byte range of each named part outside arrays.
+        places: the byte range of each named part outside arrays.
         branches: the branch that each `When` and `Select` takes.
-        following: fields whose values follow from the header, with these values. They are written
-            when a frame is built, and not checked when it is parsed.
+        following: fields with values that follow from the header, and these values. They are
+            written when a frame is built, and not checked when it is parsed.
         lengths: the length of each array, by its axis; 0 for an array inside an empty array.
         regions: the `Region` of each sequence of parts (frames within the frame), by its axis.
         held: the values of the fields that declare the sizes of parts, in the form of `constants`.
         conditions: conditions that the values of its fields have to meet.
-        derived: by path, the values that have no bytes of their own, and the places of those that
-            repeat bytes of other fields.
+        derived: the `Derivation` of each value without bytes of its own, by path. For a value that
+            repeats the bytes of another field, it is the `Leaf` of these bytes.
         notes: cache for results derived from the layout.
     """
 
@@ -661,7 +669,7 @@ class Layout:
     def known(self) -> Mapping[int, tuple[int, int]]:
         """The bits that all frames of this layout have: offset -> (mask, value).
 
-        They are the constants and the lengths in `byte_span`.
+        They are the bits of `constants` and of `held`.
         """
         both = dict(self.constants)
         for offset, (mask, value) in self.held.items():
@@ -671,16 +679,19 @@ class Layout:
 
     @cached_property
     def _mask(self) -> int:
-        """The masks of `bits_by_offset` as one little-endian number."""
+        """The masks of `known` as one little-endian number."""
         return sum(mask << 8 * offset for offset, (mask, _) in self.known.items())
 
     @cached_property
     def _value(self) -> int:
-        """The values of `bits_by_offset` as one little-endian number."""
+        """The values of `known` as one little-endian number."""
         return sum(value << 8 * offset for offset, (_, value) in self.known.items())
 
     def column(self, path: str) -> Leaf | Derivation | None:
-        """Return the position of a field, or how a derived value is computed; None without it."""
+        """Return the position of a field, or the `Derivation` of a derived value.
+
+        Returns None if the layout does not have it.
+        """
         return self.leaves.get(path) or self.derived.get(path)
 
     def load(self, path: str, rows: Bytes2D) -> NDArray[Any]:
@@ -724,7 +735,7 @@ class Layout:
             seal.fill(rows)
 
     def seal_header(self, rows: Bytes2D) -> None:
-        """Write the constants, and the values that follow from the header, into rows of bytes."""
+        """Write constants, and values that follow from the header, into rows of bytes."""
         for leaf, value in self.following:
             leaf.store(rows, value)
         set_bits(rows, self.known)
@@ -746,7 +757,10 @@ Word = tuple[int, np.dtype[Any], Any, Any]
 
 
 def sort_constants(constants: Mapping[int, tuple[int, int]]) -> Marks:
-    """Return constants sorted by offset, whole bytes first because they are more distinctive."""
+    """Return constants sorted by offset, whole bytes before single bits.
+
+    Whole bytes rule out more candidates.
+    """
     constant_bytes = [(offset, mask, value) for offset, (mask, value) in constants.items()]
     return tuple(sorted(constant_bytes, key=lambda mark: (mark[1] != 0xFF, mark[0])))
 
@@ -791,7 +805,7 @@ def match_word(values: NDArray[Any], word: Word) -> NDArray[np.bool_]:
 
 
 def match_constants(constants: tuple[Word, ...], rows: Bytes2D) -> NDArray[np.bool_] | None:
-    """Return which rows have all constants, (n,); None if all rows do."""
+    """Return which rows have all constants, (n,); None if all rows have them."""
     held: NDArray[np.bool_] | None = None
     for word in constants:
         offset, dtype, _, _ = word

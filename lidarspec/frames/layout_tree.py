@@ -36,10 +36,10 @@ from lidarspec.spec.description import Frame
 
 
 class UnknownSelectorError(Exception):
-    """The layout depends on a field whose value is not given, or on the size of parts.
+    """The layout depends on a field, or the size of parts, that is not known yet.
 
     Attributes:
-        leaf: where it stands.
+        leaf: the position of the field or of the parts.
     """
 
     def __init__(self, leaf: Leaf | PartsSize) -> None:
@@ -48,7 +48,9 @@ class UnknownSelectorError(Exception):
 
 
 class TooLongError(Exception):
-    """The header has an invalid length: longer than the maximum of the frame type, or 0.
+    """The header has an invalid length.
+
+    The frame would be longer than the maximum of the frame type, or have no bytes.
 
     Attributes:
         path: path of the part that is too long.
@@ -62,7 +64,7 @@ class TooLongError(Exception):
 
 
 class UnknownPartError(Exception):
-    """The constants of a part match no kind of parts."""
+    """No kind of parts has the constants of a part."""
 
 
 class CutOffError(Exception):
@@ -72,19 +74,19 @@ class CutOffError(Exception):
 def find_layout(
     root: tree.Node, values: Mapping[str, int], limit: int, given: Mapping[str, int] | None = None
 ) -> Layout:
-    """Return the layout of the frames whose header fields have these values.
+    """Return the layout of the frames with these values of header fields.
 
     Args:
-        values: raw, by path, of the fields that the layout depends on.
-        limit: the longest frame, in bytes.
-        given: of parts, raw values of fields of the frame around them, by their path there.
+        values: the raw values of the fields that the layout depends on, by path.
+        limit: the maximum size of a frame, in bytes.
+        given: for parts, raw values of fields of the outer frame, by their path there.
 
     Raises:
-        Unknown: where the value of a further field decides.
-        TooLong: where the frame would be longer than `limit`, or without a byte.
-        Unlike: where a part has the constants of no kind.
-        NotCompilable: where construct alone can tell what comes next.
-        Exception: whatever a formula raises on these values.
+        UnknownSelectorError: if the layout depends on another field.
+        TooLongError: if the frame would be longer than `limit`, or have no bytes.
+        UnknownPartError: if no kind of parts has the constants of a part.
+        NotCompilableError: if only construct can parse the struct.
+        Exception: any error of a formula with these values.
     """
     return walk_layout(HeaderWalk(values, limit, given or {}), root)
 
@@ -93,7 +95,8 @@ def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
     """Return the layout that a walk leads to.
 
     Raises:
-        Exception: as `find_layout`, or what `walk.asked` raises; the walk then keeps what it found.
+        Exception: as `find_layout`, or any error of `walk.request`. The walk then keeps the results
+            until there.
     """
     walk.visit(root, "")
     if not walk.cursor:
@@ -102,31 +105,35 @@ def walk_layout(walk: HeaderWalk, root: tree.Node) -> Layout:
 
 
 def find_prefix(root: tree.Node, limit: int) -> dict[int, tuple[int, int]]:
-    """Return the constants whose place depends on no header field: offset -> (mask, value)."""
+    """Return the constants at offsets that depend on no header field.
+
+    Returns:
+        offset -> (mask, value).
+    """
     walk = HeaderWalk({}, limit)
     with contextlib.suppress(
         Exception
-    ):  # whatever an expression of the struct raises: what comes before counts
+    ):  # if an expression of the struct fails, the constants before it are still known
         walk.visit(root, "")
     return walk.constants
 
 
-def _unknown(leaf: Leaf | PartsSize, _: HeaderWalk) -> int:
+def _raise_unknown(leaf: Leaf | PartsSize, _: HeaderWalk) -> int:
     raise UnknownSelectorError(leaf)
 
 
-Asked = Callable[[Leaf | PartsSize, "HeaderWalk"], int]
+ValueRequest = Callable[[Leaf | PartsSize, "HeaderWalk"], int]
 
 
 @dataclass
 class HeaderWalk:
-    """One walk through a tree: the values of header fields, how far it came, and what it found."""
+    """A walk through a tree for given values of header fields, and its results."""
 
     values: Mapping[str, int]
     limit: int
     given: Mapping[str, int] = field(default_factory=dict)
-    #: called for the value of a field that is not in `values`; may replace `values`.
-    asked: Asked = _unknown
+    #: returns the value of a field that is not in `values`; may replace `values`.
+    request: ValueRequest = _raise_unknown
     #: number of bytes of the frame if no more follow; None if more may follow.
     room: int | None = None
     cursor: int = 0
@@ -137,24 +144,24 @@ class HeaderWalk:
     branches: dict[tree.Node, tree.Node] = field(default_factory=dict)
     lengths: dict[str, int] = field(default_factory=dict)
     regions: dict[str, Region] = field(default_factory=dict)
-    #: regions whose size is not known yet.
+    #: regions of unknown size.
     open_regions: dict[str, Region] = field(default_factory=dict)
-    #: what values have to meet; each once, as a key.
+    #: conditions that values have to meet, each once.
     conditions: dict[tree.FieldInfo | tree.Check, Condition] = field(default_factory=dict)
     #: values without bytes of their own, by path.
     derived: dict[str, Leaf | Derivation] = field(default_factory=dict)
     #: the offset of each part; in arrays, that of the first element.
     starts: dict[str, int] = field(default_factory=dict)
-    #: elements without a byte, of all arrays.
+    #: number of elements of size 0 in all arrays.
     empty: int = 0
-    #: fields that formulas can ask for by now; None for a field that the header leaves out.
+    #: fields before the cursor, for formulas; None for a field that the header omits.
     parts: dict[str, Leaf | PartsSize | None] = field(default_factory=dict)
 
     def layout(self) -> Layout:
         """Return the layout that the walk found."""
         held = self._held_bits()
-        self.asked = _unknown  # what follows from the header asks for no more of it
-        seals = tuple(_in_order(self.seals))
+        self.request = _raise_unknown  # the layout is known, so no other field may be requested
+        seals = tuple(_order_seals(self.seals))
         following = tuple(self._following())
         leaves = PathMapping(self.leaves, Leaf.element)
         found = (
@@ -172,12 +179,12 @@ class HeaderWalk:
         return Layout(*found, held, tuple(self.conditions.values()), derived)
 
     def read(self, path: str) -> int | None:
-        """Return the raw value of a field that a formula asks for.
+        """Return the raw value of a field in a formula.
 
-        Returns None if the header leaves it out.
+        Returns None if the header omits the field.
 
         Raises:
-            Unknown: for a field whose value is not given.
+            UnknownSelectorError: if the value of the field is not given.
         """
         if path.startswith("_."):
             return self.given[path[2:]]
@@ -189,11 +196,11 @@ class HeaderWalk:
         if isinstance(part, PartsSize) and part.region.size is not None:
             return part.region.size
         if path not in self.values:
-            return self.asked(part, self)
+            return self.request(part, self)
         return self.values[path]
 
     def _element(self, path: str) -> int:
-        """Return the value of an element of an array that stands before the formula."""
+        """Return the value of an array element that is before the formula."""
         base, indices = without_indices(path)
         if base in self.leaves:
             leaf = self.leaves[base].element(path, indices)
@@ -203,12 +210,16 @@ class HeaderWalk:
             raise IndexError(f"{base} has no such element")
         if path in self.values:
             return self.values[path]
-        return self.asked(leaf, self)
+        return self.request(leaf, self)
 
     def visit(
         self, node: tree.Node, path: str, shape: tuple[int, ...] = (), strides: tuple[int, ...] = ()
     ) -> None:
-        """Go through a part; `shape` and `strides` of the arrays that it is in."""
+        """Add a part and move the cursor behind it.
+
+        Args:
+            shape, strides: of the arrays that the part is in.
+        """
         start = self.starts[path] = self.cursor
         match node:
             case tree.Struct():
@@ -301,7 +312,10 @@ class HeaderWalk:
     def _peek(
         self, node: tree.Derived, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Add the fields of a node at this place, whose bytes belong to the nodes behind it."""
+        """Add fields that are read at the cursor without moving it.
+
+        Their bytes belong to the nodes after them.
+        """
         start = self.cursor
         leaves = self.leaves
         self.leaves = {}
@@ -312,7 +326,10 @@ class HeaderWalk:
         self.cursor = start
 
     def _parts(self, node: tree.PartSequence, path: str) -> None:
-        """Visit parts; their size follows from the header or is requested like a field."""
+        """Add a sequence of parts.
+
+        The header gives their size, or it is requested like the value of a field.
+        """
         given = {ref.path: int(self._value(ref) or 0) for ref in node.outer}
         rule = PartRule(
             *(
@@ -346,9 +363,9 @@ class HeaderWalk:
     def _no_element(
         self, node: tree.Node, path: str, shape: tuple[int, ...], strides: tuple[int, ...]
     ) -> None:
-        """Visit an element that the array does not have, for its fields alone.
+        """Add the fields of the element type of an empty array.
 
-        Nothing is required of it.
+        No bytes, constants or conditions are added.
         """
         start = self.cursor
         constants = dict(self.constants)
@@ -357,7 +374,7 @@ class HeaderWalk:
         except UnknownSelectorError:
             raise
         except Exception:
-            pass  # whatever an expression raises: what construct never looks at cannot fail
+            pass  # construct never parses this element, so its expressions may fail
         finally:
             self.cursor = start
             self.constants = constants
@@ -474,15 +491,15 @@ class HeaderWalk:
         return {offset: (int(rows[1, offset]), int(rows[0, offset])) for offset in offsets}
 
     def _following(self) -> Iterator[tuple[Leaf, int]]:
-        """Yield the values of rebuilt fields that follow from known values.
+        """Yield rebuilt fields with the values that follow from known values.
 
-        These are constants, and the fields that the layout depends on.
+        Known are constants, and the fields that the layout depends on.
         """
         for leaf in self.leaves.values():
             if leaf.info.rebuilt is not None and not leaf.info.held and not leaf.shape:
                 with contextlib.suppress(
                     Exception
-                ):  # of the others: construct evaluates them when a frame is built
+                ):  # construct evaluates other fields when a frame is built
                     yield leaf, operator.index(tree.evaluate(leaf.info.rebuilt, self._read_known))
 
     def _read_known(self, path: str) -> int | None:
@@ -502,7 +519,7 @@ class HeaderWalk:
 
 
 def _set_stride(leaves: dict[str, Any], axis: str, depth: int, size: int) -> None:
-    """Set the distance of the elements of an array in all leaves that are in it."""
+    """Set the stride of an array in all leaves that are in it."""
     for path, leaf in leaves.items():
         is_constant = isinstance(leaf, Derivation) and not leaf.strides[depth:]
         if axis in leaf.info.axes and not is_constant:
@@ -510,8 +527,11 @@ def _set_stride(leaves: dict[str, Any], axis: str, depth: int, size: int) -> Non
             leaves[path] = replace(leaf, strides=strides)
 
 
-def _in_order(seals: list[Seal]) -> Iterator[Seal]:
-    """Checksums, each before those that cover its field; inner ones first where neither does."""
+def _order_seals(seals: list[Seal]) -> Iterator[Seal]:
+    """Yield checksums, each before the checksums that cover its field.
+
+    If neither covers the field of the other, the inner one is first.
+    """
     left = list(seals)
     while left:
         free = (
@@ -523,11 +543,11 @@ def _in_order(seals: list[Seal]) -> Iterator[Seal]:
         yield first
 
 
-#: distinct headers remembered; garbage must not fill the memory with their layouts.
-REMEMBERED = 4096
+#: maximum number of cached headers: random input must not fill the memory with layouts.
+MAX_CACHED_HEADERS = 4096
 
-#: different values of a header field that are looked for one by one.
-FEW = 4
+#: up to this number of distinct values, one search for each is faster than sorting.
+MAX_SEARCHED_VALUES = 4
 
 
 @dataclass(eq=False)
@@ -537,14 +557,14 @@ class HeaderNode:
     Attributes:
         values: raw values of the deciding fields above this node, by path.
         above: the parent node; None for the root.
-        leaf: the deciding field of this node; None if not known yet, or if there is a result.
+        leaf: the deciding field of this node; None if not known yet, or if the node has a result.
         before: all fields found before `leaf`, by path.
-        constants: the constants found before `leaf`, or before the end of a frame that is cut off.
+        constants: the constants found before `leaf`, or before the end of a truncated frame.
             Constants that all frames begin with are left out.
         least: known minimum size in bytes of a frame with these values; 0 if not known.
         value_classes: the values of `leaf` that lead to different layouts.
         children: child nodes by value of `leaf`.
-        result: the layout, or why there is none; None if not known yet.
+        result: the layout or the refusal; None if not known yet.
     """
 
     values: Mapping[str, int] = field(default_factory=dict)
@@ -564,14 +584,16 @@ class HeaderNode:
         return self.value_classes.representative(value)
 
     def child(self, value: int) -> HeaderNode:
-        """Return the branch of a value."""
+        """Return the child node of a value, and add it if it is missing."""
         if value not in self.children:
             assert self.leaf is not None
             self.children[value] = HeaderNode({**self.values, self.leaf.info.path: value}, self)
         return self.children[value]
 
 
-#: what reads the field of a node in some of the candidates: the indices of those that have it, None
+#: for all; and its values.
+#: reads the field of a node in candidates. Returns the indices of the candidates that have the
+#: field (None: all), and the values.
 #: for all; and its values.
 Reader = Callable[[HeaderNode, NDArray[np.intp]], tuple[NDArray[np.intp] | None, NDArray[Any]]]
 Group = tuple[Layout | LayoutRefusal, NDArray[np.intp]]
@@ -579,18 +601,18 @@ Group = tuple[Layout | LayoutRefusal, NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class _ValueClasses:
-    """Maps the values of a selector to the values that lead to different layouts.
+    """Maps all values of a selector with the same result to one representative.
 
     Noise in place of a header can contain any of billions of lengths or keys. Values that lead to
     the same result are therefore mapped to one value, and share one branch of the tree.
 
-    If `keys` is not empty, all values that are no key are mapped to `other`. Otherwise, values are
-    clipped to `low` and `high`.
+    If `keys` is not empty, all values that are not in it are mapped to `other`. Otherwise, values
+    are clipped to `low` and `high`.
 
     Attributes:
         limits: lowest and highest value of the field.
-        rises: from this value on, a larger value never makes the frame shorter, so if a value makes
-            it too long, all larger ones do; None if no such value is known.
+        rises: from this value on, a larger value never makes the frame shorter. So if a value makes
+            the frame too long, all larger values do. None if no such value is known.
     """
 
     limits: tuple[int, int]
@@ -602,9 +624,9 @@ class _ValueClasses:
 
     @classmethod
     def of(cls, info: tree.FieldInfo, root: tree.Node, limit: int) -> _ValueClasses:
-        """Return the values of a field that the formulas of a frame distinguish.
+        """Return the classes of the values of a field in the formulas of a frame.
 
-        Returns all its values if this cannot be derived from the formulas.
+        If they cannot be derived from the formulas, each value is a class of its own.
         """
         (low, high), nodes = info.limits, list(tree.nodes(root))
         asking = [
@@ -634,11 +656,13 @@ class _ValueClasses:
             if other is None:
                 return cls(info.limits, low, high)
             return cls(info.limits, low, high, keys, other)
-        if high - low < 1 << 62 and all(_counts(node, formula) for node, formula in asking):
+        if high - low < 1 << 62 and all(
+            _is_size_formula(node, formula) for node, formula in asking
+        ):
             values = range(low, high + 1)
             spans = []
             for _, formula in asking:
-                count = functools.partial(_with_value, formula)
+                count = functools.partial(_evaluate_with, formula)
                 spans.append(
                     (
                         bisect.bisect_left(values, 0, key=count) - 1,
@@ -646,7 +670,9 @@ class _ValueClasses:
                     )
                 )
             firsts, lasts = zip(*spans, strict=True)
-            # Why a frame with too many parts is refused depends on its parts, not on the number
+            # alone.
+            # The refusal of a frame with too many parts depends also on the parts, not only on
+            # their number.
             # alone.
             if any(isinstance(node, tree.PartSequence) for node, _ in asking):
                 rises = None
@@ -658,13 +684,13 @@ class _ValueClasses:
         return cls(info.limits, low, high)
 
     def mark_too_long(self, value: int) -> _ValueClasses:
-        """Return the same, where the frame of a value is known to be too long."""
+        """Return the classes after a value has made the frame too long."""
         if self.rises is not None and self.rises <= value < self.high:
             return replace(self, high=value)
         return self
 
     def representative(self, value: int) -> int:
-        """Return the value that stands for one that means the same."""
+        """Return the representative of a value."""
         if self.keys:
             if value in self.keys:
                 return value
@@ -672,7 +698,7 @@ class _ValueClasses:
         return min(max(value, self.low), self.high)
 
     def representatives(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return those that stand for many, of their shape and type."""
+        """Return the representative of each value, with the shape and dtype of `values`."""
         if (self.low, self.high) == self.limits and not self.keys:
             return values
         if self.keys:
@@ -689,13 +715,11 @@ def _depends_on(formula: tree.Formula, info: tree.FieldInfo) -> bool:
     return any(ref.path == info.path for ref in tree.refs(formula))
 
 
-def _counts(node: tree.Node, formula: tree.Formula) -> bool:
+def _is_size_formula(node: tree.Node, formula: tree.Formula) -> bool:
     """Return whether a formula of a node counts bytes, elements or parts.
 
-    All numbers above the longest frame then mean the same.
-
-    A part takes a byte at least (`parts`), and an array of more elements than the longest frame has
-    bytes is refused as well.
+    All numbers larger than the maximum frame size then have the same result: each part has at least
+    one byte (`HeaderWalk._parts`), and an array with more elements than that is refused too.
     """
     is_number = isinstance(node, tree.Repeat | tree.Blob) or (
         isinstance(node, tree.PartSequence) and formula is node.count
@@ -704,7 +728,7 @@ def _counts(node: tree.Node, formula: tree.Formula) -> bool:
 
 
 def _is_increasing(formula: tree.Formula) -> bool:
-    """Return whether a formula is of one field, and never falls as that grows."""
+    """Return whether a formula has one field and never decreases when it increases."""
     match formula:
         case tree.Ref() | tree.Op("+", (int(), tree.Ref())):
             return True
@@ -713,8 +737,8 @@ def _is_increasing(formula: tree.Formula) -> bool:
     return False
 
 
-def _with_value(formula: tree.Formula, value: int) -> int:
-    """Return a formula of one field, where that has this value."""
+def _evaluate_with(formula: tree.Formula, value: int) -> int:
+    """Return the value of a formula of one field for this value of the field."""
     return int(tree.evaluate(formula, lambda _: value))
 
 
@@ -742,7 +766,7 @@ class _CandidateSet:
         self.refuted: list[NDArray[np.intp]] = []
 
     def longest(self, which: NDArray[np.intp]) -> bytes | memoryview:
-        """Return the available bytes of the longest candidate, up to the longest frame."""
+        """Return the available bytes of the longest candidate, at most `limit`."""
         first = which.item(0)
         if self.stops is not None and len(which) > 1:
             first = which.item((self.stops[which] - self._offsets[which]).argmax())
@@ -757,7 +781,7 @@ class _CandidateSet:
     def read(
         self, node: HeaderNode, which: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp] | None, NDArray[Any]]:
-        """Read a field, as `Reader`; candidates whose field is incomplete are handled here."""
+        """Read the field of a node, as `Reader`, and check the incomplete candidates."""
         assert node.leaf is not None
         there, values = node.leaf.read(
             self._buffer, self._offsets[which], None if self.stops is None else self.stops[which]
@@ -767,15 +791,15 @@ class _CandidateSet:
         return there, values
 
     def cut_off(self, node: HeaderNode, which: NDArray[np.intp]) -> None:
-        """Look whether some that are cut off at a node can still be frames."""
+        """Add the candidates with a wrong constant before this node to `refuted`."""
         if node.constants:
             self.refuted.append(which[self.wrong(node.constants, which)])
 
     def wrong(
         self, constants: Mapping[int, tuple[int, int]], which: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
-        """Return the mask of candidates with a wrong constant among their available bytes, (n,)."""
-        if len(which) == 1:  # each random header has constants of its own
+        """Return which candidates have a wrong constant in their available bytes, (n,)."""
+        if len(which) == 1:  # the usual case for random headers, which differ
             data = self.longest(which)
             return np.array([_is_refuted(constants, data)])
         offsets = self._offsets[which]
@@ -788,7 +812,7 @@ class _CandidateSet:
 
 
 def _is_refuted(constants: Mapping[int, tuple[int, int]], data: bytes | memoryview) -> bool:
-    """Return whether a constant is wrong, as far as the bytes go."""
+    """Return whether a constant in the available bytes is wrong."""
     return any(
         offset < len(data) and data[offset] & mask != value
         for offset, (mask, value) in constants.items()
@@ -798,11 +822,11 @@ def _is_refuted(constants: Mapping[int, tuple[int, int]], data: bytes | memoryvi
 class HeaderTree:
     """All layouts of one frame type or kind of parts.
 
-    The layouts of parts depend on the values of fields around them, too.
+    The layouts of parts also depend on the values of fields of the outer frame.
 
     Attributes:
         root: the frame type or kind of parts.
-        limit: the longest frame, in bytes.
+        limit: the maximum size of a frame, in bytes.
     """
 
     def __init__(self, root: tree.Node, limit: int, given: Mapping[str, int] | None = None) -> None:
@@ -828,8 +852,8 @@ class HeaderTree:
         Candidates with an incomplete header are left out.
 
         Args:
-            stops: where their bytes end, and no more will come; by default with those of the
-                buffer, and more may come.
+            stops: the offset after the last byte of each candidate, which is then complete. By
+                default, candidates reach to the end of the buffer, and more bytes may follow.
         """
         places = _CandidateSet(buffer, offsets, stops, self.limit)
         groups: list[Group] = []
@@ -880,12 +904,13 @@ class HeaderTree:
                 stack.append((node.child(values.item(0)), which))
             else:
                 stack += [
-                    (node.child(value), which[rows]) for value, rows in group_by_value(values, FEW)
+                    (node.child(value), which[rows])
+                    for value, rows in group_by_value(values, MAX_SEARCHED_VALUES)
                 ]
         return groups
 
     def first(self) -> tuple[tuple[Leaf, ...], dict[int, tuple[int, int]]]:
-        """Return the fields and the constants whose place depends on no header field."""
+        """Return the fields and constants at offsets that depend on no header field."""
         self._explore(self._root)
         if isinstance(self._root.result, Layout):
             leaves = self._root.result.leaves
@@ -894,9 +919,9 @@ class HeaderTree:
         return tuple(leaves.values()), find_prefix(self.root, self.limit)
 
     def common(self, rows: NDArray[np.uint8]) -> Layout | None:
-        """Return the common layout of candidates, one a row, else None.
+        """Return the common layout of rows of bytes; None if they have none.
 
-        The fields that select the layout have to mean the same in all rows.
+        All rows must have the same class of value in each field that selects the layout.
         """
         node = self._root
         while node.result is None:
@@ -924,34 +949,34 @@ class HeaderTree:
     ) -> HeaderNode:
         """Return the node that the available bytes of a header lead to.
 
-        It has a result, or a field that is not complete.
+        The node has a result, or the deciding field is incomplete.
 
         Args:
-            since: how far it led with fewer bytes.
-            is_all: there are no more bytes of this frame.
+            since: the node for fewer bytes of the same header, to continue from.
+            is_all: True if the frame has no more bytes.
         """
         if since is None:
             self._forget_many()
         return self._end(frame, since or self._root, is_all=is_all)
 
     def _forget_many(self) -> None:
-        """Forget all nodes if they are too many."""
-        if self._size > REMEMBERED:
+        """Remove all nodes if there are too many."""
+        if self._size > MAX_CACHED_HEADERS:
             self._root = HeaderNode()
             self._size = 0
 
     def layout(self, frame: bytes) -> Layout | LayoutRefusal | None:
-        """Return the layout of one frame, or None where its header is not all there."""
+        """Return the layout of one frame; None if its header is incomplete."""
         return self._end(frame, self._root).result
 
     def layout_for(self, read: Callable[[Leaf | PartsSize], int]) -> Layout:
-        """Return the layout that values of header fields lead to.
+        """Return the layout for these values of header fields.
 
         Args:
             read: returns the value of a field that decides the layout.
 
         Raises:
-            Exception: as `find_layout`, or what `read` raises.
+            Exception: as `find_layout`, or any error of `read`.
         """
         self._forget_many()
         node = self._root
@@ -962,12 +987,12 @@ class HeaderTree:
                 node = node.child(node.find_representative(read(node.leaf)))
         if isinstance(node.result, Layout):
             return node.result
-        return find_layout(self.root, node.values, self.limit, self._given)  # raises the reason
+        return find_layout(self.root, node.values, self.limit, self._given)  # raises the error
 
     def _end(
         self, data: bytes | memoryview, node: HeaderNode, *, is_all: bool = False
     ) -> HeaderNode:
-        """Return the end of the header of a frame from a node on, as `_explore` does."""
+        """Return the last node of a header from a node on, as `_explore` does."""
         while node.leaf is not None:
             value = node.leaf.read_first(data)
             if value is None:
@@ -980,16 +1005,16 @@ class HeaderTree:
     def _explore(
         self, node: HeaderNode, data: bytes | memoryview = b"", *, is_all: bool = False
     ) -> HeaderNode:
-        """Determine which fields select the layout next, in one walk.
+        """Determine the next fields that select the layout, in one walk.
 
         The walk goes as far as the header of the frame allows.
 
-        Returns:
-            The last node: with a result, with a field that the bytes end before, or with neither
-            where the frame is longer than these.
-
         Args:
-            is_all: there are no more bytes of this frame.
+            is_all: True if the frame has no more bytes.
+
+        Returns:
+            The last node. It has a result, or a field that the available bytes do not contain, or
+            neither if the frame is longer than the available bytes.
         """
 
         def size_asked(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
@@ -1010,7 +1035,7 @@ class HeaderTree:
 
         if is_all and len(data) < node.least:
             return node
-        self._size += not node.least  # it is known, where it was cut off before
+        self._size += not node.least  # a node with a known size was counted before
         walk = HeaderWalk(
             node.values, self.limit, self._given, size_asked, len(data) if is_all else None
         )
@@ -1052,7 +1077,7 @@ class HeaderTree:
 
     def _get_value_classes(self, leaf: Leaf | PartsSize) -> _ValueClasses | None:
         if not isinstance(leaf, Leaf):
-            return None  # nothing is known of parts before they are walked
+            return None  # the size of parts is only known after a search
         if leaf.info.path not in self._value_classes:
             self._value_classes[leaf.info.path] = _ValueClasses.of(leaf.info, self.root, self.limit)
         return self._value_classes[leaf.info.path]
@@ -1062,7 +1087,7 @@ class HeaderTree:
 def find_kinds(
     node: tree.PartSequence, given: tuple[tuple[str, int], ...], limit: int
 ) -> tuple[PartKind, ...]:
-    """Return the possible kinds of parts for given values of the fields around them."""
+    """Return the possible kinds of parts for these values of outer fields."""
     values = dict(given)
     return tuple(
         PartKind(kind, HeaderTree(kind.root, limit, values), find_prefix(kind.root, limit))
@@ -1072,7 +1097,7 @@ def find_kinds(
 
 @functools.lru_cache(maxsize=2048)
 def frame_layouts(frame: Frame) -> HeaderTree | NotCompilableError:
-    """Return the layouts of a frame type, or why they cannot be computed."""
+    """Return the layouts of a frame type, or the reason why it cannot be compiled."""
     try:
         check_compilable(frame.tree)
         return HeaderTree(frame.tree, frame.room)

@@ -56,21 +56,22 @@ def parse(
     verify: bool = True,
     units: bool = False,
 ) -> Any:
-    """Return the Container of raw values of exactly one frame.
+    """Return the Container of raw values of one frame.
 
     Args:
+        data: the bytes of the frame, without others before or after it.
         frame: the frame type; by default the type that fits.
         verify: False accepts wrong constants, a wrong checksum and trailing bytes.
         units: True converts scaled fields to their units.
 
     Raises:
         WireError: if the bytes are not a valid frame of this type.
-        UnknownFrame: if the sensor has no such frame type.
+        UnknownFrame: if the sensor does not have this frame type.
     """
     data = _as_bytes(data)
-    typed_values = _find_sound(sensor, data, frame)
+    typed_values = _try_parse_any(sensor, data, frame)
     if typed_values is None:
-        typed_values = _parse_unsound(sensor, data, frame, verify=verify)
+        typed_values = _parse_invalid(sensor, data, frame, verify=verify)
     name, values = typed_values
     if units:
         return _convert_units(make_schema(sensor.frames[name].tree).all_fields, values, "")
@@ -78,20 +79,20 @@ def parse(
 
 
 def identify(sensor: SensorDescription, data: bytes, *, frame: str | None = None) -> str:
-    """Return the frame type of one frame.
+    """Return the name of the frame type of one frame.
 
     Args:
         frame: the only type to try; by default all types.
 
     Raises:
-        WireError: if no type fits; it describes the fault of the closest type.
-        UnknownFrame: if the sensor has no such frame type.
+        WireError: if no type fits. It describes the fault of the type that fits best.
+        UnknownFrame: if the sensor does not have this frame type.
     """
     data = _as_bytes(data)
-    typed_values = _find_sound(sensor, data, frame)
+    typed_values = _try_parse_any(sensor, data, frame)
     if typed_values is not None:
         return typed_values[0]
-    return _parse_unsound(sensor, data, frame, verify=True)[0]
+    return _parse_invalid(sensor, data, frame, verify=True)[0]
 
 
 def _as_bytes(data: bytes) -> bytes:
@@ -101,25 +102,25 @@ def _as_bytes(data: bytes) -> bytes:
     return bytes(data)
 
 
-def _find_sound(
+def _try_parse_any(
     sensor: SensorDescription, data: bytes, frame: str | None
 ) -> tuple[str, Any] | None:
-    """Return type and values of a frame if it is valid, else None."""
+    """Return the type and the values of a frame; None if it is invalid."""
     names = sensor.frames if frame is None or frame not in sensor.frames else (frame,)
     for name in names:
         try:
-            values = _parse_sound(sensor.frames[name], data)
+            values = _try_parse(sensor.frames[name], data)
         except SpecError:
             raise
         except Exception:
-            continue  # an expression of the plugin failed: `_parse_unsound` raises its error
+            continue  # an expression of the plugin failed: `_parse_invalid` raises its error
         if values is not None:
             return name, values[0]
     return None
 
 
-def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
-    """Return the values of a frame in a 1-tuple if it is valid, else None."""
+def _try_parse(frame: Frame, data: bytes) -> tuple[Any] | None:
+    """Return the values of a frame in a 1-tuple; None if it is invalid."""
     layouts = frame_layouts(frame)
     if isinstance(layouts, NotCompilableError):
         values, size = parse_plain(frame, data)
@@ -137,10 +138,10 @@ def _parse_sound(frame: Frame, data: bytes) -> tuple[Any] | None:
     return None
 
 
-def _parse_unsound(
+def _parse_invalid(
     sensor: SensorDescription, data: bytes, frame: str | None, *, verify: bool
 ) -> tuple[str, Any]:
-    """Return type and values of an invalid frame.
+    """Return the type and the values of an invalid frame.
 
     Raises:
         WireError: if `verify` is True, or if the values cannot be read.
@@ -157,12 +158,12 @@ def _parse_unsound(
         )
     faults = [_find_fault(sensor, name, data) for name in sensor.frames]
     if not verify:
-        for likely in sorted(faults, key=functools.partial(_progress, sensor), reverse=True):
+        for likely in sorted(faults, key=functools.partial(_rank_fault, sensor), reverse=True):
             try:
                 return likely.frame, _parse_unverified(sensor, likely.frame, data)
             except WireError:
                 continue
-    raise _find_likeliest(sensor, data, faults)
+    raise _choose_likeliest(sensor, data, faults)
 
 
 def _find_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
@@ -329,7 +330,7 @@ def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
         case When() | Select():
             return _make_reader(layout.branches[node], path, layout, count)
         case Number() | Blob():
-            return _make_field_reader(node, _leaf(layout, path))
+            return _make_field_reader(node, _find_leaf(layout, path))
         case Derived():
             return _make_derived_reader(node, path, layout, count)
         case Block():
@@ -337,8 +338,8 @@ def _make_reader(node: Node, path: str, layout: Layout, count: int) -> Reader:
     return functools.partial(_read_nothing, count)
 
 
-def _leaf(layout: Layout, path: str) -> Leaf:
-    """Return the position of a field, which may be one that is read twice."""
+def _find_leaf(layout: Layout, path: str) -> Leaf:
+    """Return the position of a field, or of the field that a derived value repeats."""
     leaf = layout.column(path)
     assert isinstance(leaf, Leaf)
     return leaf
@@ -409,7 +410,12 @@ def _read_parts(region: Region, frame: bytes) -> Sequence[ListContainer]:
 
 
 def _make_unpacker(offsets: Sequence[int], order: str, code: str) -> Reader:
-    """Return a reader of one value of a format code at each offset, in ascending order."""
+    """Return a reader of one value at each offset.
+
+    Args:
+        offsets: ascending.
+        order, code: the byte order and the format character, as for `struct`.
+    """
     form = list[str]()
     size = struct.calcsize(order + code)
     end = offsets[0]
@@ -476,7 +482,7 @@ def _apply_adapter(adapter: Adapter, raw: Reader, frame: bytes) -> Sequence[Any]
 class _LabelCache(dict[int, Any]):
     """Cache of the values of an Enum, by raw value.
 
-    construct makes a new object for each value. The cache makes each object once.
+    construct makes a new object for each value. This cache makes one for each distinct value.
     """
 
     def __init__(self, info: FieldInfo) -> None:
@@ -493,13 +499,13 @@ def _look_up_labels(names: _LabelCache, numbers: Reader, frame: bytes) -> Sequen
 def _make_block_reader(node: Block, path: str, layout: Layout, count: int) -> Reader:
     """Return a reader of bit blocks.
 
-    Each block is read as one number. The byte order is the one that splits its parts into fewer
-    runs of bits.
+    Each block is read as one number, in the byte order that splits its parts into fewer runs of
+    bits.
     """
-    leaf = _leaf(layout, ".".join(name for name in (path, *node.parts[0].names) if name))
+    leaf = _find_leaf(layout, ".".join(name for name in (path, *node.parts[0].names) if name))
     offsets = leaf.offsets()
     orders = [
-        (order, [_runs(part.bits, node.size, order) for part in node.parts])
+        (order, [_find_bit_runs(part.bits, node.size, order) for part in node.parts])
         for order in BYTE_ORDERS
     ]
     order, numbers = min(orders, key=lambda each: sum(len(runs) for runs in each[1]))
@@ -524,7 +530,7 @@ def _read_block_parts(parts: Reader, blocks: Reader, frame: bytes) -> Sequence[A
     return parts(blocks(frame))
 
 
-def _runs(
+def _find_bit_runs(
     field: BitField, size: int, order: Literal["little", "big"]
 ) -> list[tuple[int, int, int]]:
     """Return the runs of bits of a part in a block that is read as one number.
@@ -576,7 +582,7 @@ def _join_runs(
 
 
 def _group_parts(parts: Sequence[tuple[tuple[str | int, ...], Reader]], count: int) -> Reader:
-    """Return a reader that builds the structs and arrays of a bit block from its parts."""
+    """Return a reader of the structs and arrays of a bit block."""
     if not parts[0][0]:
         return parts[0][1]
     groups: dict[str | int, list[tuple[tuple[str | int, ...], Reader]]] = {}
@@ -603,10 +609,10 @@ def layout_of(sensor: SensorDescription, name: str, data: bytes) -> Layout | Lay
     return layouts.layout(data)
 
 
-def _progress(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
-    """Return a sort key for how far a frame type matched before it failed.
+def _rank_fault(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
+    """Return a sort key that is higher if the fault is later in the frame.
 
-    It is highest for a whole frame with trailing bytes, or with a wrong checksum only.
+    It is highest for a complete frame with trailing bytes, or with only a wrong checksum.
     """
     if sensor.frames[fault.frame].wire is not None:
         return 0, fault.offset
@@ -620,8 +626,8 @@ def _progress(sensor: SensorDescription, fault: WireError) -> tuple[int, int]:
     return (0, fault.offset)
 
 
-def _find_likeliest(sensor: SensorDescription, data: bytes, faults: list[WireError]) -> WireError:
-    best = max(faults, key=functools.partial(_progress, sensor))
+def _choose_likeliest(sensor: SensorDescription, data: bytes, faults: list[WireError]) -> WireError:
+    best = max(faults, key=functools.partial(_rank_fault, sensor))
     if best.offset > 0 or len(sensor.frames) == 1:
         return best
     starts = []

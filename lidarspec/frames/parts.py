@@ -1,11 +1,11 @@
 """Find the parts of many frames at once. Parts are frames within a frame.
 
-The offset of a part is known as soon as the size of the part before it is. So the search runs in
-rounds, and each round finds the next part of every frame: its kind, by its constants; its layout,
-by its header; and whether another part follows.
+The offset of a part is known when the size of the part before it is known. So the search runs in
+rounds. Each round finds the next part of every frame: its kind, from its constants; its layout,
+from its header; and whether another part follows.
 
 The results are offsets in a buffer, as for frames. So parts have layouts, rows and tables like
-frames (`frame_table.Rows.parts`).
+frames (`frame_table.Table.parts`).
 """
 
 from __future__ import annotations
@@ -45,12 +45,15 @@ CONSTANT = 3
 #: status of a frame: an expression of a plugin failed.
 FAILED = 4
 
-#: announced size of a part if nothing outside its own struct declares its size.
+#: announced size of a part if no field outside the part declares it.
 ANY = -1
 
 
 class LayoutLookup(Protocol):
-    """Lookup of the layouts of a frame type or of a kind of parts (implemented by `HeaderTree`)."""
+    """Lookup of the layouts of a frame type or of a kind of parts.
+
+    `HeaderTree` implements it.
+    """
 
     root: tree.Node
     limit: int
@@ -272,7 +275,7 @@ class _PartWalk:
         """Return the frames that have another part.
 
         Args:
-            number: of parts that were found in each.
+            number: the number of parts that were found in each frame.
         """
         if np.count_nonzero(self._status):
             active = active[self._status[active] == FOUND]
@@ -338,7 +341,7 @@ class _PartWalk:
     def _match_constants(
         self, which: Offsets, constants: tuple[Word, ...]
     ) -> NDArray[np.bool_] | None:
-        """Return in which frames the next part has these constants, None if in all."""
+        """Return in which frames the next part has these constants; None if in all."""
         if constants:
             return match_constants_at(
                 self._buffer, self._ends[which], constants, self._stops_of(which)
@@ -403,7 +406,7 @@ class _PartWalk:
         self._status[which[announced < 0]] = LENGTH
 
     def _evaluate(self, kind: PartKind, layout: Layout, formula: tree.Formula, offset: int) -> int:
-        """Return the value of a formula in one part, -1 if it fails."""
+        """Return the value of a formula in one part; -1 if it fails."""
         part = self._buffer[offset : offset + layout.size].tobytes()
 
         def read(path: str) -> int | None:
@@ -427,7 +430,7 @@ def match_constants_at(
     constants: tuple[Word, ...],
     stops: Offsets | None = None,
 ) -> NDArray[np.bool_] | None:
-    """Return which candidates have the right constants, (n,); None if all have.
+    """Return which candidates have the right constants, (n,); None if all have them.
 
     In a truncated candidate, the constants are compared up to its end.
 
@@ -480,7 +483,10 @@ class PartsSize:
     def read(
         self, buffer: NDArray[np.uint8], offsets: Offsets, stops: Offsets | None = None
     ) -> tuple[Offsets | None, NDArray[Any]]:
-        """Return sizes as `Leaf.read` does; the negative status if it cannot be a frame."""
+        """Return sizes as `Leaf.read` does.
+
+        For parts that cannot be a frame, the size is the negative status.
+        """
         walked = self.region.walk(buffer, offsets, stops)
         values = np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))
         cut_off = walked.status == CUT_OFF
@@ -488,7 +494,7 @@ class PartsSize:
             return None, values
         is_all = cut_off & (
             offsets + self.region.limit <= (len(buffer) if stops is None else stops)
-        )  # these have as many bytes as the longest frame: more bytes would not help
+        )  # these already have as many bytes as the longest frame
         values[is_all] = -LENGTH
         there = np.flatnonzero(~cut_off | is_all)
         return there, values[there]
@@ -501,6 +507,9 @@ class PartsSize:
         return None
 
     def load(self, rows: Bytes2D) -> NDArray[Any]:
-        """Return sizes as `Leaf.load` does; the negative status if not all parts were found."""
+        """Return sizes as `Leaf.load` does.
+
+        If not all parts were found, the size is the negative status.
+        """
         walked = self.region.in_rows(rows)[1]
         return np.where(walked.status == FOUND, walked.sizes, -walked.status.astype(np.int64))

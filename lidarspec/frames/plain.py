@@ -1,7 +1,7 @@
-"""Frames that have no layout, parsed and built by construct, one at a time.
+"""Parse and build frames that have no layout, with construct, one at a time.
 
-Such a struct has a part whose place no formula of header fields gives: a text up to a terminator, a
-Python function that branches on values, parts without an announced length. `lidarspec show` names
+These are frames with a part that no formula of header fields can locate: a text up to a terminator,
+a Python function that branches on values, parts without a declared length. `lidarspec show` names
 the part and the reason.
 """
 
@@ -21,16 +21,16 @@ from lidarspec.spec.sensor import SensorDescription
 from lidarspec.spec.syntax import MismatchError, field_path, leaves, remove_private
 from lidarspec.spec.tree import FieldInfo
 
-#: how often a frame is built until its lengths agree.
+#: maximum number of builds of one frame until its lengths no longer change.
 MAX_BUILDS = 4
 
 
 def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any, int]:
-    """Return the values of a frame at the start of some bytes, and its size.
+    """Return the values and the size of the frame at the start of some bytes.
 
     Raises:
-        construct.ConstructError: for other bytes.
-        Exception: whatever an expression of the struct raises.
+        construct.ConstructError: if the bytes do not begin with a frame.
+        Exception: any error of an expression of the struct.
     """
     stream = io.BytesIO(data)
     values = frame.prepared.parse_stream(stream, _verify=verify)
@@ -40,10 +40,10 @@ def parse_plain(frame: Frame, data: bytes, *, verify: bool = True) -> tuple[Any,
 def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
     """Return the bytes of a frame.
 
-    Fields that say how long a part is are known when it has been built, so it is built again.
+    The values of length fields are only known after a build, so the frame is built again with them.
 
     Raises:
-        UsageError: for values that construct does not take.
+        UsageError: for values that construct does not accept.
         SpecError: if an expression of the struct fails.
     """
     sizes: dict[str, int] = {}
@@ -62,7 +62,7 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
             f"{place}: {path or 'frame'}: expected {fault.expected}, got {fault.got}"
         ) from None
     except construct.ConstructError as fault:
-        reason = _reason(fault)
+        reason = _strip_path(fault)
         raise UsageError(f"{place}: {field_path(fault.path) or 'frame'}: {reason}") from None
     except SpecError:
         raise
@@ -72,30 +72,30 @@ def build_plain(frame: Frame, values: Mapping[str, Any], place: str) -> bytes:
 
 
 def plain_fields(frame: Frame, data: bytes) -> list[WireField] | None:
-    """Return the fields of a frame at the start of some bytes; None if they are none."""
+    """Return the fields of the frame at the start of some bytes; None if it fails."""
     try:
         values = frame.prepared.parse(data, _verify=False)
     except Exception:  # an expression of the struct may raise anything
         return None
     infos = make_schema(frame.tree).all_fields
-    return list(_fields_of(values, "", data, infos))
+    return list(_iter_fields(values, "", data, infos))
 
 
-def _fields_of(
+def _iter_fields(
     struct: Any, prefix: str, data: bytes, infos: Mapping[str, FieldInfo]
 ) -> Iterator[WireField]:
-    """Return the fields of a parsed struct, whose members say where they stand."""
+    """Yield the fields of a parsed struct, which contains the spans of its members."""
     for name, (start, end) in struct["_marks"].items():
         path = f"{prefix}.{name}".strip(".")
         value = struct[name]
         elements = value if isinstance(value, list) else [value]
-        if elements and all(_is_placed(element, start, end) for element in elements):
+        if elements and all(_has_spans(element, start, end) for element in elements):
             for index, element in enumerate(elements):
                 if isinstance(value, list):
                     below = f"{path}[{index}]"
                 else:
                     below = path
-                yield from _fields_of(element, below, data, infos)
+                yield from _iter_fields(element, below, data, infos)
         elif isinstance(value, dict):  # a bit block
             for keys, raw in leaves(value):
                 below = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
@@ -110,10 +110,11 @@ def _fields_of(
             yield WireField(path, path, info, start, end, None, raw)
 
 
-def _is_placed(value: Any, start: int, end: int) -> bool:
-    """Return whether a value is a struct whose members say where they stand in the frame.
+def _has_spans(value: Any, start: int, end: int) -> bool:
+    """Return whether a value is a struct with spans of its members in the frame.
 
-    Members of a struct in bytes that were recoded are placed in those.
+    If the bytes of the struct were converted first, the spans are in the converted bytes, and the
+    result is False.
     """
     if not isinstance(value, dict) or not value.get("_marks"):
         return False
@@ -122,7 +123,7 @@ def _is_placed(value: Any, start: int, end: int) -> bool:
 
 
 def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
-    """Return what is wrong with bytes that are no frame of this type.
+    """Return the first fault of bytes that are not a frame of this type.
 
     Raises:
         SpecError: if an expression of the struct fails.
@@ -155,7 +156,7 @@ def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
     except construct.ConstructError as fault:
         path = field_path(fault.path)
         return WireError(
-            f"{path}: {_reason(fault)}",
+            f"{path}: {_strip_path(fault)}",
             sensor=sensor.id,
             frame=name,
             offset=stream.tell(),
@@ -178,6 +179,6 @@ def plain_fault(sensor: SensorDescription, name: str, data: bytes) -> WireError:
     )
 
 
-def _reason(fault: construct.ConstructError) -> str:
-    """Return the message of construct without the path."""
+def _strip_path(fault: construct.ConstructError) -> str:
+    """Return a message of construct without its path."""
     return str(fault).partition("\n")[2].strip() or type(fault).__name__

@@ -2,8 +2,8 @@
 
 The results equal those of one call for each row.
 
-`compute_over_spans` and `compute_checksums` know the algorithms of `lidarspec.spec.checksums`; one
-of an author's own is asked for its `batch`.
+`compute_over_spans` and `compute_checksums` have fast methods for the algorithms of
+`lidarspec.spec.checksums`. For an algorithm of a plugin they call its `batch`.
 
 `load_words` turns rows into columns of eight bytes, so that one step of NumPy takes the same eight
 bytes of every row.
@@ -12,13 +12,13 @@ A CRC is linear: the register after a row is the XOR of the contributions of its
 a byte by d is to compute its contribution d bytes later. `compute_registers` chooses one of four
 methods:
 
-* `_by_place`: for few and short rows. One table lookup for each byte; the table depends on the
-  position of the byte in the row.
-* `_by_zlib`: for longer rows of the usual CRC-32. One call of `zlib.crc32` for each row.
-* `_narrow_registers`: for registers of at most one byte. The front half of each row is advanced to
-  the back half, by a table of 256 entries, and XORed onto it. This is repeated until one byte is
+* `_compute_by_position`: for few and short rows. One table lookup for each byte; the table depends
+  on the position of the byte in the row.
+* `_compute_by_zlib`: for longer rows of the usual CRC-32. One call of `zlib.crc32` for each row.
+* `_compute_narrow`: for registers of at most one byte. The first half of each row is advanced to
+  the second half, by a table of 256 entries, and XORed onto it. This is repeated until one byte is
   left. For many rows, `_sum_words` first reduces each row to one word without tables.
-* `_wide_registers`: for all others. The register of all rows advances two bytes at a time, by a
+* `_compute_wide`: for all others. The register of all rows advances two bytes at a time, by a
   table of 65,536 entries. Long rows are split into segments that are computed side by side and then
   joined in pairs.
 
@@ -59,22 +59,24 @@ from lidarspec.spec.checksums import (
 LOOP_BYTES = 2048
 #: the same for registers of at most one byte.
 NARROW_LOOP_BYTES = 256
-#: below this number of rows, one call for each row is faster (checksums other than CRCs).
-ONE_BY_ONE = 4
+#: below this number of rows, one call for each row is faster (for checksums other than CRCs).
+MIN_BATCH_ROWS = 4
 #: bytes of rows per block: small enough for the caches, large enough to hide NumPy's cost per call.
 BLOCK_BYTES = 1 << 20
-#: `_by_place` is used up to this number of bytes in all rows ...
-FEW = 1 << 13
-#: ... and up to this number of bytes in one row. Longer rows of the usual CRC-32 use zlib.
-SHORT = 1 << 7
+#: `_compute_by_position` is used up to this number of bytes in all rows, and ...
+MAX_TABLE_BYTES = 1 << 13
+#: ... up to this number of bytes in one row. Longer rows of the usual CRC-32 use zlib.
+MAX_TABLE_ROW_BYTES = 1 << 7
 #: from this number of rows on, `_sum_words` is faster than tables.
-MANY = 1024
+MIN_SUM_ROWS = 1024
 
-#: width, polynomial and reflection of the one CRC that `zlib` has: on rows that are not short, one
 #: by one, it is several times as fast.
-ZLIB = (32, 0x04C11DB7, True)
+#: width, polynomial and reflection of the CRC-32 that `zlib` computes. On rows that are not short,
+#: one call for each row is several times as fast as NumPy.
+#: by one, it is several times as fast.
+ZLIB_CRC = (32, 0x04C11DB7, True)
 
-#: which bytes of a row: from one to another, one span after another.
+#: ranges of bytes in a row: (offset of the first byte, offset after the last byte) of each.
 Spans = tuple[tuple[int, int], ...]
 
 _BYTE = np.uint64(0xFF)
@@ -82,7 +84,7 @@ _BYTE_BITS = np.uint64(8)
 
 
 def compute_checksums(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
-    """Return the checksum of each row, (n,), for frames of one length, (n, m).
+    """Return the checksum of each row, (n,), for rows of equal length, (n, m).
 
     The rows may be contiguous or not.
     """
@@ -90,8 +92,11 @@ def compute_checksums(algorithm: Checksum, rows: NDArray[np.uint8]) -> Values:
 
 
 def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> Values:
-    """Return the checksum of some bytes of each row, (n,), one span after another."""
-    values = _TOGETHER.get(type(algorithm))
+    """Return the checksum of the spans of each row, (n,).
+
+    The bytes of the spans are concatenated.
+    """
+    values = _METHODS.get(type(algorithm))
     if values is None or _are_few(algorithm, rows, spans):
         return algorithm.batch(gather_spans(rows, spans))
     step = max(1, BLOCK_BYTES // max(rows.shape[1], 1))
@@ -108,18 +113,18 @@ def compute_over_spans(algorithm: Checksum, rows: NDArray[np.uint8], spans: Span
 def _are_few(algorithm: Checksum, rows: NDArray[np.uint8], spans: Spans) -> bool:
     """Return whether one call for each row is faster than NumPy for all rows."""
     if not isinstance(algorithm, Crc):
-        return len(rows) < ONE_BY_ONE
+        return len(rows) < MIN_BATCH_ROWS
     length = _count_bytes(spans)
     return len(rows) * length < (NARROW_LOOP_BYTES if algorithm.width <= 8 else LOOP_BYTES)
 
 
 @lru_cache(maxsize=1024)
 def _count_bytes(spans: Spans) -> int:
-    """Return how many bytes of a row some spans cover."""
+    """Return the number of bytes in the spans."""
     return sum(stop - start for start, stop in spans)
 
 
-def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
+def _compute_crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
     return finalize(
         algorithm,
         compute_registers(
@@ -129,7 +134,7 @@ def _crc(algorithm: Crc, rows: NDArray[np.uint8], spans: Spans) -> Values:
 
 
 def finalize(algorithm: Crc, left: NDArray[Any]) -> Values:
-    """Return the checksums, (n,), uint64, for the final registers.
+    """Return the checksums for the final registers, (n,), uint64.
 
     Args:
         left: the registers after all bytes, (n,), in the smallest unsigned dtype that holds them.
@@ -145,19 +150,19 @@ def finalize(algorithm: Crc, left: NDArray[Any]) -> Values:
     return values
 
 
-def _xor(algorithm: Xor, rows: NDArray[np.uint8], spans: Spans) -> Values:
+def _compute_xor(algorithm: Xor, rows: NDArray[np.uint8], spans: Spans) -> Values:
     columns = load_words(rows, spans=spans)
     return fold_xor(xor_words(columns, range(len(columns))))
 
 
-def _sum(algorithm: Sum, rows: NDArray[np.uint8], spans: Spans) -> Values:
+def _compute_sum(algorithm: Sum, rows: NDArray[np.uint8], spans: Spans) -> Values:
     return sum_bytes(load_words(rows, spans=spans)) & np.uint64((1 << algorithm.width) - 1)
 
 
-def _word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans) -> Values:
+def _compute_word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans) -> Values:
     columns = load_words(rows, spans=spans)
     low, high, part = np.zeros((3, len(rows)), np.uint64)
-    for which, masks in _word_masks(algorithm, len(columns)):
+    for which, masks in _group_word_masks(algorithm, len(columns)):
         total = xor_words(columns, which)
         np.bitwise_xor(low, np.bitwise_and(total, masks[0], out=part), out=low)
         np.bitwise_xor(high, np.bitwise_and(total, masks[1], out=part), out=high)
@@ -165,7 +170,7 @@ def _word_xor(algorithm: WordXor, rows: NDArray[np.uint8], spans: Spans) -> Valu
 
 
 @lru_cache(maxsize=512)
-def _word_masks(
+def _group_word_masks(
     algorithm: WordXor, number: int
 ) -> list[tuple[list[int], tuple[np.uint64, np.uint64]]]:
     """Return masks of the low and high bytes in `number` words of `load_words`.
@@ -182,7 +187,7 @@ def _word_masks(
     return [(which, both) for both, which in places.items()]
 
 
-def _fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:
+def _compute_fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:
     rows = gather_spans(rows, spans)
     tail = rows[:, rows.shape[1] % 2 - 60 :]
     total = np.zeros(len(rows), np.uint64)
@@ -192,20 +197,20 @@ def _fold15(algorithm: Fold15, rows: NDArray[np.uint8], spans: Spans) -> Values:
     return (total & np.uint64(0x7FFF)) + (total >> np.uint64(15)) & np.uint64(0x7FFF)
 
 
-def _zero_padded(algorithm: ZeroPadded, rows: NDArray[np.uint8], spans: Spans) -> Values:
+def _compute_zero_padded(algorithm: ZeroPadded, rows: NDArray[np.uint8], spans: Spans) -> Values:
     rows = gather_spans(rows, spans)
     return compute_checksums(
         algorithm.algorithm, np.pad(rows, ((0, 0), (0, -rows.shape[1] % algorithm.to)))
     )
 
 
-_TOGETHER: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values]] = {
-    Crc: _crc,
-    Xor: _xor,
-    Sum: _sum,
-    WordXor: _word_xor,
-    Fold15: _fold15,
-    ZeroPadded: _zero_padded,
+_METHODS: dict[type[Checksum], Callable[[Any, NDArray[np.uint8], Spans], Values]] = {
+    Crc: _compute_crc,
+    Xor: _compute_xor,
+    Sum: _compute_sum,
+    WordXor: _compute_word_xor,
+    Fold15: _compute_fold15,
+    ZeroPadded: _compute_zero_padded,
 }
 
 
@@ -217,13 +222,14 @@ def load_words(
     The rows are padded with zeros.
 
     Args:
-        spans: which bytes of each row, one span after another; by default all.
+        spans: the spans of each row to load, concatenated; by default the whole row.
+        zeros_first: True pads before the first byte, False after the last.
     """
     spans = spans or ((0, rows.shape[1]),)
     if rows.shape[1] < 8 or rows.strides[1] != 1:
         rows = np.ascontiguousarray(np.pad(rows, ((0, 0), (0, 8))))
     count, size = rows.shape
-    number, runs, parts = _pieces(spans, size, zeros_first)
+    number, runs, parts = _plan_words(spans, size, zeros_first)
     columns = np.empty((number, count), "<u8")
     begun = -1
     for first, length, start in runs:
@@ -244,10 +250,10 @@ def load_words(
 
 
 @lru_cache(maxsize=1024)
-def _pieces(
+def _plan_words(
     spans: Spans, size: int, zeros_first: bool
 ) -> tuple[int, list[tuple[int, int, int]], list[tuple[Any, ...]]]:
-    """Return how to assemble the words of a row from the bytes of spans.
+    """Return how to assemble the words of a row from the bytes of the spans.
 
     Returns:
         The number of words; the runs of whole words, as (first word, number of words, offset in the
@@ -258,11 +264,11 @@ def _pieces(
     number = -(-total // 8)
     runs = list[tuple[int, int, int]]()
     parts = list[tuple[Any, ...]]()
-    spot = 8 * number - total if zeros_first else 0
+    position = 8 * number - total if zeros_first else 0
     for first, stop in spans:
         start = first
         while start < stop:
-            word, byte = divmod(spot, 8)
+            word, byte = divmod(position, 8)
             length = min(8 - byte, stop - start)
             if length == 8:
                 whole = (stop - start) // 8
@@ -277,7 +283,7 @@ def _pieces(
                 parts.append(
                     (word, place, np.uint64(8 * (start - place)), mask, np.uint64(8 * byte))
                 )
-            spot += length
+            position += length
             start += length
     return number, runs, parts
 
@@ -293,7 +299,10 @@ def xor_words(columns: NDArray[np.uint64], which: Sequence[int]) -> NDArray[np.u
 
 
 def fold_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return the XOR of the eight bytes of each word, (n,); `total` is used up."""
+    """Return the XOR of the eight bytes of each word, (n,).
+
+    The result overwrites `total`.
+    """
     part = np.empty_like(total)
     for bits in (32, 16, 8):
         np.bitwise_xor(total, np.right_shift(total, np.uint64(bits), out=part), out=total)
@@ -301,7 +310,7 @@ def fold_xor(total: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def sum_bytes(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return the sum of all bytes of each row; (n,)."""
+    """Return the sum of all bytes of each row, (n,)."""
     total = np.zeros(columns.shape[1], np.uint64)
     even = np.uint64(0x00FF00FF00FF00FF)
     for first in range(0, len(columns), 128):  # 128 * 2 * 255 is less than 2**16
@@ -315,29 +324,29 @@ def sum_bytes(columns: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def compute_registers(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[Any]:
-    """Return the register after some bytes of each row, (n,).
+    """Return the register after the spans of each row, (n,).
 
-    The dtype is the integer that holds the register.
+    The dtype is the smallest integer that holds the register.
     """
     length = _count_bytes(spans)
-    if 0 < length <= SHORT and len(rows) * length <= FEW:
-        return _by_place(rows, spans, length, start, width, poly, refin)
-    if length > SHORT and (width, poly, refin) == ZLIB:
-        return _by_zlib(gather_spans(rows, spans), start)
-    return (_narrow_registers if width <= 8 else _wide_registers)(
+    if 0 < length <= MAX_TABLE_ROW_BYTES and len(rows) * length <= MAX_TABLE_BYTES:
+        return _compute_by_position(rows, spans, length, start, width, poly, refin)
+    if length > MAX_TABLE_ROW_BYTES and (width, poly, refin) == ZLIB_CRC:
+        return _compute_by_zlib(gather_spans(rows, spans), start)
+    return (_compute_narrow if width <= 8 else _compute_wide)(
         rows, spans, start, width, poly, refin
     )
 
 
 def gather_spans(rows: NDArray[np.uint8], spans: Spans) -> NDArray[np.uint8]:
-    """Return the bytes of each row that some spans cover, one span after another, (n, bytes)."""
+    """Return the bytes of the spans of each row, concatenated, (n, bytes)."""
     parts = [rows[:, start:stop] for start, stop in spans]
     if len(parts) == 1:
         return parts[0]
     return np.concatenate(parts, axis=1)
 
 
-def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
+def _compute_by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
     """Return `compute_registers` of CRC-32 by `zlib`, row by row.
 
     zlib starts from the inverted register and ends with it inverted.
@@ -349,7 +358,7 @@ def _by_zlib(rows: NDArray[np.uint8], start: int) -> NDArray[Any]:
     ) ^ np.uint32(0xFFFFFFFF)
 
 
-def _by_place(
+def _compute_by_position(
     rows: NDArray[np.uint8],
     spans: Spans,
     length: int,
@@ -373,7 +382,7 @@ def _by_place(
 def make_place_tables(
     length: int, start: int, width: int, poly: int, refin: bool
 ) -> tuple[NDArray[Any], NDArray[np.intp], Any]:
-    """Return the contribution of each byte value at each position to the final register.
+    """Return the contribution of each byte to the final register, by position.
 
     The contribution is the register after a row in which all other bytes are 0.
 
@@ -394,30 +403,34 @@ def make_place_tables(
     return np.concatenate(tables[::-1]), np.arange(length) * 256, begun
 
 
-def _narrow_registers(
+def _compute_narrow(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[np.uint8]:
-    """`compute_registers` of at most one byte, in one byte."""
+    """Return `compute_registers` of at most one byte, as uint8."""
     length = _count_bytes(spans)
     if not length:
         return np.full(len(rows), start, np.uint8)
     left = load_words(rows, spans=spans, zeros_first=True)
     if start:
         left[0] ^= np.uint64(start << 8 * (-length % 8))
-    if len(rows) >= MANY and len(left) > 1:
+    if len(rows) >= MIN_SUM_ROWS and len(left) > 1:
         left = _sum_words(left, poly << 8 - width)[None]
     while len(left) > 1:
         half = len(left) // 2
         distance = (len(left) + 1) // 2
-        moved = left[:half].tobytes().translate(_advance(8 * distance, width, poly, refin))
+        moved = (
+            left[:half].tobytes().translate(_make_advance_table(8 * distance, width, poly, refin))
+        )
         left = left[half:]
         left[-half:] ^= np.frombuffer(moved, np.uint64).reshape(half, -1)
     side: NDArray[Any] = left[0]
     for size in (4, 2, 1):
         parts = side.view(f"<u{size}")
-        moved = parts[::2].tobytes().translate(_advance(size, width, poly, refin))
+        moved = parts[::2].tobytes().translate(_make_advance_table(size, width, poly, refin))
         side = np.frombuffer(moved, f"<u{size}") ^ parts[1::2]
-    return np.frombuffer(side.tobytes().translate(_advance(1, width, poly, refin)), np.uint8)
+    return np.frombuffer(
+        side.tobytes().translate(_make_advance_table(1, width, poly, refin)), np.uint8
+    )
 
 
 def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
@@ -425,7 +438,7 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
     `poly` has eight bits.
     """
-    shares = _shares(len(columns), poly)
+    shares = _assign_sums(len(columns), poly)
     onto = np.uint64(sum(1 << 8 * (7 - power) for power in range(8) if poly >> power & 1))
     total = np.zeros(columns.shape[1], np.uint64)
     first = np.empty(columns.shape[1], np.uint64)
@@ -442,10 +455,10 @@ def _sum_words(columns: NDArray[np.uint64], poly: int) -> NDArray[np.uint64]:
 
 
 @lru_cache(maxsize=256)
-def _shares(number: int, poly: int) -> tuple[int, ...]:
-    """Return for each word which of the eight sums of `_sum_words` it is XORed onto.
+def _assign_sums(number: int, poly: int) -> tuple[int, ...]:
+    """Return for each word the sums of `_sum_words` that it is XORed onto.
 
-    Bit n of a value stands for the sum that is advanced by n bytes, n from 0 to 7.
+    Bit n of a value is set for the sum that is advanced by n bytes, n from 0 to 7.
     """
     found = [1]
     while len(found) < number:
@@ -456,15 +469,15 @@ def _shares(number: int, poly: int) -> tuple[int, ...]:
     return tuple(reversed(found))
 
 
-def _wide_registers(
+def _compute_wide(
     rows: NDArray[np.uint8], spans: Spans, start: int, width: int, poly: int, refin: bool
 ) -> NDArray[Any]:
-    """`compute_registers` of any width."""
+    """Return `compute_registers` of any width."""
     rows = gather_spans(rows, spans)
-    (count, length), table = rows.shape, _word_table(width, poly, refin)
-    # A power of two, small enough that there are many segments, to hide NumPy's cost per call.
+    (count, length), table = rows.shape, _make_word_table(width, poly, refin)
+    # A power of two. It is small, because many segments share the cost of a NumPy call.
     segment = min(max(64, 1 << (rows.size // 2048).bit_length()), length + length % 2)
-    # Rows are padded in front with zeros, which leave a register of 0 unchanged. So the register
+    # Zeros are added before the rows; they leave a register of 0 unchanged. So the register
     # starts as 0, and `start` is XORed onto the first bytes of the row.
     padded = np.zeros((count, -(-length // segment) * segment), np.uint8)
     padded[:, -length:] = rows
@@ -478,7 +491,7 @@ def _wide_registers(
     while found.shape[1] > 1:
         odd = found.shape[1] % 2
         jumped = _jump(
-            found[:, odd::2].ravel(), _jump_table(segment.bit_length() - 1, width, poly, refin)
+            found[:, odd::2].ravel(), _make_jump_table(segment.bit_length() - 1, width, poly, refin)
         )
         found = np.hstack([found[:, :odd], jumped.reshape(count, -1) ^ found[:, odd + 1 :: 2]])
         segment *= 2
@@ -486,21 +499,23 @@ def _wide_registers(
 
 
 @lru_cache(maxsize=1024)
-def _advance(distance: int, width: int, poly: int, refin: bool) -> bytes:
+def _make_advance_table(distance: int, width: int, poly: int, refin: bool) -> bytes:
     """Return the table, 256 bytes, that advances a byte by `distance` bytes.
 
     The register has at most one byte.
     """
     if distance == 1:
         return bytes(byte_table(width, poly, refin))
-    half = _advance(distance // 2, width, poly, refin)
+    half = _make_advance_table(distance // 2, width, poly, refin)
     return half.translate(
-        half if distance % 2 == 0 else _advance(distance - distance // 2, width, poly, refin)
+        half
+        if distance % 2 == 0
+        else _make_advance_table(distance - distance // 2, width, poly, refin)
     )
 
 
 @lru_cache(maxsize=16)
-def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
+def _make_word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
     """Return the register after two bytes, (65536,).
 
     The index is the XOR of the little-endian word and the low 16 bits of the register.
@@ -512,13 +527,13 @@ def _word_table(width: int, poly: int, refin: bool) -> NDArray[Any]:
 
 
 @lru_cache(maxsize=256)
-def _jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
+def _make_jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
     """Return the register after 2**power zero bytes, (bytes, 256).
 
     The axes are the position and the value of each byte of the register.
     """
     if power:
-        half = _jump_table(power - 1, width, poly, refin)
+        half = _make_jump_table(power - 1, width, poly, refin)
         return _jump(half.ravel(), half).reshape(half.shape)
     later_places = [
         [value << 8 * place for value in range(256)] for place in range(REGISTER_BYTES[width] - 1)
@@ -527,7 +542,7 @@ def _jump_table(power: int, width: int, poly: int, refin: bool) -> NDArray[Any]:
 
 
 def _jump(values: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
-    """Registers, shape (k,) and contiguous, each advanced by a jump table."""
+    """Return registers, (k,) and contiguous, advanced by a jump table."""
     places = values.view(np.uint8).reshape(len(values), -1).T
     return np.asarray(
         np.bitwise_xor.reduce(

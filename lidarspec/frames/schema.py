@@ -1,9 +1,4 @@
-"""The fields of a frame type as a table, read off its tree without any bytes.
-
-Path, axes, type, unit and text of each field; where it stands is `layout`'s business, since that
-can depend on the header. Both engines (compiled and interpreted) make their columns by this table,
-so that they agree on types.
-"""
+"""List the fields of a frame type from its tree, without any bytes."""
 
 from __future__ import annotations
 
@@ -38,7 +33,7 @@ from lidarspec.spec.tree import (
     refs,
 )
 
-#: of a path, the index of an element of an array: "columns[0].timestamp".
+#: the index of an array element in a path: "columns[0].timestamp".
 _INDEX = re.compile(r"\[(-?\d+)\]")
 
 _Field = TypeVar("_Field")
@@ -46,7 +41,7 @@ _Field = TypeVar("_Field")
 
 @lru_cache(maxsize=1024)
 def without_indices(path: str) -> tuple[str, dict[str, int]]:
-    """Return a path without its indices, and these by the paths of their arrays.
+    """Return a path without its indices, and the indices by the path of their array.
 
     For "a[0].b" the result is "a.b", {"a": 0}.
     """
@@ -61,14 +56,14 @@ def without_indices(path: str) -> tuple[str, dict[str, int]]:
 
 
 class PathMapping(dict[str, _Field]):
-    """A mapping from paths to values of fields, also of elements of arrays.
+    """A mapping from paths of fields to values, which also accepts paths of elements.
 
-    An element is a field by itself: "columns[0].timestamp".
+    The path of an element has an index: "columns[0].timestamp".
 
     Args:
-        known: by the paths of the fields.
-        element: of what a field has, its new path and the indices of some of its arrays, what that
-            element has; None where there is none.
+        values: by the paths of the fields.
+        element: returns the value of an element, None if it does not exist. The arguments are the
+            value of the field, the path of the element, and the indices by the path of the array.
     """
 
     def __init__(
@@ -104,12 +99,15 @@ class PathMapping(dict[str, _Field]):
 
 @dataclass(frozen=True, eq=False)
 class Schema:
-    """All fields of a frame type, in the order of the wire, and the arrays they are in.
+    """All fields of a frame type and their arrays, in the order of the wire.
 
-    `arrays`: path -> declared count; a number where every frame has so many elements, else a
-    formula of header fields, or None. `parts`: frames within the frame, by path, which are tables
-    of their own; `inside`: their fields, by path from the top. `derived`: values without bytes of
-    their own.
+    Attributes:
+        fields: the fields, by path.
+        arrays: the declared length of each array, by path. It is a number if it is the same in all
+            frames, else a formula of header fields, or None.
+        parts: the parts (frames within the frame), by path. They are tables of their own.
+        inside: the fields of the parts, by path from the frame.
+        derived: values without bytes of their own, by path.
     """
 
     fields: Mapping[str, FieldInfo]
@@ -117,14 +115,12 @@ class Schema:
     parts: Mapping[str, PartSequence] = field(default_factory=dict)
     inside: Mapping[str, FieldInfo] = field(default_factory=dict)
     derived: Mapping[str, FieldInfo] = field(default_factory=dict)
-    #: arrays whose length follows from different formulas in different branches.
+    #: arrays with different formulas for the length in different branches.
     branched: frozenset[str] = frozenset()
 
     @cached_property
     def columns(self) -> Mapping[str, FieldInfo]:
-        """The values of the frame, as columns have them: its fields, with their adapters applied,
-        and the values derived from them.
-        """
+        """The fields after their adapters, and the derived values, by path."""
         every = {**self.fields, **self.derived}
         adapted = {
             path: _adapt(info)
@@ -133,7 +129,7 @@ class Schema:
         }
         if not self.derived and not adapted:
             return self.fields
-        return PathMapping(every | adapted, functools.partial(_element, self.arrays))
+        return PathMapping(every | adapted, functools.partial(_make_element, self.arrays))
 
     @cached_property
     def all_fields(self) -> Mapping[str, FieldInfo]:
@@ -144,7 +140,10 @@ class Schema:
 
     @cached_property
     def counting_fields(self) -> Mapping[str, str | None]:
-        """The field that each array takes its length from, by the path of the array."""
+        """The field that gives the length of each array, by the path of the array.
+
+        It is None if no single field gives it.
+        """
         return {
             axis: None if count is None else counting_field(count, self.fields)
             for axis, count in self.arrays.items()
@@ -152,7 +151,7 @@ class Schema:
 
     @cached_property
     def chain(self) -> tuple[str, ...]:
-        """The axes of the deepest nesting of arrays; the first one of equally deep ones."""
+        """The axes of the deepest nesting of arrays; of equally deep ones, the first."""
         return max(
             (info.axes for info in self.fields.values() if info.kind != "bytes"),
             key=len,
@@ -178,10 +177,10 @@ class Schema:
     def within(self, path: str) -> tuple[str, str, str] | None:
         """Return the axis, the kind and the remaining path of a path into parts.
 
-        Returns None if the path leads into no parts.
+        Returns None if the path does not lead into parts.
 
         Raises:
-            UnknownField: for parts of several kinds without one of them.
+            UnknownField: if the parts have several kinds and the path names none of them.
         """
         for axis, node in self.parts.items():
             if path == axis or path.startswith(f"{axis}."):
@@ -203,10 +202,10 @@ class Schema:
         }
 
     def axis(self, name: str) -> str:
-        """Return the path of an array, by it or by its last part.
+        """Return the path of an array from its path or its last name.
 
         Raises:
-            SpecError: where there is none of that name, or several.
+            SpecError: if no array has the name, or several have it.
         """
         found = [axis for axis in self.places if axis == name] or [
             axis for axis in self.places if axis.rpartition(".")[2] == name
@@ -223,16 +222,16 @@ class Schema:
         return found[0]
 
     def outer(self, axis: str) -> list[str]:
-        """Return the arrays that an array is in."""
+        """Return the arrays that contain an array."""
         return [other for other in self.arrays if axis.startswith((f"{other}.", f"{other}["))]
 
     def depth(self) -> int:
-        """Return the largest number of nested arrays."""
+        """Return the number of arrays in the deepest nesting."""
         return len(self.chain)
 
 
 def _adapt(info: FieldInfo) -> FieldInfo:
-    """Return a field with the type of the values that its adapter makes."""
+    """Return a field with the type of the values that its adapter returns."""
     assert info.adapter is not None
     dtype = info.adapter.dtype
     kinds = {"i": "int", "f": "float"}
@@ -247,14 +246,14 @@ def _adapt(info: FieldInfo) -> FieldInfo:
 
 
 def counting_field(formula: Formula, fields: Mapping[str, FieldInfo]) -> str | None:
-    """Return the path of the field that a count or length follows from; None if there is none."""
+    """Return the path of the field that gives a count or length; None if none does."""
     asked = refs(formula)
     return next((ref.path for ref in asked if ref.path in fields and "[" not in ref.path), None)
 
 
 @lru_cache(maxsize=4096)
 def make_schema(root: Node) -> Schema:
-    """Return the table of fields of a frame's tree."""
+    """Return the fields of a frame tree. The result is cached."""
     fields: dict[str, FieldInfo] = {}
     arrays: dict[str, Formula | None] = {}
     derived: dict[str, FieldInfo] = {}
@@ -268,10 +267,10 @@ def make_schema(root: Node) -> Schema:
         for kind in node.kinds:
             _walk(kind.element, inside, {}, {}, optional=False)
     return Schema(
-        PathMapping(_with_docs(fields, structs), functools.partial(_element, arrays)),
+        PathMapping(_add_struct_docs(fields, structs), functools.partial(_make_element, arrays)),
         arrays,
         {axis: node for axis, node in parts.items() if not node.total.axes},
-        _with_docs(inside, structs),
+        _add_struct_docs(inside, structs),
         derived,
         _find_branched(root),
     )
@@ -293,8 +292,8 @@ def _find_branched(root: Node) -> frozenset[str]:
     return frozenset(found)
 
 
-def _with_docs(fields: dict[str, FieldInfo], structs: dict[str, str]) -> dict[str, FieldInfo]:
-    """Return the fields, and for those without docs the docs of the struct around them."""
+def _add_struct_docs(fields: dict[str, FieldInfo], structs: dict[str, str]) -> dict[str, FieldInfo]:
+    """Add the docs of the struct to each field without docs, and return the fields."""
     for path, info in fields.items():
         docs = "" if info.docs else _docs_around(path, structs)
         if docs:
@@ -302,10 +301,10 @@ def _with_docs(fields: dict[str, FieldInfo], structs: dict[str, str]) -> dict[st
     return fields
 
 
-def _element(
+def _make_element(
     arrays: Mapping[str, Formula | None], info: FieldInfo, path: str, indices: Mapping[str, int]
 ) -> FieldInfo | None:
-    """Return an element of a field, None if it never exists.
+    """Return an element of a field as a field; None if no frame has it.
 
     The element is optional if the header determines the number of elements.
     """
@@ -343,20 +342,20 @@ def _walk(
         case Derived():
             if node.info.kind == "bytes":
                 arrays.setdefault(node.info.axes[-1], None)
-            _add(derived, node.info)
+            _add_field(derived, node.info)
         case Repeat():
-            _count(arrays, node.axis, node.count, optional=optional)
+            _add_count(arrays, node.axis, node.count, optional=optional)
         case Blob() if node.name:
-            _count(arrays, node.info.axes[-1], node.size, optional=optional)
-            _add(fields, node.info)
+            _add_count(arrays, node.info.axes[-1], node.size, optional=optional)
+            _add_field(fields, node.info)
         case Opaque() if node.name and not node.inside:
             if node.info.kind == "bytes":
-                _count(arrays, node.info.axes[-1], node.size, optional=optional)
-            _add(fields, node.info)
+                _add_count(arrays, node.info.axes[-1], node.size, optional=optional)
+            _add_field(fields, node.info)
         case Number():
-            _add(fields, node.info)
+            _add_field(fields, node.info)
         case Block():
-            _block(node, fields, arrays, optional=optional)
+            _add_block(node, fields, arrays, optional=optional)
         case PartSequence():
             return
     for child in children(node):
@@ -364,7 +363,7 @@ def _walk(
         _walk(child, fields, arrays, derived, optional=is_optional)
 
 
-def _block(
+def _add_block(
     node: Block, fields: dict[str, FieldInfo], arrays: dict[str, Formula | None], *, optional: bool
 ) -> None:
     infos = {
@@ -376,16 +375,16 @@ def _block(
         indices = [part.indices for part in node.parts if part.info.path == path]
         inner = info.axes[len(info.axes) - len(indices[0]) :]
         for depth, axis in enumerate(inner):
-            _count(arrays, axis, 1 + max(index[depth] for index in indices), optional=optional)
-        _add(fields, info)
+            _add_count(arrays, axis, 1 + max(index[depth] for index in indices), optional=optional)
+        _add_field(fields, info)
 
 
-def _add(fields: dict[str, FieldInfo], info: FieldInfo) -> None:
+def _add_field(fields: dict[str, FieldInfo], info: FieldInfo) -> None:
     known = fields.get(info.path)
     fields[info.path] = info if known is None else _merge_fields(known, info)
 
 
-def _count(
+def _add_count(
     arrays: dict[str, Formula | None], axis: str, count: Formula | None, *, optional: bool
 ) -> None:
     """Store the declared count of an array.
@@ -393,16 +392,14 @@ def _count(
     If several branches declare the array, the count is a number only if all of them agree.
     """
     if optional and isinstance(count, int):
-        count = Op(
-            "+", (count, 0)
-        )  # it has so many where it is there at all, which is not in every frame
+        count = Op("+", (count, 0))  # not a number, because only some frames have the array
     known = arrays.setdefault(axis, count)
     if isinstance(known, int) and known != count:
         arrays[axis] = None if isinstance(count, int) else count
 
 
 def _merge_fields(first: FieldInfo, other: FieldInfo) -> FieldInfo:
-    """One column for a field that several branches declare."""
+    """Return one field for a field that several branches declare."""
     kinds = {first.kind, other.kind}
     if (
         first.axes != other.axes

@@ -1,8 +1,8 @@
-"""Frames as they are sent, and as the bytes of their structs.
+"""Convert frames between their bytes on the wire and the bytes of their structs.
 
 Most frames are the bytes of their struct (`Coder`). A frame type with a wire form
-(`lidarspec.spec.wire_forms`) has a `FormCoder`: it tells the form which fields come next, by the
-layouts of the struct, and says what is wrong with bytes that are no frame of the form.
+(`lidarspec.spec.wire_forms`) has a `FormCoder`. It gives the form the fields that follow, from the
+layouts of the struct, and describes the fault of bytes that are not a frame of the form.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from lidarspec.spec.wire_forms import (
     WireForm,
 )
 
-#: The name under which a parsed frame keeps its bytes, if `encode` would write others.
+#: The name under which parsed values keep the original frame, if `encode` cannot restore it.
 SPELLING = "_wire"
-#: Bytes that are shown of a field that cannot be read.
-SHOWN_BYTES = 12
+#: Bytes of an invalid field to show in an error.
+MAX_SHOWN_BYTES = 12
 
 
 class _Undecoded(Decoded):
-    """The bytes of a frame, which are those of its struct."""
+    """The bytes of a frame that equal the bytes of its struct."""
 
     @property
     def offsets(self) -> list[int]:
@@ -50,7 +50,7 @@ class _Undecoded(Decoded):
 
 
 class Coder:
-    """Frames that are sent as the bytes of their struct.
+    """Coder of frames that are sent as the bytes of their struct.
 
     Attributes:
         begins: the bytes that all frames begin with.
@@ -58,7 +58,7 @@ class Coder:
 
     def __init__(self, frame: Frame) -> None:
         known = find_prefix(frame.tree, frame.room)
-        self.begins = _run_of_bytes(
+        self.begins = _join_bytes(
             {offset: value for offset, (mask, value) in known.items() if mask == 0xFF}
         )
 
@@ -70,30 +70,33 @@ class Coder:
         """Return the frame for the bytes of a struct.
 
         Args:
-            spelling: a frame that is returned if it stands for the same struct.
+            spelling: a frame that is returned instead if it encodes the same struct.
 
         Returns:
-            None if the wire form cannot write one of the values.
+            None if the wire form cannot encode one of the values.
         """
         return struct
 
     def keep_spelling(self, values: Any, struct: bytes, data: bytes) -> Any:
-        """Return parsed values, with the frame as `SPELLING` if `encode` would write another."""
+        """Return parsed values; they keep a frame that `encode` cannot restore.
+
+        The original frame is added under the name `SPELLING`.
+        """
         return values
 
     def find_size(self, data: bytes) -> int | None:
-        """Return the size of the frame that bytes begin with.
+        """Return the size of the frame at the start of some bytes.
 
         Returns None if the header determines the size, or if the end is missing.
         """
         return None
 
     def make_encodable(self, rows: Bytes2D, layout: Layout) -> None:
-        """Change random structs of a layout, one a row, so that each value can be written."""
+        """Change random structs, given as rows of bytes, so that each can be encoded."""
 
 
 class _FieldFinder:
-    """Finds the runs of fields that follow the first bytes of one struct, as these grow."""
+    """Finds the fields that follow the first bytes of a struct, while it grows."""
 
     def __init__(self, tree: HeaderTree) -> None:
         self._tree = tree
@@ -106,12 +109,12 @@ class _FieldFinder:
                 "frames of text cannot contain parts",
                 path=self._node.leaf.info.path,
             )
-        leaves, end = _known_fields(self._node)
+        leaves, end = _find_known_fields(self._node)
         return list_runs_between(leaves, len(struct), end)
 
 
-def _known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
-    """Return the fields that a header leads to, and the offset in the struct after the last."""
+def _find_known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
+    """Return the fields that a header leads to, and the end of the last in the struct."""
     if isinstance(node.result, Layout):
         return tuple(node.result.leaves.values()), node.result.size
     if isinstance(node.leaf, Leaf):
@@ -120,16 +123,16 @@ def _known_fields(node: HeaderNode) -> tuple[tuple[Leaf, ...], int]:
 
 
 class FormCoder(Coder):
-    """Frames with a wire form.
+    """Coder of frames with a wire form.
 
     Attributes:
         form: the form.
         tree: the layouts of the struct.
-        prefix: the bytes that all frames have at the same offsets, those of the texts before the
-            first number.
+        prefix: the bytes that all frames have at the same offsets: the texts before the first
+            number.
 
     Raises:
-        SpecError: for a struct whose fields have no computable offset.
+        SpecError: if the fields of the struct do not have computable offsets.
     """
 
     def __init__(self, frame: Frame, form: WireForm) -> None:
@@ -142,7 +145,7 @@ class FormCoder(Coder):
         self.tree: HeaderTree = tree
         self._limit = frame.max_length
         self.prefix = self._find_prefix()
-        self.begins = _run_of_bytes(self.prefix)
+        self.begins = _join_bytes(self.prefix)
 
     def _find_prefix(self) -> dict[int, int]:
         leaves, constants = self.tree.first()
@@ -168,7 +171,7 @@ class FormCoder(Coder):
         return replace(decoded, problem=self._problem(data, size, decoded))
 
     def decode_whole(self, data: bytes) -> Decoded:
-        """Decode a frame that ends where the form says; a problem has no words."""
+        """Decode a frame of exactly these bytes, without a reason text in its problem."""
         return self.form.decode(data, _FieldFinder(self.tree))
 
     def find_size(self, data: bytes) -> int | None:
@@ -178,7 +181,7 @@ class FormCoder(Coder):
         return None
 
     def refusal(self, struct: bytes) -> LayoutRefusal | None:
-        """Return why the header of a struct leads to no layout; None if that is not known."""
+        """Return why a struct has no layout; None if its header may lead to one."""
         result = self.tree.header(struct).result
         if isinstance(result, LayoutRefusal):
             return result
@@ -213,7 +216,7 @@ class FormCoder(Coder):
                     [self.form.largest(size) for size in run.sizes.tolist()], np.uint64
                 )
                 for row in part:
-                    values = _within(run.from_bytes(row.tobytes()), largest)
+                    values = _limit_values(run.from_bytes(row.tobytes()), largest)
                     if isinstance(self.form, DrawsValues):
                         values = self.form.writable(run, values)
                     row[:] = np.frombuffer(run.to_bytes(values), np.uint8)
@@ -221,7 +224,7 @@ class FormCoder(Coder):
                 part[:] = part % 26 + ord("A")
 
     def _problem(self, data: bytes, size: int, decoded: Decoded) -> Problem | None:
-        """Return what is wrong with bytes that should be one frame, in words."""
+        """Return the fault of bytes that should be one frame; None if they are valid."""
         begins = self.begins
         if not data or not data.startswith(begins):
             got = data[: len(begins)]
@@ -240,7 +243,7 @@ class FormCoder(Coder):
         is_layout = isinstance(node.result, Layout) and node.result.size == len(struct)
         if decoded.problem is None and is_layout:
             return None
-        leaves, end = _known_fields(node)
+        leaves, end = _find_known_fields(node)
         path, begin, expected = _describe_field(leaves, min(len(struct), end), end)
         if decoded.problem is None:
             offset = decoded.offset(begin)
@@ -249,18 +252,18 @@ class FormCoder(Coder):
         if not leaves:
             reason = f"the header does not match the frame length of {size} bytes"
             return Problem(offset, reason, got=size)
-        got = data[offset : offset + SHOWN_BYTES]
+        got = data[offset : offset + MAX_SHOWN_BYTES]
         reason = f"{path or 'frame'} at byte {offset}: {got!r} is not {expected}"
         return Problem(offset, reason, path=path, expected=expected, got=got)
 
 
 def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[str, int, str]:
-    """Return path, offset and expectation of the field with a byte of the struct.
+    """Return path, offset and expected value of the field at an offset of the struct.
 
     Args:
-        end: of the struct.
+        end: the size of the struct.
     """
-    offsets, owners = _places(leaves)
+    offsets, owners = _locate_elements(leaves)
     index = int(offsets.searchsorted(offset, "right")) - 1
     path = ""
     if index >= 0 and offset < offsets[index] + leaves[owners[index]].size:
@@ -280,24 +283,24 @@ def _describe_field(leaves: tuple[Leaf, ...], offset: int, end: int) -> tuple[st
 
 @functools.lru_cache(maxsize=2048)
 def frame_coder(frame: Frame) -> Coder:
-    """Return the coder of a frame type, always the same one."""
+    """Return the coder of a frame type. It is cached."""
     if frame.wire is None:
         return Coder(frame)
     return FormCoder(frame, frame.wire)
 
 
 def list_runs(layout: Layout) -> Sequence[Run]:
-    """Return the runs of fields that the structs of a layout consist of."""
+    """Return the runs of fields in the structs of a layout."""
     return list_runs_between(tuple(layout.leaves.values()), 0, layout.size)
 
 
 @functools.lru_cache(maxsize=1024)
 def list_runs_between(leaves: tuple[Leaf, ...], first: int, end: int) -> tuple[Run, ...]:
-    """Return the runs of fields from one byte of the struct to another.
+    """Return the runs of fields between two offsets of a struct.
 
-    Bytes between fields, such as constants without a name, are text.
+    Bytes between fields, for example constants without a name, are text.
     """
-    offsets, owners = _places(leaves)
+    offsets, owners = _locate_elements(leaves)
     inside = slice(int(offsets.searchsorted(first)), int(offsets.searchsorted(end)))
     offsets = offsets[inside]
     owners = owners[inside]
@@ -355,10 +358,10 @@ def _number_types(
 
 
 @functools.lru_cache(maxsize=256)
-def _places(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the offset of each element of each field, ascending, and the index of its field.
+def _locate_elements(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the offset of each element of all fields, and the index of its field.
 
-    Of the fields in one block of bits the first counts.
+    The offsets are ascending. For the fields of a bit block, it is the index of the first.
     """
     offsets = [np.zeros(0, np.intp)]
     owners = [np.zeros(0, np.intp)]
@@ -375,15 +378,15 @@ def _places(leaves: tuple[Leaf, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp
     return all_offsets, np.concatenate(owners)[first]
 
 
-def _run_of_bytes(bytes_by_offset: dict[int, int]) -> bytes:
-    """Return the known bytes from the first one on, up to the first that is not known."""
+def _join_bytes(bytes_by_offset: dict[int, int]) -> bytes:
+    """Return the known bytes from offset 0 up to the first unknown byte."""
     return bytes(
         bytes_by_offset[offset]
         for offset in itertools.takewhile(bytes_by_offset.__contains__, itertools.count())
     )
 
 
-def _within(values: NDArray[np.uint64], largest: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return values that are at most the largest ones."""
-    count = largest + np.uint64(1)  # 0 where all values of eight bytes are allowed
+def _limit_values(values: NDArray[np.uint64], largest: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Reduce values modulo, so that each is at most its largest value."""
+    count = largest + np.uint64(1)  # wraps to 0 if all values of eight bytes are allowed
     return np.where(count == 0, values, values % np.maximum(count, 1))

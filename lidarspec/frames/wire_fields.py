@@ -1,8 +1,8 @@
-"""The fields of one frame with their places, also of a damaged or truncated frame.
+"""Find the fields of one frame with their offsets, even if it is invalid or truncated.
 
-`examine` finds the layout of the bytes, or the beginning of it if the bytes end early, and
-`ExaminedFrame.fields` walks along the frame tree with it. Errors (`lidarspec.frames.diagnose`) and
-explanations use both.
+`examine` finds the layout of the bytes, or the beginning of it if the bytes end early.
+`ExaminedFrame.fields` walks through the frame tree with this layout. Errors
+(`lidarspec.frames.diagnose`) and explanations use both.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from lidarspec.spec.bits import BitField
 
 @dataclass(frozen=True)
 class WireField:
-    """One value on the wire.
+    """A value on the wire.
 
     Attributes:
-        path: with indices, "points[1].intensity".
-        block: path of the bit block that holds it, with indices; else its own path.
-        info: the field; of a constant without a name one with no path.
-        start, end: its bytes in the frame; of a value in a bit block those of the block.
-        bits: its bits in the block, None outside one.
-        raw: the value; None if the bytes end before it does.
+        path: the path, with indices: "points[1].intensity".
+        block: the path of the bit block that contains it, with indices; for others its own path.
+        info: the field. For a constant without a name, its path is empty.
+        start, end: the range of its bytes in the frame, or of the bytes of its bit block.
+        bits: its bits in the block; None for a field that is not in a bit block.
+        raw: the value; None if it is truncated.
     """
 
     path: str
@@ -44,7 +44,7 @@ class WireField:
 
     @property
     def first_byte(self) -> int:
-        """The first byte that holds a bit of it."""
+        """The offset of the first byte that contains bits of the field."""
         if self.bits is None:
             return self.start
         return self.start + min(segment.byte for segment in self.bits.segments)
@@ -52,7 +52,10 @@ class WireField:
 
 @dataclass(frozen=True)
 class PlacedSeal:
-    """A checksum in the bytes of a frame: `prefix` is the path of the part that it is in."""
+    """A checksum in the bytes of a frame.
+
+    `prefix` is the path of the part that contains it; "" for the frame.
+    """
 
     seal: Seal
     prefix: str
@@ -62,28 +65,28 @@ class PlacedSeal:
 
     @property
     def path(self) -> str:
-        """The path of the first field that holds it."""
+        """The path of the first field that holds the checksum."""
         return f"{self.prefix}.{self.seal.leaves[0].info.path}".strip(".")
 
     @property
     def offset(self) -> int:
-        """The first byte of that field."""
+        """The offset of the first byte of that field."""
         return self.start + self.seal.leaves[0].byte_span[0]
 
     @property
     def end(self) -> int:
-        """The byte after the struct that it seals."""
+        """The offset after the last byte of the struct of the checksum."""
         return self.start + self.seal.end
 
     @property
     def is_right(self) -> bool:
-        """Whether the frame carries the right value, or one that means "not filled"."""
+        """Whether the stored checksum is correct, or means "not filled"."""
         return self.stored == self.computed or self.stored in self.seal.absent
 
 
 @dataclass(frozen=True)
 class ExaminedParts:
-    """The parts of a frame at a path; the last one is broken unless `is_whole`."""
+    """The parts of a frame at a path. The last one is invalid unless `is_whole`."""
 
     parts: list[ExaminedFrame]
     is_whole: bool
@@ -91,17 +94,18 @@ class ExaminedParts:
 
 @dataclass(frozen=True, eq=False)
 class ExaminedFrame:
-    """One frame, or a part of one, with its layout as far as the bytes determine it.
+    """A frame or a part, with as much of its layout as the bytes determine.
 
     Attributes:
-        root: the frame type.
+        root: the tree of the frame type.
         data: the bytes.
-        known: the layout; or as much of it as is known before `failure`.
-        failure: what ended the walk through the tree: `UnknownSelectorError` if the bytes end,
-            `TooLongError`, `UnknownPartError`, or an error of an expression; None for a layout.
-        start: of a part, its first byte in the frame.
-        prefix: of a part, its path in the frame.
-        is_bounded: of a part, whether the frame has bytes behind those of the parts.
+        known: the layout; if `failure` is set, the walk with the layout up to the failure.
+        failure: the error that ended the walk: `UnknownSelectorError` if the bytes end early,
+            `TooLongError`, `UnknownPartError`, or an error of an expression. None for a complete
+            layout.
+        start: the offset of a part in the frame; 0 for a frame.
+        prefix: the path of a part in the frame; "" for a frame.
+        is_bounded: for a part, whether the frame has bytes after its parts.
     """
 
     root: tree.Node
@@ -122,15 +126,15 @@ class ExaminedFrame:
         return None
 
     def fields(self) -> Iterator[WireField]:
-        """Return the fields in the order of the wire.
+        """Yield the fields in the order of the wire.
 
-        The last one may be cut off: its `raw` is None.
+        The last field may be truncated: its `raw` is None.
         """
         cursor = _Cursor(self)
         yield from cursor.visit(self.root, "", self.prefix)
 
     def seals(self) -> Iterator[PlacedSeal]:
-        """Return the checksums, inner ones first, of structs whose bytes are all there."""
+        """Yield the checksums, inner ones first, of structs with complete bytes."""
         rows = np.frombuffer(self.data, np.uint8).reshape(1, -1)
         for seal in self.known.seals:
             if seal.end <= len(self.data):
@@ -145,7 +149,7 @@ class ExaminedFrame:
                 yield from part.seals()
 
     def region(self, axis: str) -> Region | None:
-        """Return the place of the parts at a path; None if it is not known."""
+        """Return the region of the parts at a path; None if it is not known."""
         if axis in self.known.regions:
             return self.known.regions[axis]
         if isinstance(self.known, HeaderWalk):
@@ -153,11 +157,11 @@ class ExaminedFrame:
         return None
 
     def parts_of(self, axis: str) -> list[ExaminedFrame]:
-        """Return the parts at a path, as far as they can be told apart."""
+        """Return the parts at a path, up to the first invalid part."""
         return self._examined_parts(axis).parts
 
     def broken_part(self, axis: str) -> ExaminedFrame | None:
-        """Return the part at a path that is no valid part; None if all are there."""
+        """Return the invalid part at a path; None if all parts are valid."""
         examined = self._examined_parts(axis)
         if examined.is_whole:
             return None
@@ -181,9 +185,9 @@ def examine(
     """Find the layout of one frame, as far as its bytes determine it.
 
     Args:
-        limit: the longest frame, in bytes.
-        given: of a part, values of fields of the frame around it, by their path there.
-        start, prefix, is_bounded: of a part, as of `ExaminedFrame`.
+        limit: the maximum size of a frame, in bytes.
+        given: for a part, values of fields of the outer frame, by their path there.
+        start, prefix, is_bounded: for a part, as in `ExaminedFrame`.
     """
 
     def read(leaf: Leaf | PartsSize, walk: HeaderWalk) -> int:
@@ -217,7 +221,7 @@ def _examine_parts(around: ExaminedFrame, axis: str) -> ExaminedParts:
     end = region.start + int(walked.sizes[0])
     is_whole = bool(walked.status[0] == FOUND) and region.size in (None, end - region.start)
     if not is_whole:
-        kind = _likely_kind(region, around.data[end:])
+        kind = _choose_kind(region, around.data[end:])
         stop = len(around.data)
         if region.rule.within is not None:
             stop = min(stop, region.start + region.rule.within)
@@ -247,8 +251,8 @@ def _examine_part(
     )
 
 
-def _likely_kind(region: Region, data: bytes) -> PartKind:
-    """Return the kind of part that bytes begin like; the last one if they begin like none."""
+def _choose_kind(region: Region, data: bytes) -> PartKind:
+    """Return the kind of part with a matching beginning, else the last kind."""
     for kind in region.kinds:
         known = [
             data[offset] & mask == value
@@ -261,7 +265,7 @@ def _likely_kind(region: Region, data: bytes) -> PartKind:
 
 
 class _Cursor:
-    """A walk along the fields of one frame."""
+    """A walk through the fields of one frame."""
 
     def __init__(self, examined: ExaminedFrame) -> None:
         self._examined = examined
@@ -272,7 +276,11 @@ class _Cursor:
         self._is_over = False
 
     def visit(self, node: tree.Node, path: str, shown: str) -> Iterator[WireField]:
-        """Return the fields of a node; `path` and `shown` without and with indices."""
+        """Yield the fields of a node.
+
+        Args:
+            path, shown: the path of the node, without and with indices.
+        """
         if self._is_over:
             return
         match node:
@@ -294,7 +302,7 @@ class _Cursor:
                 else:
                     yield from self.visit(branch, path, shown)
             case tree.Number():
-                yield self._value(node.info, shown, node.size, _number(node))
+                yield self._value(node.info, shown, node.size, _make_number_decoder(node))
             case tree.Blob():
                 yield from self._blob(node, path, shown)
             case tree.Block():
@@ -354,7 +362,7 @@ class _Cursor:
         return WireField(shown, shown, info, start, start + size, None, raw)
 
     def _take(self, size: int) -> bytes | None:
-        """Return the next bytes; None if they are not all there."""
+        """Return the next bytes and move behind them; None if they are incomplete."""
         end = self._offset + size
         if end > len(self._data):
             self._is_over = True
@@ -364,8 +372,8 @@ class _Cursor:
         return data
 
 
-def _number(node: tree.Number) -> Any:
-    """Return the function from the bytes of a number to its value."""
+def _make_number_decoder(node: tree.Number) -> Any:
+    """Return a function that decodes the bytes of a number."""
     if node.kind == "float":
         order = "<" if node.order == "little" else ">"
         code = struct.Struct(order + {2: "e", 4: "f", 8: "d"}[node.size])

@@ -1,11 +1,9 @@
-"""Make the wire table of a frame type from its tree.
+"""Make the wire table of a frame type: offset, size and meaning of each field.
 
-It has the place, width and meaning of each field.
-
-Nothing here knows a frame's bytes, so what depends on a header is a formula of its fields ("10 +
-3*i"), and a part that only some headers have is marked with the condition. `extent` gives the size
-of any part in this way, and the texts for fields, bits and formulas are those of exports and
-explanations, too.
+It is made from the tree, without the bytes of a frame. So a value that depends on the header is a
+formula of header fields ("10 + 3*i"), and a part that only some headers have is marked with its
+condition. `extent` returns the size of any part in this form. Exports and explanations use the same
+texts for fields, bits and formulas.
 """
 
 from __future__ import annotations
@@ -23,16 +21,16 @@ INDICES = "ijklmn"
 
 @dataclass(frozen=True)
 class WireRow:
-    """One line of a wire table.
+    """A row of a wire table.
 
     Attributes:
-        offset: first byte, counted from the start of the frame; a formula where that depends on a
-            header or an index.
-        size: in bytes, or "7 bits"; a formula where it depends on a header.
-        type: "uint16 le", "bytes", or the bits of a block from the most significant on.
-        field: path, array elements by index names: "points[i].distance".
+        offset: the offset of the first byte in the frame, as a number or a formula of header fields
+            and indices.
+        size: in bytes, as a number or a formula of header fields; "7 bits" for a part of a block.
+        type: "uint16 le", "bytes", or the bits of a part of a block, the most significant first.
+        field: the path, with names of indices for array elements: "points[i].distance".
         unit: unit and scale: "0.01 deg".
-        meaning: the author's text, constant, labels, checksum, condition.
+        meaning: the text of the spec, the constant, labels, checksum and condition.
     """
 
     offset: str
@@ -45,7 +43,7 @@ class WireRow:
 
 @dataclass(frozen=True)
 class SizeFormula:
-    """A number of bytes: a constant, and formulas of header fields and indices added to it."""
+    """A number of bytes: a constant plus formulas of header fields and indices."""
 
     number: int = 0
     terms: tuple[str, ...] = ()
@@ -54,7 +52,7 @@ class SizeFormula:
         return SizeFormula(self.number + other.number, self.terms + other.terms)
 
     def times(self, factor: int | str) -> SizeFormula:
-        """Return the extent of so many elements."""
+        """Return the size of this number of elements."""
         if isinstance(factor, int):
             return SizeFormula(
                 self.number * factor, tuple(f"{factor}*({term})" for term in self.terms)
@@ -92,11 +90,11 @@ def wire_table(frame: Frame) -> tuple[WireRow, ...]:
         if isinstance(node, tree.Sealed)
         for path in node.fields
     }
-    return tuple(_rows(frame.tree, "", SizeFormula(), "", seals))
+    return tuple(_iter_rows(frame.tree, "", SizeFormula(), "", seals))
 
 
 def frame_size(frame: Frame) -> str:
-    """Return the length of a frame in bytes: a number, or a formula of its header fields."""
+    """Return the size of a frame in bytes: a number or a formula of header fields."""
     return str(extent(frame.tree))
 
 
@@ -104,23 +102,25 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
     """Return the size of a part.
 
     Args:
-        shown: the name of a size that only the bytes determine: "size(points[i].text)".
+        shown: the name of the part, for a size that only its bytes determine:
+            "size(points[i].text)".
     """
     match node:
         case tree.Number() | tree.Block():
             return SizeFormula(node.size)
         case tree.Blob() | tree.Opaque():
-            return _length(node.size, shown)
+            return _format_length(node.size, shown)
         case tree.Struct():
             return sum(
-                (extent(member, _member(shown, member)) for member in node.members), SizeFormula()
+                (extent(member, _member_path(shown, member)) for member in node.members),
+                SizeFormula(),
             )
         case tree.Sealed():
             return extent(node.body, shown)
         case tree.Repeat():
             return extent(node.element, _element(shown)[0]).times(_count(node))
         case tree.PartSequence():
-            return _length(node.within, shown)
+            return _format_length(node.within, shown)
         case tree.When() | tree.Select():
             sizes = {
                 extent(branch, shown)
@@ -129,12 +129,12 @@ def extent(node: tree.Node, shown: str = "") -> SizeFormula:
             }
             if len(sizes) == 1:
                 return sizes.pop()
-            return _length(None, shown)
+            return _format_length(None, shown)
     return SizeFormula()
 
 
-def _length(size: tree.Formula | None, shown: str) -> SizeFormula:
-    """Return a declared length; None for one that only the bytes tell."""
+def _format_length(size: tree.Formula | None, shown: str) -> SizeFormula:
+    """Return a declared length; for None, the name of an unknown size."""
     if isinstance(size, int):
         return SizeFormula(size)
     return SizeFormula(0, (f"size({shown})" if size is None else format_formula(size),))
@@ -146,8 +146,8 @@ def _count(node: tree.Repeat) -> int | str:
     return format_formula(node.count)
 
 
-def _member(shown: str, member: tree.Node) -> str:
-    """How a member of what is shown so is shown."""
+def _member_path(shown: str, member: tree.Node) -> str:
+    """Return the path of a member of a struct."""
     return ".".join(filter(None, (shown, member.name or tree.UNNAMED)))
 
 
@@ -157,24 +157,26 @@ def _element(shown: str) -> tuple[str, str]:
     return f"{shown}[{index}]", index
 
 
-def _rows(
+def _iter_rows(
     node: tree.Node, shown: str, start: SizeFormula, condition: str, seals: Mapping[str, str]
 ) -> Iterator[WireRow]:
-    """Yield the rows of a part that begins at `start`, and is there under a condition."""
+    """Yield the rows of a part that begins at `start` and exists under a condition."""
     match node:
         case tree.Struct():
             for member in node.members:
-                below = _member(shown, member)
-                yield from _rows(member, below, start, condition, seals)
+                below = _member_path(shown, member)
+                yield from _iter_rows(member, below, start, condition, seals)
                 start = start + extent(member, below)
         case tree.Sealed():
-            yield from _rows(node.body, shown, start, condition, seals)
+            yield from _iter_rows(node.body, shown, start, condition, seals)
         case tree.Repeat():
             element, index = _element(shown)
             size = extent(node.element, element)
             says = "; ".join(filter(None, (condition, f"{_count(node)} elements of {size}")))
             yield WireRow(str(start), str(size.times(_count(node))), "array", shown, "", says)
-            yield from _rows(node.element, element, start + size.times(index), condition, seals)
+            yield from _iter_rows(
+                node.element, element, start + size.times(index), condition, seals
+            )
         case tree.PartSequence():
             element, _ = _element(shown)
             yield WireRow(
@@ -187,12 +189,12 @@ def _rows(
             )
             for kind in node.kinds:
                 said = f"in part {kind.name}" if kind.name else ""
-                yield from _rows(
+                yield from _iter_rows(
                     kind.element, element, SizeFormula(0, (f"at({element})",)), said, seals
                 )
         case tree.When() | tree.Select():
             for condition_text, branch in list_branches(node):
-                yield from _rows(branch, shown, start, condition_text, seals)
+                yield from _iter_rows(branch, shown, start, condition_text, seals)
         case tree.Check():
             yield WireRow(
                 str(start),
@@ -206,8 +208,13 @@ def _rows(
             yield WireRow(str(start), "0", "no frame", shown, "", condition)
         case tree.Block():
             for part in node.parts:
-                yield _row(
-                    part.info, str(start), *_bits(part), _part(shown, part), condition, seals
+                yield _make_row(
+                    part.info,
+                    str(start),
+                    *_describe_bits(part),
+                    _part(shown, part),
+                    condition,
+                    seals,
                 )
         case tree.Number() | tree.Blob() | tree.Opaque():
             if isinstance(node, tree.Opaque) and node.size is None:
@@ -218,10 +225,10 @@ def _rows(
                 info = replace(node.info, const=node.const)
             else:
                 info = node.info
-            yield _row(info, str(start), length, _type(node), shown, condition, seals)
+            yield _make_row(info, str(start), length, _describe_type(node), shown, condition, seals)
 
 
-def _row(
+def _make_row(
     info: tree.FieldInfo,
     offset: str,
     size: str,
@@ -240,10 +247,10 @@ def _part(shown: str, part: tree.Part) -> str:
     )
 
 
-def _bits(part: tree.Part) -> tuple[str, str]:
+def _describe_bits(part: tree.Part) -> tuple[str, str]:
     """Return the size and type of a part of a block.
 
-    The size is in bits, or in bytes for an integer that is wider than any number.
+    The size is in bits. For an integer that is wider than the number types, it is in bytes.
     """
     if part.info.dtype is None and part.bits.run is not None and part.bits.is_whole:
         order, _, size, _ = part.bits.run
@@ -254,7 +261,7 @@ def _bits(part: tree.Part) -> tuple[str, str]:
     return f"{part.bits.width} bit{'s' * (part.bits.width > 1)}", bit_text(part.bits)
 
 
-def _type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
+def _describe_type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
     match node:
         case tree.Number():
             return f"{node.kind}{8 * node.size}" + f" {node.order[0]}e" * (node.size > 1)
@@ -265,7 +272,7 @@ def _type(node: tree.Number | tree.Blob | tree.Opaque) -> str:
 
 
 def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
-    """Return the alternatives of a part, each with its condition in words."""
+    """Return the alternatives of a part, each with its condition as text."""
     if isinstance(node, tree.When):
         condition_text = format_formula(node.condition)
         return [(f"if {condition_text}", node.then), (f"if not {condition_text}", node.otherwise)]
@@ -279,7 +286,7 @@ def list_branches(node: tree.When | tree.Select) -> list[tuple[str, tree.Node]]:
 
 
 def describe_end(node: tree.PartSequence) -> str:
-    """Describe what determines the last one of some parts."""
+    """Describe how the last part of a sequence of parts is determined."""
     if node.count is not None:
         return f"{format_formula(node.count)} parts of variable size"
     if node.within is not None:
@@ -297,9 +304,9 @@ def describe_end(node: tree.PartSequence) -> str:
 
 
 def format_formula(formula: tree.Formula) -> str:
-    """Return a formula as text, with the whole paths of its fields.
+    """Return a formula as text, with the full paths of its fields.
 
-    Returns "?" for a function that cannot be read.
+    Returns "?" for a function that cannot be converted to a formula.
     """
     match formula:
         case tree.Op("==" | "!=" as symbol, (tree.Ref() as ref, int() as value)) if (
@@ -316,7 +323,7 @@ def format_formula(formula: tree.Formula) -> str:
 
 
 def _is_enclosed(text: str) -> bool:
-    """Return whether the first bracket of a text closes at its end."""
+    """Return whether the first bracket of a text is closed by its last character."""
     depths = list(itertools.accumulate((part == "(") - (part == ")") for part in text))
     return text.startswith("(") and depths.index(0) == len(text) - 1
 
@@ -337,7 +344,7 @@ def bit_text(bits: BitField) -> str:
 
 
 def unit_text(info: tree.FieldInfo) -> str:
-    """Unit and scale of a field: "0.01 deg", "0.01 deg - 327.68"."""
+    """Return unit and scale of a field: "0.01 deg", "0.01 deg - 327.68"."""
     if not info.scaled:
         return info.unit
     if info.offset:
@@ -350,7 +357,7 @@ def unit_text(info: tree.FieldInfo) -> str:
 def describe_field(info: tree.FieldInfo) -> str:
     """Return the description of a field.
 
-    It has its constant, the formula it follows from, its text and the names of its values.
+    It consists of its constant, the formula of its value, its text and the names of its values.
     """
     if info.const is not None:
         const = f"always {format_hex(info.const, info.bits)}"
@@ -372,7 +379,10 @@ def describe_field(info: tree.FieldInfo) -> str:
 
 
 def format_hex(value: object, bits: int) -> str:
-    """Bytes and integers in hexadecimal, integers with all digits of their width."""
+    """Return bytes or an integer in hexadecimal.
+
+    An integer has all digits of its width.
+    """
     if isinstance(value, bytes | bytearray):
         return value.hex(" ")
     if isinstance(value, int):

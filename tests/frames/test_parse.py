@@ -160,7 +160,7 @@ def test_arrays_of_all_kinds(name: str) -> None:
 def test_headers_lead_to_their_own_layout_also_after_some_were_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(layout_tree, "REMEMBERED", 20)
+    monkeypatch.setattr(layout_tree, "MAX_CACHED_HEADERS", 20)
     kinds = Switch(this.kind, {1: Int8ub, 2: Int16ub}, default=Int24ul)
     rows = Array(this.count, Int16ul)
     struct = Struct(

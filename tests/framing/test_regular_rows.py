@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from construct import Bytes, Const, Struct
 
-from lidarspec.frames.row_checksums import FEW, SHORT, compute_registers
+from lidarspec.frames.row_checksums import MAX_TABLE_BYTES, MAX_TABLE_ROW_BYTES, compute_registers
 from lidarspec.framing.regular_rows import SMALL_PIECE_BYTES
 from lidarspec.framing.results import Frames
 from lidarspec.simulation.simulator import make_opening_frame, simulate
@@ -180,8 +180,8 @@ def test_few_rows_have_the_registers_that_many_have(width: int, refin: bool) -> 
     source = np.random.default_rng(width)
     poly = int(source.integers(1 << (width - 1))) | 1
     start = (1 << width) - 1 if refin or width % 8 == 0 else 0
-    for length in (1, 7, 8, 9, 46, SHORT):
-        many = source.integers(0, 256, (FEW // length + 1, length + 2), dtype=np.uint8)
+    for length in (1, 7, 8, 9, 46, MAX_TABLE_ROW_BYTES):
+        many = source.integers(0, 256, (MAX_TABLE_BYTES // length + 1, length + 2), dtype=np.uint8)
         spans = ((0, 1), (2, length + 1)) if length > 1 else ((1, 2),)
         together = compute_registers(many, spans, start, width, poly, refin)
         assert (
