@@ -1,8 +1,7 @@
-"""Isolate the tests from settings, kernels and variables of the user; list at the end which tools
-were missing.
+"""Isolate the tests from the user's settings, and list the missing tools at the end.
 
-Ctrl-C reaches the programs that tests start, also in the background of a shell, where it is ignored
-and that is inherited.
+A shell starts background jobs with Ctrl-C ignored, and child processes inherit that. So the handler
+is restored here, and Ctrl-C reaches the programs that tests start.
 """
 
 from __future__ import annotations

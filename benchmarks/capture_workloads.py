@@ -1,4 +1,4 @@
-"""The works that read captures, go on live, take single frames or begin from nothing."""
+"""Workloads on captures, live input, single frames and program start."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""The same sensors' frames with every field at a fixed place: no parts, counts or conditions. They
-read the frames of one work alone.
+"""The same sensors' frames with every field at a fixed offset.
+
+They have no variable parts, counts or conditions, and can parse only the frames of one workload.
 """
 
 from __future__ import annotations

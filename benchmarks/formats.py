@@ -1,5 +1,6 @@
-"""Captures to files of each format: in processes of their own, so that memory is theirs, beside
-what a user would write instead.
+"""Conversions of captures to each format, compared with code of a user.
+
+Each conversion runs in a separate process, so that its memory can be measured.
 """
 
 from __future__ import annotations

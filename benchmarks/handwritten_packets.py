@@ -1,9 +1,8 @@
-"""Decoders of packets as one would write them by hand in NumPy: what the engine is to match from
-the spec alone.
+"""Packet decoders written by hand in NumPy, to compare the engine with.
 
-They know offsets, strides and scales; blocks are compacted before anything is computed, what
-depends on one 16-bit field is a table by its raw value, and chunks stay in the cache. Those of
-serial lines are in `handwritten_serial`.
+They know offsets, strides and scales. They compact blocks before they compute anything, use a
+lookup table for each function of a 16-bit field, and work in chunks that fit into the cache.
+`handwritten_serial` has the decoders of serial streams.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Decoders of serial streams, written by hand in NumPy, with framing and checksums.
 
-`handwritten_packets` has the same for packets.
+`handwritten_packets` has the decoders of packets.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Streams that cost most to find frames in, made of a sensor's own frames.
+"""Streams that are expensive to search for frames, made from a sensor's own frames.
 
-The cost of a byte depends on the declaration: on frame types that follow one another, and on
-headers that make a new layout each. So the streams have frames of all types in any order,
-announcements with and without their frames, heads of frames, random headers, damaged frames, and
-all of these in turn.
+The cost of a byte depends on the declaration: on frame types that follow each other, and on
+headers that each select a new layout. So the streams contain frames of all types in any order,
+announcements with and without their frames, truncated frames, random headers, damaged frames, and
+a mixture of all of these.
 """
 
 from __future__ import annotations

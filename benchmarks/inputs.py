@@ -1,5 +1,6 @@
-"""What the works read: packets and streams that lidarspec's own simulator makes, the same in every
-run.
+"""Input of the workloads: packets and streams from lidarspec's simulator.
+
+They are the same in every run.
 """
 
 from __future__ import annotations

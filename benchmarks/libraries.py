@@ -1,7 +1,7 @@
-"""The libraries for one format each that a user would install instead.
+"""Libraries for a single format that a user might install instead.
 
-Nothing of lidarspec is imported here: a worker in another environment (`remote_contender`) also
-runs these functions.
+This module imports nothing of lidarspec, because a worker in another environment
+(`remote_contender`) also runs these functions.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""The works on real lines: a sender in another process, capture, decoding, points; how late they
-are and what it takes.
+"""Workloads on real connections: capture, decode and compute points as data arrives.
+
+They measure latency, processor time and loss.
 """
 
 from __future__ import annotations

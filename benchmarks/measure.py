@@ -1,5 +1,6 @@
-"""Times of several contenders, taken in turn, so that what slows the machine down slows all of them
-alike.
+"""Measure the times of several contenders in turn.
+
+If the machine slows down, all contenders slow down equally.
 """
 
 from __future__ import annotations

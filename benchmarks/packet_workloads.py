@@ -1,4 +1,4 @@
-"""The works on packets and streams: each beside what makes the same of the same bytes."""
+"""Workloads on packets and streams, compared with other code for the same bytes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""What a user would write instead: construct on plain structs, without adapters and without a
-checksum.
-"""
+"""Contenders that use construct on plain structs, without adapters and checksums."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""A sender in a process of its own, which keeps a rate whatever the receiver does.
+"""Send frames at a fixed rate from a separate process, whatever the receiver does.
 
     python rate_sender.py FRAMES SIZE RATE SECONDS BURST TIMES (fd NUMBER | udp PORT)
 
-FRAMES is a file of frames of SIZE bytes each, TIMES a file for the time at which each was sent,
-int64 ns of the monotonic clock ("-" for none). Prints how many it sent.
+FRAMES is a file of frames of SIZE bytes each. TIMES is a file for the send time of each frame, as
+int64 ns of the monotonic clock ("-" for no file). Prints the number of frames that it sent.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""A contender in a process of another environment.
+"""Run a contender in a process of another environment.
 
-The parent sends a function of `libraries` with its arguments. The worker calls it, which prepares
-the contender, and from then on runs the contender when asked and replies with the seconds by its
-own clock. Requests and replies are pickles on the worker's standard input and output. The worker
-needs `libraries` and `measure`, and nothing of lidarspec. It ends when its input is closed.
+The parent sends a function of `libraries` with its arguments. The worker calls this function, which
+prepares the contender. Then the worker runs the contender for each request and replies with the
+seconds by its own clock. Requests and replies are pickles on the worker's standard input and
+output. The worker needs `libraries` and `measure`, and nothing of lidarspec. It ends when its input
+closes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The table."""
+"""Print the table of benchmark results."""
 
 from __future__ import annotations
 

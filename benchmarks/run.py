@@ -1,5 +1,6 @@
-"""Every work beside memcpy and beside what a user would pick instead: one table, one run. See
-docs/how-to/benchmarks.md.
+"""Compare every workload with memcpy and with other libraries, and print one table.
+
+See docs/how-to/benchmarks.md.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """Write the manual pages, and the generated parts of two pages of the reference.
 
-    python docs/command_pages.py          # all of it
-    python docs/command_pages.py --man    # the manual pages only
+    python docs/command_pages.py          # everything
+    python docs/command_pages.py --man    # only the manual pages
 
-`make reference` runs the first, `make wheels` the second. The manual pages go to docs/man, which
-git ignores. In docs/reference/command-line.md (shared options; usage and options of each verb) and
-docs/reference/ros2.md (parameters of the node) the text between the marks is generated and the rest
-is written by hand; tests/docs/test_reference_pages.py fails if a generated part is out of date.
+`make reference` runs the first command, `make wheels` the second. The manual pages go to docs/man,
+which git ignores. In docs/reference/command-line.md (shared options; usage and options of each
+verb) and docs/reference/ros2.md (parameters of the node) only the text between the marks is
+generated. tests/docs/test_reference_pages.py fails if a generated part is out of date.
 """
 
 from __future__ import annotations

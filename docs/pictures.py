@@ -1,15 +1,14 @@
-"""Make the pictures of the front page and the README.
-
-They are made from simulated sensors alone, with the same bytes each time.
+"""Make the pictures of the front page and the README from simulated sensors.
 
     python docs/pictures.py [--into FOLDER]
         a terminal, a point cloud and a packet diagram, as SVG
     python docs/pictures.py --page [--into FOLDER]
         the page in the browser, as PNG; requires Chromium
 
-`make docs` runs both. A PNG has other bytes wherever fonts are others: that of the page goes into
-the site alone, and for the README it is made by hand when the page has changed.
-tests/docs/test_pictures.py holds that the rest is up to date.
+`make docs` runs both commands. The SVG files are the same each time, and
+tests/docs/test_pictures.py fails if they are out of date. The bytes of the PNG depend on the
+installed fonts, so it goes only into the site. For the README, make the PNG by hand when the page
+has changed.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Makes the screens of the how-to pages, `view` as SVG and what other verbs print, from simulated
-sensors alone.
+"""Make the screens of the how-to pages from simulated sensors.
+
+`view` is shown as SVG, the output of other verbs as text.
 """
 
 from __future__ import annotations

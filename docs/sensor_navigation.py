@@ -1,4 +1,4 @@
-"""A hook of MkDocs: list the page of every sensor in the navigation, by vendor.
+"""MkDocs hook that lists the page of every sensor in the navigation, by vendor.
 
 The pages are generated from the installed sensors (`reference_pages.py`), so `mkdocs.yml` cannot
 name them.

@@ -1,4 +1,4 @@
-"""Assertions that two ways through the engine give the same frames, packets and points."""
+"""Assertions that two ways through the engine give equal frames, packets and points."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""The plan of the house: which module stands on which floor, and the rules that hold it, as
-functions from source to complaints.
+"""The layers of the modules, and architecture rules that return violations.
 
-Nothing is imported to be judged; the rules read syntax trees.
+The rules read syntax trees and import nothing.
 """
 
 from __future__ import annotations

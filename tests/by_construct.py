@@ -1,7 +1,7 @@
-"""Sensors whose frames are parsed and built by construct, as second judges of the engine.
+"""Sensors with frames that construct parses and builds, to compare the engine with.
 
-A frame type is read by construct, one frame at a time, if it has a part without a computable place.
-The frames of `by_construct` have such a part, of no bytes, behind their own.
+The engine uses construct, one frame at a time, for a frame type that has a part without a
+computable offset. `by_construct` adds an empty part of this kind at the end of each frame.
 """
 
 from __future__ import annotations

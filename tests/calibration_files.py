@@ -1,4 +1,4 @@
-"""Calibration files as vendors' tools write them, for the tests of several packages."""
+"""Calibration files as written by vendors' tools, for the tests of several packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All sensors, installed ones and invented shapes, for the long tests.
+"""All sensors, installed and invented, for the long tests.
 
 They are loaded when a test runs.
 """

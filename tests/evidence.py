@@ -1,4 +1,4 @@
-"""Vectors and captures for the tests of sensors, and decoding that construct judges."""
+"""Vectors and captures for the tests of sensors, and comparison with construct."""
 
 from __future__ import annotations
 

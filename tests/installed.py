@@ -1,5 +1,6 @@
-"""The installed sensors by the module that declares them; a module is imported when its sensors are
-asked for.
+"""The installed sensors, by the module that declares them.
+
+A module is imported when its sensors are requested.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Optional libraries that tests use: imported by the first test that needs them, never at
-collection.
+"""Optional libraries that tests use.
+
+The first test that needs a library imports it; collection imports none.
 """
 
 from __future__ import annotations

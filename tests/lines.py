@@ -1,6 +1,4 @@
-"""Real lines for live tests: pseudo terminals behind a name that can be pulled out, and senders
-that keep a rate.
-"""
+"""Pseudo terminals that can be unplugged, and senders at a fixed rate."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Captures for the tests, made byte by byte with `struct` alone: frames, pcap files, pcapng blocks;
-and where real ones are.
+"""Make captures for the tests with `struct`: frames, pcap files and pcapng blocks.
+
+The module also finds the real captures.
 """
 
 from __future__ import annotations

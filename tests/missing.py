@@ -1,5 +1,6 @@
-"""Tools, packages and captures that skipped tests need, found by the reasons of the skips, and how
-to get them.
+"""List the tools, packages and captures that skipped tests need.
+
+They are derived from the reasons of the skips, and printed with the way to get them.
 """
 
 from __future__ import annotations

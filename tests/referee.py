@@ -1,12 +1,11 @@
-"""Record what the engine makes of fixed bytes of every sensor, and compare it with what another
-version made of them.
+"""Record the engine's results on fixed bytes of every sensor, and compare versions.
 
     make referee ARGS=--record     write the record: run this on the tree before a change
-    make referee                   compare: list what this tree makes differently, and end with 1
+    make referee                   compare: list the differences of this tree, and exit with 1
 
 The record holds its inputs: example frames, a simulated stream, and damaged copies of both. So a
-change of the generators does not change what is compared. What the commands of the command line
-print is compared by `tests/cli/test_golden.py`.
+change of the generators does not change the compared inputs. `tests/cli/test_golden.py` compares
+the output of the command line.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Ten sensors that stand for all mechanisms of the installed ones.
+"""Ten sensors that represent all mechanisms of the installed sensors.
 
-A promise about the engine is proved on the shapes of `tests.shapes` and, where real variety
-matters, on these; a promise about a sensor is proved in the `tests` folder of its plugin. Ids only:
-a sensor is loaded when a test needs it.
+Promises about the engine are tested on the shapes of `tests.shapes` and, if real variety matters,
+on these sensors. Promises about a sensor are tested in the `tests` folder of its plugin. The module
+holds only ids: a sensor is loaded when a test needs it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""The rules of `tests.architecture`, held against the source, and what every distribution declares
-about itself.
-"""
+"""Tests of the architecture rules, and of the metadata of every distribution."""
 
 from __future__ import annotations
 

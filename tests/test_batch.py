@@ -1,6 +1,4 @@
-"""Many files at once: the same points as one by one, whoever makes them and however often that is
-ended.
-"""
+"""Tests of converting many files at once, also in processes and after interruption."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmarks run and say what they measured; how fast anything was is no matter here."""
+"""Tests that the benchmarks run and print their measurements, whatever the speed."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The line at the end of a run names what was missing, the tests and how to get it; other skips are
-no matter of tools.
-"""
+"""Tests of the list of missing tools at the end of a test run."""
 
 from __future__ import annotations
 

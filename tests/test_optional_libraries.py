@@ -1,4 +1,7 @@
-"""Optional libraries: the table agrees with pyproject.toml; missing and old libraries are named."""
+"""Tests of optional libraries: versions, missing and old ones.
+
+The table must agree with pyproject.toml.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files in stores: what is said if a driver gives no reason of its own."""
+"""Tests of remote files: the message if a driver gives no reason."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""List every text that a user may read: errors, warnings, help texts, labels and rules.
+"""List every text that a user may read: errors, warnings, help, labels and rules.
 
-`make messages` prints the list for review, by module, one text a line. Values that are filled in
-stand as {}. The list is read off the syntax trees: every string with at least two words that is
-neither a docstring, nor a regular expression, nor a key of a dict.
+`make messages` prints the list for review, by module, one text a line. Inserted values are shown as
+{}. The list comes from the syntax trees: every string with at least two words that is not a
+docstring, a regular expression or a dict key.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Write `lidarspec/known_sensors.json` from the plugins in `plugins/`: `make known-sensors`, which
-installs all of them first.
+"""Write `lidarspec/known_sensors.json` from the plugins in `plugins/`.
+
+`make known-sensors` installs all of them and runs this script.
 """
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
-"""Plugins with one mistake each, and a sound one; `tests/testing/test_broken.py` says which rule
-names which.
+"""Plugins with one mistake each, and a correct one.
+
+`tests/testing/test_broken.py` lists the rule that reports each mistake.
 """

@@ -1,4 +1,4 @@
-"""An acknowledgement of what is not found."""
+"""Acknowledges a finding that `check` does not report."""
 
 from __future__ import annotations
 

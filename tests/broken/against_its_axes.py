@@ -1,4 +1,4 @@
-"""Axes of a manual whose angles run clockwise, and points that run the other way."""
+"""The manual's angles run clockwise, but the points run counter-clockwise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`and` where `&` is due, in `plausible`."""
+"""Uses `and` instead of `&` in `plausible`."""
 
 from __future__ import annotations
 

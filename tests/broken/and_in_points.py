@@ -1,4 +1,4 @@
-"""`and` where `&` is due, in `points`."""
+"""Uses `and` instead of `&` in `points`."""
 
 from __future__ import annotations
 

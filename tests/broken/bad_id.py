@@ -1,4 +1,4 @@
-"""An id that is none."""
+"""An invalid sensor id."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A bare command: Const without a Struct around it."""
+"""A command that is a Const without a Struct around it."""
 
 from __future__ import annotations
 

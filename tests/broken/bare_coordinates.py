@@ -1,4 +1,4 @@
-"""Coordinates without a unit, and directions in degrees for their simulation."""
+"""Coordinates without a unit, and simulated directions in degrees."""
 
 from __future__ import annotations
 

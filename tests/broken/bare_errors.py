@@ -1,4 +1,4 @@
-"""construct's own exceptions leave the package."""
+"""Lets construct's own exceptions leave the package."""
 
 from __future__ import annotations
 

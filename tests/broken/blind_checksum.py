@@ -1,4 +1,4 @@
-"""A checksum of one's own that does not look at every byte."""
+"""A custom checksum that ignores some bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A clock that starts again after 65 s, compared as if it never did."""
+"""Ignores that the clock wraps after 65 s."""
 
 from __future__ import annotations
 

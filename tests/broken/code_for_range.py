@@ -1,4 +1,4 @@
-"""A code that is drawn as a range."""
+"""Draws the code of an invalid sample as a range."""
 
 from __future__ import annotations
 

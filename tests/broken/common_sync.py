@@ -1,4 +1,4 @@
-"""A sync pattern of one bit, which is everywhere in a payload."""
+"""A one-bit sync pattern, which occurs throughout the payload."""
 
 from __future__ import annotations
 

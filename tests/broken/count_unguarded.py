@@ -1,4 +1,4 @@
-"""A division by count - 1, for frames with one sample."""
+"""Divides by count - 1, which is 0 for frames with one sample."""
 
 from __future__ import annotations
 

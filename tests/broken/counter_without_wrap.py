@@ -1,4 +1,4 @@
-"""A counter that starts again at 100, compared with < as if it went on to 255."""
+"""Compares a counter that wraps at 100 as if it wrapped at 256."""
 
 from __future__ import annotations
 

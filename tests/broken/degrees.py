@@ -1,4 +1,4 @@
-"""Degrees where radians are due, in a function that is bound with partial."""
+"""Degrees instead of radians, in a function that is bound with partial."""
 
 from __future__ import annotations
 

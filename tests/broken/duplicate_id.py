@@ -1,4 +1,4 @@
-"""Two sensors of one id."""
+"""Two sensors with the same id."""
 
 from __future__ import annotations
 

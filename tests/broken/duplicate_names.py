@@ -1,4 +1,4 @@
-"""Two fields of one name: the last one wins."""
+"""Two fields with the same name: only the last value is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A distance in steps of a millimetre, of nothing."""
+"""A distance with the empty string as its unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Flag on a whole byte, which keeps one bit of it."""
+"""A Flag on a whole byte, which keeps one bit of the byte."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""FlagsEnum, which loses bits without a name."""
+"""A FlagsEnum, which loses bits without a name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Times by `spread`, which folds whole turns: each is 0."""
+"""Computes times with `spread`, which folds full revolutions: each time is 0."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""360.0 degrees is let through, and not folded: the table of corrections has 360 entries."""
+"""Does not fold an angle of 360.0 degrees, though its table has only 360 entries."""
 
 from __future__ import annotations
 

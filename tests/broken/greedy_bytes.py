@@ -1,4 +1,4 @@
-"""GreedyBytes, which takes the next frames along."""
+"""GreedyBytes, which also reads the frames that follow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""hasattr(this, ...), which is always true."""
+"""Uses hasattr(this, ...), which is always true."""
 
 from __future__ import annotations
 

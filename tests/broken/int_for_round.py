@@ -1,4 +1,4 @@
-"""int() where round() is meant, in an Adapter."""
+"""Uses int() instead of round() in an Adapter."""
 
 from __future__ import annotations
 

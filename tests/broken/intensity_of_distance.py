@@ -1,4 +1,4 @@
-"""An intensity that comes from the distance, beside a field for the quality."""
+"""An intensity computed from the distance, though a quality field exists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A name with a leading underscore, which == ignores."""
+"""A field name with a leading underscore, which == ignores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A longest length that no frame comes near to."""
+"""A maximum length that is far longer than any frame."""
 
 from __future__ import annotations
 

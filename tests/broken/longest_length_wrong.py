@@ -1,4 +1,4 @@
-"""A longest length that is not the frame's."""
+"""A maximum length that differs from the frame's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sensor that names no source."""
+"""A sensor without a source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A test that random frames never pass, and no sweep to begin with."""
+"""A `plausible` test that random frames never pass, without a sweep."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame that does not say how long it can be."""
+"""A frame without a maximum length."""
 
 from __future__ import annotations
 

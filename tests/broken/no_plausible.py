@@ -1,4 +1,4 @@
-"""A weak frame without a test of plausibility."""
+"""A frame with a weak header and without a `plausible` test."""
 
 from __future__ import annotations
 

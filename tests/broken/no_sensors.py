@@ -1,4 +1,4 @@
-"""A plugin that lists something else than sensors."""
+"""A plugin that lists an object that is not a sensor."""
 
 from lidarspec.spec import hookimpl
 

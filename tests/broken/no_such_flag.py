@@ -1,4 +1,4 @@
-"""Scans that end by a field that is not there."""
+"""A scan rule with a field that does not exist."""
 
 from __future__ import annotations
 

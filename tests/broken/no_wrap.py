@@ -1,6 +1,4 @@
-"""Angles from the first to the last without a wrap: backwards in the packet that crosses 360
-degrees.
-"""
+"""Angles without a wrap: they run backwards in the packet that crosses 360 degrees."""
 
 from __future__ import annotations
 

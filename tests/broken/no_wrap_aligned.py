@@ -1,4 +1,4 @@
-"""No wrap between the angles, and a sweep in which no packet crosses 360 degrees."""
+"""Angles without a wrap, and a sweep in which no packet crosses 360 degrees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A length that follows from another, which no frame that comes is held to."""
+"""A length computed from another field, which parsing does not verify."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An angle less than there are samples."""
+"""Spreads angles over one step fewer than there are samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An option that is read, and then ignored."""
+"""`configure` reads an option, and ignores its value."""
 
 from __future__ import annotations
 

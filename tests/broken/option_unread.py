@@ -1,4 +1,4 @@
-"""An option that `configure` does not read."""
+"""`configure` does not read an option."""
 
 from __future__ import annotations
 

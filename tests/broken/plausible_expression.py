@@ -1,4 +1,4 @@
-"""`plausible` with construct's `this`, which is an expression and always true."""
+"""`plausible` with construct's `this`, an expression that is always true."""
 
 from __future__ import annotations
 

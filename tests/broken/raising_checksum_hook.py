@@ -1,4 +1,4 @@
-"""A checksum hook that fails for the sensors that it does not know."""
+"""A checksum hook that raises for the sensors that it does not know."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A hook that fails while it lists its sensors."""
+"""A hook that raises while it lists its sensors."""
 
 from lidarspec.spec import hookimpl
 from tests.broken.sound import sensor

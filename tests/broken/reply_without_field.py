@@ -1,4 +1,4 @@
-"""A reply that is told by a field that it does not have."""
+"""A reply that is matched by a field that it does not have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A field called `state`, which means other packets in `points`."""
+"""A field called `state`, a name that `points` uses for other packets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scaled with its unit before its step."""
+"""A Scaled with its unit before its step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A transport that takes it for granted that everything was written."""
+"""A transport that ignores short writes."""
 
 from __future__ import annotations
 

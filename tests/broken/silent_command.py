@@ -1,4 +1,4 @@
-"""A documented reply that the simulated sensor does not give."""
+"""A documented reply that the simulated sensor does not send."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""sizeof() of a struct with an If, which leaks a KeyError."""
+"""sizeof() of a struct with an If, which raises a KeyError."""
 
 from __future__ import annotations
 

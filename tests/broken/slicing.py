@@ -1,4 +1,4 @@
-"""Slicing, which keeps some elements only."""
+"""Slicing, which keeps only some elements."""
 
 from __future__ import annotations
 

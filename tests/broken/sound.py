@@ -1,5 +1,6 @@
-"""The sensor that each broken plugin is, but for its mistake: headers, a count, an angle from first
-to last, a sum.
+"""The correct sensor that each broken plugin copies with one mistake.
+
+Its frame has a header, a count, a first and a last angle, and a checksum.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A test of plausibility that swallows what goes wrong."""
+"""A `plausible` test that hides its exceptions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sweep that gives a value to a field that the frame does not have."""
+"""A sweep that sets a field that the frame does not have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Python asks whether `this.count == 1` is true, and an expression always is."""
+"""A Python condition on `this.count == 1`, an expression that is always true."""
 
 from __future__ import annotations
 

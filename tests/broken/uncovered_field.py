@@ -1,4 +1,4 @@
-"""A checksum that leaves a field out."""
+"""A checksum that does not cover one of the fields."""
 
 from __future__ import annotations
 

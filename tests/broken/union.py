@@ -1,4 +1,4 @@
-"""Union, which ignores edits of all but one of its readings."""
+"""Union, which ignores edits of all but one of its members."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A distance in a unit that is none."""
+"""A distance in an unknown unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A hook without its mark."""
+"""A hook without the hookimpl decorator."""
 
 from tests.broken.sound import sensor
 

@@ -1,4 +1,4 @@
-"""A field without a name, whose value is lost."""
+"""A field without a name, so its value is lost."""
 
 from __future__ import annotations
 

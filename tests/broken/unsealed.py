@@ -1,4 +1,4 @@
-"""A sum at the end of the frame that is read, and never checked."""
+"""A checksum field that is never verified."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The clock of the wall for a duration."""
+"""Uses the wall clock for a duration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`points` that remembers the batch before."""
+"""A `points` function that depends on the previous batch."""
 
 from __future__ import annotations
 

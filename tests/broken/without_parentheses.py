@@ -1,4 +1,4 @@
-"""Comparisons joined by `&` without parentheses: Python takes `360 & f.last` first."""
+"""Comparisons joined by `&` without parentheses: Python evaluates `&` first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A clock that starts again after 50 s, declared to do so after 3 s."""
+"""A clock that wraps after 50 s, with a declared wrap of 3 s."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Capture files, read and written."""
+"""Tests of reading and writing captures."""

@@ -1,5 +1,6 @@
-"""Captures read in batches: the same datagrams, order and counts as one by one, whatever is in the
-file; and whose the bytes are.
+"""Tests that captures read in batches give the same datagrams as read singly.
+
+They also cover the order, the counts and the sender of each datagram.
 """
 
 from __future__ import annotations

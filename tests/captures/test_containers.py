@@ -1,6 +1,4 @@
-"""Captures and recordings in compressed files: the same packets, and what is said of files that are
-cut off, damaged or of other kinds.
-"""
+"""Tests of captures and recordings in compressed files, also truncated and damaged."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""From captured frames to UDP payloads: link layers, IPv4, IPv6, fragments; always through whole
-captures.
+"""Tests of UDP payloads from captured frames: link layers, IPv4, IPv6 and fragments.
+
+Each test reads a whole capture.
 """
 
 from __future__ import annotations

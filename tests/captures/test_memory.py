@@ -1,4 +1,4 @@
-"""Long captures decoded as a stream: memory does not grow with the file."""
+"""Tests that long captures are decoded in constant memory."""
 
 from __future__ import annotations
 

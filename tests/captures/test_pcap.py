@@ -1,5 +1,6 @@
-"""Reading captures: file formats, pipes, paths, real files. What the frames hold is tested in
-test_ip.py.
+"""Tests of reading captures: file formats, pipes, paths and real files.
+
+`test_ip.py` tests the content of the frames.
 """
 
 from __future__ import annotations

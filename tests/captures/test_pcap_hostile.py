@@ -1,5 +1,6 @@
-"""Captures that are damaged, cut, mutated or made to do harm: what can be read is read, the rest is
-counted, memory is bounded.
+"""Tests of damaged, truncated and hostile captures.
+
+The reader returns all readable packets, counts the rest, and uses bounded memory.
 """
 
 from __future__ import annotations

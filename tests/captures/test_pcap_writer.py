@@ -1,4 +1,4 @@
-"""Writing captures: the bytes, what is refused, and files that take no more."""
+"""Tests of writing captures: their bytes, refused input, and failing disks."""
 
 from __future__ import annotations
 

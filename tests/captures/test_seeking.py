@@ -1,4 +1,4 @@
-"""A time in a capture is found without reading what lies before it."""
+"""Tests that a time in a capture is found without reading the packets before it."""
 
 from __future__ import annotations
 

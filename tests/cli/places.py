@@ -1,5 +1,6 @@
-"""Places where no sensor is: real ports and sockets with something wrong, each a context manager
-that gives its SOURCE.
+"""Sources without a working sensor: real ports and sockets with a fault.
+
+Each function is a context manager that yields its SOURCE.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The command line in a process of its own, and in this one."""
+"""Run the command line in a separate process, or in this one."""
 
 from __future__ import annotations
 

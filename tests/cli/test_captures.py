@@ -1,6 +1,4 @@
-"""What verbs say of captures and files that give less than they hold: damage, packets not read,
-several senders, containers.
-"""
+"""Tests of warnings about captures: damage, unread packets, several senders."""
 
 from __future__ import annotations
 

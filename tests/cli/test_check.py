@@ -1,4 +1,4 @@
-"""`lidarspec check` as a user runs it."""
+"""Tests of `lidarspec check` as a user runs it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Completion in a shell, the guide, and help: what can be typed."""
+"""Tests of shell completion, the guide and the help."""
 
 from __future__ import annotations
 

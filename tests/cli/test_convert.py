@@ -1,4 +1,4 @@
-"""`convert`: real captures give the points that others published for them."""
+"""Tests of `convert`: real captures give their published points."""
 
 from __future__ import annotations
 

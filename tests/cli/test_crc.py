@@ -1,4 +1,4 @@
-"""`crc`: sample frames in every form that people have them in."""
+"""Tests of `crc` with sample frames in every text form."""
 
 from __future__ import annotations
 

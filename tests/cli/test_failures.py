@@ -1,5 +1,6 @@
-"""Wrong input: one clear message with its place and the next command on stderr, nothing on stdout,
-the documented exit code.
+"""Tests of wrong input: one clear message on stderr and the documented exit code.
+
+The message names the place of the error and the next command. Nothing is written to stdout.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
-"""Every verb at every kind of broken source: one clear line, the next command, the documented exit
-code; Ctrl-C and closed pipes.
+"""Tests of every verb with every kind of broken source.
+
+Each gives one clear line, the next command and the documented exit code. They also cover Ctrl-C and
+closed pipes.
 """
 
 from __future__ import annotations

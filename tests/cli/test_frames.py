@@ -1,4 +1,4 @@
-"""`parse`, `explain` and `build`."""
+"""Tests of `parse`, `explain` and `build`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The wording of the command line, in one golden file per verb: golden/VERB.txt.
+"""Tests of the wording of the command line, with one golden file per verb: golden/VERB.txt.
 
 A golden file is a list of command lines, each followed by its result:
 
@@ -7,8 +7,8 @@ A golden file is a list of command lines, each followed by its result:
     out| a line on standard output
     err| a line on standard error
 
-Lines that begin with "# " are comments. To change a text, or to add a command, edit the code or add
-the line that begins with "$", and run
+Lines that begin with "# " are comments. To change a text, edit the code; to add a command, add the
+line that begins with "$". Then run
 
     LIDARSPEC_UPDATE_GOLDEN=1 pytest tests/cli/test_golden.py
 

@@ -1,4 +1,4 @@
-"""`info`: what is in each kind of file, on one screen, however long it is."""
+"""Tests of `info`: the content of each kind of file, on one screen."""
 
 from __future__ import annotations
 

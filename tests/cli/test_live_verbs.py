@@ -1,5 +1,6 @@
-"""`view`, `stats`, `read` and `plot` on files, simulated sensors and real ports; each kind of
-failure ends in one line and its code.
+"""Tests of `view`, `stats`, `read` and `plot` on files, simulations and real ports.
+
+Each kind of failure gives one line and the documented exit code.
 """
 
 from __future__ import annotations

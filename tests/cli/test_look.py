@@ -1,4 +1,4 @@
-"""`sensors`, `show`, `plugins`, `demo`, and the help."""
+"""Tests of `sensors`, `show`, `plugins`, `demo` and the help."""
 
 from __future__ import annotations
 

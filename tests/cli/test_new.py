@@ -1,4 +1,4 @@
-"""`new`: the distribution that it writes works before anything in it is changed."""
+"""Tests that the distribution that `new` writes works without changes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""`ports`, `detect`, `doctor` and `send` at real ports: pseudo-terminals with simulated sensors,
-sockets, files; and their exit codes.
-"""
+"""Tests of `ports`, `detect`, `doctor` and `send` at pseudo terminals and sockets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`record` and `replay` as they are typed: real ports, Ctrl-C, full disks, files that exist."""
+"""Tests of `record` and `replay`: real ports, Ctrl-C, full disks, existing files."""
 
 from __future__ import annotations
 

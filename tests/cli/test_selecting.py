@@ -1,5 +1,6 @@
-"""The same words select in every verb that reads; what selects nothing is said in one line, and
-nothing is written.
+"""Tests that the selection options work in every verb that reads.
+
+An empty selection gives one line, and no file is written.
 """
 
 from __future__ import annotations

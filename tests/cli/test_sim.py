@@ -1,4 +1,4 @@
-"""`sim`: where the sensor is, what to type next, how it ends."""
+"""Tests of `sim`: its address, the suggested commands, and its exit."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""One sensor loads one plugin, and no verb imports parts that it does not use: modules are counted,
-not seconds.
+"""Tests that a command imports only the modules and the plugin that it uses.
+
+They count modules, not seconds.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""What verbs print steers no terminal, can be typed again, and is lost without harm where nobody
-reads it.
+"""Tests that output has no terminal control codes and survives a closed pipe.
+
+Printed names can be typed again as arguments.
 """
 
 from __future__ import annotations

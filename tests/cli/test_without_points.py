@@ -1,4 +1,4 @@
-"""A device without points: each verb works, or says what is missing and what to do instead."""
+"""Tests of verbs with a device without points: they work or suggest another command."""
 
 from __future__ import annotations
 

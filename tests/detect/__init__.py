@@ -1,1 +1,1 @@
-"""Bytes of unknown sensors."""
+"""Tests of the detection of sensors."""

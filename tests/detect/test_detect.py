@@ -1,5 +1,6 @@
-"""Whose bytes: captures, live ports, twins that only their clock or a name tells apart, and bytes
-of nobody.
+"""Tests of detection in captures and on live ports.
+
+They include related models that differ only in their clock or name, and bytes of no known sensor.
 """
 
 from __future__ import annotations

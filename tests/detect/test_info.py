@@ -1,6 +1,4 @@
-"""What a device says of itself: the fields that its `info` names, in text, in Python and where a
-source is examined.
-"""
+"""Tests of the device information that sensors report, as text and in Python."""
 
 from __future__ import annotations
 

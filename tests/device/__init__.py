@@ -1,1 +1,1 @@
-"""A sensor on a source."""
+"""Tests of a sensor on a source."""

@@ -1,5 +1,6 @@
-"""No warning of silence unless a test asks for it: a busy machine may not serve a line for a
-second.
+"""Disable the silence warning unless a test asks for it.
+
+A busy machine may serve no data for a second.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The asyncio device, over real lines."""
+"""Tests of the asyncio device, over real connections."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Commands over live lines: started on opening, stopped on closing, whatever ends the program; a
-control link of its own.
+"""Tests of commands on live connections, sent on opening and on closing.
+
+They cover every way in which a program can end, and separate control links.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Sensors that are talked to over links of their own: TCP, UDP, a broadcast and HTTP, each a real
-socket of a simulated sensor.
+"""Tests of commands over separate links: TCP, UDP, broadcast and HTTP.
+
+Each is a real socket of a simulated sensor.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""A device on a live line: scans as they come, silence, a slow consumer, unplugging; through real
-pseudo terminals and sockets.
+"""Tests of a live device: scans, silence, a slow consumer, unplugging.
+
+They use real pseudo terminals and sockets.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""The pieces of a file have the scans of one pass, bit for bit, whatever sensor it is of and
-however often it is cut.
-"""
+"""Tests that the parts of a file give the same scans as one pass, bit for bit."""
 
 from __future__ import annotations
 

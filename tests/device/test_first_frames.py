@@ -1,4 +1,4 @@
-"""The first reference of a clock in a file applies from the start of the file."""
+"""Tests that the first clock reference in a file applies from the start of the file."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""`lidarspec.toml`: devices by name, in Python and in every verb; mistakes are named with file,
-table and key.
+"""Tests of devices by name in `lidarspec.toml`, in Python and in every verb.
+
+Errors name the file, table and key.
 """
 
 from __future__ import annotations

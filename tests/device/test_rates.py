@@ -1,5 +1,6 @@
-"""Full rates without loss: UDP with a consumer that stalls, and a serial line; by count here, by
-the second in `make soak`.
+"""Tests of full data rates without loss: UDP and a slow consumer, and a serial port.
+
+These tests send a number of packets; `make soak` sends for a time.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""`Session`: whose answer a frame is, when something is sent, and when one gives up. The clock is
-the test's own.
-"""
+"""Tests of `Session` with a simulated clock: matching replies, sending and timeouts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A source recorded while it is decoded: strangers and a plugin that fails cost no record."""
+"""Tests of recording a source while it is decoded.
+
+Other senders and a failing plugin lose no record.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The documentation, as its readers follow it."""
+"""Tests of the documentation."""

@@ -1,11 +1,10 @@
-"""Pages of the documentation as their readers follow them: files written, shells and Python run,
-what is printed compared.
+"""Run the examples of a documentation page and compare their output.
 
-A block with ``title="NAME"`` is the file of that name; a second one with the same name is added
-below the first. A block with ``title="Output"`` is what the block before it prints, with ``...``
-for whatever is there. Of the others, ``sh`` and ``python`` are run in the order of the page, all
-Python of a page as one session; other languages (``text``, ``console``) are for reading. Python
-that imports a library which is not installed is left out, and what it prints, and said.
+A block with ``title="NAME"`` is the file of that name; a second block with the same name is
+appended. A block with ``title="Output"`` is the output of the block before it, and ``...`` matches
+anything. All other ``sh`` and ``python`` blocks run in the order of the page, all Python of a page
+in one session. Blocks in other languages (``text``, ``console``) are not run. Python that imports a
+missing library is skipped with its output, and the skip is reported.
 """
 
 from __future__ import annotations

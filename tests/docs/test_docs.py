@@ -1,4 +1,7 @@
-"""The pages say what is true: blocks run, and every hook, error and verb has its heading."""
+"""Tests that the pages' examples run.
+
+They also require a heading for every hook, error and verb.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The notebook of the documentation runs from its first cell to its last, in a kernel of its own,
-and shows what it says.
-"""
+"""Tests that the documentation's notebook runs in a new kernel with its outputs."""
 
 from __future__ import annotations
 

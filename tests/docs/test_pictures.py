@@ -1,6 +1,4 @@
-"""The pictures of the front page are what their script makes of simulated sensors, and small; pages
-and README show them all.
-"""
+"""Tests that the pictures of the front page are up to date, small and shown."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""The tests on the page about tests: the property test finds its bug and prints the failure of the
-page, and the test with a simulated port passes.
+"""Tests of the examples on the page about tests.
+
+The property test finds its bug and prints the failure of the page. The test with a simulated port
+passes.
 """
 
 from __future__ import annotations

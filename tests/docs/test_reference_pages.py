@@ -1,4 +1,4 @@
-"""The scripts in docs/ that generate pages of the reference."""
+"""Tests of the scripts in docs/ that generate pages of the reference."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""The terminal screens on the pages are what the verbs print: word for word where the moment does
-not matter, else in their headings.
+"""Tests that the terminal screens on the pages are the output of the verbs.
+
+Screens that depend on the time are compared by their headings, all others word for word.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Bytes of unknown sensors."""
+"""Tests of drafting a description of an unknown sensor."""

@@ -1,6 +1,4 @@
-"""The search for a checksum: frames sealed with a known one, and whether it is found, where it
-stands, and at what price.
-"""
+"""Tests of the search for a checksum: results and cost on frames with a known one."""
 
 from __future__ import annotations
 

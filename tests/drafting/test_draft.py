@@ -1,6 +1,4 @@
-"""Drafts of unknown frames: what stands in real captures is found, and the draft reads the capture
-that it came from.
-"""
+"""Tests of drafts of unknown frames: a draft reads the capture that it came from."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What is proved of the engine, on the shapes."""
+"""Tests of the engine's promises, on the shapes."""

@@ -1,8 +1,7 @@
-"""Whether construct's own parse of an author's struct and ours agree: frame by frame, and as
-columns on both paths.
+"""Compare our parsing of an author's struct with construct's own.
 
-The judge here is construct itself with the tree as the author wrote it; nothing of the engine takes
-part in what is expected.
+The comparison is by frame, and by column on both paths. The expected values come from construct
+with the tree as the author wrote it, without any part of the engine.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Cost of finding frames in a stream, counted in function calls and in bytes of memory.
+"""Measure the cost of finding frames, in function calls and bytes of memory.
 
-A time would depend on the other work of the machine.
+Times are not used, because they depend on the other load of the machine.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Compiled and interpreted engine of a sensor: which one a frame type has, and checks that both
-give the same.
+"""Compare the compiled and the interpreted engine of a sensor.
 
-The checks are functions of a sensor that fail where the engines differ: on damaged input, and on
-values at the edges of their fields.
+The checks are functions of a sensor that fail if the engines differ on damaged input or on values
+at the limits of their fields.
 """
 
 from __future__ import annotations

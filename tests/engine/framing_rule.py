@@ -1,9 +1,9 @@
 """The framing rule as functions of a sensor that fail if it is broken.
 
 Each function compares the decoder with the oracle, or with itself on other input, on data that has
-broken other parsers. They are functions, not tests, so that parsers with a planted mistake are held
-to them too. `length` is the size of the streams in bytes: the quick tier uses short streams, the
-slow one `streams.LENGTH`.
+broken other parsers. They are functions, not tests, so that they can also run on parsers with a
+deliberate mistake. `length` is the size of the streams in bytes: the quick tier uses short streams,
+the slow one `streams.LENGTH`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Parsers as vendors write them, in the place of the engine's decoder: one that is right, and one
-for each mistake put in on purpose.
+"""Parsers like those of vendors, used instead of the engine's decoder.
+
+One is correct; each of the others has one deliberate mistake.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""What the framing rule of the documentation says, byte by byte and by brute force; it shares no
-code with the engine's framing.
+"""The documented framing rule, implemented byte by byte and by brute force.
 
-construct parses the author's own struct at one offset, the frame's own test of plausibility judges
-what came out, and nothing is done in bulk, so that the engine's bulk work has something to be held
-against.
+It shares no code with the engine's framing. construct parses the author's own struct at one offset,
+and the frame's `plausible` test judges the result. Nothing is done in bulk, so that the engine's
+bulk code can be compared with it.
 """
 
 from __future__ import annotations

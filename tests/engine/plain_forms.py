@@ -1,5 +1,6 @@
-"""Wire forms read by hand, one character after another, for the oracle: nothing is shared with
-`lidarspec.spec.wire_forms`.
+"""Wire forms read one character at a time, for the oracle.
+
+The module shares no code with `lidarspec.spec.wire_forms`.
 """
 
 from __future__ import annotations

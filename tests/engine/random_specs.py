@@ -1,8 +1,7 @@
-"""Structs drawn at random, as Python text: what an author may write, in combinations that nobody
-thought of.
+"""Random structs as Python text, in combinations that no author may have tried.
 
-A spec that fails is printed as it could be typed. Sizes grow with the number of a spec, so that the
-first to fail is a small one.
+A spec that fails is printed as Python code. Its number determines its size, so that the first to
+fail is a small one.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Streams that the framing is held to, damaged by seed or made of false headers; decoders whose
-books are kept; what a task holds.
+"""Streams for tests of framing, with seeded damage or false headers.
+
+The module also has decoders that check their counters, and measures the memory of a task.
 """
 
 from __future__ import annotations

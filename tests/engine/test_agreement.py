@@ -1,5 +1,6 @@
-"""Both engines read alike: damaged input, values at the edges of their fields, faults in elements
-of arrays.
+"""Tests that both engines give the same results.
+
+They use damaged input, values at the limits of their fields, and faults in elements of arrays.
 """
 
 from __future__ import annotations

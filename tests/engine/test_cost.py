@@ -1,4 +1,7 @@
-"""No stream costs much more than frames do (P20): function calls and memory for each byte."""
+"""Tests that no stream costs much more than frames do (P20).
+
+They count function calls and memory for each byte.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""The framing rule (P1, P2, P18) on the shapes and against an oracle; parsers with a planted
-mistake are caught.
+"""Tests of the framing rule (P1, P2, P18) on the shapes, against an oracle.
+
+Parsers with a deliberate mistake must fail.
 """
 
 from __future__ import annotations

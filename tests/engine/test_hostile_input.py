@@ -1,8 +1,7 @@
-"""Hostile input raises only documented exceptions (P3): 20,000 mutated inputs in sum, on shapes and
-representatives.
+"""Tests that hostile input raises only documented exceptions (P3).
 
-Parsing one frame raises `WireError` alone; decoding raises on nothing. `tests.fuzz` does the same a
-million times and longer.
+The shapes and representatives get 20,000 mutated inputs in total. Parsing one frame raises only
+`WireError`; decoding never raises. `tests.fuzz` does the same with millions of inputs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bounds that hold on any input: memory (P4), and how long a frame is kept back (P6)."""
+"""Tests of limits for any input: memory (P4), and the delay of a frame (P6)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time grows with the input and no faster (P5).
+"""Tests that time grows linearly with the input (P5).
 
 Twice the worst input takes about twice as long, as a ratio of CPU seconds within one run.
 """

@@ -1,5 +1,6 @@
-"""Promises on live work that need several modules together: P9 exact replay, P12 the queue, P15
-whole files, P16 clocks.
+"""Tests of promises on live input that involve several modules.
+
+They are P9 (exact replay), P12 (the queue), P15 (whole files) and P16 (clocks).
 """
 
 from __future__ import annotations

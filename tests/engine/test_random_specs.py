@@ -1,6 +1,4 @@
-"""Random specs: what construct itself reads is what we read, frame by frame and in bulk, compiled
-and interpreted.
-"""
+"""Tests that random specs give construct's values, compiled and interpreted."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Bytes in words."""
+"""Tests of explanations of bytes."""

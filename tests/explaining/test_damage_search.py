@@ -1,4 +1,4 @@
-"""What became of a damaged frame: the flipped bit, the lost or inserted byte."""
+"""Tests of finding the damage of a frame: a flipped bit, a lost or inserted byte."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Explanations name every byte once, of whole, damaged and truncated frames, and say what the
-engine says.
+"""Tests that explanations name every byte once and agree with the engine.
+
+The frames are whole, damaged and truncated.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""A stream in pieces: frames as they come, and what was a frame before it was damaged, cut where it
-was sent.
-"""
+"""Tests of splitting a stream into frames and damaged frames."""
 
 from __future__ import annotations
 

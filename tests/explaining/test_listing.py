@@ -1,6 +1,4 @@
-"""Listings: nested parts indented, bit fields drawn, damage told to the bit, differences between
-frames, colours on a terminal alone.
-"""
+"""Tests of listings: nested parts, bit fields, damage, differences and colours."""
 
 from __future__ import annotations
 

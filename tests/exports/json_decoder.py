@@ -1,5 +1,6 @@
-"""Frames decoded by nothing but the JSON of a spec, to show that it says enough; written from
-docs/reference/spec-json.md.
+"""Decode frames from the JSON of a spec alone, to show that it is complete.
+
+The decoder was written from docs/reference/spec-json.md.
 """
 
 from __future__ import annotations

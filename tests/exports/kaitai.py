@@ -1,4 +1,4 @@
-"""The Kaitai compiler, where it is installed, and frames read by what it makes."""
+"""Run the Kaitai compiler, if it is installed, and read frames with its output."""
 
 from __future__ import annotations
 

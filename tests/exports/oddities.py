@@ -1,5 +1,6 @@
-"""A sensor whose frames hold what no other one does, so that exports are tried on it: formulas of
-every kind, odd numbers, names.
+"""A sensor with rare features, for the tests of exports.
+
+It has formulas of every kind, unusual numbers, and unusual names.
 """
 
 from __future__ import annotations

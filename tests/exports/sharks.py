@@ -1,4 +1,4 @@
-"""tshark, for tests: what it reads in a capture, with dissectors that were exported."""
+"""Run tshark on a capture with exported dissectors."""
 
 from __future__ import annotations
 

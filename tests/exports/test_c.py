@@ -1,6 +1,4 @@
-"""C headers from specs: compiled as strictly as compilers can, and read by them, frame by frame, as
-by lidarspec itself.
-"""
+"""Tests of C headers: they compile with strict warnings and read frames as we do."""
 
 from __future__ import annotations
 

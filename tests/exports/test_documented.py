@@ -1,4 +1,4 @@
-"""What the page on exports shows is what comes out."""
+"""Tests that the output on the page on exports is up to date."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The exports md, svg, json and pyi, and the verb: they say what the spec says, and their tools
-take them.
-"""
+"""Tests of the exports md, svg, json and pyi, and of the verb."""
 
 from __future__ import annotations
 

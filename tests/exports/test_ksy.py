@@ -1,6 +1,4 @@
-"""Kaitai specs compile with Kaitai's own compiler, and what it makes reads the values that
-lidarspec reads.
-"""
+"""Tests of Kaitai specs: they compile, and the result reads the values that we read."""
 
 from __future__ import annotations
 

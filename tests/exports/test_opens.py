@@ -1,6 +1,4 @@
-"""Captures that lidarspec writes, opened by tshark: nothing malformed, no warning, right checksums,
-and what was put in.
-"""
+"""Tests that tshark opens our captures without warnings and shows their content."""
 
 from __future__ import annotations
 

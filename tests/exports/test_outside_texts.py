@@ -1,5 +1,6 @@
-"""What a stranger's plugin calls its sensor stays text in every export: no code, no mark-up, no
-control character.
+"""Tests that texts of other authors' plugins are escaped in every export.
+
+They are never code, markup or control characters.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""What exports refuse, with a reason that is true, and what looks like Python but can be said."""
+"""Tests that exports refuse unsupported specs with the right reason.
+
+They also cover Python code in specs that exports can translate.
+"""
 
 from __future__ import annotations
 

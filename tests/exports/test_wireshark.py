@@ -1,6 +1,4 @@
-"""Wireshark dissectors from specs, run in tshark: what it shows of each frame is what lidarspec
-parses.
-"""
+"""Tests of Wireshark dissectors: tshark shows the values that lidarspec parses."""
 
 from __future__ import annotations
 

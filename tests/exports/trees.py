@@ -1,4 +1,4 @@
-"""What exports are tried on, and parsed frames taken apart for comparing."""
+"""Sensors for the tests of exports, and parsed frames as trees to compare."""
 
 from __future__ import annotations
 

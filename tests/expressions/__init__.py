@@ -1,1 +1,1 @@
-"""Points cut into turns."""
+"""Tests of traced expressions."""

@@ -1,5 +1,6 @@
-"""Elements of arrays, numbers along them, tables over two of them, sums along them: alike by every
-engine.
+"""Tests of array elements, indices, lookup tables and sums along an axis.
+
+Every engine gives the same results.
 """
 
 from __future__ import annotations

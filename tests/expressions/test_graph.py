@@ -1,6 +1,4 @@
-"""The graph of a traced function: every field once, gone through and computed in one way, and what
-can be said without computing it.
-"""
+"""Tests of the graph of a traced function."""
 
 from __future__ import annotations
 

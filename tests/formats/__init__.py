@@ -1,1 +1,1 @@
-"""Files of points."""
+"""Tests of files of points."""

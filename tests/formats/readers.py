@@ -1,7 +1,7 @@
-"""Readers of point cloud files, for tests: our own, written from the formats' specifications, and
-those of other libraries.
+"""Readers of point cloud files for tests.
 
-Each returns the columns of a file by name.
+Some are our own, written from the formats' specifications; others use other libraries. Each returns
+the columns of a file by name.
 """
 
 from __future__ import annotations

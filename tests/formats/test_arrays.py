@@ -1,4 +1,4 @@
-"""Zarr, as zarr reads it."""
+"""Tests of Zarr files, read with zarr."""
 
 from __future__ import annotations
 

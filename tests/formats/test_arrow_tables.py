@@ -1,4 +1,4 @@
-"""Parquet, Arrow and Feather, as pyarrow, DuckDB and pandas read them."""
+"""Tests of Parquet, Arrow and Feather files, read with pyarrow, DuckDB and pandas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Robotics logs hold the points of the scans as other people's readers see them."""
+"""Tests of points in robotics logs, read with other libraries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""E57, as pye57 reads it, and libE57Format below it."""
+"""Tests of E57 files, read with pye57 and libE57Format."""
 
 from __future__ import annotations
 

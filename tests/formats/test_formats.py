@@ -1,4 +1,4 @@
-"""Files appear whole or not at all.
+"""Tests that files are written completely or not at all.
 
 They have the format of their suffix and the content of the clouds.
 """

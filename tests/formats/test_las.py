@@ -1,4 +1,4 @@
-"""LAS and LAZ, as laspy reads them."""
+"""Tests of LAS and LAZ files, read with laspy."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Point cloud files hold the points of the scans, in the precision of the format, for our readers
-and those of others.
-"""
+"""Tests of point cloud files: they hold the points in the precision of the format."""
 
 from __future__ import annotations
 

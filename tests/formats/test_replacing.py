@@ -1,4 +1,4 @@
-"""An output replaces the files of its own format, and never deletes others."""
+"""Tests that an output replaces only files of its own format."""
 
 from __future__ import annotations
 

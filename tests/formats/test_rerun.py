@@ -1,6 +1,4 @@
-"""Recordings for Rerun hold the scans on both clocks, coloured, mounted, with figures, as Rerun's
-own reader sees them.
-"""
+"""Tests of Rerun recordings, read with Rerun's own reader."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""A frame and its bytes."""
+"""Tests of parsing and building frames."""

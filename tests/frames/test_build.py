@@ -1,4 +1,4 @@
-"""Commands from values: what an argument may go into, and what it may be."""
+"""Tests of building commands from values: field names and permitted values."""
 
 from __future__ import annotations
 

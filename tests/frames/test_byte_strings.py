@@ -1,5 +1,6 @@
-"""Byte strings in arrays and up to a terminator, elements that differ, and what is found out about
-a struct before bytes arrive.
+"""Tests of byte strings in arrays and up to a terminator, and of varying elements.
+
+They also cover the analysis of a struct at declaration.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Parts that a named value chooses: construct looks an Enum's values up by their names, and so does
-every engine.
-"""
+"""Tests of parts selected by a named value: every engine agrees with construct."""
 
 from __future__ import annotations
 

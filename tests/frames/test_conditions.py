@@ -1,6 +1,4 @@
-"""What a struct asks of values: construct judges one frame after another, and every engine as it
-does.
-"""
+"""Tests that every engine enforces a struct's conditions as construct does."""
 
 from __future__ import annotations
 

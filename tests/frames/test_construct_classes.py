@@ -1,7 +1,7 @@
-"""Each class of construct in a small struct, as people write it: values, bytes and columns are
-those of construct, and it is known by name which structs are compiled.
+"""Tests of each class of construct in a small struct.
 
-construct itself, with the struct as it is written here, is the judge.
+Values, bytes and columns must equal those of construct with the struct as written here. The tests
+also list which structs are compiled.
 """
 
 from __future__ import annotations

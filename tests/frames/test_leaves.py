@@ -1,6 +1,4 @@
-"""A leaf, the place of one field in the frames of a layout: what is stored there is loaded again,
-and nothing else changes.
-"""
+"""Tests of leaves: storing a value in a field changes no other field."""
 
 from __future__ import annotations
 

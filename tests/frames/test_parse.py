@@ -1,4 +1,4 @@
-"""`parse` by layouts gives the very Container that construct gives."""
+"""Tests that `parse` by layouts returns the same Container as construct."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Parts of sizes of their own: read, built, held to what the frame says of them, and found in many
-frames at once as in one.
-"""
+"""Tests of parts with their own sizes: read, built and checked, singly and in bulk."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What construct alone reads keeps the contract: raw numbers, unchecked parsing, errors with a
-place, and no byte that gets lost.
+"""Tests of frames that only construct can read.
 
-Each frame ends with a text up to a terminator, so that it has no layout.
+They cover raw numbers, unchecked parsing, errors with an offset, and complete bytes. Each frame
+ends with a text up to a terminator, so that it has no layout.
 """
 
 from __future__ import annotations

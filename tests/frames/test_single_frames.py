@@ -1,4 +1,4 @@
-"""The checksum of one frame by the function made for it is that of its algorithm."""
+"""Tests that the checksum function for one frame agrees with its algorithm."""
 
 from __future__ import annotations
 

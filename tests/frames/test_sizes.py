@@ -1,5 +1,6 @@
-"""Lengths that follow from what they measure: filled in, held, and the same for both engines; what
-construct prefixes, pads and aligns.
+"""Tests of computed lengths: set on building, and verified on parsing.
+
+Both engines must agree. The tests also cover construct's prefixes, paddings and alignment.
 """
 
 from __future__ import annotations

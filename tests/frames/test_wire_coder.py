@@ -1,6 +1,4 @@
-"""Wire forms on single frames: what is read, what is written, how it was spelled, and what cannot
-be either.
-"""
+"""Tests of wire forms on single frames: values read, written and refused."""
 
 from __future__ import annotations
 

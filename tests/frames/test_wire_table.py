@@ -1,6 +1,4 @@
-"""Wire tables say where the fields are: their offsets and formulas against the compiled layout of
-example frames.
-"""
+"""Tests of wire tables: offsets and formulas agree with the compiled layout."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Where frames are."""
+"""Tests of finding frames."""

@@ -1,6 +1,4 @@
-"""Frames in arrays and in one buffer: found where they stand, with the result of one datagram after
-another.
-"""
+"""Tests of frames in arrays and in one buffer, compared with single datagrams."""
 
 from __future__ import annotations
 

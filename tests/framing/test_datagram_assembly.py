@@ -1,6 +1,4 @@
-"""Messages in several datagrams: joined in any order, given up where a fragment is missing, and
-never made of two.
-"""
+"""Tests of messages in several datagrams: any order, missing fragments, no mixtures."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Framing: inputs that have broken other parsers, and single mechanisms; the rule as a whole is
-held in tests/engine.
+"""Tests of framing with input that has broken other parsers.
+
+tests/engine tests the framing rule as a whole.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Binary frames and lines of text on one line are frames of both, each of its own wire form."""
+"""Tests of binary frames and lines of text on one connection."""
 
 from __future__ import annotations
 

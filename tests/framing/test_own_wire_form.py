@@ -1,4 +1,4 @@
-"""A wire form that an author writes has the three documented operations alone."""
+"""Tests of an author's own wire form with only the three documented operations."""
 
 from __future__ import annotations
 

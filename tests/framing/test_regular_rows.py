@@ -1,5 +1,6 @@
-"""Frames that follow one another are found without a search: with the same frames and counters as
-the search has.
+"""Tests that consecutive frames are found without a search.
+
+The frames and counters equal those of the search.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Candidates of many lengths are judged together: with the same frames and counters as layout by
-layout, and with little work.
+"""Tests that candidates of many lengths are checked together.
+
+The frames and counters equal those of checking layout by layout, with less work.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Hostile input by the million, for everything that reads what others wrote: `make fuzz`.
+"""Fuzz tests of everything that reads outside data: `make fuzz`.
 
-`targets` says what is read, from which valid examples the inputs are made, and which exceptions are
-documented; `trial` reads one input within its limits of time and memory; `campaign` makes the
-inputs of one target and keeps those that reach new lines; `python -m tests.fuzz` spreads a number
-of inputs over all targets, a process each, goes on where it stopped, and says what it found.
+`targets` lists the readers, the valid examples that inputs are derived from, and the documented
+exceptions. `trial` reads one input within its limits of time and memory. `campaign` makes the
+inputs of one target and keeps those that reach new lines. `python -m tests.fuzz` runs a number of
+inputs on all targets, one process each, resumes an interrupted run, and reports its findings.
 """
 
 from __future__ import annotations

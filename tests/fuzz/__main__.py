@@ -1,5 +1,6 @@
-"""`make fuzz INPUTS=10000000 SEED=1`: hostile input for everything that reads; the same command
-goes on where it was stopped.
+"""Fuzz everything that reads outside data: `make fuzz INPUTS=10000000 SEED=1`.
+
+The same command resumes an interrupted run.
 """
 
 from __future__ import annotations

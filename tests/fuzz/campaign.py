@@ -1,5 +1,6 @@
-"""Inputs for one target, made of its examples and of what reached new lines: by atheris where it is
-installed, else by seed.
+"""Make inputs for one target from its examples and from inputs that reach new lines.
+
+Inputs are made by atheris if it is installed, otherwise at random from a seed.
 """
 
 from __future__ import annotations

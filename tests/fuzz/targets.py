@@ -1,5 +1,7 @@
-"""What is read: frames and streams of every sensor and shape, captures, recordings, settings,
-scenes, vectors, calibration, words.
+"""The fuzz targets: each reader with its valid examples and documented exceptions.
+
+They read frames and streams of every sensor and shape, captures, recordings, settings, scenes,
+vectors, calibration and command lines.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Every target reads its examples and neighbours of theirs, and what does harm is found; `make
-fuzz` does it by the million.
+"""Tests that every fuzz target reads its examples, and that faults are found.
+
+`make fuzz` runs the targets with millions of inputs.
 """
 
 from __future__ import annotations

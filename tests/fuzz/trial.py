@@ -1,6 +1,4 @@
-"""One input, read within its limits: what comes of it is nothing, a documented exception, or a
-finding.
-"""
+"""Read one input within limits, and return an undocumented result as a finding."""
 
 from __future__ import annotations
 

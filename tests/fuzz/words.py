@@ -1,8 +1,7 @@
-"""Command lines out of bytes: each byte chooses the next word, of a verb's own options and values,
-or of those that make trouble.
+"""Make command lines from bytes: each byte selects the next argument.
 
-Nothing that is chosen opens a line or goes on for ever: sources are files, and what is simulated
-goes into one for some milliseconds.
+Arguments are a verb's own options and values, or difficult ones. No command opens a port or runs
+without end: sources are files, and simulations write some milliseconds into a file.
 """
 
 from __future__ import annotations

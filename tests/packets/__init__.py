@@ -1,1 +1,1 @@
-"""Frames of one type, in order, in time."""
+"""Tests of packets: their order and times."""

@@ -1,5 +1,6 @@
-"""Packets and scans of lossy, late, doubled and noisy input: right by an oracle, and the same
-however it was cut into batches.
+"""Tests of packets and scans of lossy, late, duplicate and noisy input.
+
+The results equal those of an oracle, and do not depend on the batches.
 """
 
 from __future__ import annotations

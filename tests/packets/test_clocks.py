@@ -1,4 +1,4 @@
-"""Clocks that run on over gaps, by what the host saw."""
+"""Tests that clocks continue over gaps, according to the host's clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lost, duplicate and late packets, by the counter and by a clock with a declared pace."""
+"""Tests of lost, duplicate and late packets, by the counter and by the clock."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""What an IMU feels: decoded in bulk and as it comes, in SI and the axes of the points, in time,
-and in the scans that it belongs to.
+"""Tests of IMU samples: decoded in bulk and live, in SI units and the points' axes.
+
+They also cover their times, and the scans that they belong to.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How the packets of a frame type are timed and ordered, worked out once."""
+"""Tests of the timing and order of a frame type's packets."""
 
 from __future__ import annotations
 

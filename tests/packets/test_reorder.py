@@ -1,4 +1,4 @@
-"""Promise P17: packets that are late and doubled make the same scans as packets that are not."""
+"""Tests of promise P17: late and duplicate packets do not change the scans."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""One sensor in several forms: data frames told apart by length, counters and units that the header
-gives, angles by default.
+"""Tests of sensors with several variants of data frames.
+
+They differ in length, counter or unit, as their header says, or use default angles.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""How sensors come in: entry points, hooks, strangers' distributions."""
+"""Tests of plugins: entry points, hooks and distributions."""

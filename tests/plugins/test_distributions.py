@@ -1,6 +1,4 @@
-"""Distributions installed by pip: a foreign one is found and works, broken ones are named and
-disturb no other.
-"""
+"""Tests of installed distributions: other authors' sensors, and isolated failures."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Declarations that have to agree among the sensors of all plugins: related models, device
-information, scan rates.
+"""Tests that declarations agree among all plugins.
+
+They cover related models, device information and scan rates.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Hooks: what each may change, what is refused, and that a failing one disturbs no other."""
+"""Tests of hooks: permitted changes, refused changes, isolated failures."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Finding a sensor imports what a sensor is and its own plugin, and nothing that can be done with
-it.
-"""
+"""Tests that finding a sensor imports only its plugin and the sensor description."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Entry points as importlib.metadata finds them, and the plugins that are loaded only for their own
-ids.
-"""
+"""Tests of entry points and of loading a plugin only for its own ids."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The table of known sensors: it equals a fresh generation, lists what is installed, and names what
-is not.
+"""Tests of the table of known sensors.
 
-The environment of these tests holds the core and one plugin: a virtual environment with links to
-the installed packages that the core requires, and no other.
+It equals a new generation, lists the installed sensors, and names missing distributions. The
+environment of these tests holds the core and one plugin: a virtual environment with links to the
+installed packages that the core requires, and no other.
 """
 
 from __future__ import annotations

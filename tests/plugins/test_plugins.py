@@ -1,4 +1,4 @@
-"""Sensors out of files and distributions of others, and the names by which a sensor is found."""
+"""Tests of sensors from files and other distributions, and of finding them by name."""
 
 from __future__ import annotations
 

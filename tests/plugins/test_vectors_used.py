@@ -1,4 +1,4 @@
-"""Each published vector that is collected is used by a test of its plugin."""
+"""Tests that each collected published vector is used by a test of its plugin."""
 
 from __future__ import annotations
 

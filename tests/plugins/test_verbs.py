@@ -1,6 +1,4 @@
-"""Verbs of plugins stand in the help without being loaded, and do what their command says; one that
-cannot be loaded disturbs no other.
-"""
+"""Tests of plugins' verbs: listed without loading the plugin, isolated failures."""
 
 from __future__ import annotations
 

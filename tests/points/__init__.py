@@ -1,1 +1,1 @@
-"""Points, by every way to compute them."""
+"""Tests of points, by every way to compute them."""

@@ -1,4 +1,4 @@
-"""Test the exactness of cosines and sines of angles, and that other packets do not change them."""
+"""Tests that sines and cosines are exact and do not depend on other packets."""
 
 from __future__ import annotations
 

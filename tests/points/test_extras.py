@@ -1,6 +1,4 @@
-"""Further columns of points: the same on every way, in their types and units, carried wherever
-clouds go, free for who reads none.
-"""
+"""Tests of further columns of points: types, units, formats and cost."""
 
 from __future__ import annotations
 

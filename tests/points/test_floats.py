@@ -1,5 +1,6 @@
-"""Coordinates and floating-point fields, whatever is in them: plans and kernels give what the plain
-evaluation gives.
+"""Tests of coordinates and floating-point fields with any value.
+
+Plans and kernels give the results of the plain evaluation.
 """
 
 from __future__ import annotations

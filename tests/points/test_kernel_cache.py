@@ -1,6 +1,4 @@
-"""What lies in the folder of compiled code is run only where nobody but its user can have put it
-there, and is never in the way.
-"""
+"""Tests that cached compiled code runs only from a folder that others cannot write."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""The fused back end gives the points of the plain evaluation: same masks, coordinates within six
-units in the last place.
+"""Tests that the fused back end gives the points of the plain evaluation.
+
+Masks are equal, coordinates within six units in the last place.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""The plan gives the points of the plain evaluation: same masks, coordinates within four units in
-the last place.
+"""Tests that the plan gives the points of the plain evaluation.
+
+Masks are equal, coordinates within four units in the last place.
 """
 
 from __future__ import annotations

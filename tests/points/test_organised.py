@@ -1,6 +1,6 @@
-"""Columns of pixels, and their clouds as pictures.
+"""Tests of columns of pixels, and of their clouds as images.
 
-The arrays that values run along were worked out by hand.
+The arrays that values run along were calculated by hand.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Clouds and scans as other libraries take them: NumPy, pyarrow, pandas, Polars, DuckDB and whoever
-reads DLPack.
-"""
+"""Tests of clouds and scans in NumPy, pyarrow, pandas, Polars, DuckDB and DLPack."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Random `points` functions: the plan and the kernels give what the plain evaluation gives, in
-batches of odd sizes.
-"""
+"""Tests of random `points` functions: plan and kernels give the plain results."""
 
 from __future__ import annotations
 

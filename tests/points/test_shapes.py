@@ -1,6 +1,4 @@
-"""Points of the invented sensors, worked out by hand: each mechanism gives what its frame says, on
-both paths.
-"""
+"""Tests of the invented sensors' points, calculated by hand, on both paths."""
 
 from __future__ import annotations
 

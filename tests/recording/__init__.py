@@ -1,1 +1,1 @@
-"""Recordings, written, read and replayed."""
+"""Tests of recordings: written, read and replayed."""

@@ -1,4 +1,7 @@
-"""The recorder that is switched on and off: one file at a time, from any number of threads."""
+"""Tests of switching the recorder on and off from several threads.
+
+It writes only one file at a time.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings: what is written comes back, whatever is cut off, damaged, killed or full."""
+"""Tests of recordings: truncated, damaged, interrupted, and on a full disk."""
 
 from __future__ import annotations
 

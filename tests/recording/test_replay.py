@@ -1,4 +1,4 @@
-"""Replays: bit for bit and by the clock, to pseudo terminals, sockets and files."""
+"""Tests of replays to pseudo terminals, sockets and files: exact bytes and timing."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Planar scans of one sensor are on one grid, which fits what it sees, and one line of times fits
-all beams.
-"""
+"""Tests that a sensor's planar scans share one grid of beams and one line of times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each cut rule on sequences of one value, compared with scans worked out by hand."""
+"""Tests of each cut rule on sequences of one value, with scans worked out by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masked sectors: nothing in them is lost, and scans are cut there, one for each turn."""
+"""Tests of masked sectors: no points are lost, and each revolution gives one scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frame that each point of a scan came from, however the input was cut into batches."""
+"""Tests of the frame that each point of a scan came from, for any batches."""
 
 from __future__ import annotations
 

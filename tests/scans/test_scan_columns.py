@@ -1,6 +1,4 @@
-"""The columns of scans: those of all points in a row, cut, whether they are made for one scan or
-shared by several.
-"""
+"""Tests of the columns of scans: slices of the columns of all points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where scans end, and what is said of those that do not."""
+"""Tests of the borders of scans, and of warnings about scans without an end."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Which scans of a source are given, and what of each: the same as of all scans, by time, by number
-and by place.
-"""
+"""Tests of selecting scans by time, number and position."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Small invented sensors, one mechanism each, so that the engine is general before it is large;
-every test runs over all of them.
+"""Small invented sensors with one mechanism each.
+
+Tests of the engine run on all of them, so that the engine supports each mechanism in general.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""A frame that needs the next: the beams spread up to the next packet's angle; its neighbours and
-the last good reading count too.
+"""Points that need the next packet: the beams are spread up to its first angle.
+
+They also use the previous packet and the last valid value.
 """
 
 from __future__ import annotations

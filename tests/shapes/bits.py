@@ -1,5 +1,6 @@
-"""Bit fields in both orders: 24-bit samples from the low and from the high end, mirrored bits, and
-plain 24-bit integers.
+"""Bit fields in both orders: 24-bit samples from the low and from the high end.
+
+The frame also has mirrored bits and plain 24-bit integers.
 """
 
 from __future__ import annotations

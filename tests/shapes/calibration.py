@@ -1,5 +1,6 @@
-"""Calibration from a file: the number of channels and their elevations; before it is given there
-are no frames.
+"""Calibration from a file: the number of channels and their elevations.
+
+Without the file there are no frames.
 """
 
 from __future__ import annotations

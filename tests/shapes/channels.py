@@ -1,5 +1,6 @@
-"""Channels of different lengths, each with a checksum of its own, that fill their frame; its header
-says how wide they are.
+"""Channels of different lengths, each with its own checksum, that fill their frame.
+
+The header gives the width of their values.
 """
 
 from __future__ import annotations

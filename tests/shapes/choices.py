@@ -1,6 +1,4 @@
-"""What a frame may say: numbers of which some are allowed, names for all of a field's values,
-checks, and alternatives that are errors.
-"""
+"""Restricted values: permitted numbers, named values, checks and error branches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A clock that wraps after a minute, in two fields that add up; scans are cut by its time."""
+"""A clock that wraps after a minute, as the sum of two fields; its time cuts scans."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Columns of pixels, each with a header of its own, from tables by the columns' numbers; what all
-columns share stands beside them.
+"""Columns of pixels, each with its own header.
+
+Their angles come from tables by column number. All columns share some fields of the frame.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""An outgoing command with arguments, and the reply that belongs to it."""
+"""A command with arguments, and its reply."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Commands with texts, addresses, bytes and elements of arrays, a running number that replies
-repeat, and a table that is learned.
+"""Commands with texts, addresses, bytes and array elements.
+
+Replies repeat a sequence number, and one reply contains a table that the device keeps.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Points by coordinates: whole millimetres behind a count, whole centimetres, and floats, where a
-point may be no number at all.
+"""Points as coordinates: counted whole millimetres, whole centimetres, and floats.
+
+A float may be NaN.
 """
 
 from __future__ import annotations

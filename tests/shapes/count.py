@@ -1,5 +1,6 @@
-"""A variable count: the header says how many samples follow; the angles between the first and the
-last are even steps.
+"""A variable number of samples, given in the header.
+
+The angles are evenly spaced between the first and the last.
 """
 
 from __future__ import annotations

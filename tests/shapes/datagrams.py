@@ -1,4 +1,4 @@
-"""Datagrams with a sequence number that starts again at 1, and the host's clock."""
+"""Datagrams with a sequence number that wraps to 1, and times by the host's clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two echoes of each beam, under names of their own, side by side in the cloud."""
+"""Two echoes of each beam in separate fields, both in the cloud."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Escaped bytes between flags, with a checksum over what they stand for, and segments of their own
-lengths in it.
+"""Escaped bytes between flags, with a checksum over the bytes without escapes.
+
+The content is divided into segments of variable length.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
-"""Points with further attributes: one in a unit, with a sign; one further out, as the wire has it;
-bits; and one calculated.
+"""Points with further attributes.
+
+One has a unit and a sign, one belongs to an outer array and has no unit, one is a set of bits, and
+one is computed.
 """
 
 from __future__ import annotations

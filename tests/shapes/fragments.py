@@ -1,5 +1,7 @@
-"""Messages in several datagrams, each with the number of its message, its own and how many there
-are; a short one comes whole.
+"""Messages in several datagrams.
+
+Each has the message number, its own index and the number of fragments. A short message is one
+datagram.
 """
 
 from __future__ import annotations

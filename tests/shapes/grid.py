@@ -1,4 +1,4 @@
-"""Arrays directly in arrays, and a cartesian cloud out of them."""
+"""Arrays directly in arrays, and a Cartesian cloud from them."""
 
 from __future__ import annotations
 

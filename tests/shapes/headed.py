@@ -1,5 +1,6 @@
-"""A header that says how many blocks follow, in which unit, and whether a counter does; angles by
-default until a file is given.
+"""A header with the number of blocks, their unit, and a flag for a counter.
+
+The angles are nominal until a file is given.
 """
 
 from __future__ import annotations

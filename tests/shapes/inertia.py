@@ -1,5 +1,6 @@
-"""An IMU in frames of its own, with a clock of its own, and beside the points: three samples a
-packet, in other units and other axes.
+"""IMU samples in frames with their own clock, and three samples in each data packet.
+
+The two kinds have different units and axes.
 """
 
 from __future__ import annotations

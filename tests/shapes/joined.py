@@ -1,5 +1,6 @@
-"""Lines of steps with one to three echoes each, joined by a mark: a distance and a strength of six
-bits to a character.
+"""Lines of steps with one to three echoes each, joined by a separator.
+
+Distance and strength are characters of six bits each.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Two data frames that differ in length alone: with and without a counter; whichever arrives is
-read.
+"""Two data frames that differ only in length: with and without a counter.
+
+The sensor sends either of them.
 """
 
 from __future__ import annotations

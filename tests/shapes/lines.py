@@ -1,5 +1,6 @@
-"""Lines of text with a check character each, in which numbers are characters of six bits; decimal
-digits say how many there are.
+"""Lines of text with a check character each.
+
+Numbers are characters of six bits. Decimal digits give their count.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Lengths that follow from what they measure, counts and paddings that construct does not show: all
-filled in, all held.
+"""Computed lengths, counts and paddings that construct does not return.
+
+Building sets all of them, and parsing verifies all of them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A checksum in the middle: it stands before the samples and covers what is on both sides of it."""
+"""A checksum in the middle of the frame: it covers the bytes before and after it."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""A mirror of two faces, each with a sector of its own, one of them across 0: a scan ends where the
-angle jumps from one to the other.
+"""A mirror with two faces, each with its own sector, one of them across 0.
+
+A scan ends when the angle jumps from one sector to the other.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""The receiver with lines of text between its frames: decimal fractions, empty and missing tokens,
-and a checksum in hexadecimal digits.
+"""The receiver of `receiver.py` with lines of text between its frames.
+
+The lines have decimal fractions, empty and missing tokens, and a hexadecimal checksum.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Frame types that a descriptor switches: the same bytes are one answer or the other, after what
-was announced last.
+"""Frame types selected by a descriptor.
+
+The same bytes have one of two types, depending on the last descriptor.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""A nested checksum: the header is sealed on its own, and the frame around it once more, over named
-fields only.
-"""
+"""A nested checksum: the header has one, and the frame another over named fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A checksum in two nibbles, low bits first, each of which shares its byte with other bits."""
+"""A checksum in two nibbles, low bits first, in bytes that contain other bits."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Floats and 64-bit integers, reserved bytes that have to survive, and checksum values that mean
-"not filled".
-"""
+"""Floats, 64-bit integers, reserved bytes that are kept, and unset checksums."""
 
 from __future__ import annotations
 

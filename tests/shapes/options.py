@@ -1,5 +1,6 @@
-"""Counts and options in the header: optional parts, alternatives, a count out of two fields, and
-the unit of the distances.
+"""Counts and options in the header.
+
+They select optional parts, alternatives, a count from two fields, and the unit of the distances.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""An array with its count in the header, outside the struct of the array."""
+"""An array with its count in the header, outside the array's struct."""
 
 from __future__ import annotations
 

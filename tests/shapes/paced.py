@@ -1,5 +1,6 @@
-"""No counter, but a clock of two fields with a declared pace, whose minute another frame tells;
-axes of the vendor's own.
+"""No counter, but a clock of two fields with a declared pace.
+
+Another frame gives the minute. The axes are the vendor's.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A receiver without points: frames with a clock and a counter, and a request with its reply."""
+"""A receiver without points: frames with a clock and a counter, and one request."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame beside the data that random values never make: its own `sweep` says what it is like."""
+"""A second frame type that random values never match, with its own `sweep`."""
 
 from __future__ import annotations
 

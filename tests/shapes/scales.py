@@ -1,5 +1,6 @@
-"""Distances that a floating-point header scales, turns and lifts: whole steps of the wire, and a
-far point beside them as a float.
+"""Distances scaled, rotated and raised by floating-point fields of the header.
+
+One far point is a float.
 """
 
 from __future__ import annotations

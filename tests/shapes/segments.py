@@ -1,5 +1,6 @@
-"""A chain of segments, each of which says how long the next one is, with channels of their own
-number, under one checksum.
+"""A chain of segments under one checksum.
+
+Each gives the length of the next, and has its own number of channels.
 """
 
 from __future__ import annotations

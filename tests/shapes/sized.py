@@ -1,6 +1,4 @@
-"""Two lengths that say the same: that of the frame follows from that of its samples, and is filled
-in wherever a frame is made.
-"""
+"""Two related lengths: the frame's follows from the samples' and is always computed."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""State from another packet: elevations come with the info frame, or else by default; siblings are
-put on the points' axes.
+"""State from another packet: elevations from the info frame, otherwise defaults.
+
+Fields next to the samples are broadcast to the shape of the points.
 """
 
 from __future__ import annotations

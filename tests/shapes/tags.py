@@ -1,5 +1,6 @@
-"""Tags with a type and a length, some of types that nobody knows, then padding; points are in one
-kind of them.
+"""Tags with a type and a length, also of unknown types, then padding.
+
+One type of tag has the points.
 """
 
 from __future__ import annotations

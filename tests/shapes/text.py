@@ -1,5 +1,6 @@
-"""A terminator: one reading to a line of text, "$L" angle "," distance "," strength line-feed;
-construct alone can read it.
+"""Lines of text up to a terminator: "$L" angle "," distance "," strength line-feed.
+
+Only construct can parse them.
 """
 
 from __future__ import annotations

@@ -1,5 +1,8 @@
-"""Text in tokens: a constant behind any three characters, hexadecimal numbers of all kinds, arrays
-with counts of their own, and a name with a separator in it."""
+"""Text in tokens.
+
+The lines have a constant after any three characters, all kinds of hexadecimal numbers, arrays with
+their own counts, and a name that contains a separator.
+"""
 
 from __future__ import annotations
 

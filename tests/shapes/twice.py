@@ -1,5 +1,6 @@
-"""Two checksums around one struct, each with a field of its own: one over a whole bit block and the
-angle, one over all others.
+"""Two checksums around one struct, each with its own field.
+
+One covers a whole bit block and the angle, the other all other fields.
 """
 
 from __future__ import annotations

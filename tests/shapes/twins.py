@@ -1,5 +1,6 @@
-"""Two types with one magic: only length and checksum tell them apart, and their order decides where
-both fit.
+"""Two frame types with the same magic, different in length and checksum.
+
+If both match, the first declared type is used.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""A weak frame: five bytes, held together by a start bit, its inverse and a check bit; three in a
-row make it believable.
+"""A weak frame of five bytes: a start bit, its inverse and a check bit.
 
-Its info frame has a checksum, comes first in the order, and would pass for a weak one: it ends a
-run.
+Three frames in a row are required. Its info frame has a checksum, is declared first, and would also
+match as a weak frame: it ends a row.
 """
 
 from __future__ import annotations

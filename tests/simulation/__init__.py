@@ -1,1 +1,1 @@
-"""Sensors that are not there."""
+"""Tests of simulated sensors."""

@@ -1,6 +1,4 @@
-"""Sensors that answer in several data frames: each simulated by its own sweep; packets that need
-the next; counts further out.
-"""
+"""Tests of simulated sensors with several data frame types, each with its own sweep."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""A simulated sensor as a device, sans-IO: commands and their documented answers, start-up, pace,
-faults.
+"""Tests of a simulated sensor as a device without I/O.
+
+They cover commands and documented replies, start-up, pace and faults.
 """
 
 from __future__ import annotations

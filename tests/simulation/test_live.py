@@ -1,6 +1,4 @@
-"""Simulated sensors on real lines: as a source of this process, on pseudo terminals, UDP, TCP and
-in files.
-"""
+"""Tests of simulated sensors as a source, on pseudo terminals, sockets and in files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated sensors measure the scene; each sensor's conformance tests check the same."""
+"""Tests that simulated sensors measure the scene."""
 
 from __future__ import annotations
 

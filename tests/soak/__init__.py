@@ -1,6 +1,6 @@
-"""Every promise measured, and the table of today's figures: `make soak`.
+"""Measure every promise, and write the table of the current figures: `make soak`.
 
-`figures` measures what has a figure; `promises` says of each promise what is promised, which tests
-hold it and what is measured; `python -m tests.soak` runs both and writes the table into
+`figures` measures each promise that has a figure. `promises` lists each promise with its tests and
+measurements. `python -m tests.soak` runs both and writes the table into
 docs/explanation/reliability.md.
 """

@@ -1,5 +1,6 @@
-"""`make soak`: every promise held and measured, and the table of the figures, written into
-docs/explanation/reliability.md.
+"""Test and measure every promise, and write the table of figures: `make soak`.
+
+The table goes into docs/explanation/reliability.md.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""What is measured of a promise, as functions that return it in words and whether it is as good as
-promised.
+"""Measure a figure of a promise.
+
+Each function returns the figure as text, and whether the promise is kept.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The promises, with the tests that hold each, long ones included, and additional measurements."""
+"""The promises with their tests, including slow ones, and additional measurements."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The soak measures what it says, finds what is not kept, and writes its table; a few of the quick
-figures, in little.
-"""
+"""Tests of the soak: broken promises are found, and the table is written."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a sensor is."""
+"""Tests of the description of a sensor."""

@@ -1,6 +1,4 @@
-"""Checksums against catalogue check values, an oracle that works bit by bit, another library, and
-frames from manuals and captures.
-"""
+"""Tests of checksums: check values, a bitwise oracle, another library, real frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mistakes in the description of a sensor: each raises a typed error that says what to write."""
+"""Tests of mistakes in a sensor's description: typed errors with the correction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sensor is immutable, and its options are of the declared types, and no others."""
+"""Tests that a sensor is immutable and accepts only its declared options."""
 
 from __future__ import annotations
 

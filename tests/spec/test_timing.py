@@ -1,4 +1,4 @@
-"""The conversion of dates: `unix_time` agrees with the standard library."""
+"""Tests that `unix_time` converts dates like the standard library."""
 
 from __future__ import annotations
 

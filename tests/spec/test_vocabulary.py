@@ -1,4 +1,4 @@
-"""The step of a rotor between blocks: too long a step is replaced by the last good one."""
+"""Tests of the rotor's step between blocks: the last valid step replaces a long one."""
 
 from __future__ import annotations
 

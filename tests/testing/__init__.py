@@ -1,1 +1,1 @@
-"""The test kit: what it names in an author's sensor, and what it says of a sound one."""
+"""Tests of the test kit."""

@@ -1,4 +1,4 @@
-"""Plugins with one mistake each: `check` names it by its rule, at its place, and names no other."""
+"""Tests that `check` reports each broken plugin's mistake by its rule, and no other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The test kit over the invented shapes, and the frames that only construct can read."""
+"""Tests of the test kit with the invented shapes, and with frames of construct only."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The test kit's own promises: strategies, shrinking, acknowledgements, vectors, and the fixtures
-in a pytest run of an author's.
-"""
+"""Tests of the test kit: strategies, shrinking, acknowledgements, vectors, fixtures."""
 
 from __future__ import annotations
 

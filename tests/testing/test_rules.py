@@ -1,4 +1,4 @@
-"""Rules of `lidarspec check` that a correct declaration could break before: where they end."""
+"""Tests of `lidarspec check` rules with correct declarations that once failed."""
 
 from __future__ import annotations
 

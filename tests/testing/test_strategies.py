@@ -1,6 +1,6 @@
-"""The strategies for authors: drawn values fit together, shrink by field, and reach every layout.
+"""Tests of the strategies: drawn values are consistent and shrink.
 
-The judge of a drawn frame is the sensor itself: `build`, `parse` and `decode`.
+They reach every layout. The sensor itself judges a drawn frame: `build`, `parse` and `decode`.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Bytes from and to ports, sockets and files."""
+"""Tests of ports, sockets and files."""

@@ -1,6 +1,4 @@
-"""Hexadecimal text, in the ways that people print it; what could mean something else is refused by
-name.
-"""
+"""Tests of reading hexadecimal text in all common notations, and refusing ambiguity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sources of plugins: what may stand behind a scheme of their own."""
+"""Tests of plugins' sources with a URL scheme of their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Packets that drivers record in robotics logs come back as they were sent, and when."""
+"""Tests that packets in robotics logs are read with their bytes and times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Serial ports, on real pseudo terminals."""
+"""Tests of serial ports, on real pseudo terminals."""
 
 from __future__ import annotations
 

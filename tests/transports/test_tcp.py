@@ -1,4 +1,4 @@
-"""TCP, on real connections."""
+"""Tests of TCP, on real connections."""
 
 from __future__ import annotations
 

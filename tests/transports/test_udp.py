@@ -1,4 +1,4 @@
-"""UDP, on real sockets of the loopback interface."""
+"""Tests of UDP, on real sockets of the loopback interface."""
 
 from __future__ import annotations
 

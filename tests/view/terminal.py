@@ -1,4 +1,4 @@
-"""A program in a terminal of its own: a real pty, and a screen that is kept as ECMA-48 has it."""
+"""Run a program in a real pseudo terminal, and keep its screen according to ECMA-48."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Cells: braille dots, labels, ASCII, and the bytes that bring a terminal from one picture to the
-next.
-"""
+"""Tests of the canvas: braille dots, labels, ASCII, and updates of a terminal."""
 
 from __future__ import annotations
 

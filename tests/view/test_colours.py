@@ -1,6 +1,4 @@
-"""One scale of colours for terminal, SVG, plot, Rerun, page and notebook; in order and readable for
-everybody.
-"""
+"""Tests of the colour scale that all pictures share: in order and accessible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keys, and the program that draws the screens of the docs."""
+"""Tests of keys, and of the program that draws the screens of the docs."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Figures for reports show what was measured: to scale, with units, bounded in memory, as PNG, PDF
-and SVG.
-"""
+"""Tests of Matplotlib figures: scale, units, bounded memory, PNG, PDF and SVG."""
 
 from __future__ import annotations
 

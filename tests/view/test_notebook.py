@@ -1,6 +1,4 @@
-"""What a notebook shows: pictures where the points are, tables of what was sent, bounded, escaped,
-on light and dark pages.
-"""
+"""Tests of notebook output: pictures and tables, bounded and escaped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plugin that serves the page of `view --web`: found by its entry point, named if missing."""
+"""Tests of finding the plugin that serves the page of `view --web`."""
 
 from __future__ import annotations
 

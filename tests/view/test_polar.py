@@ -1,4 +1,4 @@
-"""Pictures in the terminal: the right way round, to scale, with nothing in the way of a point."""
+"""Tests of pictures in the terminal: orientation, scale, and uncovered points."""
 
 from __future__ import annotations
 

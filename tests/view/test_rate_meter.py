@@ -1,4 +1,4 @@
-"""The figures of `stats` and `view`: counted by hand from frames with known arrival times."""
+"""Tests of the figures of `stats` and `view`, counted by hand from known arrivals."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""A cloud as SVG: points fill the picture, and labels are written once, whole, apart from each
-other.
-"""
+"""Tests of a cloud as SVG: it fills the picture, and labels do not overlap."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""`view` in a real terminal: it draws, takes keys, follows the window, and leaves the terminal as
-it was, whatever ends it.
-"""
+"""Tests of `view` in a real terminal: drawing, keys, resizing, and restoring it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""3iRobotix Delta: packets of a unit, the span of a packet, and what tells a 2G apart."""
+"""Tests of 3iRobotix Delta: packets of a real unit, their span, and the 2G model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each 3irobotix sensor conforms: what `lidarspec check` checks, in one test for each."""
+"""Tests that the 3iRobotix sensors conform: the rules of `lidarspec check`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Benewake TFmini and TF-Luna: the manuals' frames and commands, what is unreliable, and
-millimetres.
-"""
+"""Tests of Benewake TFmini and TF-Luna: the manuals' frames, commands and units."""
 
 from __future__ import annotations
 

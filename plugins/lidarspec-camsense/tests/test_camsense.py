@@ -1,4 +1,4 @@
-"""Camsense X1 and LDS08RR: packets of real units, and where the X1's housing has its zero."""
+"""Tests of Camsense X1 and LDS08RR: packets of real units, and the zero of angles."""
 
 from __future__ import annotations
 

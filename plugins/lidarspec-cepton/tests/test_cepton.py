@@ -1,6 +1,4 @@
-"""Cepton Vista: the point that a public reader is tested with, pictures told apart by parity, and
-both orders of the signature.
-"""
+"""Tests of Cepton Vista: a published point, frame parity and both signature orders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each Cepton sensor conforms: what `lidarspec check` checks, in one test for each."""
+"""Tests that the Cepton sensors conform: the rules of `lidarspec check`."""
 
 from __future__ import annotations
 

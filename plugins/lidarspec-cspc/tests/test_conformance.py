@@ -1,4 +1,4 @@
-"""Each CSPC sensor conforms: what `lidarspec check` checks, in one test for each."""
+"""Tests that the CSPC sensors conform: the rules of `lidarspec check`."""
 
 from __future__ import annotations
 

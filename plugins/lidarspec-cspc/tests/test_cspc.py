@@ -1,6 +1,4 @@
-"""CSPC M1C1_Mini and COIN-D4: vectors, the manual's examples, a captured start-up, points worked
-out by hand.
-"""
+"""Tests of CSPC M1C1_Mini and COIN-D4: the manual's examples and calculated points."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""CSPC streams: the start-up in vectors and in a capture, turns, commands, and a struct that was
-changed.
-"""
+"""Tests of CSPC streams: start-up, revolutions, commands and a modified struct."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hesai: vectors, points and times worked out by hand, the clock, correction files."""
+"""Tests of Hesai: vectors, calculated points and times, clock and correction files."""
 
 from __future__ import annotations
 

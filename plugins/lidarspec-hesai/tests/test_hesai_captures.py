@@ -1,10 +1,9 @@
-"""Hesai captures: every published point is one of ours and every one of ours is published; the 20
-Hz Pandar40P with its sequence.
+"""Tests of Hesai captures: our points are the published points, and no others.
 
-The published clouds are one turn each, in the vendor's axes, cut where a point's own azimuth passes
-0 (not its block's), with dual return's second echo left out where it is at the place of the first,
-and nothing nearer than the nearest of them. So our points of all packets are put into turns by
-their own azimuths, and counted by place.
+Each published cloud is one revolution in the vendor's axes. It is cut where the azimuth of a point
+(not of its block) passes 0. It has no second return with the same position as the first, and no
+point nearer than its nearest one. So these tests sort our points of all packets into revolutions by
+their own azimuths, and count them by position.
 """
 
 from __future__ import annotations

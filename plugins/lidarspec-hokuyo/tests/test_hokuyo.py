@@ -1,6 +1,4 @@
-"""Hokuyo scanners: the examples of the manual, scans of some steps and clusters, what tells models,
-and the simulated twin.
-"""
+"""Tests of Hokuyo scanners: the manual's examples, partial scans and simulation."""
 
 from __future__ import annotations
 

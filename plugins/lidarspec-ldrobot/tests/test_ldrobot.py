@@ -1,6 +1,4 @@
-"""LDROBOT STL-27L, LD06 and LD14P: the manual's example, real frames, the clock, points worked out
-by hand.
-"""
+"""Tests of LDROBOT STL-27L, LD06 and LD14P: real frames, clock, calculated points."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Livox: the published frames and commands of both generations, points of each type, dates, and
-what opening a simulated one takes.
-"""
+"""Tests of Livox: published frames and commands, points, dates and start-up."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""LSLIDAR N10, N10P, M10 and C16: the published packet, two returns, lengths that the packets say,
-and the clock.
-"""
+"""Tests of LSLIDAR N10, N10P, M10 and C16: a published packet, lengths and clock."""
 
 from __future__ import annotations
 

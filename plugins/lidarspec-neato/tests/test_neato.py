@@ -1,6 +1,4 @@
-"""Neato XV-11 and its kin: the published vector, both directions, and a trailer that nobody is sure
-of.
-"""
+"""Tests of Neato XV-11 and related models: the published vector, both directions."""
 
 from __future__ import annotations
 

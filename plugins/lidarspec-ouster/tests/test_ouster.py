@@ -1,5 +1,6 @@
-"""Ouster: real packets of six layouts against the vendor's digests and points; metadata,
-recognition, a simulated web server.
+"""Tests of Ouster: real packets of six layouts, metadata, a simulated web server.
+
+The vendor published digests and points of these packets.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Each Quanergy sensor conforms: what `lidarspec check` checks, in one test for each."""
+"""Tests that the Quanergy sensors conform: the rules of `lidarspec check`."""
 
 from __future__ import annotations
 

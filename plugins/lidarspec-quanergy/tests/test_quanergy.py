@@ -1,6 +1,4 @@
-"""Quanergy M8 and MQ8: the built packet of three returns, returns that repeat another, and
-distances of older packets.
-"""
+"""Tests of Quanergy M8 and MQ8: a packet of three returns, and older distances."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""RoboSense RS-Helios-16P: vectors, the manual's examples, points worked out by hand, calibration
-as state, a real capture.
-"""
+"""Tests of RoboSense RS-Helios-16P: vectors, calculated points, a real capture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RoboSense RS-LiDAR-M1: vectors, the manual's capture, points worked out by hand, dual return."""
+"""Tests of RoboSense RS-LiDAR-M1: vectors, calculated points and dual return."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RS-LiDAR-M1: where frames are cut, and late, doubled, reordered and lost packets."""
+"""Tests of RS-LiDAR-M1 scans: borders, and late, duplicate and lost packets."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""RoboSense RS-LiDAR, RS-Bpearl, RS-Ruby, Airy: points worked out by hand, the date, dual return,
-what tells the models apart.
+"""Tests of RoboSense RS-LiDAR, RS-Bpearl, RS-Ruby and Airy.
+
+They cover calculated points, the date, dual return and detection of the model.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A client of a node, and what it gets, as somebody else's program would."""
+"""A client of a node that records the messages it receives."""
 
 from __future__ import annotations
 

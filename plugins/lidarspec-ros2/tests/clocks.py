@@ -1,4 +1,4 @@
-"""A sensor's clock and a line, simulated, and how far the stamps are from the truth.
+"""Simulate a sensor's clock and a connection, and measure the errors of the stamps.
 
     python plugins/lidarspec-ros2/tests/clocks.py [RUNS]
 

@@ -1,5 +1,6 @@
-"""A node in a process of its own, and a client of it in that of the tests; they meet on the
-loopback, in a domain that nobody else has.
+"""Fixtures that start a node in a separate process and a client in this one.
+
+They communicate over the loopback interface, in a ROS domain of their own.
 """
 
 from __future__ import annotations

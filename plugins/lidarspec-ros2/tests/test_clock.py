@@ -1,6 +1,6 @@
-"""Stamps are in order and right within a millisecond.
+"""Tests that stamps are in order and right within a millisecond.
 
-This holds for every clock of a sensor and every delay of the line.
+This holds for every sensor clock and every delay of the connection.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""The node as a client sees it: its lifecycle, parameters, services and diagnostics, a port that
-goes away, and what is left at the end.
-"""
+"""Tests of the node: lifecycle, parameters, services, reconnection and exit."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Packets that a node publishes are decoded again: by a node that takes the topic as its source,
-and out of a bag that has them.
-"""
+"""Tests that published packets can be decoded again, from a topic and from a bag."""
 
 from __future__ import annotations
 

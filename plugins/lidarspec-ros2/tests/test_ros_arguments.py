@@ -1,4 +1,4 @@
-"""The parameters on the command line, as ROS itself reads them."""
+"""Tests of parameters on the command line, compared with ROS's own parser."""
 
 from __future__ import annotations
 

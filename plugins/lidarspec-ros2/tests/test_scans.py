@@ -1,6 +1,4 @@
-"""What a subscriber in another process gets is what the library makes of the same bytes, value for
-value.
-"""
+"""Tests that a subscriber receives the values that the library computes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ROS's own tools find of an installed distribution, and that the pages say what is there."""
+"""Tests that ROS's own tools find the installed distribution, and of its pages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The shared memory of Fast DDS: when the node brings a profile, and that clouds arrive with it."""
+"""Tests of the shared memory of Fast DDS: the node's profile, and received clouds."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The times of what is published: a recording's are those of its bag, /clock goes with them, and an
-IMU's go with the points'.
-"""
+"""Tests of the times of published messages: recordings, /clock and IMU."""
 
 from __future__ import annotations
 

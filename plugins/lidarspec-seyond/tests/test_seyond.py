@@ -1,6 +1,4 @@
-"""Seyond Falcon: packets packed by hand, bit by bit, on both back ends; frames; bytes that are
-none.
-"""
+"""Tests of Seyond Falcon: packets packed by hand, frames and invalid bytes."""
 
 from __future__ import annotations
 

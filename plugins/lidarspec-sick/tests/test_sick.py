@@ -1,6 +1,4 @@
-"""SICK scanners: a TiM871S in CoLa B, a TiM5xx in CoLa A, a multiScan136; what tells models, and
-what cannot be told.
-"""
+"""Tests of SICK TiM871S (CoLa B), TiM5xx (CoLa A) and multiScan136."""
 
 from __future__ import annotations
 

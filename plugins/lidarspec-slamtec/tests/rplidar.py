@@ -1,4 +1,4 @@
-"""Streams of an RPLIDAR for its tests: nodes and capsules with seeded content."""
+"""Make streams of an RPLIDAR for its tests: nodes and capsules with seeded content."""
 
 from __future__ import annotations
 

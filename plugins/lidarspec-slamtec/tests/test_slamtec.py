@@ -1,4 +1,4 @@
-"""RPLIDAR A1, A3, S2 and C1: vectors, points of every answer worked out by hand, commands."""
+"""Tests of RPLIDAR A1, A3, S2 and C1: vectors, calculated points and commands."""
 
 from __future__ import annotations
 

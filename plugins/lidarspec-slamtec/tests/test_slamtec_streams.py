@@ -1,6 +1,4 @@
-"""Streams of RPLIDARs: every kind of capsule against the oracle, switched answers, scans, and how
-rare false nodes are.
-"""
+"""Tests of RPLIDAR streams: every capsule type, mode changes, scans and false nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each TI sensor conforms: what `lidarspec check` checks, in one test for each."""
+"""Tests that the TI sensors conform: the rules of `lidarspec check`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""TI IWR6843: points with velocities, what stands beside them, frames without any, and what is of
-another radar.
-"""
+"""Tests of TI IWR6843: points with velocities, empty frames and other radars."""
 
 from __future__ import annotations
 

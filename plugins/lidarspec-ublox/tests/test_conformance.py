@@ -1,4 +1,4 @@
-"""Each u-blox receiver conforms: what `lidarspec check` checks, in one test for each."""
+"""Tests that the u-blox sensors conform: the rules of `lidarspec check`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""u-blox receivers: published messages of both protocols on one line, times, and commands."""
+"""Tests of u-blox receivers: published messages, times and commands."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Velodyne: packets made byte by byte, points worked out by hand, the rule for the last block, a
-real packet.
-"""
+"""Tests of Velodyne packets: calculated points, the last block and a real packet."""
 
 from __future__ import annotations
 

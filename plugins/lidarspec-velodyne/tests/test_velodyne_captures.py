@@ -1,6 +1,4 @@
-"""Velodyne VLP-16 and HDL-32E: real captures against what other decoders published or give for the
-same bytes.
-"""
+"""Tests of Velodyne captures, compared with the results of other decoders."""
 
 from __future__ import annotations
 

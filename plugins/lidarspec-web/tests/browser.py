@@ -1,4 +1,4 @@
-"""The Chromium of the system, for tests in a browser; without it they are skipped."""
+"""The system's Chromium for tests in a browser; tests are skipped without it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scans read back from messages, as a page reads them."""
+"""Read scans from messages, as a page does."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The view of the bytes beside the picture.
-
-It shows the frame of a point, frames by number, and damaged frames.
-"""
+"""Tests of the byte view: the frame of a point, frames by number, damaged frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page uses the colour scale of all other pictures."""
+"""Tests that the page uses the colour scale of all other pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`view --web` in a separate process: its link, its end, and its error messages."""
+"""Tests of `view --web` in a separate process: its link, exit and error messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connections without the token: idle ones, slow ones, and too many of them."""
+"""Tests of connections without the token: idle, slow, and too many of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures and tables of a notebook, in a browser: readable on light and dark pages."""
+"""Tests of notebook pictures and tables in a browser, on light and dark pages."""
 
 from __future__ import annotations
 

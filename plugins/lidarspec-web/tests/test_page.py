@@ -1,4 +1,4 @@
-"""The page in a real browser: its picture, marked bytes and fields, and clicks."""
+"""Tests of the page in a real browser: its picture, marked bytes and clicks."""
 
 from __future__ import annotations
 

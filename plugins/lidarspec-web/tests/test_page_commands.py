@@ -1,4 +1,4 @@
-"""Commands from the page: forms, their bytes, replies, and permissions."""
+"""Tests of commands from the page: forms, bytes, replies and permissions."""
 
 from __future__ import annotations
 

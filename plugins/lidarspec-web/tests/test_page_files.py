@@ -1,4 +1,4 @@
-"""Recording, saving and reconnection on the page."""
+"""Tests of recording, saving and reconnection on the page."""
 
 from __future__ import annotations
 

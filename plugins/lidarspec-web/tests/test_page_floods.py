@@ -1,4 +1,4 @@
-"""Floods of requests, and saved scans that are not read: other pages are served."""
+"""Tests of request floods and unread saved scans: other pages are still served."""
 
 from __future__ import annotations
 

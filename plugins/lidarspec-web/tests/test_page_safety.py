@@ -1,6 +1,6 @@
-"""Access to the page: requests with foreign hosts or origins, or without token.
+"""Tests of access to the page: foreign hosts and origins, missing token.
 
-Also hostile texts of devices.
+They also cover hostile texts from devices.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Use of the page on a phone, by keyboard, and after a pause."""
+"""Tests of the page on a phone, by keyboard, and after a pause."""
 
 from __future__ import annotations
 

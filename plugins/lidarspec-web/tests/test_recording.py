@@ -1,4 +1,4 @@
-"""Recordings that pages switch on and off: only one at a time."""
+"""Tests of recordings that pages switch on and off: only one at a time."""
 
 from __future__ import annotations
 

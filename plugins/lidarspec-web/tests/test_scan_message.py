@@ -1,4 +1,4 @@
-"""Scans as messages: they are equal when read back."""
+"""Tests that scans are equal after encoding as messages and reading back."""
 
 from __future__ import annotations
 

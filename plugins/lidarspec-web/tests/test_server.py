@@ -1,4 +1,4 @@
-"""The server of the page: its messages to one page and to ten."""
+"""Tests of the page's server: its messages to one page and to ten."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The temporary folder of a server: removed at its end, or by the next server."""
+"""Tests that a server's temporary folder is removed at exit or by the next server."""
 
 from __future__ import annotations
 

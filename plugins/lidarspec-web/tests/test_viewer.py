@@ -1,4 +1,4 @@
-"""The widget in a cell, with messages of ipywidgets and a real browser."""
+"""Tests of the notebook widget, with messages of ipywidgets and a real browser."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""YDLIDAR: the protocol's examples, packets of real units of three models, and what tells the
-models apart.
-"""
+"""Tests of YDLIDAR: the protocol's examples, packets of three models, detection."""
 
 from __future__ import annotations
 

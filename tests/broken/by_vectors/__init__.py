@@ -1,1 +1,1 @@
-"""Mistakes that only the manual's own frames show: vectors.json has them."""
+"""Mistakes that only the manual's own frames in vectors.json reveal."""

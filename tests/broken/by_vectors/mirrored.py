@@ -1,4 +1,4 @@
-"""A clockwise sensor read counter-clockwise, or the other way round."""
+"""A clockwise sensor that is declared counter-clockwise, or the reverse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sound sensor beside the vectors."""
+"""The correct sensor for these vectors."""
 
 from lidarspec.spec import hookimpl
 from tests.broken.sound import sensor

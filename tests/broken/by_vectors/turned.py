@@ -1,4 +1,4 @@
-"""A zero direction that is not the manual's."""
+"""A zero direction that differs from the manual's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Unsigned where the wire is signed."""
+"""An unsigned field for a signed value."""
 
 from __future__ import annotations
 

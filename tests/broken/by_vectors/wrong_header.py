@@ -1,4 +1,4 @@
-"""Another header than the manual's."""
+"""A header that differs from the manual's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Big-endian where the wire is little-endian."""
+"""A big-endian field for a little-endian value."""
 
 from __future__ import annotations
 

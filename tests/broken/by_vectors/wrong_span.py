@@ -1,4 +1,4 @@
-"""A checksum over the wrong span: without the header."""
+"""A checksum over the wrong bytes: without the header."""
 
 from __future__ import annotations
 

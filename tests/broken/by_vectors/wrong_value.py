@@ -1,4 +1,4 @@
-"""Another scale than the manual's."""
+"""A scale that differs from the manual's."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""The Acme X1, a sensor that nobody makes: written with the public names alone, as a stranger
-would.
+"""The Acme X1, an invented sensor that uses only public names, as other authors do.
 
-It has a variable count, bit fields, a checksum in the middle, an outgoing command, state from
-another packet, a look at the next packet, and a calibration file.
+It has a variable count, bit fields, a checksum in the middle, a command, state from another packet,
+access to the next packet, and a calibration file.
 """
 
 from __future__ import annotations

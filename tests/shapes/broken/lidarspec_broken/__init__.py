@@ -1,1 +1,1 @@
-"""One module for each way in which a plugin can be broken; see `tests/plugins/test_plugins.py`."""
+"""Broken plugins, one mistake a module; see `tests/plugins/test_plugins.py`."""

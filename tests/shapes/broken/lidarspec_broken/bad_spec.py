@@ -1,4 +1,4 @@
-"""Describes a frame that loses bits, which is found when it is declared."""
+"""Declares a frame that loses bits; the declaration raises."""
 
 from construct import Flag, Int8ul, Padding, Struct
 

@@ -1,4 +1,4 @@
-"""Adds a sensor under an id that another plugin has."""
+"""Adds a sensor with the id of another plugin's sensor."""
 
 import dataclasses
 

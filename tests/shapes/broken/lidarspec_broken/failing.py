@@ -1,5 +1,6 @@
-"""Sensors that load, and then fail at work: in a checksum, an expression of the struct, `plausible`
-and `points`.
+"""Sensors that load but raise when used.
+
+They raise in a checksum, an expression of the struct, `plausible` or `points`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A checksum hook that fails for every sensor there is."""
+"""A checksum hook that raises for every sensor."""
 
 from lidarspec.spec import hookimpl
 

@@ -1,4 +1,4 @@
-"""Lists something that is no sensor."""
+"""Lists an object that is not a sensor."""
 
 from lidarspec.spec import hookimpl
 

@@ -1,4 +1,4 @@
-"""Fails while it lists its sensors."""
+"""Raises while it lists its sensors."""
 
 from lidarspec.spec import hookimpl
 

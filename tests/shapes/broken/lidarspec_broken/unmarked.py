@@ -1,4 +1,4 @@
-"""A hook without its mark."""
+"""A hook without the hookimpl decorator."""
 
 
 def lidarspec_sensors():  # type: ignore[no-untyped-def]
