@@ -151,9 +151,9 @@ class Sensor(SensorDescription):
         chosen = checked_backend(backend)
         sums = None
         if chosen == "jit":
-            from lidarspec.points.numba_kernels import compiled_sums
+            from lidarspec.points.numba_kernels import compile_sums
 
-            sums = compiled_sums()
+            sums = compile_sums()
         if stream is None:
             stream = not self.datagrams
         return Decoder(self, stream=stream, backend=chosen, sums=sums)

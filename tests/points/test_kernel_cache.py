@@ -15,7 +15,11 @@ from pathlib import Path
 import pytest
 
 from lidarspec.points.numba_kernels import cache
-from lidarspec.points.numba_kernels.kernels import _module_name, compile_source, compiled_before
+from lidarspec.points.numba_kernels.kernels import (
+    _make_module_name,
+    compile_source,
+    is_code_available,
+)
 from lidarspec.points.numba_kernels.source import HEAD
 from tests.points.backends import COMPILED
 
@@ -26,7 +30,7 @@ pytestmark = [
     ),
 ]
 
-SOURCE = HEAD + "@compiled(KEPT, (INTEGER,))\ndef kernel(number):\n    return number + 1\n"
+SOURCE = HEAD + "@compile_kernel(STORED, (INTEGER,))\ndef kernel(number):\n    return number + 1\n"
 ROOT = pytest.mark.skipif(
     not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away"
 )
@@ -42,7 +46,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def _forget() -> None:
     compile_source.cache_clear()
-    sys.modules.pop(_module_name(SOURCE), None)
+    sys.modules.pop(_make_module_name(SOURCE), None)
 
 
 def _is_read() -> bool:
@@ -58,10 +62,10 @@ def _file(folder: Path) -> Path:
 
 
 def test_a_kernel_is_read_in_the_next_run(folder: Path) -> None:
-    assert not compiled_before(SOURCE)
+    assert not is_code_available(SOURCE)
     assert [_is_read(), _is_read()] == [False, True]
     _forget()
-    assert compiled_before(SOURCE)
+    assert is_code_available(SOURCE)
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert {stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()} == {0o600}
 
@@ -70,7 +74,7 @@ def test_a_kernel_is_read_in_the_next_run(folder: Path) -> None:
 def test_names_are_hashed_with_the_key(folder: Path) -> None:
     _is_read()
     name = _file(folder).name
-    assert _module_name(SOURCE).removeprefix("lidarspec_kernel_") not in name
+    assert _make_module_name(SOURCE).removeprefix("lidarspec_kernel_") not in name
     shutil.rmtree(folder)
     _is_read()
     assert _file(folder).name.partition("-")[0] != name.partition("-")[0]
@@ -134,7 +138,7 @@ def test_a_shared_cache_folder_is_not_used_with_one_warning(folder: Path) -> Non
         assert [_is_read(), _is_read()] == [False, False]
     assert len(said) == 1
     _forget()
-    assert not compiled_before(SOURCE)
+    assert not is_code_available(SOURCE)
 
 
 @pytest.mark.slow

@@ -220,7 +220,7 @@ def test_kernels_are_chosen_after_enough_points(
     monkeypatch.setattr(backends, "MIN_WARM_KERNEL_POINTS", enough if compiled else 0)
     monkeypatch.setattr(backends, "MIN_COLD_KERNEL_POINTS", 10 * enough if compiled else enough)
     monkeypatch.setattr(
-        "lidarspec.points.numba_kernels.kernels.compiled_before", lambda source: compiled
+        "lidarspec.points.numba_kernels.kernels.is_code_available", lambda source: compiled
     )
     used = []
     for _ in range(4):

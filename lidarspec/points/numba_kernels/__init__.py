@@ -1,8 +1,9 @@
-"""Points and checksums by compiled code: an optional back end, which needs Numba.
+"""Compute points and checksums by compiled code: an optional back end, which needs Numba.
 
-In: a `points.plan.Plan`. Out: an object that fills its columns, by `compile`; and the function that
-computes the checksums of a decoder, by `compile_sums`. Only ``backend="jit"`` requires this
-package. Numba is imported with the first kernel that runs. Modules in reading order:
+In: a `points.plan.Plan`. Out: an object that fills its columns, returned by `compile`; and
+the function that computes the checksums of a decoder, returned by `compile_sums`. Only
+``backend="jit"`` requires this package. Numba is imported with the first kernel that runs. Modules
+in reading order:
 
 * `arithmetic`: the functions that kernels call; the only module that imports Numba on import.
 * `writer`: the source text of fields, tables and indices.
@@ -14,7 +15,7 @@ package. Numba is imported with the first kernel that runs. Modules in reading o
 
 from __future__ import annotations
 
-from lidarspec.points.numba_kernels.checksums import compile_sums as compiled_sums
+from lidarspec.points.numba_kernels.checksums import compile_sums
 from lidarspec.points.numba_kernels.kernels import get_kernel as compile, is_available
 
-__all__ = ["compile", "compiled_sums", "is_available"]
+__all__ = ["compile", "compile_sums", "is_available"]

@@ -1,8 +1,9 @@
-"""Primitives of generated kernels.
+"""Functions that generated kernels call.
 
-They are indexing without checks, sine and cosine of float32, and the special cases of NumPy.
+They read bytes without bounds checks, compute sine and cosine in float32, and follow NumPy in
+special cases.
 
-The only module that imports Numba as it is imported; nothing imports it but a kernel.
+This is the only module that imports Numba at import time; only generated kernels import it.
 """
 
 from __future__ import annotations
@@ -22,35 +23,39 @@ from numba.extending import intrinsic
 BYTES = types.Array(types.uint8, 1, "C", readonly=True)
 SINGLES = types.Array(types.float32, 1, "C", readonly=True)
 DOUBLES = types.Array(types.float64, 1, "C", readonly=True)
-PLACES = types.Array(types.int64, 1, "C", readonly=True)
+INTEGERS = types.Array(types.int64, 1, "C", readonly=True)
 WORDS = types.Array(types.uint16, 1, "C", readonly=True)
-MADE_SINGLES = types.Array(types.float32, 1, "C")
-MADE_PLACES = types.Array(types.int64, 1, "C")
-#: columns of whole numbers, by the name of their type.
-MADE = {
+SINGLE_COLUMN = types.Array(types.float32, 1, "C")
+INTEGER_COLUMN = types.Array(types.int64, 1, "C")
+#: types of integer columns, by the name of their dtype.
+INTEGER_COLUMNS = {
     f"{sign}int{bits}": types.Array(getattr(types, f"{sign}int{bits}"), 1, "C")
     for sign in ("", "u")
     for bits in (8, 16, 32)
 }
 INTEGER = types.int64
 
-#: added to a float64 and taken off again, it leaves a whole number, whose lowest bit is the sum's.
-_WHOLE = 6755399441055744.0
+#: added to and subtracted from a float64, it rounds to an integer; the sum has its lowest bit.
+_ROUNDING_CONSTANT = 6755399441055744.0
 _PI = math.pi
 #: largest float32 below pi.
 _BELOW_PI = np.nextafter(np.float32(_PI), np.float32(0))
-_FAR = 1e6
+_MAX_SUBTRACTED_RAD = 1e6
 _IS_BIG = sys.byteorder == "big"
 
 
-def compiled(kept, signature, **options):
-    """The decorator of a kernel: compiled for its one signature, or as an earlier run kept it."""
+def compile_kernel(stored, signature, **options):
+    """Return the decorator of a kernel, which compiles it or loads its stored code.
+
+    Args:
+        stored: loads and saves the compiled code.
+        signature: the types of the arguments.
+        options: further options of Numba.
+    """
 
     def make(function):
         dispatcher = njit(nogil=True, **options)(function)
-        dispatcher._cache = (
-            kept  # Numba's own unpickles what lies in its folder, whoever put it there
-        )
+        dispatcher._cache = stored  # Numba's own cache unpickles any file in its folder
         dispatcher.compile(signature)
         dispatcher.disable_compile()
         return dispatcher
@@ -73,7 +78,7 @@ def byte_at(context, array, index):
 
 @intrinsic
 def word_at(context, array, index):
-    """Eight bytes from an index on, the first one lowest."""
+    """Return eight bytes from an index on, little-endian."""
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
@@ -90,7 +95,7 @@ def word_at(context, array, index):
 
 @intrinsic
 def four_at(context, array, index):
-    """Four bytes from an index on, the first one lowest."""
+    """Return four bytes from an index on, little-endian."""
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
@@ -106,7 +111,7 @@ def four_at(context, array, index):
 
 
 @intrinsic
-def apart(context):
+def assume_no_alias(context):
     """Declare that the array arguments of the kernel do not overlap.
 
     The compiler can then compute several points at a time.
@@ -122,8 +127,8 @@ def apart(context):
 
 
 @intrinsic
-def fused(context, factor, other, added):
-    """Return a product and a sum of float32, rounded once."""
+def multiply_add(context, factor, other, added):
+    """Return a product plus a sum of float32, rounded once."""
 
     def make(target, builder, signature, args):
         return builder.fma(*args)
@@ -132,9 +137,13 @@ def fused(context, factor, other, added):
 
 
 def _float_at(bits, kind):
-    """Return an intrinsic that loads a float of `bits` bits as float64.
+    """Return two intrinsics that load a float as float64, little-endian and big-endian.
 
-    It loads from an index of bytes. One is made for each byte order.
+    They load from an index of bytes.
+
+    Args:
+        bits: the size of the float.
+        kind: its type in LLVM.
     """
 
     def maker(is_swapped):
@@ -166,7 +175,7 @@ float8_little, float8_big = _float_at(64, ir.DoubleType())
 
 @intrinsic
 def at(context, array, index):
-    """Return an element of an array; whether there is one is not checked."""
+    """Return an element of an array, without a bounds check."""
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
@@ -177,7 +186,7 @@ def at(context, array, index):
 
 @intrinsic
 def put(context, array, index, value):
-    """Store an element of an array; whether there is one is not checked."""
+    """Store an element of an array, without a bounds check."""
 
     def make(target, builder, signature, args):
         held = target.make_array(signature.args[0])(target, builder, args[0])
@@ -188,8 +197,8 @@ def put(context, array, index, value):
 
 
 @intrinsic
-def flipped(context, value, whole):
-    """Return a float32 with its sign changed where the lowest bit of a float64 is set."""
+def flip_sign(context, value, whole):
+    """Return a float32 with its sign changed if the lowest bit of a float64 is set."""
 
     def make(target, builder, signature, args):
         word = ir.IntType(32)
@@ -202,9 +211,9 @@ def flipped(context, value, whole):
 
 @njit(fastmath={"contract"}, forceinline=True, error_model="numpy")
 def cos_sin(angle):
-    """Cosine and sine in float32, within 1.5e-7, of an angle in half turns."""
-    whole = angle + _WHOLE
-    x = np.float32((angle - (whole - _WHOLE)) * _PI)
+    """Return cosine and sine in float32, within 1.5e-7, of an angle in half turns."""
+    whole = angle + _ROUNDING_CONSTANT
+    x = np.float32((angle - (whole - _ROUNDING_CONSTANT)) * _PI)
     w = x * x
     a = np.float32(-2.607710598567792e-07) * w + np.float32(2.4761886379565112e-05)
     b = np.float32(2.6000548132287804e-06) * w + np.float32(-0.00019806614727713168)
@@ -213,12 +222,12 @@ def cos_sin(angle):
     a = a * w + np.float32(0.04166664183139801)
     b = b * w + np.float32(-0.16666656732559204)
     a = a * w + np.float32(-0.5)
-    return flipped(a * w + np.float32(1.0), whole), flipped(b * (x * w) + x, whole)
+    return flip_sign(a * w + np.float32(1.0), whole), flip_sign(b * (x * w) + x, whole)
 
 
 @njit(forceinline=True, error_model="numpy")
 def modulo(a, b):
-    """np.mod; what is within a period already needs no division."""
+    """Return np.mod; within one period no division is needed."""
     if 0.0 <= a < b:
         return a
     if -b <= a < 0.0:
@@ -227,40 +236,40 @@ def modulo(a, b):
 
 
 @njit(forceinline=True)
-def smaller(a, b):
-    """np.minimum."""
+def minimum(a, b):
+    """Return np.minimum."""
     if a <= b or a != a:
         return a
     return b
 
 
 @njit(forceinline=True)
-def larger(a, b):
-    """np.maximum."""
+def maximum(a, b):
+    """Return np.maximum."""
     if a >= b or a != a:
         return a
     return b
 
 
 @njit(forceinline=True)
-def number(a):
-    """np.nan_to_num."""
+def replace_nan(a):
+    """Return np.nan_to_num."""
     if a != a:
         return 0.0
     return min(max(a, -1.7976931348623157e308), 1.7976931348623157e308)
 
 
 @njit(forceinline=True)
-def returned(a):
-    """`conventions.returned_range`."""
+def mark_no_return(a):
+    """Return `conventions.returned_range`."""
     if 0.0 < a < np.inf:
         return a
     return np.nan
 
 
 @njit(forceinline=True)
-def looked_up(table, index):
-    """Return the entry of a table; nan where there is none."""
+def look_up(table, index):
+    """Return an entry of a table; nan if the index is outside."""
     if 0 <= index < len(table):
         return at(table, np.int64(index))
     return np.nan
@@ -270,7 +279,7 @@ def looked_up(table, index):
 def row_at(index, rows):
     """Return the table row for an index.
 
-    Returns the last row, which is nan, for an index that the table does not have.
+    Returns the last row, which is nan, if the index is outside.
     """
     if 0 <= index < rows - 1:
         return np.int64(index)
@@ -278,10 +287,10 @@ def row_at(index, rows):
 
 
 @njit(forceinline=True, error_model="numpy")
-def narrowed(angle):
-    """Radians as float32 in [-pi, pi), as `clouds.narrowed`."""
+def narrow_angle(angle):
+    """Return radians as float32 in [-pi, pi), as `conventions.narrow_angle` does."""
     turned = angle - 2 * _PI * np.floor((angle + _PI) / (2 * _PI))
-    if abs(angle) > _FAR:
+    if abs(angle) > _MAX_SUBTRACTED_RAD:
         turned = (angle + _PI) % (2 * _PI) - _PI
     short = np.float32(turned)
     if short > _BELOW_PI:

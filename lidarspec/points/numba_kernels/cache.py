@@ -1,11 +1,11 @@
-"""Keep compiled kernels on disk between runs.
+"""Store compiled kernels on disk between runs.
 
-They are in a folder that only its user can access, because the files are executed.
+The files are executed, so they are in a folder that only the user can access.
 
-A kernel is one file: a keyed digest (HMAC), and behind it what Numba made of the kernel, a pickle,
-which is opened only where the digest is right. The key is a file that its user alone can read, and
-names come out of it too. So nothing that somebody else, a full disk or a crash left in the folder
-is ever run; whatever is wrong there means compiling again.
+A kernel is one file: a keyed digest (HMAC), followed by the pickle of the compiled code, which is
+loaded only if the digest is valid. The key is in a file that only the user can read; file names are
+derived from it too. So files that were left by another user, a full disk or a crash are never
+executed. If any check fails, the kernel is compiled again.
 """
 
 from __future__ import annotations
@@ -30,19 +30,20 @@ from lidarspec.trusted_files import describe_sharing
 
 CACHE = "LIDARSPEC_CACHE"
 
-#: bytes of the key, and of a digest.
-SIZE = 32
-#: what a file or folder has to lack, so that it is its user's alone.
-_OTHERS = stat.S_IRWXG | stat.S_IRWXO
-#: neither through a link nor waiting for a pipe's other end, where the system knows such things.
-_PLAINLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+#: the size of the key and of a digest, bytes.
+DIGEST_BYTES = 32
+#: permissions that a private file or folder must not have.
+_SHARED_PERMISSIONS = stat.S_IRWXG | stat.S_IRWXO
+#: flags to open a file without following links or waiting for a pipe, if the system has them.
+_SAFE_OPEN_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
 class StoredKernel:
-    """The compiled code of one kernel, as a dispatcher of Numba asks for it and hands it over.
+    """The compiled code of one kernel on disk, in the form that a Numba dispatcher expects.
 
     Args:
-        name: of the kernel, by all that its code depends on but for the processor.
+        name: the name of the kernel, derived from all that its code depends on, except for the
+            processor.
     """
 
     cache_path = None
@@ -51,49 +52,51 @@ class StoredKernel:
         self._name = name
 
     def load_overload(self, signature: object, target: Any) -> Any:
-        """Return the result of compiling the kernel in an earlier run.
+        """Return the code that an earlier run compiled.
 
-        Returns None if there is none, or if it is not authentic.
+        Returns None if it is not stored, or if it is not authentic.
         """
         from numba.core.compiler import CompileResult
 
-        with contextlib.suppress(Exception):  # Numba compiles what it cannot use
-            folder = _own(cache_folder())
-            key = _key(folder)
+        with contextlib.suppress(Exception):  # if this fails, Numba compiles the kernel
+            folder = _check_private(cache_folder())
+            key = _read_key(folder)
             if key is not None:
-                path = _path(folder, key, self._name, target)
+                path = _find_path(folder, key, self._name, target)
                 data = _read(path)
-                if hmac.compare_digest(data[:SIZE], _digest(key, path.name, data[SIZE:])):
-                    target.refresh()  # it knows of nothing before
-                    return CompileResult._rebuild(target, *pickle.loads(data[SIZE:]))
+                if hmac.compare_digest(
+                    data[:DIGEST_BYTES], _compute_digest(key, path.name, data[DIGEST_BYTES:])
+                ):
+                    target.refresh()  # loads the functions that the code refers to
+                    return CompileResult._rebuild(target, *pickle.loads(data[DIGEST_BYTES:]))
         return None
 
     def save_overload(self, signature: object, result: Any) -> None:
-        """Keep what Numba made of the kernel; where that cannot be done, it is said once."""
+        """Store the compiled code; if that fails, warn once."""
         from numba.core.serialize import dumps
 
         try:
             folder = _make_folder(cache_folder())
-            key = _key(folder) or _new_key(folder)
+            key = _read_key(folder) or _make_key(folder)
             data = dumps(result._reduce())
-            path = _path(folder, key, self._name, result.target_context)
-            _write(path, _digest(key, path.name, data) + data)
-        except Exception as error:  # the kernel is at hand all the same
+            path = _find_path(folder, key, self._name, result.target_context)
+            _write(path, _compute_digest(key, path.name, data) + data)
+        except Exception as error:  # the kernel can be used in this run
             _warn(f"compiled code cannot be stored for later runs: {error}")
 
 
 def is_stored(name: str) -> bool:
-    """Return whether there is a file of this kernel, for one processor or another."""
+    """Return whether there is a file of this kernel, for any processor."""
     try:
-        folder = _own(cache_folder())
-        key = _key(folder)
-        return key is not None and any(folder.glob(f"{_digest(key, name).hex()}-*"))
+        folder = _check_private(cache_folder())
+        key = _read_key(folder)
+        return key is not None and any(folder.glob(f"{_compute_digest(key, name).hex()}-*"))
     except OSError:
         return False
 
 
 def cache_folder() -> Path:
-    """Return the folder of kernels: LIDARSPEC_CACHE, or the user's cache of the system."""
+    """Return the folder of kernels: LIDARSPEC_CACHE, or the system's cache folder of the user."""
     named = os.environ.get(CACHE)
     if named:
         return Path(named)
@@ -107,66 +110,71 @@ def cache_folder() -> Path:
 
 
 def _make_folder(folder: Path) -> Path:
-    """Return the folder, made where it is missing.
+    """Create the folder if it is missing, and return it.
 
     Raises:
-        OSError: where it cannot be made, or is not its user's alone.
+        OSError: if it cannot be created, or if other users can access it.
     """
     folder.mkdir(parents=True, exist_ok=True, mode=stat.S_IRWXU)
-    return _own(folder)
+    return _check_private(folder)
 
 
-def _own(folder: Path) -> Path:
-    """Return the folder that is given.
+def _check_private(folder: Path) -> Path:
+    """Return a folder after checking that only the user can access it.
 
     Raises:
-        OSError: where it is missing, or not its user's alone.
+        OSError: if it is missing, or if other users can access it.
     """
-    if reason := describe_sharing(folder.stat(), _OTHERS):
+    if reason := describe_sharing(folder.stat(), _SHARED_PERMISSIONS):
         raise PermissionError(f"{folder} {reason}")
     return folder
 
 
-def _key(folder: Path) -> bytes | None:
-    """The key of a folder; None where it has none, or not a whole one that is its user's alone."""
+def _read_key(folder: Path) -> bytes | None:
+    """Return the key of a folder; None if it is missing or invalid.
+
+    The key is also invalid if other users can access it.
+    """
     with contextlib.suppress(OSError):
         key = _read(folder / "key")
-        if len(key) == SIZE:
+        if len(key) == DIGEST_BYTES:
             return key
         return None
     return None
 
 
-def _new_key(folder: Path) -> bytes:
-    _write(folder / "key", secrets.token_bytes(SIZE))
-    return _read(folder / "key")  # of whoever wrote it last
+def _make_key(folder: Path) -> bytes:
+    _write(folder / "key", secrets.token_bytes(DIGEST_BYTES))
+    return _read(folder / "key")  # another process may have written a key at the same time
 
 
-def _digest(key: bytes, name: str, data: bytes = b"") -> bytes:
+def _compute_digest(key: bytes, name: str, data: bytes = b"") -> bytes:
     return hmac.digest(key, name.encode() + b"\0" + data, hashlib.sha256)
 
 
-def _path(folder: Path, key: bytes, name: str, target: Any) -> Path:
-    """Return the file of a kernel, for the processor that Numba compiles for here."""
-    processor = _digest(key, repr(target.codegen().magic_tuple())).hex()[:16]
-    return folder / f"{_digest(key, name).hex()}-{processor}"
+def _find_path(folder: Path, key: bytes, name: str, target: Any) -> Path:
+    """Return the file of a kernel, for the present processor."""
+    processor = _compute_digest(key, repr(target.codegen().magic_tuple())).hex()[:16]
+    return folder / f"{_compute_digest(key, name).hex()}-{processor}"
 
 
 def _read(path: Path) -> bytes:
-    """Return the content of a file that belongs to the user alone.
+    """Return the content of a file that only the user can access.
 
     Raises:
-        OSError: where it is not, or cannot be read.
+        OSError: if other users can access it, or if it cannot be read.
     """
-    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _PLAINLY)) as file:
+    with open(
+        path, "rb", opener=lambda name, flags: os.open(name, flags | _SAFE_OPEN_FLAGS)
+    ) as file:
         status = os.fstat(file.fileno())
-        if describe_sharing(status, _OTHERS) or not stat.S_ISREG(status.st_mode):
+        if describe_sharing(status, _SHARED_PERMISSIONS) or not stat.S_ISREG(status.st_mode):
             raise PermissionError(f"{path} is accessible to other users")
         return file.read()
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Put a file in its place once it is whole; its user alone can read it."""
+    """Write a private file, which appears at its path only once it is complete."""
     number, unfinished = tempfile.mkstemp(dir=path.parent)
     try:
         with open(number, "wb") as file:
@@ -179,5 +187,5 @@ def _write(path: Path, data: bytes) -> None:
 
 @functools.cache
 def _warn(text: str) -> None:
-    """Say it, once a run."""
+    """Warn once in a run."""
     warnings.warn(text, stacklevel=2)

@@ -1,14 +1,13 @@
 """Compute checksums of many frames by compiled code.
 
-The contributions of all bytes are combined by XOR. Each position has a table of 256.
+A CRC is linear with respect to XOR, and so is every XOR of bytes or words. The checksum of a frame
+is the checksum of zeros, XORed with the share of each byte: the change that this byte alone makes.
+Each offset has a table of 256 shares, which is made by running the algorithm. If shares are equal
+to the bytes, words of eight bytes are XORed instead.
 
-A CRC is such a sum, and so is every XOR of bytes or words: the checksum of a frame is that of
-zeros, XORed with what each byte, alone among zeros, changes about it. The tables are made by the
-algorithm itself; where a share is the byte as it stands, words of eight bytes are XORed instead.
-
-A CRC over more bytes, or of more than 16 bits, runs along the row eight bytes at a time by eight
-tables of 256 ("slicing by eight"), four rows side by side, since each step waits for the one
-before.
+Long CRCs, and CRCs of more than 16 bits, are computed along the row, eight bytes at a time, by
+eight tables of 256 ("slicing by eight"). Four rows are computed side by side, because each step of
+a row depends on the step before.
 """
 
 from __future__ import annotations
@@ -24,18 +23,18 @@ from lidarspec.points.numba_kernels.kernels import compile_source, import_numba
 from lidarspec.points.numba_kernels.source import HEAD
 from lidarspec.spec.checksums import Crc, WordXor, Xor
 
-#: frames of a layout that earn its tables, and that a batch has to have.
-EARNED = 4096
-FEW = 64
-#: bytes whose tables stay in the fastest caches.
-LONGEST = 128
-#: bytes of a batch that earn calling a kernel that goes along the rows.
-WORTH = 1 << 14
+#: the number of frames of a layout from which its tables are made, and the smallest batch.
+MIN_FRAMES_SEEN = 4096
+MIN_BATCH_FRAMES = 64
+#: the largest number of covered bytes with tables that stay in the fastest caches.
+MAX_TABLE_BYTES = 128
+#: the size of a batch, bytes, from which a kernel along the rows is faster.
+MIN_ROW_BATCH_BYTES = 1 << 14
 
-_SHARES = (
+_SHARES_SOURCE = (
     HEAD
     + """\
-@compiled(KEPT, (BYTES, INTEGER, PLACES, WORDS, INTEGER, MADE_PLACES))
+@compile_kernel(STORED, (BYTES, INTEGER, INTEGERS, WORDS, INTEGER, INTEGER_COLUMN))
 def kernel(rows, size, places, tables, start, found):
     for i in range(len(found)):
         total, base = start, i * size
@@ -48,10 +47,10 @@ def kernel(rows, size, places, tables, start, found):
         put(found, i, total)
 """
 )
-_XORED = (
+_WORDS_SOURCE = (
     HEAD
     + """\
-@compiled(KEPT, (BYTES, INTEGER, PLACES, PLACES, PLACES, INTEGER, MADE_PLACES))
+@compile_kernel(STORED, (BYTES, INTEGER, INTEGERS, INTEGERS, INTEGERS, INTEGER, INTEGER_COLUMN))
 def kernel(rows, size, places, lows, highs, start, found):
     for i in range(len(found)):
         low, high, base = 0, 0, i * size
@@ -67,54 +66,64 @@ def kernel(rows, size, places, lows, highs, start, found):
 )
 
 
-#: rows that are gone along side by side.
-_SIDE = "abcd"
+#: names of the registers of the rows that are computed side by side.
+_REGISTERS = "abcd"
 
 
-def _slice(name: str) -> str:
-    """Return a register after eight more bytes, by what it and they are together."""
+def _write_slice(name: str) -> str:
+    """Return the text of a register after eight more bytes.
+
+    Args:
+        name: the register, already XORed with these bytes.
+    """
     return " ^ ".join(
         f"at(table, {256 * byte} + ({name} >> {8 * byte} & 255))" for byte in range(8)
     )
 
 
-def _single(name: str) -> str:
-    """Return a register after one more byte."""
+def _write_single(name: str) -> str:
+    """Return the text of a register after one more byte."""
     return (
         f"at(table, 1792 + (({name} ^ byte_at(rows, at_{name} + place)) & 255)) ^ ({name} >> 8 &"
         f" {(1 << 56) - 1})"
     )
 
 
-_ALONG = (
+_ROWS_SOURCE = (
     HEAD
     + f"""\
-@compiled(KEPT, (BYTES, INTEGER, PLACES, PLACES, INTEGER, MADE_PLACES))
+@compile_kernel(STORED, (BYTES, INTEGER, INTEGERS, INTEGERS, INTEGER, INTEGER_COLUMN))
 def kernel(rows, size, spans, table, start, found):
     last = len(found) - 1
-    for i in range(0, len(found), {len(_SIDE)}):
-        {"; ".join(f"{name} = start; at_{name} = min(i + {side}, last) * size" for side, name in enumerate(_SIDE))}
+    for i in range(0, len(found), {len(_REGISTERS)}):
+        {"; ".join(f"{name} = start; at_{name} = min(i + {side}, last) * size" for side, name in enumerate(_REGISTERS))}
         for k in range(0, len(spans), 2):
             place, stop = at(spans, k), at(spans, k + 1)
             while place + 8 <= stop:
-                {"; ".join(f"{name} ^= word_at(rows, at_{name} + place)" for name in _SIDE)}
-                {"; ".join(f"{name} = {_slice(name)}" for name in _SIDE)}
+                {"; ".join(f"{name} ^= word_at(rows, at_{name} + place)" for name in _REGISTERS)}
+                {"; ".join(f"{name} = {_write_slice(name)}" for name in _REGISTERS)}
                 place += 8
             while place < stop:
-                {"; ".join(f"{name} = {_single(name)}" for name in _SIDE)}
+                {"; ".join(f"{name} = {_write_single(name)}" for name in _REGISTERS)}
                 place += 1
-        {"; ".join(f"put(found, min(i + {side}, last), {name})" for side, name in enumerate(_SIDE))}
+        {"; ".join(f"put(found, min(i + {side}, last), {name})" for side, name in enumerate(_REGISTERS))}
 """
 )
 
 
-def _along(algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D) -> NDArray[np.uint64]:
-    """Return the CRCs of some bytes of each row, (n,)."""
+def _compute_along_rows(
+    algorithm: Crc, spans: tuple[tuple[int, int], ...], rows: Bytes2D
+) -> NDArray[np.uint64]:
+    """Return the CRCs of some bytes of each row, (n,).
+
+    Args:
+        spans: the first byte and the byte after the last, of each span.
+    """
     table, _, _ = make_place_tables(8, 0, algorithm.width, algorithm.poly, algorithm.refin)
     found = np.empty(len(rows), np.int64)
     edges = np.array(spans, np.int64).reshape(-1)
     start = int(np.uint64(algorithm.start).astype(np.int64))
-    compile_source(_ALONG)(
+    compile_source(_ROWS_SOURCE)(
         rows.reshape(-1), rows.shape[1], edges, table.astype(np.uint64).view(np.int64), start, found
     )
     return finalize(algorithm, found.view(np.uint64).astype(table.dtype))
@@ -124,13 +133,16 @@ class _ByteShares:
     """The share of each byte of a frame in one checksum, computed on first use.
 
     Attributes:
-        words: where eight bytes are loaded at a time.
-        tables: of each of these bytes, its share by its value; 0 for those that are not covered, or
-            were before.
-        is_plain: whether all shares are the bytes as they stand, in the low byte of the checksum or
-            the high one.
-        lows, highs: where shares are the bytes themselves, which of them go into the low byte of
-            the checksum, and the high one.
+        seen: the number of frames so far.
+        is_suited: whether the checksum can be computed by shares.
+        start: the checksum of zeros.
+        words: the offsets at which eight bytes are loaded at a time.
+        tables: for each of these bytes, its share by its value; 0 for bytes that are not covered or
+            that an earlier word has counted.
+        is_plain: whether all shares are equal to the bytes, in the low or the high byte of the
+            checksum.
+        lows, highs: masks of the bytes in each word that are XORed into the low and the high byte
+            of the checksum, if `is_plain`.
     """
 
     def __init__(self, seal: Seal) -> None:
@@ -140,13 +152,13 @@ class _ByteShares:
         self.is_suited = (
             isinstance(seal.algorithm, Crc | Xor | WordXor)
             and seal.algorithm.width <= 16
-            and len(self._places) <= LONGEST
+            and len(self._places) <= MAX_TABLE_BYTES
         )
         self.start = 0
         self.tables = np.empty(0, np.uint16)
 
     def make(self, size: int) -> None:
-        """Ask the algorithm, for frames of so many bytes."""
+        """Compute the tables, for frames of `size` bytes."""
         places = self._places.tolist()
         rows = np.zeros((len(places), 256, len(places)), np.uint8)
         rows[np.arange(len(places)), :, np.arange(len(places))] = np.arange(256)
@@ -178,53 +190,53 @@ class _ByteShares:
         checksums = np.empty(len(rows), np.int64)
         flat = rows.reshape(-1)
         if self.is_plain:
-            compile_source(_XORED)(
+            compile_source(_WORDS_SOURCE)(
                 flat, rows.shape[1], self.words, self.lows, self.highs, self.start, checksums
             )
         else:
-            compile_source(_SHARES)(
+            compile_source(_SHARES_SOURCE)(
                 flat, rows.shape[1], self.words, self.tables, self.start, checksums
             )
         return checksums.view(np.uint64)
 
 
-_KNOWN: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()
+_SHARES_BY_SEAL: WeakKeyDictionary[Seal, _ByteShares] = WeakKeyDictionary()
 
 
 def checksums(seal: Seal, rows: Bytes2D) -> NDArray[np.uint64] | None:
-    """Return the checksums of frames, (n,); None where NumPy is to compute them."""
-    known = _KNOWN.get(seal)
-    if known is None and not seal.spans:
+    """Return the checksums of frames, (n,); None if NumPy is faster or required."""
+    shares = _SHARES_BY_SEAL.get(seal)
+    if shares is None and not seal.spans:
         return None  # over no bytes there is nothing to compute
     algorithm = seal.algorithm
     length = sum(stop - start for start, stop in seal.spans)
     if isinstance(algorithm, Crc) and (
-        algorithm.width > 16 or (algorithm.width > 8 and length > LONGEST)
+        algorithm.width > 16 or (algorithm.width > 8 and length > MAX_TABLE_BYTES)
     ):
-        if not rows.flags.c_contiguous or rows.size < WORTH:
+        if not rows.flags.c_contiguous or rows.size < MIN_ROW_BATCH_BYTES:
             return None
-        return _along(algorithm, seal.spans, rows)
-    if known is None:
-        known = _KNOWN[seal] = _ByteShares(seal)
-    known.seen += len(rows)
+        return _compute_along_rows(algorithm, seal.spans, rows)
+    if shares is None:
+        shares = _SHARES_BY_SEAL[seal] = _ByteShares(seal)
+    shares.seen += len(rows)
     if (
-        not known.is_suited
-        or len(rows) < FEW
-        or known.seen < EARNED
+        not shares.is_suited
+        or len(rows) < MIN_BATCH_FRAMES
+        or shares.seen < MIN_FRAMES_SEEN
         or rows.shape[1] < 8
         or not rows.flags.c_contiguous
     ):
         return None
-    if not len(known.tables):
-        known.make(rows.shape[1])
-    return known.values(rows)
+    if not len(shares.tables):
+        shares.make(rows.shape[1])
+    return shares.values(rows)
 
 
 def compile_sums() -> Sums:
-    """Return the function that a decoder computes checksums by; the values are the same.
+    """Return the function that computes checksums for a decoder.
 
     Raises:
-        UsageError: where Numba is not installed, or does not work here.
+        LibraryError: if Numba is not installed or does not work.
     """
     import_numba()
     return checksums

@@ -1,9 +1,7 @@
-"""Compile or load kernels, and call them.
+"""Compile or load kernels, and call them in one or more threads.
 
-A kernel is called by one thread or several.
-
-Nothing here imports Numba before a kernel is wanted. The name of a kernel is a hash of all that its
-code depends on.
+Numba is not imported before a kernel is needed. The name of a kernel is a hash of all that its code
+depends on, except for the processor.
 """
 
 from __future__ import annotations
@@ -34,19 +32,19 @@ from lidarspec.points.plan import ColumnMaker, Plan, PointsFunction, Values
 
 THREADS = "LIDARSPEC_THREADS"
 
-#: points below which a second thread costs more than it saves.
-SHARE = 1 << 16
+#: the number of points for each thread: with fewer, another thread is not faster.
+MIN_THREAD_POINTS = 1 << 16
 
-#: the size of the frames that were the first to get a kernel.
-_OWN: WeakKeyDictionary[PointsFunction, int] = WeakKeyDictionary()
+#: the size of the frames with their own kernel, by `points` function.
+_OWN_KERNEL_BYTES: WeakKeyDictionary[PointsFunction, int] = WeakKeyDictionary()
 
 
 class Kernel(ColumnMaker):
-    """The columns that a text describes, for frames of one layout.
+    """The columns that a kernel computes, for frames of one layout.
 
     Args:
-        text: of the kernel.
-        width: points of a frame.
+        text: the source of the kernel and its arguments.
+        width: the number of points of a frame.
     """
 
     def __init__(self, text: KernelText, width: int) -> None:
@@ -57,16 +55,16 @@ class Kernel(ColumnMaker):
 
     @property
     def is_ready(self) -> bool:
-        """Whether the compiled code is at hand."""
+        """Whether the compiled code is loaded."""
         return self._function is not None
 
     @functools.cached_property
     def is_compiled(self) -> bool:
-        """Whether the compiled code was at hand or on disk when this was first asked."""
-        return self.is_ready or compiled_before(self._text.source)
+        """Whether the compiled code was loaded or on disk at the first access."""
+        return self.is_ready or is_code_available(self._text.source)
 
     def compile(self) -> None:
-        """Have the code at hand."""
+        """Load or compile the code, unless it is loaded."""
         self._function = self._function or compile_source(self._text.source)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
@@ -81,7 +79,7 @@ class Kernel(ColumnMaker):
         stride = rows.strides[0]
         arguments: list[Any] = []
         for node in self._text.wanted.nodes:
-            arguments += _flat(values(node), node.shape)
+            arguments += _flatten(values(node), node.shape)
         rest = (
             self._numbers,
             *self._text.wanted.arrays,
@@ -89,11 +87,13 @@ class Kernel(ColumnMaker):
             *(columns[name] for name in self._text.columns),
         )
         data = view_span(rows)
-        self._share(count, lambda first, number: self._function(data, stride, first, number, *rest))
+        self._call_in_threads(
+            count, lambda first, number: self._function(data, stride, first, number, *rest)
+        )
 
-    def _share(self, count: int, run: Callable[[int, int], Any]) -> None:
-        """Call for all frames, by parts where there are threads and enough for them."""
-        number = min(threads(), max(count * self._width // SHARE, 1), count)
+    def _call_in_threads(self, count: int, run: Callable[[int, int], Any]) -> None:
+        """Call the kernel for all frames, in several threads if that is faster."""
+        number = min(count_threads(), max(count * self._width // MIN_THREAD_POINTS, 1), count)
         if number < 2:
             if count:
                 run(0, count)
@@ -108,10 +108,10 @@ class Kernel(ColumnMaker):
             part.result()
 
 
-def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], int]:
-    """Return an array, (n or 1, *shape), as flat numbers, and how many a packet has.
+def _flatten(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], int]:
+    """Return an array, (n or 1, *shape), flat, and its length for one packet.
 
-    The second value is 0 if all packets share the numbers.
+    The length is 0 if all packets share the numbers.
     """
     full = (len(array), *shape)
     if array.shape != full:
@@ -122,14 +122,16 @@ def _flat(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[np.float
 
 
 def get_kernel(plan: Plan, names: tuple[str, ...]) -> Kernel:
-    """Return the kernel for these columns.
+    """Return the kernel for these columns; the plan keeps it.
 
-    It is for this layout alone, or for all layouts if there have been several.
+    The first layout of a `points` function has its own kernel. All other layouts share kernels that
+    accept any length.
     """
     kernel = plan.kernels.get(names)
     if not isinstance(kernel, Kernel):
         is_own = (
-            not plan.varying or _OWN.setdefault(plan.function, plan.layout.size) == plan.layout.size
+            not plan.varying
+            or _OWN_KERNEL_BYTES.setdefault(plan.function, plan.layout.size) == plan.layout.size
         )
         kernel = plan.kernels[names] = Kernel(
             write_kernel(plan, names, set() if is_own else plan.varying), plan.width
@@ -137,11 +139,11 @@ def get_kernel(plan: Plan, names: tuple[str, ...]) -> Kernel:
     return kernel
 
 
-def threads() -> int:
+def count_threads() -> int:
     """Return the number of threads of a kernel: LIDARSPEC_THREADS, by default 1.
 
     Raises:
-        UsageError: where that is no number of at least 1.
+        UsageError: if it is not an integer of at least 1.
     """
     text = os.environ.get(THREADS, "1")
     if not text.isdecimal() or not int(text):
@@ -172,10 +174,10 @@ def import_numba() -> None:
 
 
 @functools.cache
-def _module_name(source: str) -> str:
-    """Return a name from everything that the compiled code depends on.
+def _make_module_name(source: str) -> str:
+    """Return a name that is derived from everything the compiled code depends on.
 
-    Numba itself checks the processor.
+    The processor is not included, because the name of the file in the cache includes it.
     """
     from importlib.metadata import version
 
@@ -185,9 +187,9 @@ def _module_name(source: str) -> str:
     return f"lidarspec_kernel_{digest.hexdigest()[:24]}"
 
 
-def compiled_before(source: str) -> bool:
-    """Return whether compiled code of a kernel is at hand, or in the cache folder."""
-    name = _module_name(source)
+def is_code_available(source: str) -> bool:
+    """Return whether the compiled code of a kernel is loaded, or in the cache folder."""
+    name = _make_module_name(source)
     return name in sys.modules or is_stored(name)
 
 
@@ -195,11 +197,11 @@ def compiled_before(source: str) -> bool:
 def compile_source(source: str) -> Any:
     """Return the compiled function of a kernel's source.
 
-    If it cannot be kept on disk, it is compiled for this run only.
+    If it cannot be stored on disk, it is compiled for this run only.
     """
-    name = _module_name(source)
+    name = _make_module_name(source)
     module = types.ModuleType(name)
-    module.__dict__["KEPT"] = StoredKernel(name)
+    module.__dict__["STORED"] = StoredKernel(name)
     sys.modules[name] = module  # Numba looks it up by its name as it loads compiled code
     try:
         exec(compile(source, name, "exec"), module.__dict__)

@@ -1,14 +1,14 @@
-"""Write the source of a kernel, which reads the bytes of frames.
+"""Write the source of a kernel, which computes columns of a plan from the bytes of frames.
 
-The columns of a plan become one loop over packets, blocks and points.
+The columns become one loop over packets, blocks and points. Each value is computed in the outermost
+loop in which it is constant (`writer.KernelWriter`). `Expressions` writes traced expressions in
+float64 or float32. Expressions that a kernel cannot compute are computed by NumPy before, and
+passed to the kernel.
 
-Each value is computed in the loop in which it varies: what a packet has once outside the loop over
-its blocks, and so on (`writer.KernelWriter`). `Expressions` writes a traced expression so, in
-float64 or float32; what has no text of its own is computed by NumPy before, and given to the
-kernel. Where sines and cosines of each point's own angle are left, the points of a few packets go
-through scratch arrays into a second, flat loop, which computes several at a time (`DeferredFloat`,
-`KernelAssembly`). Lengths and places stand in the text as numbers where all frames have the same,
-else they are arguments, so that one kernel serves all lengths.
+If each point needs the sine or cosine of its own angle, the points of a few packets go through
+scratch arrays to a second, flat loop, which the compiler vectorizes (`DeferredFloat`,
+`KernelAssembly`). Lengths and offsets that are the same in all frames are numbers in the text.
+Others are arguments, so that one kernel serves all lengths.
 """
 
 from __future__ import annotations
@@ -42,28 +42,30 @@ from lidarspec.points.numba_kernels.writer import (
     KernelArguments,
     KernelValue,
     KernelWriter,
+    find_line,
     is_cheap,
-    line,
 )
 from lidarspec.points.plan import Plan
 from lidarspec.spec.vocabulary import TableLookup, side_by_side
 
-#: points of which the scratch arrays stay in the fastest cache.
-CHUNK = 2048
-#: half turns up to which an angle is kept in float32 in a table.
-SMALL = 0.125
-#: bits of an integer up to which float32 resolves the steps of a distance.
+#: the number of points in scratch arrays, which then stay in the fastest cache.
+SCRATCH_POINTS = 2048
+#: tables of angles up to this size, in half turns, are float32.
+MAX_SINGLE_HALF_TURNS = 0.125
+#: the largest number of bits of a distance for which float32 resolves its steps.
 MAX_DISTANCE_BITS = 21
 
 
 class Beam(NamedTuple):
     """A coordinate of points along beams.
 
-    It is a measured distance times a row of a table, plus a row of another table for the start.
+    It is a measured distance times an entry of a table for the direction, plus an entry of a table
+    for the start.
 
     Attributes:
-        distance: as the sensor sent it, in such steps of metres; or nan.
-        direction, start: the rows.
+        distance: the raw distance as sent, or nan.
+        direction, start: the table rows.
+        step: metres in one step of the raw distance.
     """
 
     distance: Node
@@ -73,7 +75,7 @@ class Beam(NamedTuple):
 
 
 def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
-    """Return the beam of a sum.
+    """Return the beam that a sum describes.
 
     Returns None for other sums, and if float32 does not resolve the steps of the distance.
     """
@@ -106,9 +108,13 @@ def find_beam(node: Node, leaves: Mapping[str, Leaf]) -> Beam | None:
 
 @dataclass(frozen=True, eq=False)
 class DeferredFloat:
-    """A product or sum (`sign`) of float32 values.
+    """A product or sum of float32 values that is computed in the flat loop.
 
-    One of them is the sine or cosine of an angle, computed in the flat loop.
+    At least one of the values depends on the sine or cosine of a point's own angle.
+
+    Attributes:
+        sign: the operator, "*", "+" or "-".
+        parts: the operands.
     """
 
     sign: str
@@ -117,39 +123,49 @@ class DeferredFloat:
 
 @dataclass(frozen=True, eq=False)
 class Trig:
-    """The cosine or sine of an angle, by its number."""
+    """The cosine or sine of an angle, computed in the flat loop.
+
+    Attributes:
+        name: "cos" or "sin".
+        angle: the number of the angle.
+    """
 
     name: str
     angle: int
 
 
 class Expressions(KernelWriter):
-    """Writes traced expressions into the loops, each value where it varies."""
+    """A writer of traced expressions into the loops."""
 
     def double(self, value: Any, depth: int = 0) -> KernelValue:
         """Return an expression in float64, or a condition."""
         if not isinstance(value, Node):
             return self.constant(value, depth)
-        return self.once(("double", value), lambda: self._double(value))  # type: ignore[no-any-return]
+        return self.once(("double", value), lambda: self._write_double(value))  # type: ignore[no-any-return]
 
-    def _double(self, node: Node) -> KernelValue:
+    def _write_double(self, node: Node) -> KernelValue:
         if node.kind == "field":
-            return self._physical(node)
+            return self._write_physical(node)
         if node.kind == "call" and not self.is_shared(node):
             source = get_only_field(node)
             if source is not None and is_full(source, self.width) and not is_cheap(node):
-                text = self.looked_up(node, source, np.float64, 1.0)
+                text = self.look_up(node, source, np.float64, 1.0)
                 if text is not None:
                     if node.sample.array.dtype.kind == "b":
                         return self.let(text.level, f"{text.text} != 0")
                     return text
-            return self._call(node)
+            return self._write_call(node)
         if node.kind == "rows" and not self.is_shared(node.args[0]):
-            return self._row(node, "float64")
+            return self._write_row(node, "float64")
         return self.add_argument(node)
 
-    def _row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> KernelValue:
-        """Return an element of the row of a table, by default the node's own, at an index."""
+    def _write_row(self, node: Node, kind: str, table: NDArray[Any] | None = None) -> KernelValue:
+        """Return an element of a table row at an index.
+
+        Args:
+            kind: the dtype of the table in the kernel.
+            table: replaces the table of the node.
+        """
         index = node.args[0]
         table = node.args[1] if table is None else table
         row = self.double(index)
@@ -160,7 +176,7 @@ class Expressions(KernelWriter):
                 f"row_at({row.text}, {self.number(len(table))}) * {self.number(table.shape[1])}",
             ),
         )
-        place = self.place(
+        place = self.index_text(
             tuple(
                 length if own == 1 else 1
                 for own, length in zip(index.shape, node.shape, strict=True)
@@ -172,9 +188,9 @@ class Expressions(KernelWriter):
         return self.let(1 + last_axis(node.shape), f"at({name}, {start.text} + {place})")
 
     def is_shared(self, node: Node) -> bool:
-        """Return whether an expression uses fields of other frames only.
+        """Return whether an expression depends only on frames of other types.
 
-        NumPy computes it then, mostly once for all packets.
+        NumPy computes it then, usually once for all packets.
         """
         return self.once(("shared", node), lambda: self._is_shared(node))  # type: ignore[no-any-return]
 
@@ -185,7 +201,7 @@ class Expressions(KernelWriter):
             self.is_shared(arg) for arg in node.args if isinstance(arg, Node)
         )
 
-    def _call(self, node: Node) -> KernelValue:
+    def _write_call(self, node: Node) -> KernelValue:
         depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
         if any(
             np.ndim(arg) > depth + 1 or (np.ndim(arg) == depth + 1 and len(arg) != 1)
@@ -206,10 +222,10 @@ class Expressions(KernelWriter):
         if isinstance(node.function, TableLookup) and len(node.function.entries):
             index = self.double(node.args[0])
             table = self.array(node.function.entries)
-            return self.let(index.level, f"looked_up({table}, {index.text})")
+            return self.let(index.level, f"look_up({table}, {index.text})")
         if node.function is np.where and len(node.args) == 3:
-            return self._where(*(self.double(arg, depth) for arg in node.args))
-        template = self._template(node)
+            return self._write_where(*(self.double(arg, depth) for arg in node.args))
+        template = self._find_template(node)
         if template is None:
             return self.add_argument(node)
         args = [self.double(arg, depth) for arg in node.args]
@@ -217,7 +233,7 @@ class Expressions(KernelWriter):
             max(arg.level for arg in args), template.format(*(arg.text for arg in args))
         )
 
-    def _template(self, node: Node) -> str | None:
+    def _find_template(self, node: Node) -> str | None:
         kinds = [
             arg.sample.array.dtype.kind if isinstance(arg, Node) else np.asarray(arg).dtype.kind
             for arg in node.args
@@ -239,13 +255,13 @@ class Expressions(KernelWriter):
             return template
         return None
 
-    def _where(
+    def _write_where(
         self, condition: KernelValue, first: KernelValue, second: KernelValue
     ) -> KernelValue:
         level = max(condition.level, first.level, second.level)
         return self.let(level, f"{first.text} if {condition.text} else {second.text}")
 
-    def _physical(self, node: Node) -> KernelValue:
+    def _write_physical(self, node: Node) -> KernelValue:
         leaf = self.layout.leaves.get(node.path)
         raw = self.raw(leaf) if leaf is not None else None
         if raw is None or leaf is None:
@@ -261,28 +277,28 @@ class Expressions(KernelWriter):
         )
 
     def single(self, value: Any, *, exact: bool = False, root: bool = False) -> Any:
-        """An expression in float32: a `KernelValue`, or a `DeferredFloat` that the flat loop completes.
+        """Return an expression in float32: a `KernelValue`, or a `DeferredFloat`.
 
         Args:
-            exact: as the plain evaluation rounds it.
-            root: sums are those of places, which may be taken in float32.
+            exact: whether it is rounded once, as in the reference evaluator.
+            root: whether it is a coordinate, whose sums may be computed in float32.
         """
         if not isinstance(value, Node):
             return self.constant(value, len(self.shape), "float32")
         return self.once(
-            ("single", value, exact), lambda: self._single(value, exact=exact, root=root)
+            ("single", value, exact), lambda: self._write_single(value, exact=exact, root=root)
         )
 
-    def _single(self, node: Node, *, exact: bool, root: bool) -> Any:
-        value = self._of_field(node, exact=exact)
+    def _write_single(self, node: Node, *, exact: bool, root: bool) -> Any:
+        value = self._write_field(node, exact=exact)
         if value is not None:
             return value
-        value = None if exact else self._mark(node)
+        value = None if exact else self._write_distance(node)
         if value is not None:
             return value
         if is_full(node, self.width) and node.kind == "call" and not exact:
             beam = find_beam(node, self.layout.leaves) if root else None
-            along = self._along(beam) if beam is not None else None
+            along = self._write_along_beam(beam) if beam is not None else None
             if along is not None:
                 return along
             if node.function is np.multiply or (root and node.function in (np.add, np.subtract)):
@@ -291,19 +307,19 @@ class Expressions(KernelWriter):
             if node.function in (np.cos, np.sin) and is_full(node.args[0], self.width):
                 return Trig(node.function.__name__, self.angle_of(node.args[0]))
         if node.kind == "rows" and not self.is_shared(node.args[0]) and not exact:
-            return self._row(node, "float32")
+            return self._write_row(node, "float32")
         made = self.double(node)
         return self.let(
-            made.level, f"np.float32({made.text if not exact else f'number({made.text})'})"
+            made.level, f"np.float32({made.text if not exact else f'replace_nan({made.text})'})"
         )
 
-    def _along(self, beam: Beam) -> KernelValue | None:
+    def _write_along_beam(self, beam: Beam) -> KernelValue | None:
         """Return a coordinate along a beam, rounded once.
 
-        It is the raw distance times a direction in two halves, plus the start of the beam. Returns
-        None if NumPy reads these.
+        It is the raw distance times a direction in two parts, plus the start of the beam. Returns
+        None if only NumPy can read these.
         """
-        sent = self._mark(beam.distance, raw=True)
+        sent = self._write_distance(beam.distance, raw=True)
         table = beam.direction.args[1]
         if (
             sent is None
@@ -312,20 +328,23 @@ class Expressions(KernelWriter):
         ):
             return None
         high, low, _ = self.once(
-            ("halves", id(table), beam.step), lambda: (*_halves(table * beam.step), table)
+            ("halves", id(table), beam.step), lambda: (*_split_halves(table * beam.step), table)
         )
-        first, second = (self._row(beam.direction, "float32", half) for half in (high, low))
+        first, second = (self._write_row(beam.direction, "float32", half) for half in (high, low))
         return self.let(
             self.inner,
-            f"fused({sent.text}, {first.text}, fused({sent.text}, {second.text},"
-            f" {self._row(beam.start, 'float32').text}))",
+            f"multiply_add({sent.text}, {first.text}, multiply_add({sent.text}, {second.text},"
+            f" {self._write_row(beam.start, 'float32').text}))",
         )
 
-    def _mark(self, node: Node, *, raw: bool = False) -> KernelValue | None:
+    def _write_distance(self, node: Node, *, raw: bool = False) -> KernelValue | None:
         """Return a distance in float32.
 
-        It is nan without a return, or if a condition says so. Returns None for other expressions,
-        and if float64 is required first.
+        It is nan without a return, or if a condition marks the point as invalid. Returns None for
+        other expressions, and if float64 is required.
+
+        Args:
+            raw: whether the distance is not scaled to metres.
         """
         if not is_full(node, self.width):
             return None
@@ -352,7 +371,9 @@ class Expressions(KernelWriter):
             return None
         if node.function is not returned_range and not is_nan_where(node):
             return None
-        made = self.once(("marked", node.args[-1], raw), lambda: self._mark(node.args[-1], raw=raw))
+        made = self.once(
+            ("marked", node.args[-1], raw), lambda: self._write_distance(node.args[-1], raw=raw)
+        )
         if made is None or node.function is returned_range:
             if made is None:
                 return None
@@ -363,13 +384,16 @@ class Expressions(KernelWriter):
         return self.let(self.inner, f"np.float32(nan) if {flag.text} else {made.text}")
 
     def combine(self, sign: str, first: Any, second: Any) -> Any:
-        """Return a product or sum; in the loops where both parts are there."""
+        """Return a product or sum; deferred to the flat loop if an operand is."""
         if isinstance(first, KernelValue) and isinstance(second, KernelValue):
             return self.let(max(first.level, second.level), f"{first.text} {sign} {second.text}")
         return DeferredFloat(sign, (first, second))
 
-    def _of_field(self, node: Node, *, exact: bool) -> KernelValue | None:
-        """Return an expression of one field that each point has: by a straight line or a table."""
+    def _write_field(self, node: Node, *, exact: bool) -> KernelValue | None:
+        """Return an expression of one field: a linear function or a table lookup.
+
+        Returns None unless each point has its own value of such a field.
+        """
         source = get_only_field(node)
         if source is not None and is_full(source, self.width):
             leaf = self.layout.leaves.get(source.path)
@@ -379,16 +403,16 @@ class Expressions(KernelWriter):
             return None
         values = tabulate_values(node, leaf)
         assert values is not None
-        straight = line(leaf, values, exact=exact)
+        straight = find_line(leaf, values, exact=exact)
         raw = self.raw(leaf) if straight is not None else None
         if straight is not None and raw is not None:
             return self.let(self.inner, straight.text(raw.text))
         if node.function in (np.cos, np.sin) and node.args[0] in self.both:
-            return self.beside(node, leaf)
-        return self.looked_up(node, source, np.float32, 1.0)
+            return self.look_up_trig(node, leaf)
+        return self.look_up(node, source, np.float32, 1.0)
 
     def angle_of(self, node: Node) -> int:
-        """Return the number of an angle whose cosine or sine the flat loop takes."""
+        """Return the number of an angle; the flat loop computes its cosine or sine."""
 
         def make() -> int:
             self.angles.append(self.angle(node, 1 / np.pi, len(node.shape)))
@@ -397,20 +421,20 @@ class Expressions(KernelWriter):
         return int(self.once(("angle", node), make))
 
     def angle(self, value: Any, factor: float, depth: int) -> KernelValue:
-        """Return an angle times a factor that makes half turns of it, in float64."""
+        """Return an angle times a factor that converts it to half turns, in float64."""
         if not isinstance(value, Node):
             return self.constant(np.asarray(value) * factor, depth)
         if not is_full(value, self.width) or value.kind != "call" or self.is_shared(value):
-            return self._scale(value, factor)
+            return self._write_scaled(value, factor)
         source = get_only_field(value)
         if source is not None and not is_cheap(value):
-            found = self._small_angle(value, source, factor)
+            found = self._write_small_angle(value, source, factor)
             if found is not None:
                 return found
-            return self._scale(value, factor)
-        return self._sum(value, factor)
+            return self._write_scaled(value, factor)
+        return self._write_angle(value, factor)
 
-    def _sum(self, node: Node, factor: float) -> KernelValue:
+    def _write_angle(self, node: Node, factor: float) -> KernelValue:
         function = node.function
         args = node.args
         depth = max(len(arg.shape) for arg in args if isinstance(arg, Node))
@@ -430,27 +454,30 @@ class Expressions(KernelWriter):
             made = self.double(other)
             return self.let(max(row.level, made.level), f"{made.text} * {row.text}")
         if function is np.where and len(args) == 3:
-            return self._where(
+            return self._write_where(
                 self.double(args[0], depth), *(self.angle(arg, factor, depth) for arg in args[1:])
             )
-        return self._scale(node, factor)
+        return self._write_scaled(node, factor)
 
-    def _scale(self, node: Node, factor: float) -> KernelValue:
+    def _write_scaled(self, node: Node, factor: float) -> KernelValue:
         made = self.double(node)
         return self.let(made.level, f"{made.text} * {factor!r}")
 
-    def _small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
-        """Return an angle by one field: a table in float32 where that is exact enough."""
+    def _write_small_angle(self, node: Node, source: Node, factor: float) -> KernelValue | None:
+        """Return an angle of one field from a table, in float32 if that is precise enough."""
         values = list_possible_values(node, self.layout.leaves)
         if values is None:
             return None
         with np.errstate(all="ignore"):
-            short = bool(np.nanmax(np.abs(values[~np.isinf(values)] * factor), initial=0) <= SMALL)
-        return self.looked_up(node, source, np.float32 if short else np.float64, factor)
+            short = bool(
+                np.nanmax(np.abs(values[~np.isinf(values)] * factor), initial=0)
+                <= MAX_SINGLE_HALF_TURNS
+            )
+        return self.look_up(node, source, np.float32 if short else np.float64, factor)
 
 
-def _halves(values: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Numbers as the sum of two of float32."""
+def _split_halves(values: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return numbers as the sum of two float32 arrays, for more precision."""
     high = values.astype(np.float32)
     return high, (values - high).astype(np.float32)
 
@@ -461,9 +488,9 @@ import math
 import numpy as np
 
 from lidarspec.points.numba_kernels.arithmetic import (
-    BYTES, DOUBLES, INTEGER, MADE_PLACES, MADE_SINGLES, PLACES, SINGLES, WORDS,
-    MADE, apart, at, byte_at, compiled, cos_sin, float4_big, float4_little, float8_big, float8_little, four_at, fused, larger, looked_up,
-    modulo, narrowed, number, put, returned, row_at, smaller, word_at,
+    BYTES, DOUBLES, INTEGER, INTEGER_COLUMN, SINGLE_COLUMN, INTEGERS, SINGLES, WORDS,
+    INTEGER_COLUMNS, assume_no_alias, at, byte_at, compile_kernel, cos_sin, float4_big, float4_little, float8_big, float8_little, four_at, look_up, mark_no_return,
+    maximum, minimum, modulo, multiply_add, narrow_angle, put, replace_nan, row_at, word_at,
 )
 
 nan, inf = np.nan, np.inf
@@ -471,17 +498,17 @@ nan, inf = np.nan, np.inf
 
 """
 
-_TYPES = {"float32": "SINGLES", "float64": "DOUBLES", "int64": "PLACES"}
+_TYPES = {"float32": "SINGLES", "float64": "DOUBLES", "int64": "INTEGERS"}
 
 
 @dataclass(frozen=True, eq=False)
 class KernelText:
-    """A kernel.
+    """The text of a kernel, its arguments and its results.
 
     Attributes:
-        source: of a module with the function `kernel`.
-        wanted: what it is called with.
-        columns: that it makes, by name, and their types.
+        source: the source of a module with the function `kernel`.
+        wanted: the arguments of the kernel.
+        columns: the dtypes of the columns that it fills, by name.
     """
 
     source: str
@@ -490,7 +517,7 @@ class KernelText:
 
 
 class KernelAssembly:
-    """The stores of a kernel, in its loops and in the flat one after them."""
+    """The lines of a kernel that store columns, in its loops or in the flat loop."""
 
     def __init__(self, writer: Expressions) -> None:
         self.writer = writer
@@ -499,14 +526,14 @@ class KernelAssembly:
         self.scratch: list[str] = []
 
     def column(self, name: str, value: Any) -> None:
-        """Return the text of the array of a column."""
+        """Add the line that stores a column."""
         if isinstance(value, KernelValue):
             self.writer.lines[-1].append(f"put(out_{name}, o, {value.text})")
         else:
             self.flat.append(f"put(out_{name}, o, {self.text(value)})")
 
     def together(self, values: Mapping[str, Any]) -> None:
-        """Coordinates that are nan all or none."""
+        """Add the lines that store coordinates, where one nan makes all coordinates nan."""
         if all(isinstance(value, KernelValue) for value in values.values()):
             lines = self.writer.lines[-1]
             texts = {name: value.text for name, value in values.items()}
@@ -520,7 +547,7 @@ class KernelAssembly:
         lines += [f"put(out_{name}, o, {name} + bad)" for name in values]
 
     def text(self, value: Any) -> str:
-        """Return an expression in the flat loop."""
+        """Return the text of an expression in the flat loop."""
         if isinstance(value, DeferredFloat):
             return f"({f' {value.sign} '.join(map(self.text, value.parts))})"
         if isinstance(value, Trig):
@@ -530,7 +557,7 @@ class KernelAssembly:
         return self._store(value, "float32")
 
     def _store(self, value: KernelValue, kind: str) -> str:
-        """Return a value of the loops, kept for the flat one."""
+        """Store a value of the loops in a scratch array; return its text in the flat loop."""
         if value.text not in self._kept:
             name = self._kept[value.text] = f"h{len(self.scratch)}"
             self.scratch.append(f"{name} = np.empty(held, np.{kind})")
@@ -538,7 +565,7 @@ class KernelAssembly:
         return f"at({self._kept[value.text]}, k)"
 
     def turns(self) -> list[str]:
-        """Return the cosines and sines that the flat loop begins with."""
+        """Return the lines of the flat loop that compute cosines and sines."""
         return [
             f"cos{index}, sin{index} = cos_sin({self._store(made, 'float64')})"
             for index, made in enumerate(self.writer.angles)
@@ -549,12 +576,13 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
     """Return the kernel of some columns of a plan.
 
     Args:
-        varying: the arrays whose lengths differ from frame to frame, if it is to serve them all.
+        varying: the arrays whose lengths the kernel accepts as arguments; empty for a kernel of one
+            layout.
     """
     expressions = {name: plan.expressions[name] for name in names}
     writer = Expressions(plan.layout, plan.shape, plan.tables, varying)
     assembly = KernelAssembly(writer)
-    writer.both = _both(expressions.values())
+    writer.both = _find_cos_sin_angles(expressions.values())
     made = {name: _make_value(writer, plan, name, value) for name, value in expressions.items()}
     columns = {
         name: plan.extra[name].dtype if name in plan.sent else np.dtype(np.float32) for name in made
@@ -566,7 +594,7 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
     places = {}
     if not all(
         is_number(value, plan.layout.leaves) for value in directed
-    ):  # where one coordinate is nan, all are
+    ):  # then a nan in one coordinate makes all of them nan
         places = {name: value for name, value in made.items() if name in "xyz"}
     if places:
         assembly.together(places)
@@ -574,11 +602,13 @@ def write_kernel(plan: Plan, names: tuple[str, ...], varying: Set[str]) -> Kerne
         if name not in places:
             assembly.column(name, value)
     turns = assembly.turns()
-    return KernelText(HEAD + _function(writer, assembly, turns, columns), writer.wanted, columns)
+    return KernelText(
+        HEAD + _write_function(writer, assembly, turns, columns), writer.wanted, columns
+    )
 
 
-def _both(expressions: Iterable[Any]) -> set[Node]:
-    """Return the angles of which the cosine and the sine are wanted."""
+def _find_cos_sin_angles(expressions: Iterable[Any]) -> set[Node]:
+    """Return the angles with both their cosine and their sine in the expressions."""
     nodes = list(traverse(*expressions))
     cosines, sines = (
         {node.args[0] for node in nodes if node.function is function}
@@ -599,31 +629,31 @@ def _make_value(writer: Expressions, plan: Plan, name: str, value: Any) -> Any:
     if name == "azimuth" or (exact and name != "intensity"):
         made = writer.double(value, len(writer.shape))
         return writer.let(
-            made.level, f"{'narrowed' if name == 'azimuth' else 'np.float32'}({made.text})"
+            made.level, f"{'narrow_angle' if name == 'azimuth' else 'np.float32'}({made.text})"
         )
     return writer.single(value, exact=name == "intensity", root=True)
 
 
-def _function(
+def _write_function(
     writer: KernelWriter,
     assembly: KernelAssembly,
     turns: list[str],
     columns: Mapping[str, np.dtype[Any]],
 ) -> str:
-    """Return the signature and the loops."""
+    """Return the text of the function: its signature and its loops."""
     width = writer.number(writer.width)
     if turns:
-        held = writer.number(max(CHUNK // writer.width, 1))
+        held = writer.number(max(SCRATCH_POINTS // writer.width, 1))
     else:
         held = "count"
-    loops = _loops(writer, width)
+    loops = _write_loops(writer, width)
     wanted = writer.wanted
     parameters = [
         ("rows", "BYTES"),
         ("stride", "INTEGER"),
         ("first", "INTEGER"),
         ("count", "INTEGER"),
-        ("numbers", "PLACES"),
+        ("numbers", "INTEGERS"),
     ]
     parameters += [
         (f"c{index}", _TYPES[array.dtype.name]) for index, array in enumerate(wanted.arrays)
@@ -631,12 +661,12 @@ def _function(
     for index in range(len(wanted.nodes)):
         parameters += [(f"g{index}", "DOUBLES"), (f"s{index}", "INTEGER")]
     parameters += [
-        (f"out_{name}", "MADE_SINGLES" if dtype.kind == "f" else f"MADE['{dtype}']")
+        (f"out_{name}", "SINGLE_COLUMN" if dtype.kind == "f" else f"INTEGER_COLUMNS['{dtype}']")
         for name, dtype in columns.items()
     ]
     arguments = ", ".join(name for name, _ in parameters)
     types = ", ".join(kind for _, kind in parameters)
-    body = ["apart()"] + [
+    body = ["assume_no_alias()"] + [
         f"n{index} = at(numbers, {index})" for index in range(len(wanted.numbers))
     ]
     body += [f"step = {held}", f"held = step * {width}", *assembly.scratch, *writer.lines[0]]
@@ -653,12 +683,12 @@ def _function(
     if turns:
         body += [f"    for k in range((end - begin) * {width}):", "        o = start + k"]
         body += [f"        {text}" for text in (*turns, *assembly.flat)]
-    head = f'@compiled(KEPT, ({types},), error_model="numpy")\ndef kernel({arguments}):\n'
+    head = f'@compile_kernel(STORED, ({types},), error_model="numpy")\ndef kernel({arguments}):\n'
     return head + "".join(f"    {text}\n" for text in body)
 
 
-def _loops(writer: KernelWriter, width: str) -> list[str]:
-    """Write the work for a packet: its own values, then the loops over its arrays."""
+def _write_loops(writer: KernelWriter, width: str) -> list[str]:
+    """Return the lines for a packet: its own values, then the loops over its arrays."""
     lines = [*writer.lines[1]]
     depth = 0
     for level in range(2, writer.inner + 1):
@@ -667,13 +697,13 @@ def _loops(writer: KernelWriter, width: str) -> list[str]:
             lines.append(f"{'    ' * depth}for i{level - 2} in range({writer.number(length)}):")
             depth += 1
         if level == writer.inner:
-            lines += [f"{'    ' * depth}{text}" for text in _spot(writer, width)]
+            lines += [f"{'    ' * depth}{text}" for text in _write_indices(writer, width)]
         lines += [f"{'    ' * depth}{text}" for text in writer.lines[level]]
     if writer.inner == 1:
-        lines = [*_spot(writer, width), *lines]
+        lines = [*_write_indices(writer, width), *lines]
     return lines
 
 
-def _spot(writer: KernelWriter, width: str) -> list[str]:
-    """Return the index of a point among those in progress, and among all."""
-    return [f"k = (p - begin) * {width} + {writer.place(writer.shape)}", "o = start + k"]
+def _write_indices(writer: KernelWriter, width: str) -> list[str]:
+    """Return the lines that compute the index of a point in scratch arrays and in columns."""
+    return [f"k = (p - begin) * {width} + {writer.index_text(writer.shape)}", "o = start + k"]

@@ -1,12 +1,12 @@
-"""Write fields, tables, constants and places as text in the loops of a kernel.
+"""Write fields, tables, constants and indices as text in the loops of a kernel.
 
-Each is written in the loop in which it varies.
+Each value is computed in the outermost loop in which it is constant.
 
-A `KernelValue` is text and the loop at which it varies. `KernelWriter` keeps the lines of each
-loop, the arguments that the kernel is to be called with, and what it has written before, so that
-nothing is computed twice. A field is an expression of its bytes (`integer`); a function of one
-field is looked up in a table by them, or computed, where the table is a straight line
-(`LinearTable`). `TEMPLATES` are NumPy's functions of numbers.
+A `KernelValue` is the text of an expression, and the loop in which it varies. `KernelWriter` keeps
+the lines of each loop, the arguments of the kernel, and the values written before, so that no value
+is computed twice. A field is an expression of its bytes (`write_integer`). A function of one field
+is looked up in a table, or computed if the table is linear (`LinearTable`). `TEMPLATES` are NumPy's
+functions of numbers.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SIGNS = {
 }
 _SIGNS |= {np.less: "<", np.less_equal: "<=", np.greater: ">", np.greater_equal: ">="}
 
-#: how a kernel writes NumPy's functions of numbers; what is not here is computed by NumPy itself.
+#: the text of NumPy's functions of numbers in a kernel; NumPy itself computes all other functions.
 TEMPLATES: dict[Any, str] = {
     **{function: f"({{}} {sign} {{}})" for function, sign in _SIGNS.items()},
     **{
@@ -58,27 +58,27 @@ TEMPLATES: dict[Any, str] = {
     },
     **{
         np.mod: "modulo({}, {})",
-        np.nan_to_num: "number({})",
-        np.minimum: "smaller({}, {})",
-        np.maximum: "larger({}, {})",
+        np.nan_to_num: "replace_nan({})",
+        np.minimum: "minimum({}, {})",
+        np.maximum: "maximum({}, {})",
     },
-    returned_range: "returned({})",
+    returned_range: "mark_no_return({})",
     **{np.negative: "(-{})", np.positive: "{}", np.absolute: "abs({})"},
 }
 
-#: operations of an expression that is computed rather than looked up, at most.
-FEW = 8
+#: the largest number of operations of an expression that is computed instead of looked up.
+MAX_COMPUTED_OPERATIONS = 8
 
 
 def is_cheap(node: Node) -> bool:
-    """Return whether an expression of one field is a few simple operations."""
-    nodes = list(islice(traverse(node), FEW + 1))
-    return len(nodes) <= FEW and all(
+    """Return whether an expression of one field has only a few simple operations."""
+    nodes = list(islice(traverse(node), MAX_COMPUTED_OPERATIONS + 1))
+    return len(nodes) <= MAX_COMPUTED_OPERATIONS and all(
         this.kind != "call" or this.function in CHEAP for this in nodes
     )
 
 
-def integer(leaf: Leaf, byte: Any) -> str | None:
+def write_integer(leaf: Leaf, byte: Any) -> str | None:
     """Return the raw value of a field as an expression of its bytes.
 
     Args:
@@ -114,12 +114,13 @@ def integer(leaf: Leaf, byte: Any) -> str | None:
 
 @dataclass(frozen=True)
 class LinearTable:
-    """A table that is a straight line of the raw value from `low` to `high`.
-
-    Its value is `other` for all other raw values.
+    """A table with values that are linear in the raw value, from `low` to `high`.
 
     Attributes:
-        exact: whether the arithmetic has to be that of float64.
+        slope, start: the value is ``slope * raw + start``.
+        low, high: the limits of the raw value; None without a limit.
+        other: the value for all other raw values, nan or inf.
+        exact: whether the arithmetic has to be float64.
     """
 
     slope: float
@@ -130,7 +131,7 @@ class LinearTable:
     exact: bool
 
     def text(self, raw: str) -> str:
-        """Return the value as an expression of the raw one."""
+        """Return the text of the value, given the text of the raw value."""
         if self.exact:
             expression = f"np.float32({raw} * {self.slope!r} + {self.start!r})"
         elif self.slope == 1 and self.start == 0:
@@ -152,10 +153,15 @@ class LinearTable:
         return expression
 
 
-def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None:
-    """Return the line that a table by a field's window follows, in float32.
+def find_line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None:
+    """Return the linear function that equals a table of a field, as float32.
 
-    It is equal if `exact`, else within a unit in the last place.
+    Returns None if the table is not linear.
+
+    Args:
+        values: the values of the table.
+        exact: whether all values have to be equal; else they may differ by a unit in the last
+            place.
     """
     field_window = find_window(leaf)
     assert field_window is not None
@@ -197,9 +203,10 @@ def line(leaf: Leaf, values: NDArray[Any], *, exact: bool) -> LinearTable | None
 
 @dataclass(frozen=True)
 class KernelValue:
-    """An expression in a kernel, and the loop at which it varies.
+    """The text of an expression in a kernel, and the loop in which it varies.
 
-    The level is 0 for never, 1 for the packet, 2 for its first array, and so on.
+    The level is 0 for a constant, 1 for the loop over packets, 2 for the loop over the first array,
+    and so on.
     """
 
     text: str
@@ -208,9 +215,12 @@ class KernelValue:
 
 @dataclass
 class KernelArguments:
-    """The arguments of a kernel besides the bytes.
+    """The arguments of a kernel, apart from the bytes.
 
-    They are arrays and numbers that are known, and nodes with results to compute.
+    Attributes:
+        arrays: arrays that do not depend on data.
+        numbers: lengths and offsets that differ from layout to layout.
+        nodes: nodes with values that NumPy computes before.
     """
 
     arrays: list[NDArray[Any]] = field(default_factory=list)
@@ -219,9 +229,9 @@ class KernelArguments:
 
 
 def find_run(leaf: Leaf) -> tuple[str, int, int, int] | None:
-    """Return the place of a field of unsigned contiguous bits in up to four bytes.
+    """Return the position of a field of unsigned contiguous bits in up to four bytes.
 
-    The place is byte order, first byte, number of bytes and lowest bit. Returns None for other
+    The position is byte order, first byte, number of bytes and lowest bit. Returns None for other
     fields.
     """
     if len(leaf.shape) > len(leaf.strides):
@@ -241,9 +251,10 @@ def find_run(leaf: Leaf) -> tuple[str, int, int, int] | None:
 
 
 def find_word(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
-    """Return the 4-byte little-endian word of its element that holds a field.
+    """Return the aligned 4-byte little-endian word that contains a field.
 
-    It is given as offset, shift and mask. Returns None if there is no such word.
+    The word is given as its offset, and the shift and mask of the field. Returns None if no such
+    word exists.
     """
     run = find_run(leaf)
     if run is None or (run[0] == ">" and run[2] > 1) or not leaf.strides or leaf.strides[-1] % 4:
@@ -268,12 +279,13 @@ def find_word(leaf: Leaf, layout: Layout) -> tuple[int, int, int] | None:
 
 
 class KernelWriter:
-    """Writes values into the loops.
+    """A writer of values into the loops of a kernel.
 
     Args:
-        layout, shape: of the frames, and of the points of a packet.
+        layout: the layout of the frames.
+        shape: the shape of the points of a packet.
+        tables: known lookup tables by their contents; new tables are added.
         varying: the arrays whose lengths differ from frame to frame.
-        tables: those known already, by what they are of; added to.
     """
 
     def __init__(
@@ -297,32 +309,32 @@ class KernelWriter:
         self._made = 0
 
     def number(self, value: int) -> str:
-        """Return a length or place in the text."""
+        """Return the text of a length or offset; an argument if it may vary."""
         if not self.varying or value in (0, 1):
             return str(value)
         self.wanted.numbers.append(value)
         return f"n{len(self.wanted.numbers) - 1}"
 
     def once(self, name: Any, make: Callable[[], Any]) -> Any:
-        """Return the value made under this key; make it on first use."""
+        """Return the value with a key; make it on first use."""
         if name not in self._known:
             self._known[name] = make()
         return self._known[name]
 
     def let(self, level: int, text: str) -> KernelValue:
-        """Return a variable in a loop."""
+        """Add a variable to a loop, and return it."""
         self._made += 1
         self.lines[level].append(f"v{self._made} = {text}")
         return KernelValue(f"v{self._made}", level)
 
-    def place(self, shape: tuple[int, ...]) -> str:
-        """Return the index of an element of an array of this shape in the loops."""
+    def index_text(self, shape: tuple[int, ...]) -> str:
+        """Return the text of the index of the current element in an array of this shape."""
         return self.format_index(
             shape, tuple(self.number(math.prod(shape[axis + 1 :])) for axis in range(len(shape)))
         )
 
     def format_index(self, shape: tuple[int, ...], strides: tuple[str, ...]) -> str:
-        """The index of an element in the loops, of an array with these steps along each axis."""
+        """Return the text of the index of the current element in an array with these strides."""
         parts = [
             f"i{axis}" if stride == "1" else f"i{axis} * {stride}"
             for axis, (length, stride) in enumerate(zip(shape, strides, strict=True))
@@ -331,11 +343,11 @@ class KernelWriter:
         return " + ".join(parts) or "0"
 
     def array(self, values: NDArray[Any]) -> str:
-        """Return an array that is known, as an argument; flat."""
+        """Add an array that does not depend on data as a flat argument; return its name."""
         flat = np.ascontiguousarray(values).reshape(-1)
-        return str(self.once(("array", id(values)), lambda: (self._keep(flat), values))[0])
+        return str(self.once(("array", id(values)), lambda: (self._add_array(flat), values))[0])
 
-    def _keep(self, flat: NDArray[Any]) -> str:
+    def _add_array(self, flat: NDArray[Any]) -> str:
         self.wanted.arrays.append(flat)
         return f"c{len(self.wanted.arrays) - 1}"
 
@@ -353,19 +365,20 @@ class KernelWriter:
         )
         element: KernelValue = self.once(
             ("element", name, shape),
-            lambda: self.let(1 + last_axis(shape), f"at({name}, {self.place(shape)})"),
+            lambda: self.let(1 + last_axis(shape), f"at({name}, {self.index_text(shape)})"),
         )
         return element
 
     def add_argument(self, node: Node) -> KernelValue:
-        """Add an argument of the kernel that NumPy computes before."""
+        """Add the value of a node, computed by NumPy, as an argument; return its element."""
         if node not in self.wanted.nodes:
             self.wanted.nodes.append(node)
         name = self.wanted.nodes.index(node)
         found = self.once(
             ("given", node),
             lambda: self.let(
-                1 + last_axis(node.shape), f"at(g{name}, p * s{name} + {self.place(node.shape)})"
+                1 + last_axis(node.shape),
+                f"at(g{name}, p * s{name} + {self.index_text(node.shape)})",
             ),
         )
         if node.sample.array.dtype.kind != "b":
@@ -373,7 +386,7 @@ class KernelWriter:
         return self.once(("given flag", node), lambda: self.let(found.level, f"{found.text} != 0"))  # type: ignore[no-any-return]
 
     def raw(self, leaf: Leaf) -> KernelValue | None:
-        """Return the raw number of a field; None where only NumPy reads it."""
+        """Return the raw value of a field; None if only NumPy can read it."""
         if leaf.info.path not in self._known:
             self._known[leaf.info.path] = self._float(leaf) or self._integer(leaf)
         return self._known[leaf.info.path]  # type: ignore[no-any-return]
@@ -389,7 +402,7 @@ class KernelWriter:
                 f"np.{kind}({four}{f' >> np.uint32({shift})' if shift else ''} &"
                 f" np.uint32({mask}))",
             )
-        text = integer(leaf, lambda offset: self.byte(leaf, offset).text)
+        text = write_integer(leaf, lambda offset: self.byte(leaf, offset).text)
         if text is None:
             return None
         return self.let(1 + last_axis(leaf.shape), text)
@@ -401,7 +414,7 @@ class KernelWriter:
         return self._read(leaf, leaf.offset, f"float{leaf.wire.itemsize}_{order}")
 
     def byte(self, leaf: Leaf, offset: int) -> KernelValue:
-        """Return a byte of the element of an array, or of the frame."""
+        """Return a byte at an offset of an array's element, or of the frame."""
         return self._read(leaf, offset, "byte_at")
 
     def _read(self, leaf: Leaf, offset: int, reader: str) -> KernelValue:
@@ -415,7 +428,7 @@ class KernelWriter:
             ("element", shape, leaf.strides),
             lambda: self.let(level, f"base + {self.format_index(shape, self._strides(leaf))}"),
         )
-        if self._stays(leaf):
+        if self._has_fixed_offset(leaf):
             place = str(offset)
         else:
             place = self.number(offset)
@@ -436,10 +449,10 @@ class KernelWriter:
             strides[-1] = str(leaf.strides[-1])
         return tuple(strides)
 
-    def _stays(self, leaf: Leaf) -> bool:
-        """Return whether a field has the same place in all frames.
+    def _has_fixed_offset(self, leaf: Leaf) -> bool:
+        """Return whether a field has the same offset in all frames.
 
-        It is before everything that varies, or in the first element of it.
+        It is before all arrays of varying length, or in the first element of the first of them.
         """
         leaves = self.layout.leaves.values()
         found = [
@@ -451,8 +464,8 @@ class KernelWriter:
         inside = bool(strides) and leaf.strides == strides and leaf.offset - first < strides[-1]
         return leaf.offset <= first or inside
 
-    def looked_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
-        """An expression of one field from a table; None where the field has too many values."""
+    def look_up(self, node: Node, source: Node, kind: Any, factor: float) -> KernelValue | None:
+        """Return an expression of one field from a table; None without a window."""
         leaf = self.layout.leaves.get(source.path)
         field_window = find_window(leaf) if leaf is not None else None
         if leaf is None or field_window is None:
@@ -487,7 +500,7 @@ class KernelWriter:
             return first
         return f"({first} | {self.byte(leaf, field_window.offset + 1).text} << 8)"
 
-    def beside(self, node: Node, leaf: Leaf) -> KernelValue:
+    def look_up_trig(self, node: Node, leaf: Leaf) -> KernelValue:
         """Return a cosine or sine from a table that has both side by side.
 
         Both are then loaded together.

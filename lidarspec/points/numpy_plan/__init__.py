@@ -1,12 +1,12 @@
-"""Compute points by NumPy alone.
+"""Compute points with NumPy alone.
 
 This back end compiles the columns of a plan to calls on arrays that stay in the cache.
 
-In: a `points.plan.Plan`. Out: an object that fills its columns, by `compile`. Modules in reading
-order:
+In: a `points.plan.Plan`. Out: an object that fills its columns, returned by `compile`. Modules in
+reading order:
 
 * `program`: calls on registers, chunk by chunk.
-* `compiler`: from expressions to the steps of a program.
+* `compiler`: compiles expressions to the steps of a program.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidarspec.points.plan import ColumnMaker, Plan
 
 
 def compile(plan: Plan, names: tuple[str, ...]) -> ColumnMaker:
-    """Return a program for these columns of the plan's points; the plan keeps it."""
+    """Return a program that computes columns of a plan; the plan keeps it."""
     if names not in plan.programs:
         plan.programs[names] = _compile(plan, names, plan.tables).program
     return plan.programs[names]
@@ -38,7 +38,7 @@ def _compile(plan: Plan, names: tuple[str, ...], tables: dict[Any, NDArray[Any]]
 
 
 def describe(plan: Plan) -> list[str]:
-    """Describe a plan in lines of text.
+    """Return a description of a plan as lines of text.
 
     They show the shape, the values computed for each packet, and the calls for each chunk.
     """

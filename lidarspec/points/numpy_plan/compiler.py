@@ -1,9 +1,9 @@
 """Compile the expressions of a plan to the steps of a program.
 
-Each step is one NumPy call for a chunk of packets. An expression of one field of one or two bytes
-is a table by its raw value (`points.lookup_tables`). Values that are not full (one for a packet or
-block) are evaluated plainly for the whole batch and broadcast. Everything else is the NumPy
-function of the expression.
+Each step is one NumPy call for a chunk of packets. An expression of one field in at most two bytes
+is a lookup table (`points.lookup_tables`). Values that are not full (with one value for a packet or
+block instead of a value for each point) are evaluated by the reference evaluator for the whole
+batch and broadcast. All other expressions are the NumPy calls as written.
 
 Columns that are not exact may be computed in another order: products, offsets, cosines and sines
 are float32, and the terms of a sum that are not full are added before they are broadcast.
@@ -40,13 +40,13 @@ _FASTER_THAN_TABLE = {function for function in CHEAP if isinstance(function, np.
 
 
 class Compiler:
-    """Appends the steps of expressions to a program.
+    """A compiler of expressions, which appends steps to a program.
 
     Each method that compiles an expression returns the register of its result.
 
     Attributes:
-        program: the program, with an output for each column that was requested.
-        low: the nodes whose plain results the program needs.
+        program: the program, with an output for each column added.
+        low: the nodes that are not full and that the program reads.
     """
 
     def __init__(self, plan: Plan, tables: dict[Any, NDArray[Any]]) -> None:
@@ -64,40 +64,45 @@ class Compiler:
 
         Args:
             kind: "single" or "double".
-            exact: computed in float64, each operation as it is written; else products may be
-                float32, and sums in another order.
+            exact: whether each operation is computed in float64 as it is written; else products may
+                be float32, and sums in another order.
         """
         self._is_exact = exact
         if kind == "single":
-            self.program.outputs[name] = self._single(value)
+            self.program.outputs[name] = self._compile_single(value)
         else:
-            self.program.outputs[name] = self._double(value)
+            self.program.outputs[name] = self._compile_double(value)
 
     def add_integers(self, name: str, leaf: Leaf) -> None:
-        """Add an output column of the integers of a field, as they were sent."""
+        """Add an output column of the integers of a field as they were sent."""
         assert leaf.info.dtype is not None
         kind = f"{leaf.info.dtype.kind}{leaf.info.dtype.itemsize}"
-        self.program.outputs[name] = self._raw(leaf, kind)
+        self.program.outputs[name] = self._load_raw(leaf, kind)
 
-    def _once(self, name: Any, make: Callable[[], int]) -> int:
-        """Return the register of this name; make it if there is none."""
+    def _make_once(self, name: Any, make: Callable[[], int]) -> int:
+        """Return the register with a name; make it on first use."""
         if name not in self._registers:
             self._registers[name] = make()
         return self._registers[name]
 
-    def _single(self, value: Any) -> int:
-        """Compile an expression to float32. Only products and tables have this precision."""
+    def _compile_single(self, value: Any) -> int:
+        """Compile an expression to float32.
+
+        Only products and tables are computed in float32; other results are converted.
+        """
         if not is_full(value, self._width):
             return self._broadcast(value, "single")
-        return self._once(("single", self._is_exact, value), lambda: self._full_single(value))
+        return self._make_once(
+            ("single", self._is_exact, value), lambda: self._compile_full_single(value)
+        )
 
-    def _full_single(self, node: Node) -> int:
-        register = self._lookup(node, "single")
+    def _compile_full_single(self, node: Node) -> int:
+        register = self._compile_lookup(node, "single")
         if register is None and not self._is_exact:
-            register = self._product(node)
+            register = self._compile_product(node)
         if register is not None:
             return register
-        read = RegisterRead(self._double(node))
+        read = RegisterRead(self._compile_double(node))
         return self.program.step(
             "as float32",
             "single",
@@ -105,42 +110,42 @@ class Compiler:
             read,
         )
 
-    def _product(self, node: Node) -> int | None:
-        """Compile a product, an offset, a cosine or a sine to float32, else return None."""
+    def _compile_product(self, node: Node) -> int | None:
+        """Compile a product, an offset, a cosine or a sine to float32; None otherwise."""
         if node.kind != "call":
             return None
         name = node.function.__name__
         if node.function in (np.cos, np.sin):
-            return self._direction(node.function, node.args[0])
+            return self._compile_direction(node.function, node.args[0])
         is_offset = node.function is np.add and any(not isinstance(arg, Node) for arg in node.args)
         if node.function is np.multiply or is_offset:
-            first, second = (self._factor(arg) for arg in node.args)
+            first, second = (self._compile_factor(arg) for arg in node.args)
             return self.program.call(name, "single", node.function, first, second)
         return None
 
-    def _factor(self, value: Any) -> Callable[[ProgramRun], Any]:
+    def _compile_factor(self, value: Any) -> Callable[[ProgramRun], Any]:
         """Return a factor of a float32 product: a number or a register."""
         if not isinstance(value, Node) and np.size(value) == 1:
-            return _constant(np.float32(np.asarray(value).reshape(())))
+            return _make_constant(np.float32(np.asarray(value).reshape(())))
         if is_full(value, self._width):
-            return RegisterRead(self._single(value))
+            return RegisterRead(self._compile_single(value))
         return RegisterRead(
-            self._once(("factor", id(value)), lambda: self._broadcast(value, "single"))
+            self._make_once(("factor", id(value)), lambda: self._broadcast(value, "single"))
         )
 
-    def _direction(self, function: np.ufunc, value: Node) -> int:
+    def _compile_direction(self, function: np.ufunc, value: Node) -> int:
         """Compile the cosine or sine of an angle to float32."""
         parts = split_sum(value, self._width)
         is_fixed = all(part.low is None or part.row.size == 1 for part in parts)
         if is_fixed and all(part.full is None for part in parts):
             return self._compile_turned(function, parts)
-        angle = self._once(("angle", value), lambda: self._full_angle(value))
+        angle = self._make_once(("angle", value), lambda: self._compile_full_angle(value))
         return self.program.call(function.__name__, "single", function, RegisterRead(angle))
 
     def _compile_turned(self, function: np.ufunc, parts: list[Term]) -> int:
-        """Compile the cosine or sine of angles that are not full plus constants.
+        """Compile the cosine or sine of a sum of angles that are not full.
 
-        By the theorem of addition this takes no trigonometry for each point.
+        The angle addition theorem avoids a trigonometric function for each point.
         """
         self.low += [part.low for part in parts if part.low is not None]
         depth = len(self._shape)
@@ -164,9 +169,9 @@ class Compiler:
 
         return self.program.step(f"{function.__name__} by addition", "single", run)
 
-    def _full_angle(self, value: Node) -> int:
-        """Compile an angle to float32, reduced to half a turn before it loses precision."""
-        angle = RegisterRead(self._double(value))
+    def _compile_full_angle(self, value: Node) -> int:
+        """Compile an angle to float32, folded to half a turn before it loses precision."""
+        angle = RegisterRead(self._compile_double(value))
         scratch = RegisterRead(self.program.register("double"))
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
@@ -179,33 +184,35 @@ class Compiler:
 
         return self.program.step("reduce to half a turn", "single", run, angle, scratch)
 
-    def _double(self, value: Any) -> int:
+    def _compile_double(self, value: Any) -> int:
         """Compile an expression to float64, or a condition to flags."""
         if not is_full(value, self._width):
             return self._broadcast(value, "double")
-        return self._once(("double", self._is_exact, value), lambda: self._full_double(value))
+        return self._make_once(
+            ("double", self._is_exact, value), lambda: self._compile_full_double(value)
+        )
 
-    def _full_double(self, node: Node) -> int:
+    def _compile_full_double(self, node: Node) -> int:
         if node.sample.array.dtype.kind == "b":
             kind = "flag"
         else:
             kind = "double"
-        register = self._lookup(node, kind)
+        register = self._compile_lookup(node, kind)
         if register is None and node.kind == "call" and not self._is_exact:
-            register = self._sum(node)
+            register = self._compile_sum(node)
         if register is None and node.kind == "call":
-            register = self._call(node, kind)
+            register = self._compile_call(node, kind)
         if register is None:
             register = self._broadcast(node, kind)
         return register
 
-    def _lookup(self, node: Node, kind: str) -> int | None:
-        """Compile rows of a table or an expression of one field, else return None."""
+    def _compile_lookup(self, node: Node, kind: str) -> int | None:
+        """Compile table rows or an expression of one field; return None otherwise."""
         if node.kind == "rows":
-            return self._rows(node, kind)
-        return self._of_field(node, kind)
+            return self._look_up_rows(node, kind)
+        return self._compile_field(node, kind)
 
-    def _of_field(self, node: Node, kind: str) -> int | None:
+    def _compile_field(self, node: Node, kind: str) -> int | None:
         """Load a field, or look up an expression of one field by its window.
 
         Returns None if neither is possible.
@@ -223,12 +230,12 @@ class Compiler:
         if field_window is None or (is_long and node.function in _FASTER_THAN_TABLE):
             return None
         index = RegisterRead(
-            self._once(
+            self._make_once(
                 ("index", field_window, leaf.strides),
                 lambda: self._load(leaf, field_window.dtype, field_window.offset, "index"),
             )
         )
-        table = self._table(node, leaf, field_window, kind)
+        table = self._make_table(node, leaf, field_window, kind)
         bits = (len(table) - 1).bit_length()
         return self.program.step(
             f"{node.path or source.path}: table of {len(table)} by {bits} bits",
@@ -237,7 +244,9 @@ class Compiler:
             index,
         )
 
-    def _table(self, node: Node, leaf: Leaf, field_window: FieldWindow, kind: str) -> NDArray[Any]:
+    def _make_table(
+        self, node: Node, leaf: Leaf, field_window: FieldWindow, kind: str
+    ) -> NDArray[Any]:
         """Return the values of an expression for each value of its window."""
         name = (
             kind,
@@ -253,7 +262,7 @@ class Compiler:
         return self._tables[name]
 
     def _load_whole(self, leaf: Leaf, kind: str) -> int | None:
-        """Load a field in its unit; None if it requires float64 first."""
+        """Load a field in its unit; return None if that requires float64 first."""
         info = leaf.info
         assert info.dtype is not None
         if kind == "single" and (info.dtype.itemsize > 4 or (info.scaled and self._is_exact)):
@@ -261,7 +270,7 @@ class Compiler:
         if kind == "single" and info.offset:
             return None
 
-        register = self._raw(leaf, kind)
+        register = self._load_raw(leaf, kind)
         if not info.scaled:
             return register
         raw = RegisterRead(register)
@@ -273,7 +282,7 @@ class Compiler:
 
         return self.program.step(f"{info.path} in its unit", kind, scale, raw)
 
-    def _raw(self, leaf: Leaf, kind: str) -> int:
+    def _load_raw(self, leaf: Leaf, kind: str) -> int:
         """Load the raw values of a field."""
         if leaf.wire is not None:
             return self._load(leaf, leaf.wire, leaf.offset, kind)
@@ -295,8 +304,11 @@ class Compiler:
 
         return self.program.step(f"{leaf.info.path}: {dtype} at byte {offset}", kind, run)
 
-    def _rows(self, node: Node, kind: str) -> int | None:
-        """Look up rows of a table that are as long as the innermost arrays, else return None."""
+    def _look_up_rows(self, node: Node, kind: str) -> int | None:
+        """Look up rows of a table that have the length of the innermost arrays.
+
+        Returns None if rows have another length, or if each point has its own index.
+        """
         index, table = node.args
         inner = table.shape[1]
         inner_shape = self._shape[last_axis(index.shape) :]
@@ -313,22 +325,22 @@ class Compiler:
 
         return self.program.step(f"rows of a table of {len(table) - 1} x {inner}", kind, run)
 
-    def _sum(self, node: Node) -> int | None:
-        """Compile a sum: first the terms that are not full, then the full ones.
+    def _compile_sum(self, node: Node) -> int | None:
+        """Compile a sum: the terms that are not full first, then the full terms.
 
-        Returns None if all terms are full, or if a full term has a row as its factor.
+        Returns None if all terms are full, or if an array is the factor of a full term.
         """
         parts = split_sum(node, self._width)
         low = [part for part in parts if part.full is None]
         full = [part for part in parts if part.full is not None]
         if not low or any(part.row.ndim for part in full):
             return None
-        register = self._sum_of_low(low)
+        register = self._compile_low_sum(low)
         for part in full:
-            register = self._plus(register, part)
+            register = self._add_term(register, part)
         return register
 
-    def _sum_of_low(self, parts: list[Term]) -> int:
+    def _compile_low_sum(self, parts: list[Term]) -> int:
         self.low += [part.low for part in parts if part.low is not None]
         shape = self._shape
         depth = len(shape)
@@ -346,11 +358,11 @@ class Compiler:
 
         return self.program.step(f"sum of {len(parts)} products", "double", run)
 
-    def _plus(self, sum_: int, part: Term) -> int:
+    def _add_term(self, sum_: int, part: Term) -> int:
         """Add a full term to a sum."""
         assert part.full is not None
         before = RegisterRead(sum_)
-        full = RegisterRead(self._double(part.full))
+        full = RegisterRead(self._compile_double(part.full))
         factor = float(part.row)
 
         def run(execution: ProgramRun, out: NDArray[Any]) -> None:
@@ -359,11 +371,15 @@ class Compiler:
 
         return self.program.step(f"add {factor:.6g} times", "double", run, before, full)
 
-    def _call(self, node: Node, kind: str) -> int:
+    def _compile_call(self, node: Node, kind: str) -> int:
         """Compile any other function of arrays, as NumPy evaluates it."""
         depth = max(len(arg.shape) for arg in node.args if isinstance(arg, Node))
-        reads = [self._argument(arg, depth) for arg in node.args]
-        used = [RegisterRead(self._double(arg)) for arg in node.args if is_full(arg, self._width)]
+        reads = [self._make_argument(arg, depth) for arg in node.args]
+        used = [
+            RegisterRead(self._compile_double(arg))
+            for arg in node.args
+            if is_full(arg, self._width)
+        ]
         function = node.function
         is_direct = isinstance(function, np.ufunc)
 
@@ -377,18 +393,18 @@ class Compiler:
         name = getattr(function, "__name__", "function")
         return self.program.step(f"copy {name}", kind, run, *used)
 
-    def _argument(self, value: Any, depth: int) -> Callable[[ProgramRun], Any]:
+    def _make_argument(self, value: Any, depth: int) -> Callable[[ProgramRun], Any]:
         if not isinstance(value, Node):
-            return _constant(value)
+            return _make_constant(value)
         if is_full(value, self._width):
-            read = RegisterRead(self._double(value))
+            read = RegisterRead(self._compile_double(value))
             shape = (*value.shape, *(1,) * (depth - len(value.shape)))
             return lambda run: read(run).reshape(-1, *shape)
         self.low.append(value)
         return lambda run: add_axes(run.part(run.values(value)), depth)
 
     def _broadcast(self, value: Any, kind: str) -> int:
-        """Broadcast a constant or a plain result to all points."""
+        """Broadcast a constant or a value that is not full to all points."""
         shape = self._shape
         if not isinstance(value, Node):
             return self.program.tile(np.broadcast_to(np.asarray(value, TYPES[kind]), shape), kind)
@@ -401,5 +417,5 @@ class Compiler:
         return self.program.step("already computed per packet", kind, run)
 
 
-def _constant(value: Any) -> Callable[[ProgramRun], Any]:
+def _make_constant(value: Any) -> Callable[[ProgramRun], Any]:
     return lambda run: value

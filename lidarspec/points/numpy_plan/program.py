@@ -1,11 +1,11 @@
-"""A program: NumPy calls on registers, for one chunk of packets at a time.
+"""Run a program: NumPy calls on registers, for one chunk of packets at a time.
 
-A program computes flat columns from frames of one layout. It knows nothing of fields or
-expressions: `numpy_plan.compiler` appends the steps. A step makes one register out of others, of
-the frames, or of plain results of the batch. A register is an array of one kind for a chunk:
-float32 ("single"), float64 ("double"), indices, flags or integers. Registers of output columns are
-the columns' own memory. The others use scratch memory: registers that are never needed at the same
-time share a slot, so that a chunk stays in the cache.
+A program computes flat columns from frames of one layout. It does not depend on fields or
+expressions: `numpy_plan.compiler` appends the steps. A step computes one register from other
+registers, from the frames, or from values of the batch. A register is an array of one kind for
+a chunk: float32 ("single"), float64 ("double"), indices, flags or integers. Registers of output
+columns are the memory of the columns. All others use scratch memory: registers that are not needed
+at the same time share a slot, so that a chunk stays in the cache.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lidarspec.frames.layout import Bytes2D
 from lidarspec.points.plan import ColumnMaker, Values
 
-#: points of a chunk; its scratch arrays stay in the cache.
+#: the number of points of a chunk: its scratch arrays stay in the cache.
 CHUNK_POINTS = 1 << 16
 
 _CODES = {
@@ -40,9 +40,11 @@ _NOTHING = np.empty(0)
 
 @dataclass
 class ProgramRun:
-    """One execution: the frames, the plain results, and the current chunk.
+    """One execution: the frames, the values of nodes, and the current chunk.
 
     Attributes:
+        rows: the frames, (n, size).
+        values: returns the value of a node for the batch, (n or 1, ...).
         views: the array of each register for the current chunk.
         start, stop: the packets of the current chunk.
     """
@@ -62,7 +64,14 @@ class ProgramRun:
 
 @dataclass(frozen=True, eq=False)
 class ProgramStep:
-    """One call, `run(execution, output)`, and the registers that it reads."""
+    """One call, `run(execution, output)`, and the registers that it reads.
+
+    Attributes:
+        text: a description.
+        run: the call.
+        output: the register that it fills.
+        reads: the registers that it reads.
+    """
 
     text: str
     run: Callable[[ProgramRun, NDArray[Any]], Any]
@@ -81,17 +90,17 @@ class RegisterRead:
 
 
 class Program(ColumnMaker):
-    """The calls that make some flat columns.
+    """The calls that compute some flat columns.
 
     Args:
-        width: points of a packet.
-        safe: returns whether a nan marks all coordinates of a point alike, for some values of the
-            packets. Otherwise the program marks the others.
+        width: the number of points of a packet.
+        safe: returns whether a nan in one coordinate of a point is a nan in all of them, given the
+            values of nodes. If not, the program sets the other coordinates to nan.
 
     Attributes:
-        chunk: packets of a chunk.
-        steps: in their order.
-        kinds: of the registers.
+        chunk: the number of packets of a chunk.
+        steps: the steps, in order.
+        kinds: the kind of each register.
         outputs: the register of each column.
     """
 
@@ -105,7 +114,7 @@ class Program(ColumnMaker):
         self._tiles: dict[int, NDArray[Any]] = {}
 
     def register(self, kind: str) -> int:
-        """Return a new register."""
+        """Add a register, and return its number."""
         self.kinds.append(kind)
         return len(self.kinds) - 1
 
@@ -116,20 +125,20 @@ class Program(ColumnMaker):
         run: Callable[[ProgramRun, NDArray[Any]], Any],
         *reads: Callable[[ProgramRun], Any],
     ) -> int:
-        """Add a step; return its register."""
+        """Add a step, and return its register."""
         output = self.register(kind)
         registers = tuple(read.register for read in reads if isinstance(read, RegisterRead))
         self.steps.append(ProgramStep(text, run, output, registers))
         return output
 
     def call(self, text: str, kind: str, function: Any, *reads: Callable[[ProgramRun], Any]) -> int:
-        """Add a call of a function that takes `out`; return its register."""
+        """Add a call of a function that accepts `out`, and return its register."""
         return self.step(
             text, kind, lambda run, out: function(*(read(run) for read in reads), out=out), *reads
         )
 
     def tile(self, row: NDArray[Any], kind: str) -> int:
-        """Return a new register with the same values in every packet."""
+        """Add a register with the same values in every packet, and return its number."""
         register = self.register(kind)
         self._tiles[register] = np.tile(row.reshape(-1), self.chunk)
         return register
@@ -154,11 +163,11 @@ class Program(ColumnMaker):
                 execution.start = start
                 execution.stop = min(start + self.chunk, len(rows))
                 self._run_chunk(execution, registers, columns)
-        places = [columns[name] for name in "xyz" if name in columns]
-        if places and not self._safe(values):
-            bad = np.isnan(places).any(axis=0)
-            for place in places:
-                place[bad] = np.nan
+        coordinates = [columns[name] for name in "xyz" if name in columns]
+        if coordinates and not self._safe(values):
+            bad = np.isnan(coordinates).any(axis=0)
+            for coordinate in coordinates:
+                coordinate[bad] = np.nan
 
     def _run_chunk(
         self, run: ProgramRun, registers: list[NDArray[Any]], columns: Mapping[str, NDArray[Any]]
@@ -177,7 +186,7 @@ class Program(ColumnMaker):
 
     @cached_property
     def _slots(self) -> list[int]:
-        """The slot of each register; not to be used before the last step is added."""
+        """The slot of each register, computed once; all steps must have been added before."""
         uses = [(step.output, *step.reads) for step in self.steps]
         return assign_slots(uses, self.kinds, {*self.outputs.values(), *self._tiles})
 
@@ -187,21 +196,21 @@ def assign_slots(
 ) -> list[int]:
     """Return a slot for each register.
 
-    Registers of one kind that are never needed at the same time share a slot.
+    Registers of one kind that are not needed at the same time share a slot.
 
     Args:
-        uses: the registers that each step makes or reads, in the order of the steps.
-        kinds: of the registers.
-        own: registers that have memory of their own.
+        uses: the registers that each step fills or reads, in the order of the steps.
+        kinds: the kind of each register.
+        own: registers that have their own memory.
 
     Returns:
         The number of each register's slot, -1 for a register without a slot.
     """
-    last = {register: place for place, used in enumerate(uses) for register in used}
+    last = {register: index for index, used in enumerate(uses) for register in used}
     slots = [-1] * len(kinds)
     free = dict[str, list[int]]()
     count = 0
-    for place, used in enumerate(uses):
+    for index, used in enumerate(uses):
         shared = set(used) - set(own)
         for register in shared:
             if slots[register] >= 0:
@@ -212,6 +221,6 @@ def assign_slots(
                 count += 1
             slots[register] = waiting.pop()
         for register in shared:
-            if last[register] == place:
+            if last[register] == index:
                 free[kinds[register]].append(slots[register])
     return slots
